@@ -12,6 +12,7 @@ from itertools import combinations, combinations_with_replacement
 from pathlib import Path
 from unittest.mock import patch
 
+import aces
 import pytest
 from brute_force import Key, minimal_maps
 from hypothesis import given, settings
@@ -149,8 +150,7 @@ def test_the_backbone_is_what_the_brute_force_says(data: st.DataObject) -> None:
 def test_reasoning_from_one_map_says_what_the_whole_list_says(
     theory: Theory, count: int, shared: str
 ) -> None:
-    trace = Trace.load(ACES3)
-    every, first = solve(trace, theory, max_maps=None), solve(trace, theory, max_maps=1)
+    every, first = aces.solution(theory), aces.solution(theory, 1)
     assert every.summary == f"{count} minimal maps: {shared}"
     backbone = find_backbone(first)
     assert backbone == every.backbone
@@ -229,7 +229,7 @@ def test_a_share_of_the_time_is_kept_for_reasoning_where_the_list_does_not_end()
     search = Search(
         rectangle(14), theory, max_maps=None, time_limit=1000, _start=Start(reasons=True)
     )
-    with patch.object(Watch, "reserve_begins", 2.0):
+    with patch.object(Watch, "reserve_begins", 0.5):
         count = sum(1 for _ in search)
     solution = search.solution()
     assert solution.stopped == "time limit"
@@ -245,7 +245,7 @@ def test_a_share_of_the_time_is_kept_for_reasoning_where_the_list_does_not_end()
 
 def test_a_solution_is_a_value(tmp_path: Path) -> None:
     """It survives pickle, copies and files, and finds a backbone only where it is asked to."""
-    solution = solve(Trace.load(ACES3), max_maps=1)
+    solution = aces.solution(max_maps=1)
     solution.save(tmp_path / "maps.json")
     loaded = Solution.load(tmp_path / "maps.json", solution.trace)
     copies = [pickle.loads(pickle.dumps(solution)), deepcopy(solution), replace(solution), loaded]
@@ -263,12 +263,12 @@ def test_a_solution_is_a_value(tmp_path: Path) -> None:
 
 
 def test_a_backbone_that_cannot_be_found_in_time_is_not_proven() -> None:
-    solution = solve(Trace.load(ACES3), max_maps=1)
+    solution = aces.solution(max_maps=1)
     assert find_backbone(solution, time_limit=1e-9) == solution.backbone
 
 
 def test_a_backbone_needs_the_trace(tmp_path: Path) -> None:
-    solve(Trace.load(ACES3), max_maps=1).save(tmp_path / "maps.json")
+    aces.solution(max_maps=1).save(tmp_path / "maps.json")
     loaded = Solution.load(tmp_path / "maps.json")
     with pytest.raises(SolverError, match="trace: expected the trace that was solved, got none"):
         find_backbone(loaded)
@@ -314,7 +314,7 @@ def test_while_the_robot_drives_the_backbone_is_that_of_the_maps_listed() -> Non
     ],
 )
 def test_the_summary_is_a_sentence(theory: Theory, maps: int, within: int, summary: str) -> None:
-    assert solve(Trace.load(ACES3), theory, max_maps=maps or None, within=within).summary == summary
+    assert aces.solution(theory, maps or None, within).summary == summary
 
 
 def test_nothing_is_shared_where_no_map_is_proven_minimal() -> None:

@@ -15,6 +15,7 @@ from itertools import combinations, product
 from math import prod
 from pathlib import Path
 
+import aces
 import clingo
 import numpy as np
 import pytest
@@ -262,7 +263,7 @@ def naive_groups(ssh_map: SSHMap, sort: Matter) -> set[tuple[int, ...]]:
 
 
 def test_maps_that_differ_in_places_alone() -> None:
-    solution = solve(Trace.load(ACES3), FREE_PLACES, max_maps=None)
+    solution = aces.solution(FREE_PLACES)
     found = compare(solution)
     assert (
         found.sentence
@@ -334,7 +335,7 @@ def test_maps_of_all_kinds_are_compared_whatever_they_are_of() -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_ids_do_not_depend_on_how_things_are_numbered(seed: int) -> None:
     rng = random.Random(seed)
-    maps = solve(Trace.load(ACES3), max_maps=None).maps
+    maps = aces.solution().maps
     assert len({m.id for m in maps}) == len(maps)
     for ssh_map in maps:
         number, place, path = (
@@ -419,7 +420,7 @@ def test_the_order_of_a_complete_list_is_the_same_with_any_number_of_threads(
 def test_a_list_is_in_order_whatever_order_maps_are_found_in(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    usual = solve(Trace.load(ACES3), FREE_PLACES, max_maps=None)
+    usual = aces.solution(FREE_PLACES)
     found = searching.Search._found
 
     def shuffled(search: searching.Search) -> Iterator[Priced]:
@@ -468,7 +469,7 @@ def test_the_shell_prints_what_python_says(
     file_of: Callable[..., Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = file_of(ACES3, "-n", "0")
-    solution = solve(Trace.load(ACES3), max_maps=None)
+    solution = aces.solution()
     found = compare(solution)
     assert main(["compare", str(path)]) == 0
     assert capsys.readouterr().out.startswith(f"{solution.summary}\n  4 = 2 x 2: ")
@@ -502,13 +503,13 @@ def test_where_not_all_are_listed_the_backbone_says_what_all_share(
     assert not found.listed.proven
     assert found.shared == replace(compare(Listing.load(every)).shared, proven=True)
     assert found.unlisted
-    solution = solve(Trace.load(ACES3), max_maps=2)
+    solution = aces.solution(max_maps=2)
     python = compare(replace(solution, shared=find_backbone(solution)))
     assert python.shared == found.shared
 
 
 def test_a_search_that_was_stopped_says_as_far_as_was_found_out() -> None:
-    maps = solve(Trace.load(ACES3), max_maps=None).maps
+    maps = aces.solution().maps
     listing = Listing(maps[:2], minimal=2, complete=False, stopped="time limit")
     assert compare(listing).sentence.endswith("as far as is known: other maps may differ in more")
     assert compare(maps[:1]).sentence == "1 map"
@@ -667,9 +668,7 @@ def test_json_streams_what_is_too_much_to_hold(
     printed_by.cache_clear()
     monkeypatch.setattr(solving, "HELD", 2)
     streamed = json.loads(file_of(ACES3, "-n", "0").read_text())
-    assert [m["id"] for m in held["maps"]] == [
-        m.id for m in solve(Trace.load(ACES3), max_maps=None).maps
-    ]
+    assert [m["id"] for m in held["maps"]] == [m.id for m in aces.solution().maps]
     assert {m["id"] for m in streamed["maps"]} == {m["id"] for m in held["maps"]}
     assert streamed["count"] == held["count"] == len(streamed["maps"])
     printed_by.cache_clear()

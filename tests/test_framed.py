@@ -234,7 +234,7 @@ def test_maps_that_a_search_beside_shows_to_be_minimal(
     assert found.complete
 
 
-@pytest.mark.parametrize("limit", [0.5, 2])
+@pytest.mark.parametrize("limit", [0.5, 1])
 def test_a_limit_ends_the_search_beside(limit: float) -> None:
     """While it guesses, or while it asks clingo. What is left is a map, and a bound."""
     trace = maze(10, 10, steps=4000, seed=2, stars=True).trace.prefix(400)
@@ -251,7 +251,7 @@ def test_a_limit_ends_the_search_beside(limit: float) -> None:
     assert check(trace, solution.maps[0], Theory.topological()) == ()
 
 
-@pytest.mark.parametrize(("side", "steps", "seed"), [(4, 120, 7), (5, 200, 4)])
+@pytest.mark.parametrize(("side", "steps", "seed"), [(4, 120, 7)])
 def test_names_list_all_ways_to_be_at_the_fewest_dstates(side: int, steps: int, seed: int) -> None:
     """There are several in these mazes, most of which have no paths."""
     walk = maze(side, side, steps=steps, seed=seed, stars=True)

@@ -323,21 +323,21 @@ def explore(trace: Trace, mapper: OnlineMapper) -> list[Solution]:
 
 def test_maps_are_guessed_while_the_robot_drives() -> None:
     """Without time for clingo. The guess is made for some of the steps; its map goes on."""
-    walk = maze(4, 4, steps=140, seed=1, stars=True)
+    walk = maze(4, 4, steps=90, seed=1, stars=True)
     trace = walk.trace
     with (
         patch.object(guessing, "has_processors", lambda _: True),
-        patch.object(guesser, "GUESSED", 120),
+        patch.object(guesser, "GUESSED", 70),
     ):
         mapper = OnlineMapper(
             trace.steps[0].view or "", star=trace.steps[0].star, time_limit=NO_TIME
         )
-        explore(trace.prefix(125), mapper)
+        explore(trace.prefix(75), mapper)
         guess = guess_of(mapper)
         assert guess is not None
         assert guess.result() is not None  # waits for it
         answers = explore(trace, mapper)
-    for i, answer in enumerate(answers, 126):
+    for i, answer in enumerate(answers, 76):
         assert answer.status is Status.FEASIBLE
         assert check(trace.prefix(i), answer.maps[0], mapper.theory) == ()
     assert (
@@ -394,11 +394,12 @@ def test_a_guess_ends_with_its_mapper_and_with_the_program() -> None:
 import threading
 from instances import maze
 from ssh_abduction import OnlineMapper
-from ssh_abduction.online import background_guess as guessing
+from ssh_abduction.online import background_guess as guessing, guesser
 guessing.has_processors = lambda _: True
+guesser.GUESSED = 30
 
 def begun():
-    trace = maze(10, 10, steps=150, seed=1, stars=True).trace
+    trace = maze(10, 10, steps=40, seed=1, stars=True).trace
     mapper = OnlineMapper(trace.steps[0].view, star=trace.steps[0].star, time_limit=1e-9)
     for action, step in zip(trace.actions, trace.steps[1:]):
         mapper.observe(action, step.view, star=step.star)

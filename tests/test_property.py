@@ -41,7 +41,7 @@ def agree(trace: Trace, theory: Theory) -> None:
         assert getattr(solution.cost, name) == getattr(counts, name)
 
 
-@settings(max_examples=30)
+@settings(max_examples=20)
 @given(st.data())
 def test_solver_lists_the_maps_of_the_brute_force(data: st.DataObject) -> None:
     trace = data.draw(traces(), label="trace")

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
-import subprocess
-import sys
 from typing import Any
 from unittest.mock import patch
 
+import aces
 import pytest
 from brute_force import key, minimal_maps, near_minimal_maps
 from hypothesis import given, settings
@@ -17,6 +18,7 @@ from strategies import TOYS, theories, traces
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.claims import false_claims
+from ssh_abduction.cli import main
 from ssh_abduction.data import SolverError
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver import Cost, Status, prefixes
@@ -111,7 +113,7 @@ def test_without_an_order_behind_dstates_all_maps_of_so_few_dstates_are_listed()
 def test_maps_come_in_the_order_of_their_cost_up_to_as_many_as_are_asked_for(
     maps: int, levels: list[int]
 ) -> None:
-    solution = solve(Trace.load(ACES3), max_maps=maps or None, within=3)
+    solution = aces.solution(max_maps=maps, within=3)
     assert [level.count for level in solution.levels] == levels
     assert solution.complete == (maps == 11)
     assert solution.stopped == (None if maps == 11 else "maps limit")
@@ -176,10 +178,9 @@ def test_a_wrong_within_is_an_error(within: object) -> None:
 @pytest.fixture(scope="module")
 def near() -> dict[str, Any]:
     """What `solve --within 3 --json` prints of the real route."""
-    shell = [sys.executable, "-m", "ssh_abduction", "solve", ACES3, "--within", "3", "--json"]
-    return dict(
-        json.loads(subprocess.run(shell, check=True, capture_output=True, text=True).stdout)
-    )
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        assert main(["solve", ACES3, "--within", "3", "--json"]) == 0
+    return dict(json.loads(printed.getvalue()))
 
 
 def test_the_json_says_what_each_map_costs(near: dict[str, Any]) -> None:
