@@ -30,7 +30,7 @@ SEES = 5.0
 @pytest.fixture(scope="module")
 def drive() -> tuple[Scan, ...]:
     """A drive around a corner of a hall, with a scan each metre and true ranges."""
-    return tuple(scans_of(record(World.named("taylor-hall"), every=1.0)))[:50]
+    return tuple(scans_of(record(World.named("taylor-hall"), every=1.0)))[:80]
 
 
 def written(
