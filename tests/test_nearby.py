@@ -363,6 +363,17 @@ def fewest_dstates(trace: Trace) -> int:
     return cost.dstates
 
 
+@cache
+def pinned_in_a_maze() -> tuple[Trace, Pinned]:
+    """A long trace in a maze of 9 cells, and what is pinned in all of it."""
+    trace = maze(3, 3, steps=1600, seed=0).trace
+    watch = Watch(100.0)
+    watch.start()
+    long = CausalEngine(engine.Task.of(Problem.of(trace, CAUSAL), watch))._named
+    long.grow(len(trace))
+    return trace, long.program.pinned
+
+
 @pytest.mark.parametrize(
     ("first", "guessed", "goes_on"), [(1200, 0, True), (20, 0, False), (20, 1601, True)]
 )
@@ -373,14 +384,10 @@ def test_a_guess_at_the_beginning_of_a_long_trace_goes_on_if_it_can(
     links; of 20 and 40 steps it is of no use, but where
     the trace is not too long all of it is guessed then.
     """
-    trace = maze(3, 3, steps=1600, seed=0).trace
+    trace, pinned_nodes = pinned_in_a_maze()
     watch = Watch(100.0)
     watch.start()
-    long = CausalEngine(engine.Task.of(Problem.of(trace, CAUSAL), watch))._named
-    long.grow(len(trace))
-    small = small_maps.SmallMaps(
-        engine.Task.of(Problem.of(trace, CAUSAL), watch), long.program.pinned
-    )
+    small = small_maps.SmallMaps(engine.Task.of(Problem.of(trace, CAUSAL), watch), pinned_nodes)
     with patch.multiple(small_maps, AT_ONCE=first, GUESSED=guessed):
         found = list(small.from_beginning(watch.check))
     assert bool(found) == goes_on

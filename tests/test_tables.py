@@ -3,6 +3,7 @@ solved, counted and checked."""
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from worlds import TOURS, drive, rectangle, written
 
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
-from ssh_abduction.solver import Status
+from ssh_abduction.solver import Solution, Status
 
 P0 = Theory.causal()
 P1 = Theory(
@@ -32,10 +33,16 @@ C = "o T e A o T e A o"
 Expected = int | tuple[int, ...]
 
 
+@cache
+def solved(trace: Trace, theory: Theory) -> Solution:
+    """All minimal maps, which several tables ask for."""
+    return solve(trace, theory, max_maps=None)
+
+
 def answer(trace: Trace, theory: Theory, expected: Expected) -> tuple[Expected, int | None]:
     """The counts of the minimal maps in the table's form, and how many maps there are; each map is
     checked."""
-    solution = solve(trace, theory, max_maps=None)
+    solution = solved(trace, theory)
     assert solution.status is Status.OPTIMAL
     assert solution.complete
     assert solution.cost is not None
@@ -294,9 +301,7 @@ def test_notched_rectangle_by_number_of_actions(
 @pytest.mark.parametrize("theory", [P0, P1, P2, P3])
 @pytest.mark.parametrize("actions", LENGTHS)
 def test_the_mirror_image_has_mirrored_maps(theory: Theory, actions: int) -> None:
-    clockwise, anticlockwise = (
-        solve(rectangle(actions, turn=turn), theory, max_maps=None) for turn in "RL"
-    )
+    clockwise, anticlockwise = (solved(rectangle(actions, turn=turn), theory) for turn in "RL")
     assert {m.labels for m in clockwise.maps} == {m.labels for m in anticlockwise.maps}
     assert {m.dstates for m in clockwise.maps} == {m.dstates for m in anticlockwise.maps}
 
