@@ -483,6 +483,24 @@ def test_what_is_not_told_beforehand_is_found() -> None:
         assert set(maps) == set(expected.maps)
 
 
+def test_clingo_is_told_of_a_path_that_an_answer_contradicts() -> None:
+    """Else maps would be the same, but each answer without paths would be forbidden alone."""
+    trace = maze(3, 3, steps=60, seed=0, stars=True).trace
+    asked = Search(trace, Theory(star="frame"))._parts.prefixes.engine
+    assert isinstance(asked, FramedEngine)
+    with patch.object(FramedEngine, "_charted", plainly_charted):
+        asked.grow(len(trace))
+    labels, chart, paths = asked._visits.fewest(), asked._chart, asked._fitting.paths
+    assert isinstance(labels, list)
+    control = paths.contrary(chart, labels)
+    contrary, _ = next(asked.asker.answers(paths_lp.read_contrary, "ignore", 1, control=control))
+    standing = asked._visits.program.standing(labels)
+    assert contrary
+    assert asked._sides.say_of_path(paths, chart, labels, standing)
+    (told,) = asked._sides._said
+    assert told in {("path", standing[dstate]) for dstate in contrary}
+
+
 @pytest.mark.parametrize(
     "theory",
     [
