@@ -143,7 +143,7 @@ def test_the_map_of_a_drive_joins_what_is_one_place(runs: Path) -> None:
 
 
 def test_corrected_poses_are_not_read(hall: Path) -> None:
-    log = RobotLog(read_log(hall).scans[:45], source="x")
+    log = RobotLog(read_log(hall).scans[:60], source="x")
     blind = tuple(
         Scan(scan.ranges, scan.laser, scan.odometry, None, scan.time, scan.line)
         for scan in log.scans
