@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.trace import STANDARD_ACTIONS, Action, Trace
 from ssh_abduction.theory.encodings import axioms
-from ssh_abduction.theory.fields import COUNTS, Count
+from ssh_abduction.theory.fields import COUNTS, PRICES, Count
 from ssh_abduction.theory.rules import Rules
 from ssh_abduction.theory.theory import Theory
 
@@ -192,6 +192,8 @@ def choices_of(field: str, trace: Trace) -> st.SearchStrategy[Any]:
         "misread": st.just(0.0),  # tests/test_faults.py has tests of its own
         "slipped": st.just(0.0),
         "jumped": st.just(0.0),
+        "weigh": st.just("auto"),  # tests/test_weighing.py has tests of its own
+        "prices": st.just(PRICES),
         "unknown_views": st.just(False),  # the trace says it
         "same": _seldom(_pairs(len(trace))),
         "different": _pairs(len(trace)),

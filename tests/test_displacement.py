@@ -20,7 +20,7 @@ from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data import DState, Odometry, TheoryError
 from ssh_abduction.solver.asp.facts.answer_maps import causal_map
-from ssh_abduction.solver.fit import _Problem, fit
+from ssh_abduction.solver.fit import Poses, fit
 from ssh_abduction.solver.ranking import noise_warning, units_warning
 from ssh_abduction.theory.evidence import pairs_of
 from ssh_abduction.theory.evidence.displacement import Displacement
@@ -187,7 +187,9 @@ def test_errors_that_repeat_are_estimated_along(scale: float, bend: float) -> No
 @given(st.data())
 def test_the_jacobian_of_a_fit_is_right(data: st.DataObject) -> None:
     trace = data.draw(traces().filter(lambda trace: trace.has_displacements), label="trace")
-    problem = _Problem(trace, solve(trace, Theory.causal().replace(displacement="none")).maps[0])
+    problem = Poses.of_map(
+        trace, solve(trace, Theory.causal().replace(displacement="none")).maps[0]
+    )
     assume(len(problem._moved))
     rng = np.random.default_rng(0)
     unknown = problem._begun() + 0.01 * rng.normal(size=problem._size)

@@ -76,6 +76,8 @@ def run(options: argparse.Namespace) -> int:
     print(f"{len(maps) - broken} of {len(maps)} maps satisfy the {checked} axioms")
     if not_checked:
         print(f"not checked, as they are a user's own: {printable(', '.join(not_checked))}")
+    if resolved.weigh == "cost" and isinstance(data, dict) and data.get("weighed"):
+        broken += not _costs_hold(trace, data, maps, resolved)
     if not options.bound:
         return EXIT_VIOLATED if broken else 0
     if resolved.has_faults or (solved is not None and solved.has_faults):
@@ -93,12 +95,34 @@ def run(options: argparse.Namespace) -> int:
         doubt = "some maps break axioms"
     elif solved is None:
         doubt = "the file does not say of which theory"
-    elif resolved.replace(prefer=()) != settle(trace, solved).theory.replace(prefer=()):
+    elif _axioms_of(resolved) != _axioms_of(settle(trace, solved).theory):
         doubt = "the file is of another theory"
     proven = _bound(
         trace, data, theory, maps, doubt, settle(trace, solved or theory).theory, bool(broken)
     )
     return EXIT_VIOLATED if broken or not proven else 0
+
+
+def _axioms_of(theory: Theory) -> Theory:
+    """The theory without its choice of what is minimal."""
+    return theory.replace(prefer=(), weigh="count")
+
+
+def _costs_hold(
+    trace: Trace, data: Mapping[str, Any], maps: Sequence[SSHMap], theory: Theory
+) -> bool:
+    """Compute the costs of maps in nats anew, print what is false, and return whether all hold."""
+    from ssh_abduction.checker.misfit import LONGEST, false_costs  # loads numpy
+
+    Solution.from_dict(data, "the file", trace)  # the fields that claim costs have the right form
+    false = list(false_costs(trace, data, maps, theory))
+    for claim in false:
+        print(printable(claim))
+    if len(trace) > LONGEST:
+        print(f"costs in nats are not checked, as the trace has more than {LONGEST} steps")
+    elif not false:
+        print("the costs in nats are right, by an account of its own")
+    return not false
 
 
 def _bound(

@@ -72,13 +72,22 @@ def headline(solution: Solution, count: int, explanation: Explanation | None) ->
         counted(v, k) if k != "faults" else f"faults that cost {v:g} dstates"
         for k, v in solution.cost.to_dict().items()
     )
+    weighed = solution.weighed
+    if weighed is not None:
+        counts += f", {weighed.nats:.1f} nats"
+        seconds = f"{weighed.sentence}; {seconds}"
     if solution.status is Status.FEASIBLE:
+        claim = "not proven minimal" if weighed is None else "not proven to cost least"
+        if weighed is not None:
+            bound = f"{weighed.bound:.1f} nats or more"
         return (
-            f"feasible{why}: {counts}, not proven minimal; any map has "
-            f"{bound or 'no proven bound'}; {seconds}"
+            f"feasible{why}: {counts}, {claim}; any map has {bound or 'no proven bound'}; {seconds}"
         )
-    found = counted(
-        solution.levels[0].count if solution.levels else count, "minimal maps"
+    least = solution.levels[0].count if solution.levels else count
+    found = (
+        counted(least, "minimal maps")
+        if weighed is None
+        else f"{counted(least, 'maps')} of least cost"
     ) + _levels_above(solution)
     beyond = f" that cost up to {solution.within} more" if solution.minimal_listed else ""
     return (

@@ -31,6 +31,7 @@ from ssh_abduction.explain.question import Question
 from ssh_abduction.explain.verdict import PairExplanation, Side, Verdict
 from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import Cost, Status, Stop, facts
+from ssh_abduction.theory.settle import displacement_of
 from ssh_abduction.theory.theory import Theory, checked_theory
 
 # Pieces of at most this many steps are tried before the whole trace. That takes less than a second.
@@ -46,6 +47,8 @@ CONFIRMING = 5.0
 # Share of the remaining time that the search for minimal maps may take, and then the search for the
 # best map of the other side.
 SHARE = 0.45
+# Costs in nats that differ by less are equal.
+EQUAL = 1e-6
 
 
 @renamed_parameters("limit", "maps", "memory")
@@ -126,6 +129,7 @@ class PairQuestion(Question[PairExplanation]):
         self._sides = {True: Side(), False: Side()}
         self._minimal = {True: False, False: False}  # whether the side has a minimal map
         self._minimum: Cost | None = None
+        self._least_nats: float | None = None  # of the best map, if maps are weighed
         self._listed = False
         self._derivation: Derivation | None = None
         self._clash: Explanation | None = None
@@ -150,7 +154,16 @@ class PairQuestion(Question[PairExplanation]):
             self._clash,
             stopped,
             self.theory,
+            self._loop(),
         )
+
+    def _loop(self) -> str | None:
+        """How far off the loop between the steps closes, in words; None without displacements."""
+        evidence = displacement_of(self.problem)
+        if evidence is None:
+            return None
+        closing = evidence.returns_of(self.trace).closing(self.first, self.second)
+        return f"the loop of {closing.way:.0f} m closes {closing.size:.1f} m off"
 
     def _verdict(self) -> Verdict:
         one, two = self._sides[True], self._sides[False]
@@ -174,13 +187,17 @@ class PairQuestion(Question[PairExplanation]):
         """Tell whether all maps of this side are known to cost more than the minimum."""
         if self._minimum is None or side.cost is None or not side.proven:
             return False
+        least = self._least_nats
+        if side.nats is not None and least is not None:
+            return side.nats > least + EQUAL
         return side.cost.preferred_by(self.theory) > self._minimum.preferred_by(self.theory)
 
     def _is_beaten(self, side: Side, by: Side) -> bool:
         """Tell whether all maps of this side are known to cost more than a map of the side `by`."""
         if side.cost is None or not side.proven or by.cost is None:
             return False
-        return side.cost.preferred_by(self.theory) > by.cost.preferred_by(self.theory)
+        here, there = side.dearness(self.theory), by.dearness(self.theory)
+        return here is not None and there is not None and here > there
 
     def _find_out(self) -> None:
         # if a few steps around the pair have no map of a side, the whole trace has none
@@ -287,11 +304,17 @@ class PairQuestion(Question[PairExplanation]):
             if search.status is Status.OPTIMAL:
                 self._minimum = search.cost
                 self._minimal[one] = True
+                self._least_nats = search.nats
                 self._sides[one] = replace(
-                    side, possible=True, cost=search.cost, proven=True, maps=side.maps + 1
+                    side,
+                    possible=True,
+                    cost=search.cost,
+                    proven=True,
+                    maps=side.maps + 1,
+                    nats=search.nats,
                 )
             elif side.cost is None:
-                self._sides[one] = replace(side, possible=True, cost=search.cost)
+                self._sides[one] = replace(side, possible=True, cost=search.cost, nats=search.nats)
         if search.status is Status.UNSATISFIABLE:
             self._sides = {True: Side(possible=False), False: Side(possible=False)}
         self._listed = search.complete and not settled
@@ -315,6 +338,7 @@ class PairQuestion(Question[PairExplanation]):
                 possible=True,
                 cost=search.cost,
                 proven=search.status is Status.OPTIMAL,
+                nats=search.nats,
             )
         if search.status is Status.UNSATISFIABLE:
             self._sides[one] = Side(possible=False)

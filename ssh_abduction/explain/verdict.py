@@ -41,12 +41,20 @@ class Side:
         cost: The cost of the best known map of this side; None if no map is known.
         proven: Whether it is proven that no map of this side costs less.
         maps: The number of listed minimal maps that are on this side.
+        nats: The cost of the best known map in nats, if maps are compared by it; else None.
     """
 
     possible: bool | None = None
     cost: Cost | None = None
     proven: bool = False
     maps: int = 0
+    nats: float | None = None
+
+    def dearness(self, theory: Theory) -> tuple[float, ...] | None:
+        """The numbers that are compared to find the better side; None if no map is known."""
+        if self.nats is not None:
+            return (self.nats,)
+        return None if self.cost is None else self.cost.preferred_by(theory)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the side as plain data, as `explain --json` prints it."""
@@ -55,6 +63,7 @@ class Side:
             "cost": self.cost.to_dict() if self.cost else None,
             "proven": self.proven,
             "maps": self.maps,
+            **({"nats": round(self.nats, 6)} if self.nats is not None else {}),
         }
 
 
@@ -75,6 +84,7 @@ class PairExplanation:
         clash: Why the trace has no map; None if it has one, or if the reason is not known.
         stopped: The limit that ended the search; None if it ended by itself.
         theory: The theory, with each "auto" replaced by the value that was used.
+        loop: How far off the loop between the steps closes, in words; None without displacements.
     """
 
     first: int
@@ -87,6 +97,7 @@ class PairExplanation:
     clash: Explanation | None
     stopped: Stop | None
     theory: Theory = field(repr=False)
+    loop: str | None = None
 
     @property
     def proven(self) -> bool:
@@ -139,9 +150,33 @@ class PairExplanation:
             yield f"no map {rival} satisfies the axioms"
         elif lost.cost is None or won.cost is None:
             yield f"it is unknown whether there is a map {rival}"
+        elif lost.nats is not None and won.nats is not None:
+            yield self._weighed(lost, won)
         else:
             known = "the best map" if lost.proven else "the best map found"
             yield f"{known} {rival} has {_difference(lost.cost, won.cost, self.theory)}"
+
+    def _weighed(self, lost: Side, won: Side) -> str:
+        """Say in nats why the maps of one side cost more than those of the other."""
+        assert lost.nats is not None
+        assert won.nats is not None
+        assert lost.cost is not None
+        assert won.cost is not None
+        joining = self.verdict is Verdict.DIFFERENT_IN_MINIMAL
+        pair = f"steps {self.first} and {self.second}"
+        names = ("dstates", "places", "paths")
+        more = {name: getattr(lost.cost, name) - getattr(won.cost, name) for name in names}
+        price = sum(self.theory.prices[i] * more[name] for i, name in enumerate(names))
+        misfit = lost.nats - won.nats - price
+        priced = ", ".join(
+            f"{abs(number)} {_noun(name, abs(number))}{' less' if number < 0 else ' more'}"
+            for i, (name, number) in enumerate(more.items())
+            if number and self.theory.prices[i]
+        )
+        what = f"joining {pair}" if joining else f"making {pair} different dstates"
+        counts = f"{_effect(price)} of price ({priced or 'the same counts'})"
+        loop = f": {self.loop}" if self.loop else ""
+        return f"{what} {counts} and {_effect(misfit)} of misfit{loop}"
 
     @property
     def assuming(self) -> dict[str, str]:
@@ -151,8 +186,8 @@ class PairExplanation:
         """
         sides = {"same": self.same, "different": self.different}
         best = min(
-            (s.cost for s in sides.values() if s.cost),
-            key=lambda cost: cost.preferred_by(self.theory),
+            (s for s in sides.values() if s.cost),
+            key=lambda side: side.dearness(self.theory) or (),
             default=None,
         )
         told = {}
@@ -162,14 +197,17 @@ class PairExplanation:
                 told[name] = "no map satisfies the axioms"
             elif other.possible is False:
                 told[name] = "costs nothing, as it holds in every map"
-            elif side.cost is None or best is None:
+            elif side.cost is None or best is None or best.cost is None:
                 told[name] = "its cost is unknown"
-            elif side.cost.preferred_by(self.theory) == best.preferred_by(self.theory):
+            elif side.nats is not None and best.nats is not None and side is not best:
+                known = "" if side.proven else "at most "
+                told[name] = f"costs {known}{side.nats - best.nats:.1f} nats more"
+            elif side is best or side.dearness(self.theory) == best.dearness(self.theory):
                 known = "costs nothing" if side.proven else "no map is known that costs less"
                 told[name] = f"{known}: {_in_words(side.cost, self.theory.priorities)}"
             else:
                 known = "" if side.proven else "at most, "
-                told[name] = f"{known}{_difference(side.cost, best, self.theory)}"
+                told[name] = f"{known}{_difference(side.cost, best.cost, self.theory)}"
         return told
 
     def __str__(self) -> str:
@@ -213,6 +251,11 @@ def _in_words(cost: Cost, names: Iterable[str]) -> str:
 def _noun(name: str, number: float) -> str:
     noun = "dstates with its faults" if name == "tenths" else name
     return noun.removesuffix("s") if number == 1 and name != "tenths" else noun
+
+
+def _effect(nats: float) -> str:
+    """A difference of costs in words."""
+    return f"costs {nats:.1f} nats" if nats >= 0 else f"saves {-nats:.1f} nats"
 
 
 def _difference(lost: Cost, won: Cost, theory: Theory) -> str:

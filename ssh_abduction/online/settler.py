@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from ssh_abduction.data.errors import TraceError
+from ssh_abduction.data.errors import TheoryError, TraceError
 from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.theory.evidence import evidence_of
+from ssh_abduction.theory.fields import choice
 from ssh_abduction.theory.settle import Problem, count_returns, settle
 from ssh_abduction.theory.theory import Theory
 
@@ -20,12 +21,18 @@ class TheorySettler:
         first: A trace with only the first step.
 
     Raises:
-        TheoryError: The theory needs stars, but the first step has none.
+        TheoryError: The theory needs stars, but the first step has none; or it weighs maps.
         TraceError: The first step lacks something else that the theory needs.
     """
 
     def __init__(self, theory: Theory, first: Trace) -> None:
         # The first step has no displacement, so `star` is chosen without displacements.
+        if theory.weigh == "cost":
+            raise TheoryError(
+                "weigh: expected count while a robot drives, as weighing needs the whole trace, "
+                f"got cost; take {choice('weigh', 'count')}, and solve the trace at the end"
+            )
+        theory = theory.replace(weigh="count")
         settled = settle(first, theory.replace(displacement="none")).theory
         self._refuses_stars = theory.star == "auto" and settled.star == "none"
         self._theory = theory.replace(star=settled.star)

@@ -128,7 +128,7 @@ def find_backbone(
     check_limit("memory_limit", "MiB", memory_limit)
     trace = solution.trace if trace is None else checked_trace(trace)
     minimal, known = solution.minimal_maps, solution.backbone
-    if known is None or known.proven or not minimal:
+    if known is None or known.proven or not minimal or solution.theory.weigh == "cost":
         return known
     if trace is None:
         raise SolverError("trace: expected the trace that was solved, got none; give it")

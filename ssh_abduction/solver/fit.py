@@ -21,7 +21,7 @@ distributed. The sum ranks equally minimal maps, and may cause a warning. It rej
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -45,6 +45,9 @@ EXACT = 2e-3
 # SWEEPS is the number of iterations of the power method. HELD is the weight that keeps a rotation
 # at its old value. It is small: a metre weighs some hundreds.
 SWEEPS, HELD = 20, 1e-2
+# The number of unknowns that move and turn the whole map. If the matrix of derivatives has at most
+# DENSE entries, it is a dense array.
+GAUGE, DENSE = 3, 4_000_000
 
 
 def fit(trace: Trace, ssh_map: SSHMap) -> Fit:
@@ -57,20 +60,29 @@ def fit(trace: Trace, ssh_map: SSHMap) -> Fit:
     Returns:
         The poses of the dstates, and chi-square with its degrees of freedom.
     """
-    return _Problem(trace, ssh_map).solved()
+    return Poses.of_map(trace, ssh_map).fit()
 
 
-class _Problem:
-    """Least squares over the positions and headings of one map.
+class Poses:
+    """Least squares over positions and headings that the steps of a trace share.
 
     The vector of unknowns has x and y of each position in metres, then the heading of each dstate
     in radians, then the scale and the drift as multiples of their standard deviations.
     """
 
-    def __init__(self, trace: Trace, ssh_map: SSHMap) -> None:
+    def __init__(
+        self, trace: Trace, headings: Sequence[int], positions: Sequence[Hashable]
+    ) -> None:
+        """Collect the equations; solve nothing yet.
+
+        Args:
+            trace: A trace with displacements at some of its steps.
+            headings: The heading of each step, as a number. The numbers are consecutive, from 0.
+            positions: The position of each heading, as a number or another name.
+        """
         odometry = trace.odometry or Odometry()
         steps = [t for t in range(1, len(trace)) if trace.steps[t].displacement is not None]
-        labels = np.asarray(ssh_map.labels, dtype=int)
+        labels = np.asarray(headings, dtype=int)
         self._of_step = np.asarray(steps, dtype=int)
         self._from, self._to = labels[self._of_step - 1], labels[self._of_step]
         self._moved = np.array([trace.steps[t].displacement for t in steps], dtype=float).reshape(
@@ -89,19 +101,45 @@ class _Problem:
         self._whitening = np.linalg.inv(np.linalg.cholesky(noise)) if steps else noise
         self._way = np.hypot(self._moved[:, 0], self._moved[:, 1])
         self._sigma = np.array([odometry.scale, odometry.bend])
-        places = [s.place if s.place is not None else -1 - s.id for s in ssh_map.dstates]
-        number = {place: i for i, place in enumerate(dict.fromkeys(places))}
-        self._place = np.array([number[place] for place in places], dtype=int)
-        self._positions, self._headings = len(number), len(places)
+        number = {position: i for i, position in enumerate(dict.fromkeys(positions))}
+        self._place = np.array([number[position] for position in positions], dtype=int)
+        self._positions, self._headings = len(number), len(positions)
         self._size = 2 * self._positions + self._headings + 2
         # Displacements connect the headings of a group, and the positions of a part of the map.
         self._group = connected_components(
             self._graph(self._from, self._to, self._headings), directed=False
         )[1]
 
-    def solved(self) -> Fit:
+    @staticmethod
+    def of_map(trace: Trace, ssh_map: SSHMap) -> Poses:
+        """The poses of the dstates of a map of the whole trace, still unknown."""
+        places = [s.place if s.place is not None else -1 - s.id for s in ssh_map.dstates]
+        return Poses(trace, ssh_map.labels, places)
+
+    def misfit(self) -> float:
+        """The least chi-square of the displacements."""
+        return float((self._residuals(self._best()) ** 2).sum())
+
+    def _best(self) -> Array:
+        """The unknowns with the least sum of squares."""
         unknown = self._begun()
-        if len(self._moved):
+        if not len(self._moved):
+            return unknown
+        equations = 3 * len(self._moved) + 2
+        if self._size <= equations + GAUGE and self._size * equations <= DENSE:
+            # The equations leave open where the first pose is: fix it.
+            gauge = np.zeros((GAUGE, self._size))
+            gauge[range(GAUGE), [0, 1, 2 * self._positions]] = 1.0
+
+            def residuals(at: Array) -> Array:
+                off: Array = np.concatenate([self._residuals(at), gauge @ (at - unknown)])
+                return off
+
+            def jacobian(at: Array) -> Array:
+                return np.concatenate([self._jacobian(at).toarray(), gauge])
+
+            found = least_squares(residuals, unknown, jacobian, method="lm", x_scale="jac")
+        else:
             found = least_squares(
                 self._residuals,
                 unknown,
@@ -111,7 +149,12 @@ class _Problem:
                 x_scale="jac",
                 max_nfev=50,
             )
-            unknown = found.x
+        best: Array = found.x
+        return best
+
+    def fit(self) -> Fit:
+        """The best poses, and how well they agree with the displacements."""
+        unknown = self._best()
         squares = float((self._residuals(unknown) ** 2).sum())
         freedom = self._freedom(unknown)
         p = float(gammaincc(freedom / 2, squares / 2)) if freedom > 0 else 1.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from typing import TypeAlias
 
 from ssh_abduction.data.maps import SSHMap
@@ -24,16 +24,14 @@ Priced: TypeAlias = tuple[SSHMap, tuple[int, ...]]
 """A map and its preferred counts, the most important one first."""
 
 
-def listed(
-    parts: Parts, mended_maps: tuple[SSHMap, ...] | None, *, keeps_time: bool
-) -> Iterator[Priced]:
+def listed(parts: Parts, found: Iterator[Priced], *, keeps_time: bool) -> Iterator[Priced]:
     """Yield the maps asked for, each with its preferred counts, after the checker passed it.
 
     The clock of the search stops while the caller works with a map.
 
     Args:
         parts: The parts of the search.
-        mended_maps: The minimal maps, if mending the trace found them; else None.
+        found: The minimal maps, and then those that cost more.
         keeps_time: Whether to keep a share of the time limit for finding the backbone later.
     """
     known, watch, most = parts.known, parts.watch, parts.limits.most
@@ -42,7 +40,7 @@ def listed(
         ends = watch.reserve_begins if keeps_time else math.inf
         ends = ends if ends > watch.elapsed() else math.inf
         watch.end_stage_after(ends)
-        for ssh_map, cost in _by_cost(parts, mended_maps):
+        for ssh_map, cost in found:
             if most and known.count == most:
                 known.stopped = "maps limit"
                 return
@@ -67,8 +65,13 @@ def note(parts: Parts, ssh_map: SSHMap, cost: tuple[int, ...]) -> None:
         parts.rivals.add(ssh_map, cost)
 
 
-def _by_cost(parts: Parts, mended_maps: tuple[SSHMap, ...] | None) -> Iterator[Priced]:
-    """Yield the minimal maps, then those with up to `within` dstates more, with their counts."""
+def by_count(parts: Parts, mended_maps: tuple[SSHMap, ...] | None) -> Generator[Priced, None, None]:
+    """Yield the minimal maps, then those with up to `within` dstates more, with their counts.
+
+    Args:
+        parts: The parts of the search.
+        mended_maps: The minimal maps, if mending the trace found them; else None.
+    """
     known, limits = parts.known, parts.limits
     minimal = mended_maps or parts.prefixes.minimal_maps()
     yield from ((ssh_map, known.cost) for ssh_map in minimal)

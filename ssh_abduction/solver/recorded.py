@@ -75,12 +75,15 @@ class Support:
             certificate needs, or if the solution was read from a file.
         odometry_warning: A sentence that warns of wrong odometry; None if there is nothing to warn
             of.
+        weigh_warning: A sentence that says why maps were counted though they should be weighed;
+            None if there is nothing to say.
         recorded: The certificate and warnings of the file, if the solution was read from a file;
             else None.
     """
 
     basis: Basis | None = None
     odometry_warning: str | None = None
+    weigh_warning: str | None = None
     recorded: Recorded | None = None
 
     @property

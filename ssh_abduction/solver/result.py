@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 from typing import Any, overload
 
 from ssh_abduction.checker.claims import contradictions
-from ssh_abduction.data.errors import MapError, brief, checked_index, named
+from ssh_abduction.data.checks import one_of
+from ssh_abduction.data.errors import MapError, SolverError, brief, checked_index, named
 from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.map_file import SOLUTION_FORMAT, check_format, read_json, write_map
@@ -44,6 +45,7 @@ from ssh_abduction.solver.values import (
     Status,
     cost_as_counted,
 )
+from ssh_abduction.solver.weighed import Weighed
 from ssh_abduction.solver.writing import ending, opening, summary_of, written_map
 from ssh_abduction.theory.theory import Theory
 
@@ -76,6 +78,7 @@ class Solution:
             that are not in `maps`; None if it is to be computed from `maps`.
         trace: The trace; None in a solution that was read from a file without its trace.
         support: The data behind the certificate and the warnings.
+        weighed: The costs in nats and the rival maps, if maps were compared by cost; else None.
     """
 
     status: Status
@@ -93,6 +96,7 @@ class Solution:
     shared: Backbone | None = field(default=None, repr=False, compare=False)
     trace: Trace | None = field(default=None, repr=False, compare=False)
     support: Support = field(default=Support(), repr=False, compare=False)
+    weighed: Weighed | None = field(default=None, repr=False)
 
     def __len__(self) -> int:
         """The number of maps in this solution."""
@@ -167,12 +171,52 @@ class Solution:
             for k, v in self.cost.to_dict().items()
             if self.theory.level != "causal" or k in ("dstates", "faults")
         )
+        if self.weighed is not None:
+            counts += f"; {self.weighed.nats:.1f} nats"
+            bound = f"each map costs {self.weighed.bound:.1f} or more"
         if self.status is Status.FEASIBLE:
             return f"{self.status.value}{why}: {counts}; {bound}"
         least = self.levels[0].count if self.levels else self.count
         more = f" and {counted(self.count - least, 'maps')} with more" if self.count > least else ""
         perhaps = "" if self.complete else f", perhaps more{why}"
-        return f"{self.status.value}: {counts}; {counted(least, 'minimal maps')}{more}{perhaps}"
+        minimal = (
+            counted(least, "minimal maps")
+            if self.weighed is None
+            else f"{counted(least, 'maps')} of least cost"
+        )
+        return f"{self.status.value}: {counts}; {minimal}{more}{perhaps}"
+
+    @property
+    def confidence(self) -> float | None:
+        """The probability that the best map has the true dstates and places.
+
+        None if maps were counted, as then nothing observed says how probable they are.
+        """
+        return None if self.weighed is None else self.weighed.confidence
+
+    def probability(self, first: int, second: int, of: str = "dstate") -> float:
+        """The probability that two steps are at one dstate, or at one place.
+
+        Args:
+            first: The number of a step.
+            second: The number of another step.
+            of: "dstate" or "place".
+
+        Returns:
+            A number from 0 to 1. It sums the weights of the rival maps that say so.
+
+        Raises:
+            SolverError: A step does not exist, or maps were counted and not weighed.
+        """
+        if self.weighed is None:
+            raise SolverError(
+                "probability: expected a trace with displacements, whose maps are compared by "
+                "cost, got one whose maps are counted; nothing observed says how probable they are"
+            )
+        one_of("of", of, ("dstate", "place"), SolverError)
+        for step in (first, second):
+            checked_index(step, self.steps, "steps")
+        return self.weighed.probability(first, second, of)
 
     @property
     def costs(self) -> tuple[Cost, ...]:
@@ -243,8 +287,8 @@ class Solution:
         if self.support.recorded is not None:
             return self.support.recorded.warnings
         noise = [self.noise.sentence(self.trace)] if self.noise and self.trace else []
-        odometry = self.support.odometry_warning
-        return (*noise, *([odometry] if odometry else []))
+        others = (self.support.odometry_warning, self.support.weigh_warning)
+        return (*noise, *(warning for warning in others if warning))
 
     @property
     def noise(self) -> Noise | None:
@@ -379,6 +423,9 @@ class Solution:
             shared=backbone_in(read, record, steps),
             trace=trace,
             support=Support(recorded=Recorded.of(read, record, steps)),
+            weighed=Weighed.from_dict(read, record["weighed"], steps)
+            if record.get("weighed")
+            else None,
         )
 
 

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import replace
 from itertools import groupby
-from typing import get_args
+from typing import TYPE_CHECKING, get_args
 
 from ssh_abduction.data.checks import an_instance, one_of
 from ssh_abduction.data.errors import SolverError, TheoryError, brief
@@ -26,7 +26,7 @@ from ssh_abduction.solver.answer import Answer
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError, Stop
 from ssh_abduction.solver.asp.rules import check_rules
 from ssh_abduction.solver.fallback import OVERTIME, best_map, fall_back
-from ssh_abduction.solver.map_list import Priced, listed
+from ssh_abduction.solver.map_list import Priced, by_count, listed
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.ranking import Ranking
 from ssh_abduction.solver.result import Solution
@@ -43,6 +43,16 @@ SHORTEST = 0.05
 # Without a time limit, the proof of what all minimal maps share may take this many seconds, or as
 # long as the search if that is more.
 REASONING = 5.0
+if TYPE_CHECKING:
+    from ssh_abduction.solver.weighing import Weighing
+
+COUNTED = (
+    "weigh: maps are counted instead of weighed, as the trace has no displacements whose misfit "
+    "could be weighed"
+)
+# Maps are counted before they are weighed, for at most this share of the time. The fewest dstates
+# give the first map, and are seldom those of the best one.
+COUNTING_SHARE = 0.4
 _log = log_of(__name__)
 
 
@@ -85,6 +95,7 @@ class Search:
         before = _start.after.task.problem if _start.after else None
         problem = settle(trace, theory, before)
         self.theory = problem.theory
+        self._asked_weigh = theory.weigh if theory else "auto"
         if within and self.theory.has_faults:
             raise TheoryError(
                 "within: expected 0 where faults are allowed; leave it out, or see what each "
@@ -97,6 +108,13 @@ class Search:
         self._parts = Parts(problem, self.limits, checked_speedups(speedups), on_progress, _start)
         self._stages = Stages(self._parts, self._solve_mended, goes_on=_start.after is not None)
         self._answer = Answer(self._parts)
+        self._weighing: Weighing | None = None
+        if self.theory.weigh == "cost":
+            from ssh_abduction.solver.weighing import Weighing  # loads numpy
+
+            self._weighing = Weighing(self._parts)
+            self._reasons = False  # what clingo proves about minimal maps is about counts
+            self._parts.rivals.reasons = False
 
     @classmethod
     def continuing(
@@ -175,6 +193,12 @@ class Search:
         return self._answer.cost
 
     @property
+    def nats(self) -> float | None:
+        """The least cost in nats that is known; None if maps are counted, or none is known."""
+        best = self._weighing.best if self._weighing else None
+        return best.nats if best else None
+
+    @property
     def backbone(self) -> Backbone | None:
         """The backbone: what the minimal maps known so far share; None if none is known."""
         return self._parts.rivals.backbone
@@ -225,9 +249,17 @@ class Search:
         try:
             with heeding(watch.check):
                 self._stages.make_first_map()
-                self._stages.find_minimum()
-            maps = listed(parts, self._stages.mended_maps, keeps_time=self._reasons)
-            yield from each_heeding(watch.check, maps)
+                if self._weighing is None:
+                    self._stages.find_minimum()
+                else:
+                    self._weigh(self._weighing)
+            with closing(
+                self._weighing.maps()
+                if self._weighing
+                else by_count(parts, self._stages.mended_maps)
+            ) as found:  # clingo has to stop before it is asked again
+                maps = listed(parts, found, keeps_time=self._reasons)
+                yield from each_heeding(watch.check, maps)
         except StageTimeError:
             known.stopped = "maps limit" if known.count == self.limits.most else "time limit"
         except LimitError as limit:
@@ -240,6 +272,8 @@ class Search:
         finally:
             parts.end_clingo()
         fall_back(parts, self._answer, may_search=not self._stages.mends)
+        if self._weighing is not None:
+            self._weighing.keep_best()
         yield from best_map(parts)
         if self._reasons:
             self._reason()
@@ -251,6 +285,21 @@ class Search:
             counted(self.count, "maps"),
             "" if self.complete else ", perhaps not all",
         )
+
+    def _weigh(self, weighing: Weighing) -> None:
+        """Find some minimal map by counting, and then the maps of least cost."""
+        watch = self._parts.watch
+        if watch.left() < math.inf:
+            watch.end_stage_after(watch.elapsed() + COUNTING_SHARE * watch.left())
+        with suppress(StageTimeError):
+            self._stages.find_minimum()
+        watch.end_stage_after(math.inf)
+        if self._parts.known.status is not Status.UNSATISFIABLE:
+            weighing.search(self._of_labels)
+
+    def _of_labels(self, theory: Theory, seconds: float) -> tuple[tuple[SSHMap, ...], bool]:
+        """The minimal maps of a theory that fixes the dstates and places of this trace."""
+        return self._solve_mended(self.trace, theory, self.limits.most, seconds)
 
     def _solve_mended(
         self, mended: Trace, theory: Theory, most: int, seconds: float
@@ -329,7 +378,12 @@ class Search:
             maps: The maps that the answer holds. If all maps that were given are among them and no
                 minimal map is missing, they are sorted into an order that is the same in each run.
         """
-        return self._answer.solution(self._answer.in_order(checked_maps(maps)))
+        solution = self._answer.solution(self._answer.in_order(checked_maps(maps)))
+        if self._weighing is not None:
+            return replace(solution, weighed=self._weighing.weighed())
+        if self._asked_weigh != "cost":
+            return solution
+        return replace(solution, support=replace(solution.support, weigh_warning=COUNTED))
 
     def snapshot(self, stopped: Stop) -> Solution:
         """Make an answer while another thread still searches and cannot be stopped.

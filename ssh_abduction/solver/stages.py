@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.logs import log_of
 from ssh_abduction.solver import choosing, prefixes
@@ -133,16 +131,16 @@ class Stages:
             Whether it ended in that time.
         """
         parts, watch = self._parts, self._parts.watch
-        watch.end_stage_after(
-            watch.elapsed() + min(seconds, choosing.STEPWISE_SHARE * watch.left())
-        )
+        whole = watch.stage_ends
+        ends = watch.elapsed() + min(seconds, choosing.STEPWISE_SHARE * watch.left())
+        watch.end_stage_after(min(ends, whole))
         try:
             parts.prefixes.find_minimum()
         except StageTimeError:
             parts.prefixes.start = max(parts.prefixes.start, parts.engine.size)
             return False
         finally:
-            watch.end_stage_after(math.inf)
+            watch.end_stage_after(whole)
         return True
 
     def _settle_dstates_first(self) -> None:

@@ -29,7 +29,9 @@ def summary_of(solution: Solution, count: int, backbone: Backbone | None) -> str
         return "a map that is not proven minimal" if solution.cost else "no map was found"
     minimal = solution.levels[0].count if solution.levels else count
     listed = solution.minimal_listed
-    told = f"{'' if listed else 'at least '}{minimal} minimal map{'' if minimal == 1 else 's'}"
+    kind = "minimal map" if solution.weighed is None else "map"
+    told = f"{'' if listed else 'at least '}{minimal} {kind}{'' if minimal == 1 else 's'}"
+    told += "" if solution.weighed is None else " of least cost"
     if not listed:
         told += (
             f" (listing was stopped by the {solution.stopped})"
@@ -42,7 +44,8 @@ def summary_of(solution: Solution, count: int, backbone: Backbone | None) -> str
             "" if backbone.proven else ", as far as was found out: others may differ in more"
         )
     more = sum(level.count for level in solution.levels[1:])
-    return told + (f"; and {more} with up to {solution.within} more" if more else "")
+    told += f"; and {more} with up to {solution.within} more" if more else ""
+    return told + (f"; {solution.weighed.sentence}" if solution.weighed else "")
 
 
 def opening(theory: Theory, steps: int, within: int) -> dict[str, Any]:
@@ -105,6 +108,8 @@ def ending(solution: Solution, count: int, backbone: Backbone | None) -> dict[st
         end["certificate"] = dict(recorded.written_certificate)
     elif solution.certificate:
         end["certificate"] = solution.certificate.to_dict(solution.trace)
+    if solution.weighed is not None:
+        end["weighed"] = solution.weighed.to_dict()
     if solution.stopped:
         end["stopped"] = solution.stopped
     if solution.partial:

@@ -21,6 +21,7 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "path_order": ("partial", "total"),
     "star": ("auto", "none", "alike", "pattern", "frame", "gateways"),
     "displacement": ("auto", "none", "use"),
+    "weigh": ("auto", "cost", "count"),
 }
 # Values of `star` for which gateways match if their directions agree within their spreads.
 IN_TOLERANCE = ("alike", "gateways")
@@ -31,6 +32,10 @@ COUNTS: tuple[Count, ...] = ("dstates", "paths", "places", "excuses")
 AUTO: tuple[Count, ...] = ("auto",)
 PREFERRED: tuple[Count, ...] = ("dstates", "paths", "places")
 WITH_DISPLACEMENTS: tuple[Count, ...] = ("dstates", "places", "paths")
+# The default prices of a dstate, a place and a path, in nats (docs/measurements/truth.md says how
+# they were chosen), and the highest price.
+PRICES = (8.0, 8.0, 0.0)
+DEAREST_PRICE = 1e6
 # The axioms that a fault of each kind may break. Speed-ups cannot rely on them.
 EXCUSED = {
     "misread": {"functional_view", "star_pattern", "star_frame"},
@@ -73,6 +78,7 @@ def normalise(theory: Theory) -> None:
                 f"{field.name}: expected true or false, got {brief(getattr(theory, field.name))}"
             )
     _check_numbers(theory)
+    _check_prices(theory)
     _set_names(theory, "prefer", (*COUNTS, *AUTO))
     _set_names(theory, "without", [a.name for a in encodings.axioms()])
     object.__setattr__(theory, "rules", Rules.all_of(theory.rules))
@@ -98,6 +104,8 @@ def normalise(theory: Theory) -> None:
         )
     if theory.has_faults:
         _check_faults(theory)
+    if theory.weigh == "cost":
+        _check_weigh(theory)
     if "excuses" in theory.prefer and theory.boundary != "defeasible":
         raise TheoryError(
             f"prefer: expected no excuses with boundary={theory.boundary}; take "
@@ -109,6 +117,31 @@ def choice(name: str, value: str) -> str:
     """Say how to set a field in Python and in the shell, such as "star=none (--star none)"."""
     flag = f"--{name} {value}" if name == "star" else f"--set {name}={value}"
     return f"{name}={value} ({flag})"
+
+
+def _check_weigh(theory: Theory) -> None:
+    if theory.prefer != AUTO and theory.prefer[:1] != ("dstates",):
+        raise TheoryError(
+            "prefer: expected dstates first where maps are weighed, got "
+            f"{', '.join(theory.prefer) or 'nothing'}; leave it out, or take "
+            f"{choice('weigh', 'count')}"
+        )
+    for reason, is_given in (("faults", theory.has_faults), ("excuses", _has_excuses(theory))):
+        if is_given:
+            raise TheoryError(
+                f"weigh: expected count where {reason} are allowed, as their price in nats is not "
+                f"known, got cost; take {choice('weigh', 'count')}"
+            )
+
+
+def _has_excuses(theory: Theory) -> bool:
+    return theory.boundary == "defeasible"
+
+
+def can_weigh(theory: Theory) -> bool:
+    """Whether the maps of a theory can be compared by their cost in nats."""
+    dstates_first = theory.prefer == AUTO or theory.prefer[:1] == ("dstates",)
+    return dstates_first and not theory.has_faults and not _has_excuses(theory)
 
 
 def _check_faults(theory: Theory) -> None:
@@ -161,6 +194,29 @@ def _check_numbers(theory: Theory) -> None:
             )
         object.__setattr__(theory, name, int(value))
     object.__setattr__(theory, "reject", float(theory.reject))
+
+
+def _check_prices(theory: Theory) -> None:
+    """Convert the prices to three floats. Raises TheoryError."""
+    given: Any = theory.prices
+    if isinstance(given, str):
+        given = [price.strip() for price in given.split(",")]
+    try:
+        prices = tuple(float(price) for price in given if not isinstance(price, bool))
+    except (TypeError, ValueError):
+        prices = ()
+    if len(prices) != 3 or not all(0 <= price <= DEAREST_PRICE for price in prices):
+        raise TheoryError(
+            f"prices: expected three numbers from 0 to {DEAREST_PRICE:g}, the nats that a dstate, "
+            f"a place and a path cost, got {brief(theory.prices)}; write prices=(8, 8, 0) "
+            "(--set prices=8,8,0)"
+        )
+    if prices[0] == 0:
+        raise TheoryError(
+            f"prices: expected a dstate to cost more than 0 nats, got {brief(theory.prices)}; "
+            "free dstates explain every trace; write prices=(8, 8, 0)"
+        )
+    object.__setattr__(theory, "prices", prices)
 
 
 def _check_rules(theory: Theory) -> None:

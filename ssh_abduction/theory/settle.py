@@ -16,7 +16,7 @@ from typing import Literal, TypeAlias
 from ssh_abduction.data.errors import TheoryError, TraceError
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.theory.evidence import Displacement, Evidence, evidence_of, pairs_of
-from ssh_abduction.theory.fields import choice
+from ssh_abduction.theory.fields import AUTO, can_weigh, choice
 from ssh_abduction.theory.pairs import Pairs
 from ssh_abduction.theory.theory import Theory, checked_theory
 
@@ -101,7 +101,13 @@ def settle(trace: Trace, theory: Theory | None = None, known: Problem | None = N
             f"{trace.at(0)}: view: expected one, got only an image; cluster the images into views "
             "first (ssh-abduction cluster)"
         )
-    settled = replace(theory, star=star, displacement=displacement, unknown_views=None in views)
+    settled = replace(
+        theory,
+        star=star,
+        displacement=displacement,
+        weigh=_weigh_of(theory, displacement),
+        unknown_views=None in views,
+    )
     counts = ["dstates" if count == "tenths" else count for count in settled.priorities]
     prefer = tuple(c for c in counts if c in theory.prefer or c != "excuses")
     settled = replace(settled, prefer=prefer)
@@ -127,6 +133,17 @@ def count_returns(problem: Problem) -> int:
 def displacement_of(problem: Problem) -> Displacement | None:
     """Return the evidence of displacements; None if the theory does not use it."""
     return next((e for e in problem.evidence if isinstance(e, Displacement)), None)
+
+
+def _weigh_of(theory: Theory, displacement: str) -> Literal["cost", "count"]:
+    """How to compare maps. Without displacements there is no misfit to weigh, so maps are counted.
+
+    If the user chose in `prefer` what to minimise, `auto` counts that.
+    """
+    chosen = theory.weigh == "cost" or (
+        theory.weigh == "auto" and theory.prefer == AUTO and can_weigh(theory)
+    )
+    return "cost" if chosen and displacement == "use" else "count"
 
 
 def _star_of(trace: Trace, theory: Theory) -> Star:

@@ -32,6 +32,7 @@ from ssh_abduction.theory.fields import (
     EXCUSED,
     FAULTS,
     PREFERRED,
+    PRICES,
     WITH_DISPLACEMENTS,
     Count,
     Pair,
@@ -60,6 +61,9 @@ SPOKEN_FOR = {
     "reject",
     "joint",
     "returns",
+    # Engines find the fewest dstates in any case. Maps are weighed above them.
+    "weigh",
+    "prices",
     *ASSERTIONS,
 }
 # The fields that the trace decides, not the user.
@@ -113,6 +117,11 @@ class Theory:
         same: Pairs of steps known to be one dstate.
         different: Pairs of steps known to be different dstates.
         elsewhere: Pairs of steps known to be at different places.
+        weigh: How to compare maps. count: by the counts in `prefer`. cost: by their cost in nats,
+            which is the prices of what they have, plus half of the chi-square of their misfit to
+            the displacements. auto: cost if displacements are used and the theory allows it.
+        prices: The prices of a dstate, a place and a path, in nats (natural logarithms of odds),
+            where maps are compared by cost.
     """
 
     level: Literal["causal", "topological"] = "topological"
@@ -137,6 +146,8 @@ class Theory:
     slipped: float = 0.0
     jumped: float = 0.0
     unknown_views: bool = False
+    weigh: Literal["auto", "cost", "count"] = "auto"
+    prices: tuple[float, float, float] = PRICES
 
     def __post_init__(self) -> None:
         normalise(self)

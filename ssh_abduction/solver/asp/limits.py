@@ -143,6 +143,11 @@ class Watch:
         """Lower the time limit to this many seconds since the start, without a reserve."""
         self._limit = self._allowed = seconds if self._limit is None else min(seconds, self._limit)
 
+    @property
+    def stage_ends(self) -> float:
+        """What the clock shows when the present stage ends; infinity for no end."""
+        return self._stage_ends
+
     def end_stage_after(self, seconds: float) -> None:
         """Let `check` raise StageTimeError once, when the clock shows this many seconds."""
         self._stage_ends = seconds

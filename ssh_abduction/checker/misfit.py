@@ -1,0 +1,189 @@
+"""Compute the cost of maps in nats anew, and compare it with what an answer claims.
+
+The solver looks for poses of dstates. This module looks for errors of the displacements instead, so
+the two share nothing. The unknowns z are the errors of all displacements, the scale and the drift,
+each in standard deviations. A map demands that its loops close: c(z) = 0. The misfit is the least
+sum of z², found by Gauss-Newton: z is moved to the smallest solution of J z = J z - c(z), where J
+holds the derivatives of c. This is the update of an iterated Kalman filter for all loops at once.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ssh_abduction.data.errors import brief
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.odometry import Odometry
+from ssh_abduction.data.trace import Trace
+from ssh_abduction.runtime.clock import look_at_clock
+from ssh_abduction.theory.theory import Theory
+
+Array: TypeAlias = NDArray[np.float64]
+
+ROUNDS = 50
+# Stop when no unknown moves by more than this many standard deviations.
+STILL = 1e-9
+# The standard deviation of a missing displacement, in metres and radians: it may be anything.
+MISSING = 1e4
+# Claimed costs may be off by this many nats, and by this share of the misfit.
+EXACT, SHARE = 1e-3, 1e-3
+# The rivals whose costs are checked.
+RIVALS = 5
+# Traces with more steps are not weighed anew: the derivatives are a dense matrix.
+LONGEST = 400
+
+
+def misfit(trace: Trace, dstates: Sequence[int], places: Sequence[int]) -> float:
+    """The least chi-square of the displacements if each step is at this dstate and this place.
+
+    Args:
+        trace: A trace with displacements.
+        dstates: The dstate of each step, as a number.
+        places: The place of each step, as a number.
+    """
+    return _Errors(trace, dstates, places).least()
+
+
+def false_costs(
+    trace: Trace, answer: Mapping[str, Any], maps: Sequence[SSHMap], theory: Theory
+) -> Iterator[str]:
+    """Check what an answer claims about the costs of its maps in nats.
+
+    Args:
+        trace: The trace.
+        answer: The answer as `solve --json` prints it.
+        maps: The maps that it lists.
+        theory: The theory of the answer, with all defaults resolved.
+
+    Yields:
+        A sentence for each false claim.
+    """
+    weighed = answer.get("weighed")
+    if not isinstance(weighed, Mapping) or not maps:
+        return
+    nats, bound, rivals = (weighed.get(name) for name in ("nats", "bound", "rivals"))
+    if answer.get("status") == "optimal" and bound != nats:
+        yield (
+            f"weighed.bound: expected {nats}, the cost of map 1, as the status is optimal, got "
+            f"{brief(bound)}"
+        )
+    if not isinstance(bound, int | float) or not isinstance(nats, int | float) or bound > nats:
+        yield f"weighed.bound: expected a number up to {brief(nats)}, got {brief(bound)}"
+        return
+    if len(trace) > LONGEST:
+        return
+    places = [maps[0].dstates[label].place for label in maps[0].labels]
+    here = [p if p is not None else s for p, s in zip(places, maps[0].labels, strict=True)]
+    courses = [("weighed.nats", nats, maps[0].labels, here, len(maps[0].places))]
+    for i, rival in enumerate(rivals[:RIVALS] if isinstance(rivals, list) else ()):
+        at = rival.get("places") or rival.get("dstates")
+        there = len(set(at)) if rival.get("places") else 0
+        courses.append((f"weighed.rivals[{i}]", rival.get("nats"), rival["dstates"], at, there))
+    paths = theory.prices[2] * len(maps[0].paths)
+    for name, claimed, dstates, at, count in courses:
+        square = misfit(trace, dstates, at)
+        true = theory.prices[0] * len(set(dstates)) + theory.prices[1] * count + square / 2
+        # The paths of a rival are not listed.
+        true += paths if name == "weighed.nats" or not theory.prices[2] else math.nan
+        if abs(true - claimed) > EXACT + SHARE * square:
+            yield f"{name}: expected {true:.3f} nats, by the displacements, got {claimed}"
+
+
+class _Errors:
+    """The errors of the displacements that make the loops of a map close."""
+
+    def __init__(self, trace: Trace, dstates: Sequence[int], places: Sequence[int]) -> None:
+        odometry = trace.odometry or Odometry()
+        size = len(trace)
+        self._moved = np.zeros((size, 3))
+        self._root = np.zeros((size, 3, 3))
+        for t in range(1, size):
+            displacement, covariance = trace.steps[t].displacement, trace.covariance(t)
+            if displacement is None or covariance is None:
+                self._root[t] = MISSING * np.identity(3)
+                continue
+            off = odometry.offset if trace.actions[t - 1].kind != "turn" else 0.0
+            facing = odometry.facing if off or trace.actions[t - 1].kind != "turn" else 0.0
+            at_ends = 2 * np.diag([off, off, facing]) ** 2
+            self._moved[t] = displacement
+            self._root[t] = np.linalg.cholesky(np.array(covariance) + at_ends)
+        self._way = np.hypot(self._moved[:, 0], self._moved[:, 1])
+        self._sigma = np.array([odometry.scale, odometry.bend])
+        # The loops: the last step at the same place, and whether it is at the same dstate.
+        self._loops: list[tuple[int, int, bool]] = []
+        at_place: dict[int, int] = {}
+        at_dstate: dict[int, int] = {}
+        for t, (dstate, place) in enumerate(zip(dstates, places, strict=True)):
+            if at_dstate.get(dstate, -1) >= 0:
+                self._loops.append((at_dstate[dstate], t, True))
+            elif place in at_place:
+                self._loops.append((at_place[place], t, False))
+            at_dstate[dstate], at_place[place] = t, t
+
+    def least(self) -> float:
+        """The least sum of squares of the errors, in standard deviations."""
+        z: Array = np.zeros(3 * len(self._moved) + 2)
+        for _ in range(ROUNDS):
+            look_at_clock()
+            closing, jacobian = self._closings(z)
+            if not len(closing):
+                return 0.0
+            new = np.asarray(np.linalg.lstsq(jacobian, jacobian @ z - closing, rcond=1e-14)[0], dtype=float)
+            moved, z = float(abs(new - z).max()), new
+            if moved < STILL:
+                break
+        return float(z @ z)
+
+    def _closings(self, z: Array) -> tuple[Array, Array]:
+        """How far off the loops close with these errors, and the derivatives by the errors."""
+        size = len(self._moved)
+        scale, bend = self._sigma * z[-2:]
+        noise = np.einsum("tij,tj->ti", self._root, z[:-2].reshape(size, 3))
+        turned = self._moved[:, 2] + noise[:, 2] - bend * self._way
+        turned[0] = 0.0
+        heading = np.cumsum(turned)
+        before = np.concatenate([[0.0], heading[:-1]])
+        angle = before - bend * self._way / 2
+        cos, sin = np.cos(angle), np.sin(angle)
+        gone = (self._moved[:, :2] + noise[:, :2]) / (1 + scale)
+        gone[0] = 0.0
+        onward = np.stack(
+            [cos * gone[:, 0] - sin * gone[:, 1], sin * gone[:, 0] + cos * gone[:, 1]], axis=1
+        )
+        pose = np.column_stack([np.cumsum(onward, axis=0), heading])
+        # The derivative of each movement by its own unknowns: (x, y, heading) x (noise, 2 more).
+        own = np.zeros((size, 3, 5))
+        own[:, 0, 0], own[:, 0, 1] = cos / (1 + scale), -sin / (1 + scale)
+        own[:, 1, 0], own[:, 1, 1] = sin / (1 + scale), cos / (1 + scale)
+        own[:, 2, 2] = 1.0
+        own[:, :2, 3] = -onward / (1 + scale) * self._sigma[0]
+        own[:, 0, 4] = onward[:, 1] * self._way / 2 * self._sigma[1]
+        own[:, 1, 4] = -onward[:, 0] * self._way / 2 * self._sigma[1]
+        own[:, 2, 4] = -self._way * self._sigma[1]
+        own[:, :, :3] = own[:, :, :3] @ self._root
+        own[0] = 0.0
+        rows: list[Array] = []
+        off: list[float] = []
+        for first, last, is_dstate in self._loops:
+            along = slice(first + 1, last + 1)
+            rest = pose[last, :2] - pose[along, :2]
+            # An error of the heading turns the rest of the way.
+            carried = own[along].copy()
+            carried[:, 0] -= rest[:, 1, None] * own[along, 2]
+            carried[:, 1] += rest[:, 0, None] * own[along, 2]
+            row = np.zeros((3, 3 * size + 2))
+            row[:, 3 * first + 3 : 3 * last + 3] = (
+                carried[:, :, :3].transpose(1, 0, 2).reshape(3, -1)
+            )
+            row[:, -2:] = carried[:, :, 3:].sum(axis=0)
+            gap = pose[last] - pose[first]
+            gap[2] = math.remainder(gap[2], math.tau)
+            kept = 3 if is_dstate else 2
+            rows.append(row[:kept])
+            off += gap[:kept].tolist()
+        return np.array(off), np.concatenate(rows) if rows else np.zeros((0, 3 * size + 2))

@@ -1,0 +1,158 @@
+"""The misfit of a map to the displacements, and small sets of returns that cause a misfit.
+
+A *return* is a pair of steps that a map takes for one dstate or one place. The misfit of a set of
+returns is the least sum of squares of the displacements, if the two steps of each return have one
+pose, or one position (`solver/fit.py`). More returns leave less freedom. So the misfit of a set is
+never less than that of a part of it, and a part of the returns of a map bounds the misfit of every
+map that has them.
+
+A visit to a place holds several steps, as turns stay at their place. So these steps have one
+position in each topological map, also without a return.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import TypeAlias
+
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.solver.fit import Poses
+from ssh_abduction.theory.evidence import Equality
+from ssh_abduction.theory.settle import Problem
+
+# The heading and the position of each step, as numbers. Steps with equal numbers share them.
+_Groups: TypeAlias = tuple[tuple[int, ...], tuple[int, ...]]
+
+
+class Misfit:
+    """The misfits of sets of returns of one trace, each computed once.
+
+    Attributes:
+        trace: The trace.
+        visit: For each step, the first step of its visit. Without places, each step is a visit.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        """Compute nothing yet.
+
+        Args:
+            problem: The trace, and its theory with all defaults filled in.
+        """
+        self.trace = problem.trace
+        stays = problem.theory.level == "topological" and "turn_stays" in problem.theory.hard
+        self.visit = [0]
+        for t, action in enumerate(self.trace.actions, 1):
+            self.visit.append(self.visit[-1] if stays and action.kind == "turn" else t)
+        self._known: dict[_Groups, float] = {}
+
+    def of_returns(self, returns: Iterable[Equality]) -> float:
+        """The chi-square of a set of returns."""
+        headings, positions = list(range(len(self.visit))), list(self.visit)
+        for found in returns:
+            if found.of == "dstate":
+                _join(headings, found.first, found.second)
+            _join(positions, found.first, found.second)
+        return self._of_groups(_roots(headings), _roots(positions))
+
+    def of_course(self, dstates: Sequence[int], places: Sequence[int]) -> float:
+        """The chi-square if each step is at this dstate and this place.
+
+        Args:
+            dstates: The dstate of each step, as a number.
+            places: The place of each step, as a number. Steps at one dstate are at one place.
+        """
+        first_at: dict[int, int] = {}
+        first_in: dict[int, int] = {}
+        headings = [first_at.setdefault(name, t) for t, name in enumerate(dstates)]
+        positions = [first_in.setdefault(name, t) for t, name in enumerate(places)]
+        return self._of_groups(tuple(headings), tuple(positions))
+
+    def of_map(self, ssh_map: SSHMap) -> float:
+        """The chi-square of all returns of a map of the whole trace."""
+        return self.of_returns(self.returns_of(ssh_map))
+
+    def returns_of(self, ssh_map: SSHMap) -> list[Equality]:
+        """The returns of a map to the last step at the same dstate or place, by their later step.
+
+        All other returns follow from these.
+        """
+        found: list[Equality] = []
+        at_dstate: dict[int, int] = {}
+        at_place: dict[int, int] = {}
+        for t, label in enumerate(ssh_map.labels):
+            place = ssh_map.dstates[label].place
+            if label in at_dstate:
+                found.append(Equality(at_dstate[label], t))
+            elif place in at_place and self.visit[at_place[place]] != self.visit[t]:
+                found.append(Equality(at_place[place], t, "place"))
+            at_dstate[label] = t
+            if place is not None:
+                at_place[place] = t
+        return found
+
+    def core(self, returns: Sequence[Equality], least: float) -> list[Equality]:
+        """A minimal subset of returns whose misfit is at least `least`.
+
+        Args:
+            returns: The returns.
+            least: A chi-square.
+
+        Returns:
+            The subset. All returns if even their misfit is less; none if no return is needed.
+
+        Reference:
+            Junker 2004, "QuickXplain: preferred explanations and relaxations for over-constrained
+            problems".
+        """
+        if self.of_returns(returns) < least:
+            return list(returns)
+
+        def suffices(some: Sequence[Equality]) -> bool:
+            return self.of_returns(some) >= least
+
+        return [] if suffices([]) else _minimal(suffices, list(returns))
+
+    def _of_groups(self, headings: tuple[int, ...], positions: tuple[int, ...]) -> float:
+        key = headings, positions
+        if key not in self._known:
+            number = {heading: i for i, heading in enumerate(dict.fromkeys(headings))}
+            position = dict(zip(headings, positions, strict=True))
+            self._known[key] = Poses(
+                self.trace, [number[heading] for heading in headings], [position[h] for h in number]
+            ).misfit()
+        return self._known[key]
+
+
+def _minimal(
+    suffices: Callable[[Sequence[Equality]], bool], returns: list[Equality]
+) -> list[Equality]:
+    """A minimal subset that suffices, by halving. `suffices` never fails for more returns."""
+
+    def needed(kept: list[Equality], is_new: bool, rest: list[Equality]) -> list[Equality]:
+        if is_new and suffices(kept):
+            return []
+        if len(rest) == 1:
+            return rest
+        first, second = rest[: len(rest) // 2], rest[len(rest) // 2 :]
+        of_second = needed(kept + first, True, second)
+        of_first = needed(kept + of_second, bool(of_second), first)
+        return of_first + of_second
+
+    return needed([], False, returns)
+
+
+def _join(groups: list[int], first: int, second: int) -> None:
+    """Make the groups of two members one, in a forest of links to earlier members."""
+    a, b = _root(groups, first), _root(groups, second)
+    groups[max(a, b)] = min(a, b)
+
+
+def _root(groups: list[int], member: int) -> int:
+    while groups[member] != member:
+        groups[member] = groups[groups[member]]
+        member = groups[member]
+    return member
+
+
+def _roots(groups: list[int]) -> tuple[int, ...]:
+    return tuple(_root(groups, member) for member in range(len(groups)))

@@ -1,0 +1,179 @@
+"""What weighing the maps of a trace has found: costs in nats, rival maps, and probabilities.
+
+The cost of a map is the sum of the prices of its dstates, places and paths, and half of the
+chi-square of its misfit to the displacements. A nat is the unit of natural logarithms: of two maps,
+one that costs 3 nats more is exp(3) = 20 times less probable.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from ssh_abduction.data.fields import FieldReader
+
+
+@dataclass(frozen=True, slots=True)
+class Rival:
+    """A map of the whole trace, without its paths.
+
+    Attributes:
+        nats: Its cost, in nats.
+        dstates: The dstate of each step, numbered by first visit.
+        places: The place of each step, numbered by first visit; empty for a causal map.
+        estimated: Whether the map was made from the best one by taking a visit out of its place. It
+            fits the displacements, but may break an axiom.
+    """
+
+    nats: float
+    dstates: tuple[int, ...]
+    places: tuple[int, ...] = ()
+    estimated: bool = False
+
+    def to_dict(self) -> dict[str, Any]:
+        """The rival as plain data."""
+        written: dict[str, Any] = {"nats": round(self.nats, 6), "dstates": list(self.dstates)}
+        written |= {"places": list(self.places)} if self.places else {}
+        return written | ({"estimated": True} if self.estimated else {})
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """The costs of the maps of a trace, as far as they are known.
+
+    Attributes:
+        bound: A proven lower bound on the cost of every map, in nats.
+        within: All maps that cost less than this many nats more than the best one are in `rivals`.
+            0 if the best map is not proven to be the best.
+        rivals: The maps that cost little more than the best one, the best one first. Estimated
+            ones come last.
+    """
+
+    bound: float
+    within: float
+    rivals: tuple[Rival, ...]
+
+    @property
+    def nats(self) -> float:
+        """The cost of the best map."""
+        return self.rivals[0].nats
+
+    @cached_property
+    def weights(self) -> tuple[float, ...]:
+        """The probability of each rival, if there were no others."""
+        likely = [math.exp(self.nats - rival.nats) for rival in self.rivals]
+        return tuple(weight / sum(likely) for weight in likely)
+
+    @property
+    def confidence(self) -> float:
+        """The probability of the best map among its rivals."""
+        return self.weights[0]
+
+    def probability(self, first: int, second: int, of: str = "dstate") -> float:
+        """The probability that two steps are at one dstate, or at one place.
+
+        Args:
+            first: A step.
+            second: A step.
+            of: "dstate" or "place".
+        """
+        names = [r.dstates if of == "dstate" or not r.places else r.places for r in self.rivals]
+        return math.fsum(
+            weight
+            for weight, name in zip(self.weights, names, strict=True)
+            if name[first] == name[second]
+        )
+
+    @cached_property
+    def doubtful(self) -> tuple[int, int, float] | None:
+        """The join of the best map that is least sure: two steps at one place, and its probability.
+
+        Of a causal map they are at one dstate. None if no place is visited twice.
+        """
+        best = self.rivals[0]
+        at, of = (best.places, "place") if best.places else (best.dstates, "dstate")
+        last: dict[int, int] = {}
+        joins = []
+        for step, name in enumerate(at):
+            if step - last.get(name, step) > 1:
+                joins.append((last[name], step, self.probability(last[name], step, of)))
+            last[name] = step
+        return min(joins, key=lambda join: join[2], default=None)
+
+    @property
+    def sentence(self) -> str:
+        """How probable the best map is, and which of its joins is least sure, in words."""
+        told = f"the best map has probability {_percent(self.confidence)}"
+        if self.doubtful is None:
+            return f"{told}; it joins no two visits"
+        first, second, probability = self.doubtful
+        joined = "one place" if self.rivals[0].places else "one dstate"
+        return (
+            f"{told}; its most doubtful join makes steps {first} and {second} {joined} "
+            f"({_percent(probability)})"
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """The costs as plain data."""
+        return {
+            "nats": round(self.nats, 6),
+            "bound": round(self.bound, 6),
+            "within": round(self.within, 6),
+            "confidence": round(self.confidence, 6),
+            "rivals": [rival.to_dict() for rival in self.rivals],
+        }
+
+    @classmethod
+    def from_dict(cls, read: FieldReader, value: Any, steps: int) -> Weighed:
+        """Read what `to_dict` wrote.
+
+        Args:
+            read: Checks the fields.
+            value: The data.
+            steps: The number of steps of the trace.
+
+        Raises:
+            MapError: A field is wrong.
+        """
+        record = read.mapping(value, "weighed")
+        written = record.get("rivals")
+        if not isinstance(written, list) or not written:
+            raise read.wrong("weighed.rivals", "a list of maps", written)
+        rivals = tuple(
+            _rival(read, rival, f"weighed.rivals[{i}]", steps) for i, rival in enumerate(written)
+        )
+        bound, within = (_number(read, record, name, "weighed") for name in ("bound", "within"))
+        return cls(bound, within, rivals)
+
+
+def _percent(probability: float) -> str:
+    """A probability with two digits, but never 1, as nothing is certain."""
+    return "above 0.99" if probability >= 0.995 else f"{probability:.2f}"
+
+
+def _rival(read: FieldReader, value: Any, name: str, steps: int) -> Rival:
+    record = read.mapping(value, name)
+    dstates, places = (
+        _names(read, record.get(field, default), f"{name}.{field}")
+        for field, default in (("dstates", None), ("places", []))
+    )
+    if len(dstates) != steps or len(places) not in (0, steps):
+        raise read.wrong(name, f"the dstates and places of {steps} steps", value)
+    nats = _number(read, record, "nats", name)
+    return Rival(nats, dstates, places, bool(record.get("estimated", False)))
+
+
+def _names(read: FieldReader, value: Any, name: str) -> tuple[int, ...]:
+    if not isinstance(value, list):
+        raise read.wrong(name, "a list of numbers", value)
+    return tuple(read.integer(x, f"{name}[{i}]") for i, x in enumerate(value))
+
+
+def _number(read: FieldReader, record: Mapping[Any, Any], name: str, where: str) -> float:
+    value = record.get(name)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise read.wrong(f"{where}.{name}", "a number", value)
+    return float(value)
