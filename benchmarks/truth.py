@@ -58,6 +58,7 @@ ACES3 = {
     name: (COLUMNS[i % 3], ROWS[i // 3])
     for i, name in enumerate(("NW", "N", "NE", "W", "C", "E", "SW", "S", "SE"))
 }
+SURE = 0.95  # the confidence from which a map counts as sure
 COMPASS = {"E": 0.0, "N": math.pi / 2, "W": math.pi, "S": -math.pi / 2}
 
 
@@ -179,17 +180,32 @@ def told(name: str, trace: Trace) -> Known:
     )
 
 
-def row(known: Known, theory: Theory, limit: float) -> tuple[str, bool, float]:
-    """Solve a trace, and compare its maps with the truth.
+@dataclass(frozen=True)
+class Judged:
+    """What came out for one trace.
 
-    Returns:
-        A row of the table; whether all minimal maps are proven to be true; and the seconds.
+    Attributes:
+        right: Whether all maps that the solver calls best are true, and it has proven so.
+        best: Whether the first map is true.
+        confidence: The probability that the solver gives the first map; None if it counts.
+        joins: For each join of the first map, its probability, and whether it is true.
+        seconds: The time of the solver.
     """
+
+    right: bool
+    best: bool
+    confidence: float | None
+    joins: tuple[tuple[float, bool], ...]
+    seconds: float
+
+
+def judged(known: Known, theory: Theory, limit: float) -> tuple[str, Judged]:
+    """Solve a trace, and return a row of the table and what came out."""
     began = time.perf_counter()
     solution = solve(known.trace, theory, time_limit=limit)
     seconds = time.perf_counter() - began
-    right = [is_true(ssh_map, known) for ssh_map in solution.maps]
-    all_true = bool(right) and all(right) and (solution.complete or share_all(solution))
+    true = [is_true(ssh_map, known) for ssh_map in solution.maps]
+    all_true = bool(true) and all(true) and (solution.complete or share_all(solution))
     cost = (
         f"{solution.cost.dstates}, {solution.cost.places}, {solution.cost.paths}"
         if solution.cost
@@ -197,13 +213,53 @@ def row(known: Known, theory: Theory, limit: float) -> tuple[str, bool, float]:
     )
     truth = f"{len(set(known.dstates))}, {len(set(known.places))}"
     more = "" if solution.complete else " or more, all alike" if all_true else " or more"
-    listed = f"{sum(right)} of {len(right)}{more}"
+    listed = f"{sum(true)} of {len(true)}{more}"
+    sure = "–" if solution.confidence is None else f"{solution.confidence:.3f}"
     return (
         f"| {known.name} | {len(known.trace)} | {truth} | {solution.status.value} | {cost} | "
-        f"{listed} | {seconds:.2f} |",
-        all_true,
-        seconds,
+        f"{listed} | {sure} | {seconds:.2f} |",
+        Judged(
+            all_true, bool(true) and true[0], solution.confidence, joins(solution, known), seconds
+        ),
     )
+
+
+def joins(solution: Solution, known: Known) -> tuple[tuple[float, bool], ...]:
+    """Each visit to a place where the first map has been before, joined with the visit before.
+
+    Returns:
+        For each join, the probability that the solver gives it, and whether it is true. Empty if
+        maps are counted.
+    """
+    if solution.weighed is None:
+        return ()
+    ssh_map = solution.maps[0]
+    at = [ssh_map.dstates[label].place for label in ssh_map.labels]
+    last: dict[Hashable, int] = {}
+    found = []
+    for step, label in enumerate(ssh_map.labels):
+        place = label if at[step] is None else at[step]
+        if place in last and step - last[place] > 1:
+            before = last[place]
+            truth = known.dstates if at[step] is None else known.places
+            of = "dstate" if at[step] is None else "place"
+            probability = solution.probability(before, step, of)
+            found.append((probability, truth[before] == truth[step]))
+        last[place] = step
+    return tuple(found)
+
+
+def reliability(found: Sequence[tuple[float, bool]]) -> tuple[float, float]:
+    """The expected calibration error over ten bins, and the Brier score, of joins."""
+    bins: dict[int, list[tuple[float, bool]]] = {}
+    for probability, true in found:
+        bins.setdefault(min(int(10 * probability), 9), []).append((probability, true))
+    error = sum(
+        abs(sum(p for p, _ in members) - sum(true for _, true in members))
+        for members in bins.values()
+    )
+    brier = sum((p - true) ** 2 for p, true in found)
+    return error / len(found), brier / len(found)
 
 
 def share_all(solution: Solution) -> bool:
@@ -223,21 +279,39 @@ def share_all(solution: Solution) -> bool:
 
 
 def report(traces: Iterator[Known], theory: Theory, limit: float) -> str:
-    """Solve each trace, print a row for each, and return a line that summarises them."""
+    """Solve each trace, print a row for each, and return the sums."""
     print(
         "| trace | steps | true dstates, places | status | dstates, places, paths | "
-        "true maps | s |\n|---|---|---|---|---|---|---|",
+        "true maps | confidence | s |\n|---|---|---|---|---|---|---|---|",
         flush=True,
     )
     found = []
     for known in traces:
-        text, right, seconds = row(known, theory, limit)
+        text, one = judged(known, theory, limit)
         print(text, flush=True)
-        found.append((right, seconds))
+        found.append(one)
     if not found:
         return "no traces"
-    right, median = sum(right for right, _ in found), statistics.median(s for _, s in found)
-    return f"all minimal maps are true: {right} of {len(found)}; median {median:.2f} s"
+    count, median = len(found), statistics.median(one.seconds for one in found)
+    told = [
+        f"all best maps are true, and proven: {sum(one.right for one in found)} of {count}",
+        f"the first map is true: {sum(one.best for one in found)} of {count}",
+    ]
+    sure = [one for one in found if one.confidence is not None and one.confidence >= SURE]
+    if any(one.confidence is not None for one in found):
+        told += [
+            f"sure: {len(sure)} of {count}",
+            f"wrong and sure: {sum(not one.best for one in sure)} of {count}",
+        ]
+    all_joins = [join for one in found for join in one.joins]
+    if all_joins:
+        error, brier = reliability(all_joins)
+        wrong = sum(not true for _, true in all_joins)
+        told.append(
+            f"{len(all_joins)} joins, {wrong} of them false: expected calibration error "
+            f"{error:.3f}, Brier score {brier:.3f}"
+        )
+    return "; ".join([*told, f"median {median:.2f} s"])
 
 
 def arguments() -> argparse.ArgumentParser:
@@ -277,7 +351,7 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument(
         "--causal", action="store_true", help="use the causal theory, and judge only dstates"
     )
-    for name in ("displacement", "boundary", "prefer"):
+    for name in ("displacement", "boundary", "prefer", "weigh", "prices"):
         parser.add_argument(f"--{name}", metavar="CHOICE", help=f"the theory's field {name}")
     for name in NUMBERS:
         parser.add_argument(
@@ -331,7 +405,7 @@ def main() -> None:
     options = arguments().parse_args()
     choices = {
         name: value
-        for name in ("displacement", "boundary", "prefer")
+        for name in ("displacement", "boundary", "prefer", "weigh", "prices")
         if (value := getattr(options, name))
     }
     if options.causal:

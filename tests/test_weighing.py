@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
+from pathlib import Path
 
 import pytest
+import truth
 from brute_force import Key, consistent_maps, key
 from brute_misfit import LeastSquares
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import TOYS, theories, traces
 
-from ssh_abduction import Theory, Trace, solve
+from ssh_abduction import OnlineMapper, Solution, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
-from ssh_abduction.data import TheoryError
+from ssh_abduction.checker.misfit import false_costs, misfit
+from ssh_abduction.data import Odometry, RangeError, SolverError, TheoryError
 from ssh_abduction.solver import Status
+from ssh_abduction.solver.fit import Poses, fit
+from ssh_abduction.solver.misfit import Misfit
+from ssh_abduction.theory.settle import settle
 
 EQUAL = 1e-6
 
@@ -88,3 +95,119 @@ def test_maps_are_counted_where_there_is_no_misfit_to_weigh() -> None:
     solution = solve(Trace.from_steps("aba", ["travel", "travel"]), Theory(weigh="cost"))
     assert solution.theory.weigh == "count"
     assert any("no displacements" in warning for warning in solution.warnings)
+
+
+# The noise of the odometry that traces declare by default.
+DEFAULT = {**truth.NOISE, "scale": 0.05, "bend": 0.0035}
+
+
+@pytest.fixture(scope="module")
+def route() -> truth.Known:
+    """The ACES3 route with noisy displacements, of which the map with fewest dstates is false."""
+    (known,) = truth.aces3([3], truth.Noise(Odometry(**DEFAULT)))
+    return known
+
+
+@pytest.fixture(scope="module")
+def weighed_route(route: truth.Known) -> Solution:
+    return solve(route.trace, time_limit=100)
+
+
+def test_the_cheapest_map_is_true_where_the_smallest_is_not(
+    route: truth.Known, weighed_route: Solution
+) -> None:
+    counted = solve(route.trace, Theory(weigh="count"), time_limit=100)
+    assert not any(truth.is_true(ssh_map, route) for ssh_map in counted.maps)
+    assert counted.weighed is counted.confidence is None
+    assert weighed_route.status is Status.OPTIMAL
+    assert all(truth.is_true(ssh_map, route) for ssh_map in weighed_route.maps)
+    assert weighed_route.confidence is not None
+    assert weighed_route.confidence > 0.9
+
+
+def test_probabilities_are_of_steps_of_the_trace(weighed_route: Solution) -> None:
+    assert weighed_route.probability(0, 12) > 0.9
+    assert weighed_route.probability(0, 1) < 0.1
+    with pytest.raises(RangeError):
+        weighed_route.probability(0, 23)
+    with pytest.raises(SolverError, match="of: expected dstate or place, got 'path'"):
+        weighed_route.probability(0, 1, of="path")
+    counted = solve(Trace.from_steps("aba", ["travel", "travel"]))
+    with pytest.raises(SolverError, match="nothing observed says how probable"):
+        counted.probability(0, 2)
+
+
+def test_costs_are_written_and_read(weighed_route: Solution, tmp_path: Path) -> None:
+    weighed_route.save(tmp_path / "maps.json")
+    read = Solution.load(tmp_path / "maps.json", weighed_route.trace)
+    assert read.weighed is not None
+    assert weighed_route.weighed is not None
+    assert read.weighed.nats == pytest.approx(weighed_route.weighed.nats, abs=1e-5)
+    assert read.weighed.rivals[0].dstates == weighed_route.weighed.rivals[0].dstates
+    assert read.confidence == pytest.approx(weighed_route.confidence, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("nats", "weighed.bound: expected"), ("rivals", "weighed.rivals[0]: expected")],
+)
+def test_false_costs_are_found(weighed_route: Solution, name: str, said: str) -> None:
+    assert weighed_route.trace is not None
+    data = weighed_route.to_dict()
+    maps = list(weighed_route.maps)
+    theory = weighed_route.theory
+    assert list(false_costs(weighed_route.trace, data, maps, theory)) == []
+    if name == "nats":
+        data["weighed"]["nats"] -= 1.0
+    else:
+        data["weighed"]["rivals"][0]["nats"] -= 1.0
+    found = list(false_costs(weighed_route.trace, data, maps, theory))
+    assert any(said in claim for claim in found)
+
+
+def test_a_stopped_search_does_not_claim_to_be_sure(route: truth.Known) -> None:
+    solution = solve(route.trace, time_limit=0.5)
+    assert solution.status is Status.FEASIBLE
+    assert solution.weighed is not None
+    assert solution.weighed.bound < solution.weighed.nats
+    assert solution.confidence is not None
+    assert solution.confidence < 0.5
+    assert "nats less may exist" in solution.weighed.sentence
+
+
+def test_more_returns_never_fit_better_and_a_core_is_minimal(route: truth.Known) -> None:
+    problem = settle(route.trace, Theory())
+    misfit = Misfit(problem)
+    smallest = solve(route.trace, Theory(weigh="count"), max_maps=1).maps[0]
+    returns = misfit.returns_of(smallest)
+    squares = [misfit.of_returns(returns[:size]) for size in range(len(returns) + 1)]
+    assert all(after >= before - 1e-6 for before, after in pairwise(squares))
+    assert squares[-1] == pytest.approx(fit(route.trace, smallest).chi2)
+    least = squares[0] + 20
+    core = misfit.core(returns, least)
+    assert misfit.of_returns(core) >= least
+    for left_out in core:
+        assert misfit.of_returns([other for other in core if other != left_out]) < least
+    assert misfit.core(returns, squares[-1] + 1) == returns
+    assert misfit.core(returns, 0.0) == []
+
+
+@settings(max_examples=10)
+@given(st.data())
+def test_the_checker_and_the_solver_have_one_misfit(data: st.DataObject) -> None:
+    """The errors of displacements and the poses of dstates are two ways to one number."""
+    seed = data.draw(st.integers(0, 10_000), label="seed")
+    (known,) = truth.mazes(3, 12, [seed], truth.Noise(Odometry(**DEFAULT)))
+    names = truth.partition(known.dstates)
+    places = truth.partition(known.places)
+    ends = data.draw(st.lists(st.integers(0, 12), max_size=3), label="joined with the first place")
+    joined = {places[step] for step in ends} | {places[0]}
+    places = truth.partition([0 if place in joined else place for place in places])
+    where = dict(zip(names, places, strict=True))
+    poses = Poses(known.trace, names, [where[name] for name in range(len(where))])
+    assert misfit(known.trace, names, places) == pytest.approx(poses.misfit(), rel=1e-5, abs=1e-5)
+
+
+def test_a_robot_that_drives_counts() -> None:
+    with pytest.raises(TheoryError, match="weigh: expected count while a robot drives"):
+        OnlineMapper("a", Theory(weigh="cost"))

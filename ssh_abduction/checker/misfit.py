@@ -133,7 +133,9 @@ class _Errors:
             closing, jacobian = self._closings(z)
             if not len(closing):
                 return 0.0
-            new = np.asarray(np.linalg.lstsq(jacobian, jacobian @ z - closing, rcond=1e-14)[0], dtype=float)
+            new = np.asarray(
+                np.linalg.lstsq(jacobian, jacobian @ z - closing, rcond=1e-14)[0], dtype=float
+            )
             moved, z = float(abs(new - z).max()), new
             if moved < STILL:
                 break

@@ -15,6 +15,9 @@ from typing import Any
 
 from ssh_abduction.data.fields import FieldReader
 
+EQUAL = 1e-6  # costs that differ by less are equal
+MOST = 700.0  # exp of more nats is too large for a number
+
 
 @dataclass(frozen=True, slots=True)
 class Rival:
@@ -47,7 +50,7 @@ class Weighed:
     Attributes:
         bound: A proven lower bound on the cost of every map, in nats.
         within: All maps that cost less than this many nats more than the best one are in `rivals`.
-            0 if the best map is not proven to be the best.
+            0 if it is not proven that no map costs less.
         rivals: The maps that cost little more than the best one, the best one first. Estimated
             ones come last.
     """
@@ -68,12 +71,22 @@ class Weighed:
         return tuple(weight / sum(likely) for weight in likely)
 
     @property
+    def proven(self) -> bool:
+        """Whether no map costs less than the best one."""
+        return self.bound >= self.nats - EQUAL
+
+    @property
     def confidence(self) -> float:
-        """The probability of the best map among its rivals."""
-        return self.weights[0]
+        """The probability of the best map among its rivals.
+
+        If it is not proven to be the best, a map at the bound counts as one more rival. Then the
+        confidence is small, as such a map may cost much less.
+        """
+        unknown = 0.0 if self.proven else math.exp(min(self.nats - self.bound, MOST))
+        return 1 / (1 / self.weights[0] + unknown)
 
     def probability(self, first: int, second: int, of: str = "dstate") -> float:
-        """The probability that two steps are at one dstate, or at one place.
+        """The probability that two steps are at one dstate, or at one place, by the known rivals.
 
         Args:
             first: A step.
@@ -106,7 +119,11 @@ class Weighed:
     @property
     def sentence(self) -> str:
         """How probable the best map is, and which of its joins is least sure, in words."""
-        told = f"the best map has probability {_percent(self.confidence)}"
+        told = (
+            f"the best map has probability {_percent(self.confidence)}"
+            if self.proven
+            else f"a map that costs {self.nats - self.bound:.1f} nats less may exist"
+        )
         if self.doubtful is None:
             return f"{told}; it joins no two visits"
         first, second, probability = self.doubtful
