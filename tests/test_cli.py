@@ -121,6 +121,7 @@ def test_every_field_of_a_theory_is_a_flag(
             "level=topological",
         ),
         *("--set", "displacement=none", "--set", "reject=0.01", "--set", "joint=1"),
+        *("--set", "weigh=count", "--set", "prices=7,6,0.5"),
     ]
     route = saved(drive(*TOURS["square"], stars=True), tmp_path)
     assert main(["solve", route, "-n", "1", "--json", *flags]) == 0
@@ -136,6 +137,8 @@ def test_every_field_of_a_theory_is_a_flag(
         displacement="none",
         reject=0.01,
         joint=1,
+        weigh="count",
+        prices=(7.0, 6.0, 0.5),
     )
     assert Theory.from_dict(json.loads(capsys.readouterr().out)["theory"]) == expected
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any, overload
 
 from ssh_abduction.checker.claims import contradictions
-from ssh_abduction.data.checks import one_of
+from ssh_abduction.data.checks import a_whole_number, one_of
 from ssh_abduction.data.errors import MapError, SolverError, brief, checked_index, named
 from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.data.files import json_line
@@ -214,8 +214,11 @@ class Solution:
                 "cost, got one whose maps are counted; nothing observed says how probable they are"
             )
         one_of("of", of, ("dstate", "place"), SolverError)
-        for step in (first, second):
-            checked_index(step, self.steps, "steps")
+        mend = f"the trace has steps 0 to {self.steps - 1}"
+        first, second = (
+            a_whole_number(name, step, SolverError, 0, self.steps - 1, mend=mend)
+            for name, step in (("first", first), ("second", second))
+        )
         return self.weighed.probability(first, second, of)
 
     @property
