@@ -4,6 +4,7 @@
     python benchmarks/truth.py --family plans --folder ../shared/data/plans [--steps 100]
     python benchmarks/truth.py --family aces3 [--seeds 10] [--stars]
     python benchmarks/truth.py --family taylor-hall [--seeds 20] [--stars]
+    python benchmarks/truth.py --family worlds --folder FOLDER --causal [--stars]
 
 The script prints a table in Markdown with a row for each trace, and a summary below. A map is true
 if its labels are the true dstates up to renaming, and its places are the true places. The options
@@ -171,6 +172,14 @@ def drive(tours: int, seed: int, body: Body) -> Trace:
     )
 
 
+def worlds(folder: Path) -> Iterator[Known]:
+    """Traces of files whose steps have their true dstate; true places are not known."""
+    for path in sorted(folder.glob("*.jsonl")):
+        trace = Trace.load(path)
+        dstates = tuple(step.truth["dstate"] for step in trace.steps if step.truth)
+        yield Known(path.stem, trace, dstates, dstates)
+
+
 def told(name: str, trace: Trace) -> Known:
     """Collect the truth of a trace whose steps state their true dstate and place."""
     return Known(
@@ -317,7 +326,7 @@ def report(traces: Iterator[Known], theory: Theory, limit: float) -> str:
 def arguments() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument(
-        "--family", choices=("mazes", "plans", "aces3", "taylor-hall"), required=True
+        "--family", choices=("mazes", "plans", "aces3", "taylor-hall", "worlds"), required=True
     )
     parser.add_argument(
         "--seeds",
@@ -342,7 +351,7 @@ def arguments() -> argparse.ArgumentParser:
         type=Path,
         default=ROOT.parent / "shared" / "data" / "plans",
         metavar="FOLDER",
-        help="folder of the plans",
+        help="folder of the plans, or of the traces of worlds",
     )
     parser.add_argument(
         "--limit", type=float, default=60, metavar="S", help="seconds for each (default 60)"
@@ -396,6 +405,8 @@ def chosen(options: argparse.Namespace) -> Iterator[Known]:
             if not options.folder.is_dir():
                 sys.exit(f"--folder: expected a folder of plans, got {options.folder}; name one")
             return plans(options.folder, options.steps or 100, seeds(1), noise)
+        case "worlds":
+            return worlds(options.folder)
         case "aces3":
             return aces3(seeds(10), noise)
     return taylor_hall(options.tours, seeds(20), noise)

@@ -92,11 +92,19 @@ def test_the_table_says_which_maps_are_true(capsys: pytest.CaptureFixture[str]) 
     said = truth.report(
         truth.chosen(options), Theory.topological().replace(displacement="none"), 30
     )
-    assert said.startswith("all minimal maps are true: 0 of 1; median ")
+    assert said.startswith("all best maps are true, and proven: 0 of 1; the first map is")
     assert "| ACES3, 0 | 23 | 22, 9 | optimal | 19, 10, 4 | 0 of 4 |" in capsys.readouterr().out
     said = truth.report(truth.chosen(options), Theory.topological(), 30)
-    assert said.startswith("all minimal maps are true: 1 of 1; median ")
+    assert said.startswith("all best maps are true, and proven: 1 of 1; the first map is")
+    assert "; wrong and sure: 0 of 1; 6 joins, 0 of them false" in said
     assert "| 22, 9, 6 | 1 of 1 |" in capsys.readouterr().out
+
+
+def test_joins_are_reliable_where_their_probabilities_are_their_shares() -> None:
+    half = [(0.5, True), (0.5, False)]
+    assert truth.reliability(half) == (0.0, 0.25)
+    assert truth.reliability([(1.0, False)]) == (1.0, 1.0)
+    assert truth.reliability([*half, (0.9, True), (0.9, True)]) == pytest.approx((0.05, 0.13))
 
 
 def test_what_is_refused_of_true_maps_is_counted() -> None:

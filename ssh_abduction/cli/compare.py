@@ -86,7 +86,14 @@ def run(options: argparse.Namespace) -> int:
         print(json_line({**told, **between.to_dict()}) if options.json else between)
         return 0
     found = compare(listing, other)
-    print(json_line({**told, **found.to_dict()}) if options.json else "\n".join(_lines(found)))
+    if listing.weighed is not None:
+        told["confidence"] = listing.weighed.confidence
+    if options.json:
+        print(json_line({**told, **found.to_dict()}))
+        return 0
+    print("\n".join(_lines(found)))
+    if listing.weighed is not None:
+        print(listing.weighed.sentence)
     return 0
 
 

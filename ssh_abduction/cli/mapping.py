@@ -225,8 +225,10 @@ class MapQuestion:
             )
         )
         how = (
-            f"{solution.status.value}, "
-            f"{counted(solution.count, 'minimal maps')}{'' if solution.complete else ' or more'}"
+            f"{solution.status.value}, {solution.weighed.sentence}"
+            if solution.weighed
+            else f"{solution.status.value}, {counted(solution.count, 'minimal maps')}"
+            f"{'' if solution.complete else ' or more'}"
         )
         total = sum(done.seconds.values())
         line = (

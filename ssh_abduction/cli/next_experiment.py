@@ -11,12 +11,13 @@ from ssh_abduction.cli.options import Verbs, add_theory, in_order, theory_of
 from ssh_abduction.cli.outcome import on_ctrl_c, warn
 from ssh_abduction.cli.text import table
 from ssh_abduction.data.errors import MapError, named, printable
+from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.maps import maps_of
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.program import interrupted_code
-from ssh_abduction.solver import Watch, check_limit
+from ssh_abduction.solver import Watch, Weighed, check_limit
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
@@ -103,7 +104,13 @@ def run(options: argparse.Namespace) -> int:
             )
     except MapError as error:
         raise MapError(f"{named(options.maps)}: {error}") from None
-    print(json_line(experiment.to_dict()) if options.json else "\n".join(_lines(experiment)))
+    if options.json:
+        print(json_line(experiment.to_dict()))
+    else:
+        print("\n".join(_lines(experiment)))
+        if isinstance(data, dict) and data.get("weighed"):
+            read = FieldReader(named(options.maps))
+            print(Weighed.from_dict(read, data["weighed"], len(trace)).sentence)
     if experiment.warning:
         warn([experiment.warning])
     if experiment.stopped == "interrupted":

@@ -18,10 +18,11 @@ from typing import Any, TypeAlias
 
 from ssh_abduction.data.checks import a_flag, a_text, an_instance
 from ssh_abduction.data.errors import MapError, brief, is_whole, named
+from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.maps import ID_LENGTH, SSHMap, maps_of
 from ssh_abduction.data.trace import View
-from ssh_abduction.solver import Backbone, Solution, Status, theory_in
+from ssh_abduction.solver import Backbone, Solution, Status, Weighed, theory_in
 from ssh_abduction.theory.theory import Theory
 
 
@@ -38,6 +39,7 @@ class Listing:
             unknown.
         backbone: What all minimal maps share, listed or not; None if unknown.
         source: The name of the list, for messages.
+        weighed: The costs of the maps in nats, if they were compared by cost; else None.
     """
 
     maps: tuple[SSHMap, ...]
@@ -46,6 +48,7 @@ class Listing:
     stopped: str | None = None
     backbone: Backbone | None = field(default=None, repr=False)
     source: str = "maps"
+    weighed: Weighed | None = None
 
     @property
     def steps(self) -> int:
@@ -71,7 +74,14 @@ class Listing:
                 else None
             )
             backbone = source.backbone if source.maps else None
-            listing = cls(source.maps, minimal, source.minimal_listed, source.stopped, backbone)
+            listing = cls(
+                source.maps,
+                minimal,
+                source.minimal_listed,
+                source.stopped,
+                backbone,
+                weighed=source.weighed,
+            )
             return listing.checked(one_view=_has_one_view(source.theory))
         if isinstance(source, SSHMap):
             source = [source]
@@ -169,8 +179,17 @@ class Listing:
             )
         is_optimal = status == Status.OPTIMAL.value
         listed = complete or (minimal < len(maps)) if is_optimal else complete
+        weighed = None
+        if maps and told.get("weighed"):
+            weighed = Weighed.from_dict(FieldReader(where), told["weighed"], len(maps[0].labels))
         listing = cls(
-            maps, minimal if is_optimal else None, listed, told.get("stopped"), backbone, where
+            maps,
+            minimal if is_optimal else None,
+            listed,
+            told.get("stopped"),
+            backbone,
+            where,
+            weighed,
         )
         return listing.checked(one_view=theory is None or _has_one_view(theory))
 

@@ -100,11 +100,13 @@ def _summary(solution: Solution, run: Mapping[str, Any]) -> str:
     if cost is None:
         return f"{seen} No map of them: {solution.status.value}."
     if solution.status is not Status.OPTIMAL:
-        proven = "a map without a proof that it is minimal"
+        proven = "a map without a proof that it is the best"
     elif solution.complete and solution.count == 1:
-        proven = "one minimal map"
+        proven = "one minimal map" if solution.weighed is None else "one map of least cost"
     else:
         proven = f"{'' if solution.complete else 'at least '}{solution.count} minimal maps"
+    if solution.weighed is not None:
+        proven += f"; {solution.weighed.sentence}"
     size = f"{cost.places} places, {cost.paths} paths, {cost.dstates} distinctive states"
     return f"{seen} {size}: {proven}."
 

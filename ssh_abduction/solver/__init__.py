@@ -46,6 +46,7 @@ if TYPE_CHECKING:
         Status,
         cost_as_counted,
     )
+    from ssh_abduction.solver.weighed import Weighed
     from ssh_abduction.solver.writing import ending, opening, summary_of, written_map
 
 _HOMES = {  # module: the names that this package exports from it
@@ -110,6 +111,7 @@ _HOMES = {  # module: the names that this package exports from it
         "Outcome",
         "observation",
     ),
+    "weighed": ("Weighed",),
     "values": (
         "Bound",
         "Cost",
@@ -160,6 +162,7 @@ __all__ = [
     "Stop",
     "Task",
     "Watch",
+    "Weighed",
     "check_limit",
     "check_rules",
     "cost_as_counted",
