@@ -51,6 +51,8 @@ class Weighed:
         bound: A proven lower bound on the cost of every map, in nats.
         within: All maps that cost less than this many nats more than the best one are in `rivals`.
             0 if it is not proven that no map costs less.
+        smallest: Whether the best map is proven to be the smallest one by count, and its misfit is
+            not improbable. Such a map is seldom false, also if it is not proven to cost least.
         rivals: The maps that cost little more than the best one, the best one first. Estimated
             ones come last.
     """
@@ -58,6 +60,7 @@ class Weighed:
     bound: float
     within: float
     rivals: tuple[Rival, ...]
+    smallest: bool = False
 
     @property
     def nats(self) -> float:
@@ -79,10 +82,11 @@ class Weighed:
     def confidence(self) -> float:
         """The probability of the best map among its rivals.
 
-        If it is not proven to be the best, a map at the bound counts as one more rival. Then the
-        confidence is small, as such a map may cost much less.
+        If it is neither proven to be the best nor the `smallest`, a map at the bound counts as one
+        more rival. Then the confidence is small, as such a map may cost much less.
         """
-        unknown = 0.0 if self.proven else math.exp(min(self.nats - self.bound, MOST))
+        is_likely = self.proven or self.smallest
+        unknown = 0.0 if is_likely else math.exp(min(self.nats - self.bound, MOST))
         return 1 / (1 / self.weights[0] + unknown)
 
     def probability(self, first: int, second: int, of: str = "dstate") -> float:
@@ -122,6 +126,9 @@ class Weighed:
         told = (
             f"the best map has probability {_percent(self.confidence)}"
             if self.proven
+            else f"the best map has probability {_percent(self.confidence)}, as it is the smallest "
+            "one and closes well"
+            if self.smallest
             else f"a map that costs {self.nats - self.bound:.1f} nats less may exist"
         )
         if self.doubtful is None:
@@ -139,6 +146,7 @@ class Weighed:
             "nats": round(self.nats, 6),
             "bound": round(self.bound, 6),
             "within": round(self.within, 6),
+            "smallest": self.smallest,
             "confidence": round(self.confidence, 6),
             "rivals": [rival.to_dict() for rival in self.rivals],
         }
@@ -163,7 +171,7 @@ class Weighed:
             _rival(read, rival, f"weighed.rivals[{i}]", steps) for i, rival in enumerate(written)
         )
         bound, within = (_number(read, record, name, "weighed") for name in ("bound", "within"))
-        return cls(bound, within, rivals)
+        return cls(bound, within, rivals, record.get("smallest") is True)
 
 
 def _percent(probability: float) -> str:

@@ -26,9 +26,12 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import TypeAlias
 
+from scipy.special import gammaincc
+
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.runtime.logs import log_of
+from ssh_abduction.solver.asp.limits import LimitError
 from ssh_abduction.solver.choosing import new_engine, takes_all
 from ssh_abduction.solver.engines.base import Engine, Found, Task
 from ssh_abduction.solver.engines.stepwise import StepEngine
@@ -56,6 +59,11 @@ WITHIN = math.log(100)
 RIVALS = 50
 # Costs that differ by less are equal. Their least squares are not more exact.
 EQUAL = 1e-6
+# A misfit is improbable if a true map is worse with less than this probability.
+IMPROBABLE = 0.01
+# Without a time limit, give the proof up when no better map was found for this many seconds, and
+# this many times as long as it took to find the best one.
+PATIENCE, MORE = 20.0, 10.0
 # Estimating rivals may take this many seconds. A rival that costs CERTAIN nats more than the best
 # map does not count: a million of them make 0.005 of a doubt.
 ESTIMATING, CERTAIN = 0.5, 19.0
@@ -98,6 +106,8 @@ class Weighing:
         self.bound = 0.0
         self.proven = False
         self._of_labels: OfLabels | None = None
+        self._counted: tuple[int, ...] | None = None  # the counts of the minimal maps, if proven
+        self._improved = 0.0  # when the best map was found
 
     @property
     def best(self) -> Candidate | None:
@@ -119,7 +129,10 @@ class Weighing:
             LimitError: A limit is over. What was found so far is kept.
         """
         parts, self._of_labels = self._parts, of_labels
+        if parts.known.status is Status.OPTIMAL:
+            self._counted = parts.known.cost
         parts.known.status = Status.UNKNOWN  # what was proven is about counts
+        self._improved = parts.watch.elapsed()
         parts.watch.use_reserve()
         if parts.known.best is not None:
             self.add(parts.known.best)
@@ -193,6 +206,8 @@ class Weighing:
         counts = Cost.of(ssh_map)
         prices = self._price({name: getattr(counts, name) for name in NAMES})
         nats = prices + self._misfit.of_map(ssh_map) / 2
+        if self.candidates and nats < self.candidates[0].nats - EQUAL:
+            self._improved = self._parts.watch.elapsed()
         if all(known.map != ssh_map for known in self.candidates):
             self.candidates.append(Candidate(ssh_map, nats))
             self.candidates.sort(key=lambda candidate: candidate.nats)
@@ -210,6 +225,7 @@ class Weighing:
             ssh_map: The map that has the fewest dstates, places and paths of all maps left.
         """
         look_at_clock()
+        self._check_patience()
         least = self._cost_of_others(ssh_map)
         self.bound = max(self.bound, min(least, self.candidates[0].nats if self.candidates else 0))
         if self.candidates and least >= self._most:
@@ -222,6 +238,12 @@ class Weighing:
         # The misfit of no returns is in `least` already.
         enough = 2 * (self._most - least + self._base)
         return frozenset(self._misfit.core(returns[::-1], enough)) or None
+
+    def _check_patience(self) -> None:
+        """Without a time limit, raise LimitError if no better map was found for long."""
+        watch = self._parts.watch
+        if watch.left() == math.inf and watch.elapsed() > PATIENCE + MORE * self._improved:
+            raise LimitError("no proof")
 
     @property
     def _most(self) -> float:
@@ -261,7 +283,18 @@ class Weighing:
             bound=self.bound,
             within=self._within if self.proven else 0.0,
             rivals=(*found, *self._estimated(found[0], set(rivals))),
+            smallest=self._is_smallest_and_closes(),
         )
+
+    def _is_smallest_and_closes(self) -> bool:
+        """Whether counting has proven the best map minimal, and its misfit is not improbable."""
+        best = self.candidates[0].map
+        if Cost.of(best).preferred_by(self._parts.task.theory) != self._counted:
+            return False
+        returns = self._misfit.returns_of(best)
+        square = self._misfit.of_returns(returns) - self._misfit.of_returns([])
+        freedom = sum(3 if found.of == "dstate" else 2 for found in returns)
+        return freedom == 0 or float(gammaincc(freedom / 2, max(square, 0.0) / 2)) >= IMPROBABLE
 
     def _estimated(
         self, best: Rival, known: Collection[tuple[tuple[int, ...], ...]]
