@@ -42,8 +42,8 @@ from ssh_abduction.solver.engines.framed_guess import GuessBeside
 from ssh_abduction.solver.engines.framed_paths import FramedPaths
 from ssh_abduction.solver.engines.nearby import NearbySearch
 from ssh_abduction.solver.engines.sides import FramedSides
-from ssh_abduction.solver.engines.visit_labels import OPEN, VisitLabels
-from ssh_abduction.solver.engines.visit_program import VisitProgram
+from ssh_abduction.solver.engines.visit_labels import VisitLabels
+from ssh_abduction.solver.engines.visit_program import OPEN, VisitProgram
 from ssh_abduction.solver.guesses import annealing, sampling
 from ssh_abduction.solver.guesses.annealing import Guess, attempts
 from ssh_abduction.solver.guesses.merging import kept, merged_near

@@ -14,6 +14,7 @@ from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.solver.sharing import Backbone
 from ssh_abduction.solver.steps.certificate import Basis, Certificate
 from ssh_abduction.solver.values import Bound, Cost, Effort, Grounding, Level, Seconds
+from ssh_abduction.solver.weighed import Weighed
 from ssh_abduction.theory.fields import COUNTS
 from ssh_abduction.theory.theory import Theory
 
@@ -77,6 +78,7 @@ class Support:
             of.
         weigh_warning: A sentence that says why maps were counted though they should be weighed;
             None if there is nothing to say.
+        weighed: The costs in nats and the rival maps, if maps were compared by cost; else None.
         recorded: The certificate and warnings of the file, if the solution was read from a file;
             else None.
     """
@@ -84,6 +86,7 @@ class Support:
     basis: Basis | None = None
     odometry_warning: str | None = None
     weigh_warning: str | None = None
+    weighed: Weighed | None = None
     recorded: Recorded | None = None
 
     @property

@@ -6,16 +6,17 @@ Importing this module does not load clingo.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, overload
+from typing import Any
 
 from ssh_abduction.checker.claims import contradictions
 from ssh_abduction.data.checks import a_whole_number, one_of
-from ssh_abduction.data.errors import MapError, SolverError, brief, checked_index, named
+from ssh_abduction.data.errors import MapError, SolverError, brief, named
 from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.map_file import SOLUTION_FORMAT, check_format, read_json, write_map
+from ssh_abduction.data.map_sequence import MapSequence
 from ssh_abduction.data.maps import SSHMap, check_of_trace, maps_of
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.data.words import counted
@@ -51,7 +52,7 @@ from ssh_abduction.theory.theory import Theory
 
 
 @dataclass(frozen=True, slots=True)
-class Solution:
+class Solution(MapSequence):
     """The answer for one trace.
 
     A solution is a sequence of its maps: `len(solution)`, `solution[0]`, and
@@ -78,7 +79,6 @@ class Solution:
             that are not in `maps`; None if it is to be computed from `maps`.
         trace: The trace; None in a solution that was read from a file without its trace.
         support: The data behind the certificate and the warnings.
-        weighed: The costs in nats and the rival maps, if maps were compared by cost; else None.
     """
 
     status: Status
@@ -96,36 +96,6 @@ class Solution:
     shared: Backbone | None = field(default=None, repr=False, compare=False)
     trace: Trace | None = field(default=None, repr=False, compare=False)
     support: Support = field(default=Support(), repr=False, compare=False)
-    weighed: Weighed | None = field(default=None, repr=False)
-
-    def __len__(self) -> int:
-        """The number of maps in this solution."""
-        return len(self.maps)
-
-    def __bool__(self) -> bool:
-        """True, even without a map. Ask `len` or `status` whether there are maps."""
-        return True
-
-    def __iter__(self) -> Iterator[SSHMap]:
-        return iter(self.maps)
-
-    @overload
-    def __getitem__(self, index: int) -> SSHMap: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> tuple[SSHMap, ...]: ...
-
-    def __getitem__(self, index: int | slice) -> SSHMap | tuple[SSHMap, ...]:
-        """The map at a position, or a tuple of maps for a slice.
-
-        Raises:
-            RangeError: There is no map at this position.
-        """
-        return (
-            self.maps[index]
-            if isinstance(index, slice)
-            else self.maps[checked_index(index, len(self.maps), "maps")]
-        )
 
     def __repr__(self) -> str:
         return f"<Solution {self.headline}>"
@@ -185,6 +155,11 @@ class Solution:
             else f"{counted(least, 'maps')} of least cost"
         )
         return f"{self.status.value}: {counts}; {minimal}{more}{perhaps}"
+
+    @property
+    def weighed(self) -> Weighed | None:
+        """The costs in nats and the rival maps, if maps were compared by cost; else None."""
+        return self.support.weighed
 
     @property
     def confidence(self) -> float | None:
@@ -425,10 +400,12 @@ class Solution:
             levels=levels_in(read, record, len(maps)),
             shared=backbone_in(read, record, steps),
             trace=trace,
-            support=Support(recorded=Recorded.of(read, record, steps)),
-            weighed=Weighed.from_dict(read, record["weighed"], steps)
-            if record.get("weighed")
-            else None,
+            support=Support(
+                recorded=Recorded.of(read, record, steps),
+                weighed=Weighed.from_dict(read, record["weighed"], steps)
+                if record.get("weighed")
+                else None,
+            ),
         )
 
 

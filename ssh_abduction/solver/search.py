@@ -295,11 +295,8 @@ class Search:
             self._stages.find_minimum()
         watch.end_stage_after(math.inf)
         if self._parts.known.status is not Status.UNSATISFIABLE:
-            weighing.search(self._of_labels)
-
-    def _of_labels(self, theory: Theory, seconds: float) -> tuple[tuple[SSHMap, ...], bool]:
-        """The minimal maps of a theory that fixes the dstates and places of this trace."""
-        return self._solve_mended(self.trace, theory, self.limits.most, seconds)
+            most = self.limits.most
+            weighing.search(lambda theory, s: self._solve_mended(self.trace, theory, most, s))
 
     def _solve_mended(
         self, mended: Trace, theory: Theory, most: int, seconds: float
@@ -380,7 +377,8 @@ class Search:
         """
         solution = self._answer.solution(self._answer.in_order(checked_maps(maps)))
         if self._weighing is not None:
-            return replace(solution, weighed=self._weighing.weighed())
+            support = replace(solution.support, weighed=self._weighing.weighed())
+            return replace(solution, support=support)
         if self._asked_weigh != "cost":
             return solution
         return replace(solution, support=replace(solution.support, weigh_warning=COUNTED))

@@ -45,7 +45,8 @@ from ssh_abduction.solver.engines.framed_guess import GuessBeside, SoonMaps
 from ssh_abduction.solver.engines.framed_paths import Fitted, FramedPaths, Naming
 from ssh_abduction.solver.engines.refusing import all_accepted, first_accepted_of
 from ssh_abduction.solver.engines.sides import FramedSides
-from ssh_abduction.solver.engines.visit_labels import OPEN, VisitLabels
+from ssh_abduction.solver.engines.visit_labels import VisitLabels
+from ssh_abduction.solver.engines.visit_program import OPEN
 from ssh_abduction.solver.guesses.merging import kept
 from ssh_abduction.solver.steps.chart import Chart, FramedChart
 from ssh_abduction.theory.evidence import Equality

@@ -19,8 +19,8 @@ from ssh_abduction.solver.asp.control import Asker, new_control
 from ssh_abduction.solver.asp.facts import names_lp
 from ssh_abduction.solver.asp.facts.atoms import numbers
 from ssh_abduction.solver.engines.base import Task
-from ssh_abduction.solver.engines.nearby import AT_A_TIME, SECONDS_A_CHARACTER
 from ssh_abduction.solver.engines.pinned import Pinned
+from ssh_abduction.solver.engines.spare_names import AT_A_TIME, SECONDS_A_CHARACTER
 from ssh_abduction.solver.steps.chart import Chart, Link
 
 # Clingo cannot be stopped while it prepares to solve. That takes about this share of the time that

@@ -1,14 +1,14 @@
 """Finds small maps near a guess, and proves that there are none with fewer dstates.
 
-It is used for the causal theory, and for the causal axioms of theories with frames. `NearbySearch`
-yields ever smaller maps. If it ends with a `bound`, the last map is minimal.
+It serves the causal theory, and the causal axioms of theories with frames. `NearbySearch` yields
+ever smaller maps. If it ends with a `bound`, the last map is minimal.
 
 If all steps were free to change their dstates, the search would take long. So most steps keep the
 dstates of a known map, and the search tries to save one dstate. If that is impossible, clingo
 returns an unsat core: a set of steps that cannot all stay where they are. The dstates of these
 steps become free. This is repeated until a dstate is saved, or is proven to be needed. If neither
-happens soon, all steps in some part of the map become free at once. The size of parts is adapted so
-that each question is answered soon (large neighbourhood search: Shaw 1998).
+happens soon, all steps in some part of the map become free at once (large neighbourhood search:
+Shaw 1998). The size of parts is adapted so that each question is answered soon.
 
 When each single dstate is needed, all steps become free. But at first no view may have more dstates
 than in the known map. Then views are allowed more dstates, one view after the other, and in the end
@@ -16,17 +16,10 @@ any number (the rest, see `engines/naming.py`). Each time clingo is asked for a 
 dstates in total.
 
 *Claim.* If there is no such map when everything is allowed, the known map is minimal.
-*Proof.* This last question is the one of `engines/naming.py`, for a cost that is lower by one. By
-the claim there, every map with fewer dstates is an answer to it. ∎
+*Proof.* This is the question of `engines/naming.py` for a cost lower by one (see its claim). ∎
 
-If everything were allowed at once, the proof might take hours. What clingo learns from one question
-makes the next one shorter. So one, two, four names and so on are allowed at a time, while the
-answers come soon.
-
-The nodes need not be the steps of a trace. If places have frames, the nodes are those of
-`Chart.framed`, and rotations are links like actions. The maps then need not fit a frame, as
-names.lp does not know how rotations compose, but the bound holds. Names suit this search, but not
-one that raises the bound core by core. So `engines/visit_labels.py` has none.
+If places have frames, the nodes are those of `Chart.framed`, and rotations are links. The maps then
+need not fit a frame, but the bound holds.
 """
 
 from __future__ import annotations
@@ -36,7 +29,6 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
 import clingo
@@ -47,8 +39,14 @@ from ssh_abduction.solver.asp.facts import names_lp
 from ssh_abduction.solver.asp.facts.atoms import numbers
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.engines.pinned import Pinned
+from ssh_abduction.solver.engines.spare_names import (
+    AT_A_TIME,
+    SECONDS_A_CHARACTER,
+    SpareNames,
+    seen_labels,
+)
 from ssh_abduction.solver.steps.apart import Matrix
-from ssh_abduction.solver.steps.chart import Chart, numbered
+from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.theory.speedups import Speedups
 
 # At first, give up a question after this many conflicts. Each round of questions doubles it.
@@ -65,37 +63,8 @@ LARGER, SMALLER = 2, 4
 # Clingo cannot be stopped while it prepares to solve. That takes about this many times as long as
 # grounding took.
 PREPARING = 1.0
-# Give clingo this many links at once. It cannot be stopped while it grounds them.
-AT_A_TIME = 100
-# Clingo cannot be stopped while it reads and grounds the facts about names. That takes at most
-# about this many seconds for each character of the facts.
-SECONDS_A_CHARACTER = 1e-6
-
 Labels: TypeAlias = list[int]
-Key: TypeAlias = tuple[int, int]  # the observation at a node, and the label of the node
 _Verdict: TypeAlias = Literal["moved", "needed", "open"]
-
-
-@dataclass(frozen=True)
-class _Names:
-    """The names that the control knows.
-
-    A literal is a number by which clingo is asked about an atom.
-
-    Attributes:
-        spare: The spare names of each view. The last one is the rest, which any number of dstates
-            without a name of their own share.
-        rests: The rests of all views.
-        choices: For each node, the names that it may have.
-        used: For each spare name, the literal that some node has it.
-        ordered: The literal that the spare names of each view first occur in their order.
-    """
-
-    spare: Mapping[int, range]
-    rests: frozenset[int]
-    choices: Sequence[Sequence[int]]
-    used: Mapping[int, int]
-    ordered: int
 
 
 class NearbySearch:
@@ -120,21 +89,19 @@ class NearbySearch:
             watch: The limits.
             speedups: The speed-ups that are on.
             pinned: The nodes, their links, and the clique of nodes that have names of their own.
-            far: Returns, for a node, a row of flags that mark nodes at other dstates, which clingo
-                has to keep different. None if there are no such pairs to give to clingo.
+            far: Returns flags of the nodes at other dstates than a node; None for no such pairs.
             configuration: A configuration of clasp; None for its default.
         """
         self.bound: int | None = None
         self._asker = Asker(watch)
         self._speedups, self._pinned, self._far = speedups, pinned, far
         self._configuration = configuration
-        self._names = _Names({}, frozenset(), (), {}, 0)
+        self._names = SpareNames({}, frozenset(), (), {}, 0)
         self._labels: Labels = []
         self._needed: set[int] = set()  # names whose dstate is proven to be needed
         # For each view, the number of spare names that it keeps, as fewer were not enough once.
         self._fewest: dict[int, int] = {}
-        # Names that do not help even if all of them are allowed at once. None before each name was
-        # tried alone.
+        # Names that do not help if allowed together. None before each was tried alone.
         self._allowed: list[int] | None = None
         self._waiting: list[int] = []  # names that are not yet allowed
         self._region = FIRST_REGION
@@ -143,12 +110,9 @@ class NearbySearch:
     def fewer(self, guess: Sequence[int], tries: int | None = None) -> Iterator[Labels]:
         """Yield labels of all nodes, each time with fewer dstates.
 
-        At the end, `bound` is set if the last labels are proven to have the fewest dstates.
-
         Args:
             guess: The dstate of each node, -1 if it is unknown. It need not be a map.
-            tries: Give up after this many rounds of questions without a proof; None to go on until
-                there is one.
+            tries: Give up after this many rounds without a proof; None to go on until there is one.
         """
         if known := self._pinned.chart.is_map(guess):
             yield list(guess)
@@ -242,7 +206,7 @@ class NearbySearch:
         used = {
             name: self._literal(names_lp.used(name)) for some in spare.values() for name in some
         }
-        self._names = _Names(
+        self._names = SpareNames(
             spare,
             frozenset(some[-1] for some in spare.values()),
             choices,
@@ -534,15 +498,3 @@ class NearbySearch:
             for old, new in zip(names, self._names.spare[view], strict=False)
         }
         self._label([renamed.get(name, name) for name in self._labels])
-
-
-def seen_labels(guess: Sequence[int], chart: Chart) -> list[Key | None]:
-    """Return the pair of observation and label for each node; None if the label is unknown.
-
-    Args:
-        guess: The label of each node, -1 if it is unknown.
-        chart: The chart of the nodes.
-    """
-    return [
-        None if label < 0 else (view, label) for view, label in zip(chart.seen, guess, strict=True)
-    ]

@@ -19,8 +19,9 @@ from itertools import islice
 
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.engines.base import AT_ONCE, Task
-from ssh_abduction.solver.engines.nearby import Key, NearbySearch, seen_labels
+from ssh_abduction.solver.engines.nearby import NearbySearch
 from ssh_abduction.solver.engines.pinned import Pinned
+from ssh_abduction.solver.engines.spare_names import Key, seen_labels
 from ssh_abduction.solver.guesses.annealing import annealed, annealed_steps
 from ssh_abduction.solver.guesses.continuing import followed
 from ssh_abduction.solver.guesses.merging import merged, merged_near, thinned

@@ -29,17 +29,14 @@ relaxation, and an answer that locates all visits is an answer for all of them.
 *From below.* Unsat cores raise the bound (`Cores`). Clasp has this built in, but starts again with
 each call, and each answer that is not transitive needs another call.
 
-*Near a guess.* If the search takes long, clingo is asked for answers near a guessed map. Such an
-answer has the fewest dstates only if their number equals the bound.
+*Near a guess.* If the search takes long, clingo is asked for answers near a guessed map.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
-from enum import Enum
 from functools import partial
 from itertools import combinations, islice
-from typing import Final
 
 import clingo
 
@@ -48,7 +45,9 @@ from ssh_abduction.solver.asp.facts import visits_lp
 from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.refusing import first_accepted, smaller
 from ssh_abduction.solver.engines.visit_program import (
+    OPEN,
     Answer,
+    Open,
     Refusal,
     Sides,
     VisitProgram,
@@ -73,15 +72,6 @@ GROWN = 1.1
 MANY = 5
 # After this many violations of transitivity nearby, ask for single answers again.
 FAR = 200
-
-
-class Open(Enum):
-    """The result of a search that was interrupted before it had an answer."""
-
-    OPEN = "open"
-
-
-OPEN: Final = Open.OPEN
 
 
 class VisitLabels:

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
-from typing import Protocol
+from enum import Enum
+from typing import Final, Protocol
 
 import clingo
 
@@ -24,6 +25,15 @@ from ssh_abduction.solver.steps.localising import Located, State, faced, located
 # Clingo takes about this many seconds to ground one pair of visits that may be at one place. It
 # cannot be stopped meanwhile.
 SECONDS_A_PAIR = 3e-5
+
+
+class Open(Enum):
+    """The result of a search that was interrupted before it had an answer."""
+
+    OPEN = "open"
+
+
+OPEN: Final = Open.OPEN
 
 
 class Sides(Protocol):

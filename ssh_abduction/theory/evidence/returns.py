@@ -11,12 +11,13 @@ from bisect import bisect
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.theory.evidence.closing import Closing
+from ssh_abduction.theory.evidence.courses import Course, hold
 from ssh_abduction.theory.evidence.protocol import Equality
 from ssh_abduction.theory.pairs import NO_PAIRS, Earlier, Pairs
 
@@ -62,7 +63,7 @@ class Returns:
             trace, before.reckoning if before else None
         )
         # Accepted maps, the last one last.
-        self._accepted: dict[_Course, Together] = dict(before._accepted) if before else {}
+        self._accepted: dict[Course, Together] = dict(before._accepted) if before else {}
         # Sets of two returns, the last one last.
         self._refused: list[frozenset[Equality]] = list(before._refused) if before else []
         self._pairs: Pairs | None = before._pairs if before else None
@@ -294,16 +295,16 @@ class Returns:
         import numpy as np
 
         labels, places = ssh_map.labels, tuple(s.place for s in ssh_map.dstates)
-        course = _Course.of(labels, places)
+        course = Course.of(labels, places)
         if course in self._accepted:
             return None
         if (
             known := next(
-                (found for found in reversed(self._refused) if _hold(found, labels, places)), None
+                (found for found in reversed(self._refused) if hold(found, labels, places)), None
             )
         ) is not None:
             return known
-        before = self._accepted.pop(_Course.of(labels[:since], places), None)
+        before = self._accepted.pop(Course.of(labels[:since], places), None)
         rows = self._returns_of(labels, places, since if before else 0)
         if before:
             rows = np.concatenate([before.rows, rows])
@@ -486,39 +487,6 @@ class Returns:
         )
         new: Mask = np.isin(codes, known_codes, invert=True)
         return new
-
-
-class _Course(NamedTuple):
-    """The parts of a map that displacements depend on: labels of steps, and places of dstates."""
-
-    labels: tuple[int, ...]
-    places: tuple[int | None, ...]
-
-    @staticmethod
-    def of(labels: tuple[int, ...], places: tuple[int | None, ...]) -> _Course:
-        """Make a course of some labels. Places of dstates with larger numbers are left out."""
-        return _Course(labels, places[: max(labels, default=-1) + 1])
-
-
-def _hold(
-    equalities: Collection[Equality], labels: Sequence[int], places: Sequence[int | None]
-) -> bool:
-    """Whether all these equalities hold in a map.
-
-    Args:
-        equalities: Equalities of two steps, the earlier one first.
-        labels: The dstate of each step.
-        places: The place of each dstate.
-    """
-    return all(
-        equality.second < len(labels)
-        and (
-            labels[equality.first] == labels[equality.second]
-            if equality.of == "dstate"
-            else places[labels[equality.first]] == places[labels[equality.second]] is not None
-        )
-        for equality in equalities
-    )
 
 
 def _parts(size: int, most: int = AT_A_TIME) -> Iterator[slice]:

@@ -1,0 +1,45 @@
+"""A value that is used as the sequence of its maps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import overload
+
+from ssh_abduction.data.errors import checked_index
+from ssh_abduction.data.maps import SSHMap
+
+
+class MapSequence:
+    """A sequence of maps, for a class with the attribute `maps`: `len`, indices and iteration."""
+
+    __slots__ = ()
+    maps: tuple[SSHMap, ...]
+
+    def __len__(self) -> int:
+        """The number of maps."""
+        return len(self.maps)
+
+    def __bool__(self) -> bool:
+        """True, even without a map. Ask `len` or `status` whether there are maps."""
+        return True
+
+    def __iter__(self) -> Iterator[SSHMap]:
+        return iter(self.maps)
+
+    @overload
+    def __getitem__(self, index: int) -> SSHMap: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> tuple[SSHMap, ...]: ...
+
+    def __getitem__(self, index: int | slice) -> SSHMap | tuple[SSHMap, ...]:
+        """The map at a position, or a tuple of maps for a slice.
+
+        Raises:
+            RangeError: There is no map at this position.
+        """
+        return (
+            self.maps[index]
+            if isinstance(index, slice)
+            else self.maps[checked_index(index, len(self.maps), "maps")]
+        )
