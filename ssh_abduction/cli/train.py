@@ -32,7 +32,12 @@ def add_parser(verbs: Verbs) -> None:
         "train", help="train a recogniser on the labels of a map", description=text
     )
     train.add_argument(
-        "-o", "--output", type=output, required=True, metavar="FILE.skops", help="file to write"
+        "-o",
+        "--output",
+        type=output,
+        required=True,
+        metavar="FILE.skops",
+        help="file for the trained recogniser",
     )
     train.set_defaults(run=run_train)
     text = (

@@ -87,7 +87,7 @@ class Theory:
             branch on the right in one direction is on the left in the other.
         path_order: Order of the places of a path. partial: some pairs may stay unordered. total:
             every two places are ordered.
-        next_place: Whether a travel leads to the next place of its path, and passes none.
+        next_place: Whether a travel leads to the next place of its path, with no place between.
         all_on_paths: Whether every dstate is on a path, even one where no travel starts or ends.
         star: How to use stars (the gateways seen at a place). none: not at all. alike: a dstate has
             one star, within tolerance. pattern: the stars of a place are one star, rotated. frame:
@@ -120,8 +120,8 @@ class Theory:
         weigh: How to compare maps. count: by the counts in `prefer`. cost: by their cost in nats,
             which is the prices of what they have, plus half of the chi-square of their misfit to
             the displacements. auto: cost if displacements are used and the theory allows it.
-        prices: The prices of a dstate, a place and a path, in nats (natural logarithms of odds),
-            where maps are compared by cost.
+        prices: Three numbers D,P,H: the prices of a dstate, a place and a path in nats (natural
+            logarithms of odds). Only weigh=cost uses them.
     """
 
     level: Literal["causal", "topological"] = "topological"

@@ -86,7 +86,8 @@ class Chart:
         the nodes of an excluded pair must have different labels.
 
         Args:
-            labels: The dstate of each node; a negative number if it is unknown, which is no map.
+            labels: The dstate of each node, negative if unknown. With an unknown dstate the result
+                is False.
         """
         view: dict[int, int] = {}
         leads: dict[tuple[int, int], int] = {}

@@ -63,7 +63,7 @@ def picked(symbol: Symbol) -> Symbol:
 
 
 def some_fail() -> Symbol:
-    """The atom that says that some picked conclusion does not hold."""
+    """The atom that holds if at least one of the picked conclusions does not hold."""
     return Function("some_fail")
 
 
