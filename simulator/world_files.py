@@ -282,7 +282,16 @@ class WorldReader:
         return float(value)
 
     def angles(self, value: Any, walls: Array) -> Angles:
-        """Check how streets meet, "right" or "any". If the file does not say it, walls decide."""
+        """Return how streets meet: at right angles ("right") or at any angles ("any").
+
+        Args:
+            value: What the file says. With None the result is "right" if nearly all walls have one
+                of two perpendicular directions, else "any".
+            walls: (n, 4) metres.
+
+        Raises:
+            SimulatorError: The value is another one.
+        """
         if value not in (None, "right", "any"):
             raise self.wrong("angles", '"right" or "any"', value)
         chosen: Angles = value or ("right" if are_square(walls) else "any")

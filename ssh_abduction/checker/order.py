@@ -113,7 +113,11 @@ class Order:
         return way[::-1]
 
     def ring_steps(self, ring: Sequence[int]) -> list[int]:
-        """List the steps of the travels around a ring of places."""
+        """List the steps of the travels that put places in a circular order.
+
+        Args:
+            ring: The places. A travel leads from each to the next, and from the last to the first.
+        """
         edges = zip(ring, [*ring[1:], ring[0]], strict=True)
         return [step for edge in edges for step in self.travels[edge].steps]
 

@@ -118,7 +118,12 @@ def options_of(columns: Sequence[Bools] | Bools, maps: int) -> NDArray[np.intp]:
 
 
 def _split(column: Bools, groups: NDArray[np.intp]) -> int:
-    """Count the pairs of maps of the same group that give different answers."""
+    """Count the pairs of maps that are in one group but answer a question differently.
+
+    Args:
+        column: The answer of each map to the question.
+        groups: The number of the group of each map, from 0.
+    """
     sizes = np.bincount(groups)
     yes = np.bincount(groups, weights=column).astype(np.int64)
     return int((yes * (sizes - yes)).sum())

@@ -121,7 +121,7 @@ class Theory:
             which is the prices of what they have, plus half of the chi-square of their misfit to
             the displacements. auto: cost if displacements are used and the theory allows it.
         prices: Three numbers D,P,H: the prices of a dstate, a place and a path in nats (natural
-            logarithms of odds). Only weigh=cost uses them.
+            logarithms of odds). Used only if maps are compared by cost.
     """
 
     level: Literal["causal", "topological"] = "topological"

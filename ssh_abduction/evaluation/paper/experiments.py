@@ -303,9 +303,9 @@ def _contrast(e: Experiment, seed: int, trace: Trace, alone: NDArray[Any], k: in
 
 
 def _step(trace: Trace) -> float:
-    """Compute the distance between images that gives about one image per step of a trace.
+    """Compute the spacing of images, in metres, that gives about one image per step of a trace.
 
-    It is the length of the way, measured along x and y, divided by the number of steps, in metres.
+    The spacing is the length of the route, |dx| + |dy| summed, divided by the number of steps.
     """
     poses = np.array([step.truth["pose"][:2] for step in trace.steps])
     return round(float(np.abs(np.diff(poses, axis=0)).sum() / len(poses)), 2)

@@ -31,8 +31,8 @@ def in_process(work: Callable[..., Result], *arguments: object, watch: Watch) ->
     Args:
         work: The function to call. It, its arguments, its result and its errors can be pickled.
         arguments: The first arguments of `work`.
-        watch: The limits, which end the other process. `work` gets a watch as its last argument.
-            In the other process, that watch only limits the memory.
+        watch: The limits. The other process is ended at a limit. The last argument of `work` is a
+            new watch with only the memory limit in the other process, and `watch` in this one.
 
     Returns:
         The result of `work`.

@@ -259,14 +259,14 @@ class NearbySearch:
     ) -> _Verdict:
         """Change the labels of some nodes so that the assumptions hold.
 
-        Nodes whose name is not free keep it, unless a core shows that this is impossible.
+        Nodes with a name that is not free keep it, unless a core shows that this is impossible.
 
         Args:
             assumed: The assumptions, as literals.
             free: Names whose nodes may change their labels.
             conflicts: Give up after this many conflicts.
-            step_by_step: If a core shows that some nodes cannot all stay, free only these nodes.
-                Otherwise free all nodes that have the same names.
+            step_by_step: What to free if a core shows that some nodes cannot all keep their names.
+                True: these nodes only. False: all nodes with the names of these nodes.
 
         Returns:
             "moved" if the labels were changed; "needed" if the assumptions cannot hold; "open" if

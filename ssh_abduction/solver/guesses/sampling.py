@@ -154,12 +154,12 @@ class Sampler:
         ways: int,
         random: np.random.Generator,
     ) -> None:
-        """Draw a state for each visit at random.
+        """Draw a state (a number for a placing) at random for each visit.
 
         Args:
-            options: Visits x possible states, padded with -1.
+            options: One row per visit: the numbers of its possible states, padded with -1.
             leaves: The slot and action at which each visit but the last ends.
-            ways: The states of a place, as ways to stand there: 1 or 4.
+            ways: The number of states per place: 4 with right angles, 1 without headings.
             random: The source of random numbers.
         """
         self._random = random

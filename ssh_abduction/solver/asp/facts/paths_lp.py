@@ -233,7 +233,9 @@ def settled_labels(labels: Iterable[tuple[int, int]]) -> str:
 
 
 def open_labels(labels: Sequence[int]) -> str:
-    """The rules by which clingo chooses some nodes such that no places and paths fit their labels.
+    """The rules that let clingo keep or drop the label of each node.
+
+    An answer is a set of kept labels that no places and paths fit.
 
     Args:
         labels: The dstate of each node.
