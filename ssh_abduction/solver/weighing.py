@@ -41,8 +41,9 @@ from ssh_abduction.solver.map_list import Priced
 from ssh_abduction.solver.misfit import Misfit
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.prefixes import Prefixes
+from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.solver.values import Cost, Status
-from ssh_abduction.solver.weighed import Rival, Weighed
+from ssh_abduction.solver.weighed import EQUAL, Rival, Weighed
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.theory import Theory
@@ -57,8 +58,6 @@ NAMES = ("dstates", "places", "paths")
 WITHIN = math.log(100)
 # At most this many maps are kept. If there are more, fewer nats count.
 RIVALS = 50
-# Costs that differ by less are equal. Their least squares are not more exact.
-EQUAL = 1e-6
 # A misfit is improbable if a true map is worse with less than this probability.
 IMPROBABLE = 0.01
 # Without a time limit, give the proof up when no better map was found for this many seconds, and
@@ -309,9 +308,9 @@ class Weighing:
         least = best.nats + self._within if self.proven else -math.inf
         at = best.places or best.dstates
         visits: dict[int, list[int]] = {}  # the first steps of the visits to each place
-        for step, name in enumerate(at):
-            if not step or at[step - 1] != name or self._misfit.visit[step] == step:
-                visits.setdefault(name, []).append(step)
+        for step, begin in enumerate(_begins(at, self._misfit.visit)):
+            if begin == step:
+                visits.setdefault(at[step], []).append(step)
         ends = time.perf_counter() + ESTIMATING
         tried = set(known)
         for name, begins in visits.items():
@@ -342,21 +341,27 @@ def _moved(
         moved: The first steps of the visits.
     """
     at = best.places or best.dstates
-    begin, new = 0, []
-    for step, name in enumerate(at):
-        if not step or at[step - 1] != name or visit[step] == step:
-            begin = step
-        new.append(name == place and begin in moved)
+    begins = _begins(at, visit)
+    new = [name == place and begin in moved for name, begin in zip(at, begins, strict=True)]
     more = len(at)
     dstates = [name + more * is_new for name, is_new in zip(best.dstates, new, strict=True)]
     places = [name + more * is_new for name, is_new in zip(best.places, new, strict=False)]
-    return _numbered(dstates), _numbered(places)
+    return tuple(numbered(dstates)), tuple(numbered(places))
+
+
+def _begins(at: Sequence[int], visit: Sequence[int]) -> list[int]:
+    """The first step of the visit of each step to its place, or without places to its dstate."""
+    begins: list[int] = []
+    for step, name in enumerate(at):
+        is_first = not step or at[step - 1] != name or visit[step] == step
+        begins.append(step if is_first else begins[-1])
+    return begins
 
 
 def _course(ssh_map: SSHMap) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """The dstate and the place of each step, numbered by first visit."""
     places = [ssh_map.dstates[label].place for label in ssh_map.labels]
-    return _numbered(ssh_map.labels), _numbered(places)
+    return tuple(numbered(ssh_map.labels)), tuple(numbered(places))
 
 
 def _pinned(theory: Theory, ssh_map: SSHMap) -> Theory:
@@ -380,12 +385,6 @@ def _pinned(theory: Theory, ssh_map: SSHMap) -> Theory:
 def _rival_of(candidate: Candidate) -> Rival:
     dstates, places = _course(candidate.map)
     return Rival(candidate.nats, dstates, places if candidate.map.places else ())
-
-
-def _numbered(names: Sequence[int | None]) -> tuple[int, ...]:
-    """The names as numbers, by first appearance."""
-    number: dict[int | None, int] = {}
-    return tuple(number.setdefault(name, len(number)) for name in names)
 
 
 class _Judging(Judging):
