@@ -215,7 +215,7 @@ def test_the_shell_lines_of_a_tutorial_can_be_followed_in_an_empty_folder(
     page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(log_maps, "LEAST", 1000.0)  # however slow this machine is
-    monkeypatch.setattr(log_maps, "LEAST_RUNG", 1000.0)
+    monkeypatch.setattr(log_maps, "ladder", lambda *_, **__: ())  # what is shown has none
     monkeypatch.chdir(tmp_path)
     for block in blocks(page):
         if not block.why:
