@@ -21,6 +21,7 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import combinations
 
 from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.star import SPREAD, Frame, Star
@@ -163,6 +164,57 @@ def headings(sights: Sequence[Sight], turns: Turns, axioms: Collection[str]) -> 
         for sight, (frame, shift) in zip(seen, fitted, strict=True) if fitted else ():
             if fitted and sight.shows:
                 found[sight.dstate.id] = _middle(rotations(fitted[0][0], frame, shift))
+    return found
+
+
+@dataclass(frozen=True)
+class Facing:
+    """How the dstates of a map face in the frames of their places.
+
+    Attributes:
+        headings: For each dstate, its heading in degrees.
+        opposite: Pairs of dstates at one place that face opposite ways.
+        ends: Pairs of a dstate and a direction, 0 (ahead) or 180 (behind), in which no gateway
+            leads on.
+    """
+
+    headings: dict[int, int]
+    opposite: list[tuple[int, int]]
+    ends: list[tuple[int, int]]
+
+
+def facing(trace: Trace, ssh_map: SSHMap, axioms: Collection[str]) -> Facing | None:
+    """Fit the stars of a map without paths.
+
+    Args:
+        trace: The trace, with stars.
+        ssh_map: A map of the trace. Its headings and paths are ignored.
+        axioms: Names of the axioms that hold.
+
+    Returns:
+        How the dstates face; None if no frame fits the stars of some place.
+    """
+    sights, turns = sights_of(trace, ssh_map, lambda s: ())
+    found = Facing({}, [], [])
+    for seen in by_place(sights).values():
+        fitted = fit(seen, turns, set(axioms) - {"gateway_path", "gateway_end"}, as_shown=False)
+        if fitted is None:
+            return None
+        read = list(zip(seen, fitted, strict=True))
+        for sight, (frame, shift) in read:
+            s = sight.dstate.id
+            if sight.shows:
+                found.headings[s] = _middle(rotations(fitted[0][0], frame, shift))
+            found.ends.extend(
+                (s, towards)
+                for towards in (0, 180)
+                if not any(_leads(frame, towards) for frame in sight.star.frames)
+            )
+        for (a, (first, back)), (b, (then, on)) in combinations(read, 2):
+            shift = (on - back) % max(first.slots, 1)
+            turns_by = rotations(first, then, shift)
+            if _ways(first, then, shift, turns_by)[1] and not turns_by & {90, 270}:
+                found.opposite.append((a.dstate.id, b.dstate.id))
     return found
 
 

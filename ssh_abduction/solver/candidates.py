@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -36,6 +36,8 @@ SKETCH_SHARE = 0.4
 # The sketch that succeeds most often may take this many seconds even if less time is left.
 # Otherwise a slow machine finds no map.
 SUREST = 1.5
+# The width of a broad beam of hypotheses.
+BROAD = 4
 
 
 class Candidates:
@@ -61,6 +63,28 @@ class Candidates:
         """
         if self._task.speedups.greedy and self._task.theory.level == "causal":
             self.offer(answer_maps.causal_map(self._task.log.merged(), self._task.trace))
+
+    def by_displacements(self, width: int) -> Iterator[SSHMap]:
+        """Maps that a beam of hypotheses about the displacements finds, the best one first.
+
+        Nothing is yielded without the speed-up `greedy`, or if the trace has no displacements or
+        the theory has faults.
+
+        Args:
+            width: The number of hypotheses.
+        """
+        theory = self._task.theory
+        if (
+            theory.displacement != "use"
+            or theory.has_faults
+            or not self._task.speedups.greedy
+            or not self._judging.can_accept
+        ):
+            return
+        from ssh_abduction.solver.guesses.beam import Beam  # loads numpy
+
+        beam = Beam(self._task.problem, self._task.log, width)
+        yield from filter(self._judging.accepts, map(self._with_unknown_views, beam.maps()))
 
     def sketch(self, seconds: float = math.inf) -> None:
         """Make a sketch (a map without a search), if no map of the whole trace is known.
@@ -134,12 +158,19 @@ class Candidates:
         """The functions that each make one sketch, those that make small maps first."""
         trace, theory = self._task.trace, self._task.theory
         known = self._known.partial if trace is self._trace else None
+        beams = [partial(self._offer_beam, width) for width in (BROAD, 1)]
         if theory.star == "gateways":
-            return [partial(self._offer_gated, homing=homing) for homing in (True, False)]
+            gated = [partial(self._offer_gated, homing=homing) for homing in (True, False)]
+            return [*beams, *gated]
         sketches = Sketch.all_of(trace.steps[0], theory)
         if known is not None:
             sketches.insert(0, Sketch.beyond(known, trace.prefix(len(known.labels)), theory))
-        return [self.merge, *(partial(self._go_on_to_end, sketch) for sketch in sketches)]
+        return [*beams, self.merge, *(partial(self._go_on_to_end, sketch) for sketch in sketches)]
+
+    def _offer_beam(self, width: int) -> None:
+        """Offer the maps that a beam of hypotheses about the displacements finds."""
+        for ssh_map in self.by_displacements(width):
+            self.offer(ssh_map)
 
     def _offer_gated(self, *, homing: bool) -> None:
         """Offer a sketch for places with gateways at any angles, if there is one.
@@ -182,11 +213,7 @@ class Candidates:
 
     def offer(self, ssh_map: SSHMap) -> None:
         """Keep a map of the whole trace if it is the best so far and the checker accepts it."""
-        if self._task.trace is not self._trace:
-            views = answer_maps.views_of(dict(enumerate(ssh_map.labels)), self._trace)
-            ssh_map = replace(
-                ssh_map, dstates=tuple(replace(s, view=views[s.id]) for s in ssh_map.dstates)
-            )
+        ssh_map = self._with_unknown_views(ssh_map)
         found = Found.of(ssh_map, self._task.theory)
         if self._known.is_better(found) and self._judging.accepts(ssh_map):
             _log.info(
@@ -197,6 +224,14 @@ class Candidates:
             )
             self._known.keep(found, ssh_map.labels)
             self._task.watch.use_reserve()
+
+    def _with_unknown_views(self, ssh_map: SSHMap) -> SSHMap:
+        """Undo what `_with_all_views` did to the trace, in a map of it."""
+        if self._task.trace is self._trace:
+            return ssh_map
+        views = answer_maps.views_of(dict(enumerate(ssh_map.labels)), self._trace)
+        dstates = tuple(replace(s, view=views[s.id]) for s in ssh_map.dstates)
+        return replace(ssh_map, dstates=dstates)
 
 
 def _with_all_views(task: Task) -> Task:

@@ -63,6 +63,20 @@ def fit(trace: Trace, ssh_map: SSHMap) -> Fit:
     return Poses.of_map(trace, ssh_map).fit()
 
 
+def noises(trace: Trace, steps: Sequence[int]) -> Array:
+    """The covariances of the displacements that lead to some steps: n x 3 x 3.
+
+    A dstate has one pose in a map, but the robot is not at exactly this pose on each visit. That
+    error counts in the displacements to the dstate and from it.
+    """
+    odometry = trace.odometry or Odometry()
+    offset = 2 * np.diag([odometry.offset, odometry.offset, odometry.facing]) ** 2
+    travelled = np.array([trace.actions[t - 1].kind != "turn" for t in steps], dtype=float)
+    noise = np.array([trace.covariance(t) for t in steps], dtype=float).reshape(-1, 3, 3)
+    whole: Array = noise + travelled.reshape(-1, 1, 1) * offset
+    return whole
+
+
 class Poses:
     """Least squares over positions and headings that the steps of a trace share.
 
@@ -88,16 +102,7 @@ class Poses:
         self._moved = np.array([trace.steps[t].displacement for t in steps], dtype=float).reshape(
             -1, 3
         )
-        noise = np.array([trace.covariance(t) for t in steps], dtype=float).reshape(-1, 3, 3)
-        # A dstate has one pose here, but the robot is not at exactly this pose on each visit. Count
-        # that error in the displacements to the dstate and from it.
-        travelled = np.array(
-            [trace.actions[t - 1].kind != "turn" for t in steps], dtype=float
-        ).reshape(-1, 1, 1)
-        noise = (
-            noise
-            + travelled * 2 * np.diag([odometry.offset, odometry.offset, odometry.facing]) ** 2
-        )
+        noise = noises(trace, steps)
         self._whitening = np.linalg.inv(np.linalg.cholesky(noise)) if steps else noise
         self._way = np.hypot(self._moved[:, 0], self._moved[:, 1])
         self._sigma = np.array([odometry.scale, odometry.bend])

@@ -287,8 +287,9 @@ class Search:
         )
 
     def _weigh(self, weighing: Weighing) -> None:
-        """Find some minimal map by counting, and then the maps of least cost."""
+        """Find the maps of least cost: guess some, find some minimal map by counting, and prove."""
         watch = self._parts.watch
+        weighing.guess()
         if watch.left() < math.inf:
             watch.end_stage_after(watch.elapsed() + COUNTING_SHARE * watch.left())
         with suppress(StageTimeError):

@@ -22,6 +22,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import TypeAlias
@@ -31,8 +32,8 @@ from scipy.special import gammaincc
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.runtime.logs import log_of
-from ssh_abduction.solver.asp.limits import LimitError
-from ssh_abduction.solver.choosing import new_engine, takes_all
+from ssh_abduction.solver.asp.limits import LimitError, StageTimeError
+from ssh_abduction.solver.choosing import FEW_STEPS, new_engine, takes_all
 from ssh_abduction.solver.engines.base import Engine, Found, Task
 from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.judging import Judging
@@ -52,8 +53,6 @@ _log = log_of(__name__)
 
 # What has a price, in the order of `Theory.prices`.
 NAMES = ("dstates", "places", "paths")
-# What has a price, in the order of `Theory.prices`.
-NAMES = ("dstates", "places", "paths")
 # Maps that cost less than this many nats more than the best one are found: 100 times less probable.
 WITHIN = math.log(100)
 # At most this many maps are kept. If there are more, fewer nats count.
@@ -63,6 +62,9 @@ IMPROBABLE = 0.01
 # Without a time limit, give the proof up when no better map was found for this many seconds, and
 # this many times as long as it took to find the best one.
 PATIENCE, MORE = 20.0, 10.0
+# Guess maps by beams of hypotheses of these widths. Each may take time until this share of the time
+# limit is over.
+WIDTHS = {1: 0.8, 4: 0.5, 16: 0.4}
 # Estimating rivals may take this many seconds. A rival that costs CERTAIN nats more than the best
 # map does not count: a million of them make 0.005 of a doubt.
 ESTIMATING, CERTAIN = 0.5, 19.0
@@ -117,6 +119,22 @@ class Weighing:
         """The maps of least cost."""
         least = self.candidates[0].nats + EQUAL if self.candidates else 0.0
         return [candidate for candidate in self.candidates if candidate.nats <= least]
+
+    def guess(self) -> None:
+        """Find some maps of little cost without clingo, in a share of the time."""
+        parts, watch = self._parts, self._parts.watch
+        begun, left = watch.elapsed(), watch.left()
+        if len(parts.task.trace) > FEW_STEPS:
+            parts.candidates.sketch(0.0)  # only the surest sketch has time
+            self.keep_best()
+        for width, share in WIDTHS.items():
+            watch.end_stage_after(begun + share * left)
+            with suppress(StageTimeError):
+                for ssh_map in parts.candidates.by_displacements(width):
+                    self.add(ssh_map)
+                    self.keep_best()
+                    parts.report()
+        watch.end_stage_after(math.inf)
 
     def search(self, of_labels: OfLabels) -> None:
         """Find the maps of least cost and their rivals, and prove that there are no others.

@@ -399,7 +399,8 @@ TABLE = (
     Speedup(
         "greedy",
         "greedy",
-        "Some map without a search, for a limit that leaves no other; it passes the checker.",
+        "Some map without clingo: by sketches, or by a beam of hypotheses about the "
+        "displacements. It passes the checker.",
         _any_theory,
         NOTHING,
         EVERY,

@@ -1,0 +1,188 @@
+"""Complete the dstates and places of a trace to a map: find its links, headings, paths and orders.
+
+>>> from ssh_abduction import Theory, Trace
+>>> from ssh_abduction.solver.guesses.completing import completed
+>>> from ssh_abduction.theory.settle import settle
+>>> trace = Trace.from_steps("abab", ["travel", "around", "travel"])
+>>> theory = settle(trace, Theory(boundary="none")).theory
+>>> ssh_map = completed(trace, theory, [0, 1, 2, 3], [0, 1, 1, 0], [0.0, 0.0, 3.14, 3.14])
+>>> [path.order for path in ssh_map.paths]
+[(0, 1)]
+
+Two dstates are on one path only if the axioms say so: a travel or a turn around links them, or they
+face opposite ways at one place. So the map has as many paths as it can have. If it is not
+consistent, hardly any map with these dstates and places is. The order of a path is an order of its
+travels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from graphlib import CycleError, TopologicalSorter
+from itertools import combinations
+
+from ssh_abduction.data import gateways
+from ssh_abduction.data.gateways import Facing
+from ssh_abduction.data.maps import DState, MapPath, SSHMap
+from ssh_abduction.data.trace import Trace
+from ssh_abduction.theory.theory import Theory
+
+# A path and one of its directions, 1 or -1.
+_Course = tuple[int, int]
+
+
+def completed(
+    trace: Trace,
+    theory: Theory,
+    labels: Sequence[int],
+    places: Sequence[int],
+    facing: Sequence[float],
+) -> SSHMap | None:
+    """Complete dstates and places to a map. The caller has to check it.
+
+    Args:
+        trace: The trace.
+        theory: The theory, with all defaults filled in.
+        labels: The dstate of each step of the trace.
+        places: The place of each dstate. A causal theory ignores it.
+        facing: The heading of each dstate in radians, counterclockwise. Only star=frame uses it.
+
+    Returns:
+        The map; None if an action leads to two dstates, or a path would be a circle or run both
+        ways.
+    """
+    links: dict[tuple[int, str], int] = {}
+    for here, action, there in zip(labels, trace.actions, labels[1:], strict=False):
+        if links.setdefault((here, action.name), there) != there:
+            return None
+    views = {label: step.view for label, step in zip(labels, trace.steps, strict=False)}
+    listed = tuple((s, action, x) for (s, action), x in links.items())
+    if theory.level == "causal":
+        dstates = tuple(DState(s, views[s]) for s in range(len(views)))
+        return SSHMap(tuple(labels), dstates, listed).renumbered()
+    dstates = tuple(DState(s, views[s], place=places[s]) for s in range(len(views)))
+    bare = SSHMap(tuple(labels), dstates, listed, tuple(sorted(set(places))))
+    framed = _facing(bare, trace, theory, facing)
+    courses = _courses(bare, trace, theory, framed.opposite) if framed else None
+    orders = _orders(bare, trace, courses, framed.ends) if framed and courses is not None else None
+    if framed is None or courses is None or orders is None:
+        return None
+    dstates = tuple(
+        replace(
+            s,
+            path=courses.get(s.id, (None, None))[0],
+            direction=courses.get(s.id, (None, None))[1],
+            heading=framed.headings.get(s.id),
+        )
+        for s in dstates
+    )
+    return replace(bare, dstates=dstates, paths=orders).renumbered()
+
+
+def _facing(
+    ssh_map: SSHMap, trace: Trace, theory: Theory, facing: Sequence[float]
+) -> Facing | None:
+    """How the dstates face, if places have frames; None if no frame fits what was seen."""
+    if theory.star == "gateways":
+        return gateways.facing(trace, ssh_map, theory.axioms)
+    found = Facing({}, [], [])
+    if theory.star == "frame":
+        first: dict[int | None, float] = {}
+        for s in ssh_map.dstates:
+            back = first.setdefault(s.place, facing[s.id]) - facing[s.id]
+            found.headings[s.id] = round(back / (math.pi / 2)) % 4
+        found.opposite.extend(
+            (s.id, x.id)
+            for s, x in combinations(ssh_map.dstates, 2)
+            if s.place == x.place and (found.headings[s.id] + 2) % 4 == found.headings[x.id]
+        )
+    return found
+
+
+def _courses(
+    ssh_map: SSHMap, trace: Trace, theory: Theory, opposite: Sequence[tuple[int, int]]
+) -> dict[int, _Course] | None:
+    """The path and direction of each dstate that is on a path; None if a path runs both ways.
+
+    Args:
+        ssh_map: The map without paths.
+        trace: The trace.
+        theory: The theory.
+        opposite: Pairs of dstates that face opposite ways.
+    """
+    actions = {action.name: action for action in trace.actions}
+    travels = [(s, x) for s, name, x in ssh_map.links if actions[name].kind == "travel"]
+    around = [(s, x) for s, name, x in ssh_map.links if actions[name].turn == "around"]
+    founded = {s for pair in travels for s in pair}
+    if theory.all_on_paths:
+        founded = {s.id for s in ssh_map.dstates}
+    grows = True
+    while grows:
+        more = {s for pair in around if founded & set(pair) for s in pair} - founded
+        founded |= more
+        grows = bool(more)
+    beside: dict[int, list[tuple[int, int]]] = defaultdict(list)
+    for pairs, sign in ((travels, 1), (around, -1), (opposite, -1)):
+        for s, x in pairs:
+            beside[s].append((x, sign))
+            beside[x].append((s, sign))
+    courses: dict[int, _Course] = {}
+    for path, start in enumerate(sorted(founded)):
+        reached = [] if start in courses else [start]
+        courses.setdefault(start, (path, 1))
+        while reached:
+            s = reached.pop()
+            on, direction = courses[s]
+            for x, sign in beside[s]:
+                if x in founded and x not in courses:
+                    courses[x] = (on, direction * sign)
+                    reached.append(x)
+                elif x in founded and courses[x] != (on, direction * sign):
+                    return None
+    return courses
+
+
+def _orders(
+    ssh_map: SSHMap,
+    trace: Trace,
+    courses: Mapping[int, _Course],
+    ends: Sequence[tuple[int, int]],
+) -> tuple[MapPath, ...] | None:
+    """The paths with the orders of their places; None if a path is a circle.
+
+    Args:
+        ssh_map: The map without paths.
+        trace: The trace.
+        courses: The path and direction of each dstate that is on a path.
+        ends: Pairs of a dstate and a direction, 0 (ahead) or 180 (behind), in which its path ends.
+    """
+    kinds = {action.name: action.kind for action in trace.actions}
+    before: dict[int, dict[int, set[int]]] = defaultdict(dict)
+    for s in ssh_map.dstates:
+        if s.id in courses and s.place is not None:
+            before[courses[s.id][0]].setdefault(s.place, set())
+    place = {s.id: s.place or 0 for s in ssh_map.dstates}
+    for here, name, there in ssh_map.links:
+        if kinds[name] == "travel":
+            path, direction = courses[here]
+            first, second = (place[here], place[there])[::direction]
+            before[path][second].add(first)
+    for here, towards in ends:
+        if here in courses:
+            path, direction = courses[here]
+            end, others = place[here], set(before[path])
+            if (direction == 1) == (towards == 0):
+                before[path][end] |= others - {end}
+            else:
+                for other in others - {end}:
+                    before[path][other].add(end)
+    try:
+        return tuple(
+            MapPath(path, tuple(TopologicalSorter(earlier).static_order()))
+            for path, earlier in before.items()
+        )
+    except CycleError:
+        return None

@@ -1,0 +1,85 @@
+"""Maps that a beam of hypotheses about the displacements finds (guesses/beam.py)."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import truth
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import theories, traces
+from test_plans import plan_of, xml
+
+from simulator.plan_tours import tour
+from ssh_abduction import Theory, Trace, solve
+from ssh_abduction.checker.checker import check
+from ssh_abduction.data import Odometry
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.solver.guesses.beam import Beam
+from ssh_abduction.solver.guesses.completing import completed
+from ssh_abduction.solver.steps.log import Log
+from ssh_abduction.theory.settle import settle
+
+DRIFTING = truth.Noise(Odometry(**{**truth.NOISE, "scale": 0.05, "bend": 0.0035}))
+
+
+def maps_of(trace: Trace, theory: Theory, width: int) -> list[SSHMap]:
+    problem = settle(trace, theory)
+    return list(Beam(problem, Log(trace, problem.theory, problem.pairs), width).maps())
+
+
+@pytest.mark.parametrize("seed", range(700, 703))
+def test_the_first_map_of_a_maze_is_true(seed: int) -> None:
+    (known,) = truth.mazes(5, 120, [seed], DRIFTING)
+    assert truth.is_true(maps_of(known.trace, Theory.topological(), 1)[0], known)
+
+
+@pytest.mark.parametrize("stars", [True, False])
+def test_the_map_of_aces3_is_among_those_of_a_beam(stars: bool) -> None:
+    (known,) = truth.aces3([700], DRIFTING)
+    theory = Theory.topological() if stars else Theory(star="none")
+    assert any(truth.is_true(ssh_map, known) for ssh_map in maps_of(known.trace, theory, 16))
+
+
+def test_a_causal_map_needs_no_places() -> None:
+    (known,) = truth.mazes(3, 40, [700], DRIFTING)
+    assert truth.is_true(maps_of(known.trace, Theory.causal(), 4)[0], known)
+
+
+def test_gateways_at_any_angles(tmp_path: Path) -> None:
+    """A room with one gateway ends a path, so the axioms force some returns."""
+    plan = plan_of(tmp_path, xml())
+    known = truth.told("ring", tour(plan, 60, 5, DRIFTING.odometry))
+    assert truth.is_true(maps_of(known.trace, Theory.topological(), 4)[0], known)
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data())
+def test_all_maps_of_a_beam_satisfy_the_axioms(data: st.DataObject) -> None:
+    trace = data.draw(traces().filter(lambda trace: trace.has_displacements))
+    theory = data.draw(theories(trace)).without_faults().replace(displacement="use", weigh="auto")
+    for ssh_map in maps_of(trace, theory, data.draw(st.sampled_from([1, 3]))):
+        assert check(trace, ssh_map, theory) == ()
+
+
+def test_a_search_that_is_stopped_gives_the_map_of_least_cost() -> None:
+    """Without the beam, the best map after this time has more places."""
+    (known,) = truth.mazes(6, 120, [700], DRIFTING)
+    solution = solve(known.trace, time_limit=2)
+    assert solution.stopped == "time limit"
+    assert truth.is_true(solution.maps[0], known)
+
+
+def test_an_action_cannot_lead_to_two_dstates() -> None:
+    trace = Trace.from_steps("abab", ["travel", "around", "travel"])
+    theory = settle(trace, Theory(boundary="none")).theory
+    assert completed(trace, theory, [0, 1, 0, 2], [0, 1, 1], [0.0, 0.0, math.pi]) is None
+
+
+def test_a_path_is_no_circle() -> None:
+    trace = Trace.from_steps("abca", ["travel", "travel", "travel"])
+    theory = settle(trace, Theory(boundary="none", star="none")).theory
+    assert completed(trace, theory, [0, 1, 2, 0], [0, 1, 2], [0.0] * 3) is None
+    assert completed(trace, theory, [0, 1, 2, 3], [0, 1, 2, 3], [0.0] * 4) is not None
