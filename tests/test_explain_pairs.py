@@ -225,6 +225,7 @@ def test_what_a_rival_costs_that_lost() -> None:
     assert explanation.sentences == (
         "steps 0 and 8 are one dstate in every minimal map",
         "the best map with step 0 ≠ step 8 has 9 dstates, not 8",
+        "nothing observed decides this: it rests on minimality alone",
     )
     other = solve(RECTANGLE, Theory(different=[(0, 8)]), max_maps=1)
     assert other.cost == explanation.different.cost

@@ -88,12 +88,14 @@ def run(options: argparse.Namespace) -> int:
     found = compare(listing, other)
     if listing.weighed is not None:
         told["confidence"] = listing.weighed.confidence
+    elif listing.by_minimality:
+        told["by_minimality"] = [join.to_dict() for join in listing.by_minimality]
     if options.json:
         print(json_line({**told, **found.to_dict()}))
         return 0
     print("\n".join(_lines(found)))
-    if listing.weighed is not None:
-        print(listing.weighed.sentence)
+    if listing.sureness:
+        print(listing.sureness)
     return 0
 
 

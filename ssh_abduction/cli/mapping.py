@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ssh_abduction.checker.joins import sentence_of
 from ssh_abduction.cli import EXIT_ERROR, unwritten
 from ssh_abduction.cli.cluster_jobs import answers_on_cluster
 from ssh_abduction.cli.guard import Guard
@@ -230,6 +231,8 @@ class MapQuestion:
             else f"{solution.status.value}, {counted(solution.count, 'minimal maps')}"
             f"{'' if solution.complete else ' or more'}"
         )
+        if told := sentence_of(solution.by_minimality, solution.count):
+            how += f"; {told}"
         total = sum(done.seconds.values())
         line = (
             f"{named(path)}: {found}; {how}; {counted(len(done.imported.visits), 'visits')} in "

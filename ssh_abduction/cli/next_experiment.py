@@ -11,13 +11,12 @@ from ssh_abduction.cli.options import Verbs, add_theory, in_order, theory_of
 from ssh_abduction.cli.outcome import on_ctrl_c, warn
 from ssh_abduction.cli.text import table
 from ssh_abduction.data.errors import MapError, named, printable
-from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.maps import maps_of
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.program import interrupted_code
-from ssh_abduction.solver import Watch, Weighed, check_limit
+from ssh_abduction.solver import Watch, check_limit
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
@@ -72,6 +71,7 @@ def add_parser(verbs: Verbs) -> None:
 
 def run(options: argparse.Namespace) -> int:
     from ssh_abduction.rivals.explore import next_experiment  # loads numpy
+    from ssh_abduction.rivals.listing import Listing
 
     check_limit("--time-limit", "seconds", options.time_limit)
     check_limit("--memory-limit", "MiB", options.memory_limit)
@@ -84,6 +84,7 @@ def run(options: argparse.Namespace) -> int:
             f"{named(options.maps)}: maps: expected one to seek an experiment for, got none; see "
             "the status that solve printed"
         )
+    sureness = Listing.from_dict(data, named(options.maps)).sureness
     found = data.get("theory") if isinstance(data, dict) else None
     theory: Theory | None = theory_of(options, None if found is None else Theory.from_dict(found))
     if found is None and options.theory is None and theory == Theory.topological():
@@ -108,9 +109,8 @@ def run(options: argparse.Namespace) -> int:
         print(json_line(experiment.to_dict()))
     else:
         print("\n".join(_lines(experiment)))
-        if isinstance(data, dict) and data.get("weighed"):
-            read = FieldReader(named(options.maps))
-            print(Weighed.from_dict(read, data["weighed"], len(trace)).sentence)
+        if sureness:
+            print(sureness)
     if experiment.warning:
         warn([experiment.warning])
     if experiment.stopped == "interrupted":

@@ -304,6 +304,8 @@ def _lines(
 ) -> Iterator[str]:
     yield headline(solution, search.count, explanation)
     yield from by_displacements(solution)
+    if solution.weighed is None and solution.sureness:  # else the headline says it
+        yield solution.sureness
     if solution.status is Status.UNSATISFIABLE:
         if explanation:
             yield from explanation.sentences

@@ -30,7 +30,7 @@ from ssh_abduction.explain.piece import Piece
 from ssh_abduction.explain.question import Question
 from ssh_abduction.explain.verdict import PairExplanation, Side, Verdict
 from ssh_abduction.runtime.deprecated import renamed_parameters
-from ssh_abduction.solver import Cost, Status, Stop, facts
+from ssh_abduction.solver import EQUAL, Cost, Status, Stop, facts
 from ssh_abduction.theory.settle import displacement_of
 from ssh_abduction.theory.theory import Theory, checked_theory
 
@@ -47,8 +47,6 @@ CONFIRMING = 5.0
 # Share of the remaining time that the search for minimal maps may take, and then the search for the
 # best map of the other side.
 SHARE = 0.45
-# Costs in nats that differ by less are equal.
-EQUAL = 1e-6
 
 
 @renamed_parameters("limit", "maps", "memory")

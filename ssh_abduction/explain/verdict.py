@@ -155,6 +155,8 @@ class PairExplanation:
         else:
             known = "the best map" if lost.proven else "the best map found"
             yield f"{known} {rival} has {_difference(lost.cost, won.cost, self.theory)}"
+            if not self.theory.has_faults:  # else disbelief in an observation may decide
+                yield "nothing observed decides this: it rests on minimality alone"
 
     def _weighed(self, lost: Side, won: Side) -> str:
         """Say in nats why the maps of one side cost more than those of the other."""

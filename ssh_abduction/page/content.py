@@ -27,6 +27,8 @@ from ssh_abduction.rivals.listing import Listing, Maps
 
 DRAWING = 3.0  # processor seconds for the drawings of all maps except the first
 DRAWN = 10_000  # dstates of all drawings together; more would make the page too large
+DOUBTED = 0.95  # joins of a smaller probability are listed
+JOINS = 20  # at most this many joins are listed
 CUT = 0.5  # the largest standard deviation of an ellipse, as a share of the extent of the map
 
 
@@ -90,6 +92,8 @@ def content_of(
     spots = _spots(maps[0], layouts[0][1])
     return {
         "sentence": found.sentence,
+        "sureness": listing.sureness,
+        "joins": _joins(listing),
         "file": called.maps,
         "trace": called.trace,
         "flags": called.flags,
@@ -121,6 +125,17 @@ def _shared(listing: Listing) -> dict[str, Any] | None:
         return None
     dstates = listing.backbone.dstates
     return None if dstates.untold else {"always": dstates.always, "sometimes": dstates.sometimes}
+
+
+def _joins(listing: Listing) -> list[tuple[int, int, float | None]]:
+    """List the joins of the first map that a reader may doubt, the most doubtful ones first.
+
+    Each is two steps and the probability of their join; None if the join rests on minimality alone.
+    """
+    if listing.weighed is None:
+        return [(join.first, join.second, None) for join in listing.by_minimality[:JOINS]]
+    doubted = [join for join in listing.weighed.joins if join[2] < DOUBTED]
+    return [(first, second, round(share, 2)) for first, second, share in doubted[:JOINS]]
 
 
 class _Pool:

@@ -16,13 +16,14 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
+from ssh_abduction.checker.joins import Join, sentence_of
 from ssh_abduction.data.checks import a_flag, a_text, an_instance
 from ssh_abduction.data.errors import MapError, brief, is_whole, named
 from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.maps import ID_LENGTH, SSHMap, maps_of
 from ssh_abduction.data.trace import View
-from ssh_abduction.solver import Backbone, Solution, Status, Weighed, theory_in
+from ssh_abduction.solver import Backbone, Solution, Status, Weighed, joins_in, theory_in
 from ssh_abduction.theory.theory import Theory
 
 
@@ -40,6 +41,7 @@ class Listing:
         backbone: What all minimal maps share, listed or not; None if unknown.
         source: The name of the list, for messages.
         weighed: The costs of the maps in nats, if they were compared by cost; else None.
+        by_minimality: The joins of the first map that rest on minimality alone, if known.
     """
 
     maps: tuple[SSHMap, ...]
@@ -49,11 +51,19 @@ class Listing:
     backbone: Backbone | None = field(default=None, repr=False)
     source: str = "maps"
     weighed: Weighed | None = None
+    by_minimality: tuple[Join, ...] = ()
 
     @property
     def steps(self) -> int:
         """The number of steps of the trace."""
         return len(self.maps[0].labels)
+
+    @property
+    def sureness(self) -> str:
+        """How sure the first map is, in words; an empty text if this is unknown."""
+        if self.weighed is not None:
+            return self.weighed.sentence
+        return sentence_of(self.by_minimality, len(self.maps), minimal=self.minimal is not None)
 
     @classmethod
     def of(cls, source: Maps) -> Listing:
@@ -81,6 +91,7 @@ class Listing:
                 source.stopped,
                 backbone,
                 weighed=source.weighed,
+                by_minimality=source.by_minimality,
             )
             return listing.checked(one_view=_has_one_view(source.theory))
         if isinstance(source, SSHMap):
@@ -179,9 +190,10 @@ class Listing:
             )
         is_optimal = status == Status.OPTIMAL.value
         listed = complete or (minimal < len(maps)) if is_optimal else complete
+        read, steps = FieldReader(where), len(maps[0].labels) if maps else 0
         weighed = None
         if maps and told.get("weighed"):
-            weighed = Weighed.from_dict(FieldReader(where), told["weighed"], len(maps[0].labels))
+            weighed = Weighed.from_dict(read, told["weighed"], steps)
         listing = cls(
             maps,
             minimal if is_optimal else None,
@@ -190,6 +202,7 @@ class Listing:
             backbone,
             where,
             weighed,
+            joins_in(read, told if maps else {}, steps),
         )
         return listing.checked(one_view=theory is None or _has_one_view(theory))
 

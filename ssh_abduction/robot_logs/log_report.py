@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from perception.places.importing import Imported
 from perception.readers.scans import Pose, RobotLog
+from ssh_abduction.checker.joins import sentence_of
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import between, moved
 from ssh_abduction.data.words import counted
@@ -107,6 +108,8 @@ def _summary(solution: Solution, run: Mapping[str, Any]) -> str:
         proven = f"{'' if solution.complete else 'at least '}{solution.count} minimal maps"
     if solution.weighed is not None:
         proven += f"; {solution.weighed.sentence}"
+    elif told := sentence_of(solution.by_minimality, solution.count):
+        proven += f"; {told}"
     size = f"{cost.places} places, {cost.paths} paths, {cost.dstates} distinctive states"
     return f"{seen} {size}: {proven}."
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.guesses.tree import Sketch
     from ssh_abduction.solver.judging import InternalError, Judging
     from ssh_abduction.solver.ranking import Ranking
-    from ssh_abduction.solver.recorded import theory_in
+    from ssh_abduction.solver.recorded import joins_in, theory_in
     from ssh_abduction.solver.result import Solution
     from ssh_abduction.solver.search import Search
     from ssh_abduction.solver.sharing import SORTS, Backbone, Shared, Sharing, Sort, stretches
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
         Status,
         cost_as_counted,
     )
-    from ssh_abduction.solver.weighed import Weighed
+    from ssh_abduction.solver.weighed import EQUAL, Weighed
     from ssh_abduction.solver.writing import ending, opening, summary_of, written_map
 
 _HOMES = {  # module: the names that this package exports from it
@@ -88,7 +88,10 @@ _HOMES = {  # module: the names that this package exports from it
         "Judging",
     ),
     "ranking": ("Ranking",),
-    "recorded": ("theory_in",),
+    "recorded": (
+        "joins_in",
+        "theory_in",
+    ),
     "result": ("Solution",),
     "search": ("Search",),
     "start": (
@@ -111,7 +114,10 @@ _HOMES = {  # module: the names that this package exports from it
         "Outcome",
         "observation",
     ),
-    "weighed": ("Weighed",),
+    "weighed": (
+        "EQUAL",
+        "Weighed",
+    ),
     "values": (
         "Bound",
         "Cost",
@@ -131,6 +137,7 @@ _HOMES = {  # module: the names that this package exports from it
 }
 __all__ = [
     "AT_ONCE",
+    "EQUAL",
     "POLL",
     "RESTS_ON",
     "SORTS",
@@ -173,6 +180,7 @@ __all__ = [
     "find_backbone",
     "has_processors",
     "in_process",
+    "joins_in",
     "observation",
     "opening",
     "resident_memory",

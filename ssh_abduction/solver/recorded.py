@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from ssh_abduction.checker.joins import Join
 from ssh_abduction.data.errors import MapError, TheoryError
 from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.solver.sharing import Backbone
@@ -29,12 +30,14 @@ class Recorded:
             steps; None if the file has none.
         warnings: Sentences that say what makes the trace suspicious.
         explanation: Why there is no map, as in the file; None if the file does not say.
+        joins: The joins of the first map that rest on minimality alone.
     """
 
     certificate: Certificate | None
     written_certificate: Mapping[str, Any] | None
     warnings: tuple[str, ...]
     explanation: Mapping[str, Any] | None
+    joins: tuple[Join, ...]
 
     @classmethod
     def of(cls, read: FieldReader, record: Mapping[str, Any], steps: int) -> Recorded:
@@ -64,6 +67,7 @@ class Recorded:
             explanation=None
             if record.get("explanation") is None
             else read.mapping(record["explanation"], "explanation"),
+            joins=joins_in(read, record, steps),
         )
 
 
@@ -105,6 +109,24 @@ def backbone_in(read: FieldReader, record: Mapping[str, Any], steps: int) -> Bac
     if record.get("backbone") is None:
         return None
     return Backbone.from_dict(record["backbone"], steps, f"{read.where}: backbone")
+
+
+def joins_in(read: FieldReader, record: Mapping[str, Any], steps: int) -> tuple[Join, ...]:
+    """Read the joins of the first map that rest on minimality alone. Raises MapError."""
+
+    def join(value: Any, name: str) -> Join:
+        written = read.mapping(value, name)
+        pair, of = written.get("steps"), written.get("of")
+        if not isinstance(pair, list) or len(pair) != 2:
+            raise read.wrong(f"{name}.steps", "two steps", pair)
+        first, second = (read.integer(step, f"{name}.steps") for step in pair)
+        if not 0 <= first < second < steps:
+            raise read.wrong(f"{name}.steps", f"two steps from 0 to {steps - 1}", pair)
+        if of not in ("place", "dstate"):
+            raise read.wrong(f"{name}.of", "place or dstate", of)
+        return Join(first, second, of == "place")
+
+    return read.each(record, "by_minimality", join, optional=True)
 
 
 def _certificate(read: FieldReader, written: Mapping[str, Any], steps: int) -> Certificate:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ssh_abduction.checker.claims import contradictions
+from ssh_abduction.checker.joins import Join, joins_by_minimality, sentence_of
 from ssh_abduction.data.checks import a_whole_number, one_of
 from ssh_abduction.data.errors import MapError, SolverError, brief, named
 from ssh_abduction.data.fields import FieldReader
@@ -168,6 +169,31 @@ class Solution(MapSequence):
         None if maps were counted, as then nothing observed says how probable they are.
         """
         return None if self.weighed is None else self.weighed.confidence
+
+    @property
+    def by_minimality(self) -> tuple[Join, ...]:
+        """The joins of the first map that rest on minimality alone, and imply all its others.
+
+        A join is two steps at one place or one dstate (`ssh_abduction.checker.joins`). Empty if
+        maps were weighed, as then `probability` says how sure a join is.
+        """
+        if self.support.recorded is not None:
+            return self.support.recorded.joins
+        if self.weighed is not None or self.trace is None or not self.maps:
+            return ()
+        return joins_by_minimality(self.trace, self.maps[0], self.theory)
+
+    @property
+    def sureness(self) -> str:
+        """How sure the first map is, in words; an empty text if there is nothing to say.
+
+        If maps were weighed, these are its probability and its most doubtful join. If they were
+        counted, these are the joins that rest on minimality alone.
+        """
+        if self.weighed is not None:
+            return self.weighed.sentence
+        minimal = self.status is Status.OPTIMAL
+        return sentence_of(self.by_minimality, self.count, minimal=minimal)
 
     def probability(self, first: int, second: int, of: str = "dstate") -> float:
         """The probability that two steps are at one dstate, or at one place.

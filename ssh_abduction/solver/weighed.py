@@ -15,7 +15,7 @@ from typing import Any
 
 from ssh_abduction.data.fields import FieldReader
 
-EQUAL = 1e-6  # costs that differ by less are equal
+EQUAL = 1e-6  # costs in nats that differ by less are equal
 MOST = 700.0  # exp of more nats is too large for a number
 
 
@@ -105,20 +105,21 @@ class Weighed:
         )
 
     @cached_property
-    def doubtful(self) -> tuple[int, int, float] | None:
-        """The join of the best map that is least sure: two steps at one place, and its probability.
+    def joins(self) -> tuple[tuple[int, int, float], ...]:
+        """The joins of the best map, the least sure one first.
 
-        Of a causal map they are at one dstate. None if no place is visited twice.
+        A join is two steps at one place, with no step there in between, and its probability. In a
+        causal map the two steps are at one dstate.
         """
         best = self.rivals[0]
         at, of = (best.places, "place") if best.places else (best.dstates, "dstate")
         last: dict[int, int] = {}
-        joins = []
+        joins = list[tuple[int, int, float]]()
         for step, name in enumerate(at):
             if step - last.get(name, step) > 1:
                 joins.append((last[name], step, self.probability(last[name], step, of)))
             last[name] = step
-        return min(joins, key=lambda join: join[2], default=None)
+        return tuple(sorted(joins, key=lambda join: join[2]))
 
     @property
     def sentence(self) -> str:
@@ -131,12 +132,11 @@ class Weighed:
             if self.smallest
             else f"a map that costs {self.nats - self.bound:.1f} nats less may exist"
         )
-        if self.doubtful is None:
-            return f"{told}; it joins no two visits"
-        first, second, probability = self.doubtful
-        joined = "one place" if self.rivals[0].places else "one dstate"
+        if not self.joins:
+            return f"{told}; the best map joins no two visits"
+        first, second, probability = self.joins[0]
         return (
-            f"{told}; its most doubtful join makes steps {first} and {second} {joined} "
+            f"{told}; the most doubtful join is of steps {first} and {second} "
             f"({_percent(probability)})"
         )
 

@@ -110,6 +110,8 @@ def ending(solution: Solution, count: int, backbone: Backbone | None) -> dict[st
         end["certificate"] = solution.certificate.to_dict(solution.trace)
     if solution.weighed is not None:
         end["weighed"] = solution.weighed.to_dict()
+    if joins := solution.by_minimality:
+        end["by_minimality"] = [join.to_dict() for join in joins]
     if solution.stopped:
         end["stopped"] = solution.stopped
     if solution.partial:

@@ -7,6 +7,7 @@ function load(judging = true) {
   $("which").replaceChildren();
   data.replays.forEach(({ name }, k) => element("option", { value: k }, name, $("which")));
   $("replay").hidden = data.replays.length < 2;
+  tellDoubts();
   $("choices").replaceChildren();
   for (const choice of data.choices.slice(0, 20)) {
     const item = element("li", {}, null, $("choices"));
@@ -52,6 +53,24 @@ function load(judging = true) {
     if (state.picked.length === 2) tellVerdict(...state.picked);
   }
   $("forget").hidden = !theory();
+}
+
+// Joins of the first map that may be wrong. A click chooses the two steps of a join.
+function tellDoubts() {
+  $("sureness").textContent = data.sureness;
+  $("joins").replaceChildren();
+  $("doubts").hidden = !data.joins.length;
+  const weighed = data.joins.length && data.joins[0][2] !== null;
+  $("doubted").textContent = weighed
+    ? "The best map joins these steps. Their probability, by the maps that are known:"
+    : "These joins of map 1 rest on minimality alone. The others follow from them:";
+  for (const [a, b, probability] of data.joins) {
+    const text = `steps ${a} and ${b}${weighed ? `: ${probability.toFixed(2)}` : ""}`;
+    element("button", {}, text, element("li", {}, null, $("joins"))).addEventListener("click", () => {
+      state.picked = [a, b];
+      judge();
+    });
+  }
 }
 
 for (const mode of ["overview", "one", "two"])
