@@ -257,9 +257,10 @@ def test_kilometres_are_noticed() -> None:
         "the odometry tells no travel from standing still: the longest displacement of one is "
         "0.01 m, and its noise about 0.1 m; "
     )
-    assert (solve(scaled(0.001)).support.odometry_warning or "").startswith(said)
+    count = Theory(weigh="count")
+    assert (solve(scaled(0.001), count).support.odometry_warning or "").startswith(said)
     assert "the longest displacement of one is 0 m" in (
-        solve(scaled(0.0)).support.odometry_warning or ""
+        solve(scaled(0.0), count).support.odometry_warning or ""
     )
     assert units_warning(scaled(0.001, position=0.001)) is None
     assert units_warning(trace) is None

@@ -234,7 +234,7 @@ def test_maps_that_a_search_beside_shows_to_be_minimal(
     assert found.complete
 
 
-@pytest.mark.parametrize("limit", [0.5, 1])
+@pytest.mark.parametrize("limit", [0.3, 0.6])
 def test_a_limit_ends_the_search_beside(limit: float) -> None:
     """While it guesses, or while it asks clingo. What is left is a map, and a bound."""
     trace = maze(10, 10, steps=4000, seed=2, stars=True).trace.prefix(400)
@@ -251,9 +251,9 @@ def test_a_limit_ends_the_search_beside(limit: float) -> None:
     assert check(trace, solution.maps[0], Theory.topological()) == ()
 
 
-@pytest.mark.parametrize(("side", "steps", "seed"), [(5, 200, 4)])
+@pytest.mark.parametrize(("side", "steps", "seed"), [(5, 100, 1)])
 def test_names_list_all_ways_to_be_at_the_fewest_dstates(side: int, steps: int, seed: int) -> None:
-    """There are several in these mazes, most of which have no paths."""
+    """There are several in this maze, some of which have no paths; from few sweeps of annealing."""
     walk = maze(side, side, steps=steps, seed=seed, stars=True)
     expected = solve(
         walk.trace, Theory.topological(), max_maps=None, speedups=Speedups.without("annealed")
@@ -263,12 +263,14 @@ def test_names_list_all_ways_to_be_at_the_fewest_dstates(side: int, steps: int, 
         patch.object(framed_guess, "Beside", Before),
         patch.object(engine.Task, "has_processors", True),
         patch.object(GuessBeside, "proved", always_proved),
+        patch.object(annealing, "ANNEALED", ((0.5, 300),)),
     ):
         found = solve(walk.trace, Theory.topological(), max_maps=None)
     assert found.status is Status.OPTIMAL
     assert found.bound == expected.bound
     assert set(found.maps) == set(expected.maps)
     assert found.count == len(set(found.maps))
+    assert len({ssh_map.labels for ssh_map in found.maps}) > 1
 
 
 @settings(max_examples=5)

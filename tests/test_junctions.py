@@ -24,7 +24,7 @@ from simulator.robot import Body, Robot
 from simulator.surroundings import Panorama, Place, compass
 from simulator.tours import simulate
 from simulator.world import World
-from ssh_abduction import Trace, solve
+from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main
 from ssh_abduction.evaluation import evaluate
@@ -289,7 +289,7 @@ def test_the_true_map_is_found_from_what_was_simulated(
     assert main(["simulate", name, "--tours", str(tours), "--seed", str(seed), "-o", run]) == 0
     assert main(["cluster", run, "-o", views]) == 0
     trace = Trace.load(views)
-    solution = solve(trace)
+    solution = solve(trace, Theory(weigh="count"))
     assert (solution.status, solution.complete, len(solution.maps)) == (Status.OPTIMAL, True, 1)
     ssh_map = solution.maps[0]
     assert (len(ssh_map.dstates), len(ssh_map.places), len(ssh_map.paths)) == SHIPPED[name]

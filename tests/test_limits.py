@@ -43,8 +43,10 @@ POSIX = pytest.mark.skipif(sys.platform == "win32", reason="signals")
 # Sits in clingo, which cannot be stopped, under a guard.
 DEAF = """
 import sys, clingo
+from ssh_abduction.cli import guard as patience
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.outcome import on_ctrl_c
+patience.DEAF, patience.LATE = 0.2, (1.1, 0.1)
 limit, memory = (float(word) or None for word in sys.argv[1:])
 with on_ctrl_c(lambda: None), Guard(
     lambda: None, lambda why: (f"known: {why}", 10), limit, memory

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields
+from functools import cache
 from itertools import islice, product
 from pathlib import Path
 from unittest.mock import patch
@@ -172,6 +173,7 @@ def hurried() -> Iterator[None]:
         yield
 
 
+@cache
 def reads_of(case: str) -> list[str]:
     """The speed-ups that a search of this case asks for."""
     trace, theory = CASES[case]

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -97,6 +98,11 @@ SOLVED: dict[str, Callable[[], tuple[Trace, Solution]]] = {
 }
 
 
+@cache
+def solved(kind: str) -> tuple[Trace, Solution]:
+    return SOLVED[kind]()
+
+
 def test_reprs_are_short() -> None:
     """A plain repr of a dataclass would have 9,976 characters here."""
     assert repr(SOLUTION) == "<Solution optimal: 19 dstates, 10 places, 4 paths; 4 minimal maps>"
@@ -119,7 +125,7 @@ def test_reprs_are_short() -> None:
 
 @pytest.mark.parametrize("kind", SOLVED)
 def test_no_repr_is_long(kind: str) -> None:
-    trace, solution = SOLVED[kind]()
+    trace, solution = solved(kind)
     values = [
         trace,
         trace[0],
@@ -261,7 +267,7 @@ def test_what_is_no_bad_input_is_no_value_error() -> None:
 
 @pytest.mark.parametrize("kind", SOLVED)
 def test_a_solution_survives_files(kind: str, tmp_path: Path) -> None:
-    trace, solution = SOLVED[kind]()
+    trace, solution = solved(kind)
     file = tmp_path / "maps.json"
     solution.save(file)
     data = json.loads(file.read_text())
