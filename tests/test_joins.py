@@ -177,6 +177,7 @@ def test_weighed_maps_have_probabilities_instead() -> None:
     weighed = solve(trace)
     assert weighed.by_minimality == ()
     assert "probability" in weighed.sureness
+    assert compare(weighed).sentence == "1 map of least cost"
     counted = solve(trace, Theory(weigh="count"))
     assert "probability" not in counted.sureness
     assert counted.sureness.startswith("minimal; nothing observed separates")

@@ -518,6 +518,9 @@ def test_page_in_the_browser(browser: Any, tmp_path: Path, content: dict[str, An
     page.click("one")
     page.choose(0, 1)
     assert page["costs"].text.split("\n")[1::2] == assuming["texts"]
+    assert page["joins"].text.split("\n") == [f"steps {a} and {b}" for a, b, _ in content["joins"]]
+    page["joins"].find_element("tag name", "button").click()
+    assert page["verdict"].text.startswith("Steps 0 and 9: one dstate in every minimal map")
     page.choose(0, 2)
     assert page["verdict"].text.startswith("Steps 0 and 2: different dstates in every minimal map")
     page.click("same")

@@ -107,8 +107,8 @@ class Exploration:
             "time": there was no time to prove which maps are minimal, or to weigh a doubt.
             "contradicted": no map explains what was seen.
         is_unique: Whether all minimal maps have the same dstates and the same places.
-        is_true: Whether the map is unique and its dstates and places are the true ones, as far as
-            the robot drove; None if what the robot saw came without the truth.
+        is_true: Whether the minimal map is unique and its dstates and places are the true ones, as
+            far as the robot drove; None if what the robot saw came without the truth.
         solution: The minimal maps of all that was seen, or the best map found in time.
         rival: A map with more dstates that also explains everything, and that nothing the robot
             can do distinguishes from the minimal map; None if none was found.
@@ -123,7 +123,7 @@ class Exploration:
 
     @property
     def sentence(self) -> str:
-        """One sentence that says whether the map is unique, and why the exploration ended."""
+        """Whether the minimal map is unique, and why the exploration ended, in one sentence."""
         truth = (
             {None: "", True: ", and true", False: ", and not true"}[self.is_true]
             if self.is_unique
@@ -137,7 +137,8 @@ class Exploration:
                 "and nothing that the robot can do tells them apart"
             )
         unique = "" if self.is_unique else "not "
-        return f"after {counted(self.steps, 'steps')} the map is {unique}unique{truth}: {why}"
+        after = f"after {counted(self.steps, 'steps')}"
+        return f"{after} the minimal map is {unique}unique{truth}: {why}"
 
     def to_dict(self) -> dict[str, Any]:
         told = {name: getattr(self, name) for name in ("steps", "ending", "is_unique", "is_true")}
@@ -176,8 +177,8 @@ class Explorer:
     ...         self.at = (self.at + 1) % 4
     >>> found = Explorer(Ring(), Theory.causal()).explore(100)
     >>> print(found.sentence)  # doctest: +NORMALIZE_WHITESPACE
-    after 7 steps the map is unique, and true: one map is left, nothing in it is untried, and no
-    return in it is in doubt
+    after 7 steps the minimal map is unique, and true: one map is left, nothing in it is untried,
+    and no return in it is in doubt
     """
 
     @renamed_parameters("limit", "maps")

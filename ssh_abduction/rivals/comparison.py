@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 
 from ssh_abduction.data.errors import MapError, printable
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.words import counted
 from ssh_abduction.rivals.differences import Difference, difference
 from ssh_abduction.rivals.factors import deciding, independent, options_of
 from ssh_abduction.rivals.listing import Listing, Maps
@@ -162,6 +163,7 @@ class Comparison:
             this size.
         fits: The least and the greatest chi-square; None if the maps have no fits.
         others: The comparison with another list; None if there is no other list.
+        by_cost: Whether the maps were compared by their cost in nats, and not by counts.
     """
 
     ids: tuple[str, ...] = field(repr=False)
@@ -178,13 +180,16 @@ class Comparison:
     sizes: tuple[tuple[tuple[int, int, int], int], ...] = ()
     fits: tuple[float, float] | None = None
     others: Others | None = None
+    by_cost: bool = False
 
     @property
     def sentence(self) -> str:
         """A sentence: the number of maps, what they share, and where they differ."""
         count = len(self.ids) if self.minimal is None else self.minimal
         is_partial = self.complete is False
-        told = f"{count} {'minimal ' if self.minimal is not None else ''}map{'s' * (count != 1)}"
+        told = counted(count, "maps")
+        if self.minimal is not None:
+            told = f"{told} of least cost" if self.by_cost else counted(count, "minimal maps")
         if is_partial and self.stopped == "no proof":
             told += f", not proven to be the only one{'s' * (count != 1)}"
         elif is_partial and self.stopped:
@@ -315,6 +320,7 @@ def compare(maps: Maps, other: Maps | None = None) -> Comparison:
         sizes=_sizes(listing.maps),
         fits=(min(fits), max(fits)) if fits else None,
         others=_others(listing, listing_there) if listing_there else None,
+        by_cost=listing.weighed is not None,
     )
 
 

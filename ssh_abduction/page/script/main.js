@@ -66,7 +66,8 @@ function tellDoubts() {
     : "These joins of map 1 rest on minimality alone. The others follow from them:";
   for (const [a, b, probability] of data.joins) {
     const text = `steps ${a} and ${b}${weighed ? `: ${probability.toFixed(2)}` : ""}`;
-    element("button", {}, text, element("li", {}, null, $("joins"))).addEventListener("click", () => {
+    const item = element("li", {}, null, $("joins"));
+    element("button", {}, text, item).addEventListener("click", () => {
       state.picked = [a, b];
       judge();
     });
