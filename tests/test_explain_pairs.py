@@ -231,6 +231,27 @@ def test_what_a_rival_costs_that_lost() -> None:
     assert other.cost == explanation.different.cost
 
 
+def test_what_a_join_costs_in_nats() -> None:
+    """A square whose loop closes some metres off."""
+    told = []
+    for off in (3, 6):
+        moved = [(10, 0, 0), (0, 0, 1.5708)] * 3 + [(10 - off, 0, 0), (0, 0, 1.5708)]
+        trace = Trace.from_steps("abcdefgha", ["travel", "left"] * 4, displacements=moved)
+        told.append(explain_pair(trace, 0, 8, Theory(reject=1e-12)).sentences)
+    assert told == [
+        (
+            "steps 0 and 8 are one dstate in every map of least cost",
+            "making steps 0 and 8 different dstates costs 1 dstate (8.0 nats) and saves 2.1 nats "
+            "of misfit: the loop of 37 m closes 3.0 m off",
+        ),
+        (
+            "steps 0 and 8 are different dstates in every map of least cost",
+            "joining steps 0 and 8 saves 1 dstate, 1 place (16.0 nats) and costs 23.0 nats of "
+            "misfit: the loop of 34 m closes 6.0 m off",
+        ),
+    ]
+
+
 def test_rivals_that_disagree_are_counted() -> None:
     """Turned back, travel may stop at the place before, or skip it (G1 of
     docs/explanation/theory.md)."""

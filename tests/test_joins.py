@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from itertools import combinations
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import pytest
 from brute_force import Key, consistent_maps, key
@@ -15,9 +17,11 @@ from strategies import theories, traces
 from ssh_abduction import Solution, Theory, Trace, compare, solve
 from ssh_abduction.checker.joins import Join, joins_by_minimality, sentence_of
 from ssh_abduction.cli import main
+from ssh_abduction.cli.mapping import MapQuestion
 from ssh_abduction.data import MapError, SSHMap
 from ssh_abduction.page.content import content_of
 from ssh_abduction.rivals import Listing
+from ssh_abduction.robot_logs import log_report
 from ssh_abduction.solver.weighed import Rival, Weighed
 from ssh_abduction.theory.settle import settle
 
@@ -195,3 +199,18 @@ def test_the_page_lists_doubtful_joins() -> None:
     content = content_of(Listing((one,), weighed=weighed))
     assert content["joins"] == [(2, 4, 0.73)]
     assert content["sureness"] == weighed.sentence
+
+
+def test_maps_of_logs_say_it_too() -> None:
+    solution = solve(Trace.load(EXAMPLES / "notched-rectangle.jsonl"))
+    told = f"minimal map; {TOLD.removeprefix('minimal; ')}"
+    run = {"log": {"scans": 9, "metres": 5.0}, "visits": 3, "steps": 401}
+    assert told in log_report._summary(solution, run)
+    imported = SimpleNamespace(visits=(), track=SimpleNamespace(way=[5.0]))
+    log = MagicMock(warnings=(), __len__=lambda _: 9)
+    files = {"run.json": b'{"log": {}}'}
+    done = MagicMock(
+        solution=solution, imported=imported, seconds={}, notes=(), files=lambda: dict(files)
+    )
+    question = MapQuestion(None, {}, {}, None, None, None, None, 0, ladder=False)
+    assert told in question._told(0, "a.log", log, done, None).line

@@ -108,11 +108,13 @@ class PairExplanation:
     def sentences(self) -> tuple[str, ...]:
         """The verdict in words, and the cost of the best map that contradicts it, as sentences."""
         pair = f"steps {self.first} and {self.second}"
+        weighed = any(side.nats is not None for side in (self.same, self.different))
+        best = "map of least cost" if weighed else "minimal map"
         verdict = {
             Verdict.DIFFERENT: f"{pair} are different dstates in every map",
             Verdict.SAME: f"{pair} are one dstate in every map",
-            Verdict.DIFFERENT_IN_MINIMAL: f"{pair} are different dstates in every minimal map",
-            Verdict.SAME_IN_MINIMAL: f"{pair} are one dstate in every minimal map",
+            Verdict.DIFFERENT_IN_MINIMAL: f"{pair} are different dstates in every {best}",
+            Verdict.SAME_IN_MINIMAL: f"{pair} are one dstate in every {best}",
             Verdict.DISAGREE: f"{pair} are one dstate in some minimal maps, and different dstates "
             "in others",
             Verdict.NO_MAP: f"no map satisfies the axioms, so nothing is known about {pair}",
@@ -170,13 +172,18 @@ class PairExplanation:
         more = {name: getattr(lost.cost, name) - getattr(won.cost, name) for name in names}
         price = sum(self.theory.prices[i] * more[name] for i, name in enumerate(names))
         misfit = lost.nats - won.nats - price
-        priced = ", ".join(
-            f"{abs(number)} {_noun(name, abs(number))}{' less' if number < 0 else ' more'}"
+        what = f"joining {pair}" if joining else f"making {pair} different dstates"
+        changed = [
+            (number, f"{abs(number)} {_noun(name, abs(number))}")
             for i, (name, number) in enumerate(more.items())
             if number and self.theory.prices[i]
-        )
-        what = f"joining {pair}" if joining else f"making {pair} different dstates"
-        counts = f"{_effect(price)} of price ({priced or 'the same counts'})"
+        ]
+        if len({number > 0 for number, _ in changed}) == 1:  # all counts rise, or all fall
+            effect = "costs" if price > 0 else "saves"
+            counts = f"{effect} {', '.join(text for _, text in changed)} ({abs(price):.1f} nats)"
+        else:
+            priced = (f"{text} {'more' if number > 0 else 'less'}" for number, text in changed)
+            counts = f"{_effect(price)} of price ({', '.join(priced) or 'the same counts'})"
         loop = f": {self.loop}" if self.loop else ""
         return f"{what} {counts} and {_effect(misfit)} of misfit{loop}"
 
