@@ -10,19 +10,28 @@ BIN := .venv/bin
 export PIP_CONSTRAINT := $(CURDIR)/requirements.lock
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test lint docs bench bench-faults bench-grid parts lock clean
+.PHONY: demo test lint style types unit docs bench bench-faults bench-grid parts lock clean
 
 demo: .venv/base
 	$(BIN)/python examples/demo.py out
 
-test: lint
-	$(BIN)/pytest -n auto --dist loadfile
+# Types are checked beside the tests, some of which wait. The tests begin about a hundred processes, which need not compile each module anew where the environment says that nothing compiled is kept.
+test: export PYTHONDONTWRITEBYTECODE :=
+test: style
+	@$(MAKE) --no-print-directory -j2 types unit
 
-lint: .venv/dev
+lint: style types
+
+style: .venv/dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+types: .venv/dev
+	$(BIN)/mypy
+
+unit: .venv/dev
+	$(BIN)/pytest -n auto --dist loadfile
 
 docs: .venv/dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict -q

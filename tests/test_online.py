@@ -323,21 +323,21 @@ def explore(trace: Trace, mapper: OnlineMapper) -> list[Solution]:
 
 def test_maps_are_guessed_while_the_robot_drives() -> None:
     """Without time for clingo. The guess is made for some of the steps; its map goes on."""
-    walk = maze(4, 4, steps=90, seed=1, stars=True)
+    walk = maze(4, 4, steps=70, seed=1, stars=True)
     trace = walk.trace
     with (
         patch.object(guessing, "has_processors", lambda _: True),
-        patch.object(guesser, "GUESSED", 70),
+        patch.object(guesser, "GUESSED", 55),
     ):
         mapper = OnlineMapper(
             trace.steps[0].view or "", star=trace.steps[0].star, time_limit=NO_TIME
         )
-        explore(trace.prefix(75), mapper)
+        explore(trace.prefix(60), mapper)
         guess = guess_of(mapper)
         assert guess is not None
         assert guess.result() is not None  # waits for it
         answers = explore(trace, mapper)
-    for i, answer in enumerate(answers, 76):
+    for i, answer in enumerate(answers, 61):
         assert answer.status is Status.FEASIBLE
         assert check(trace.prefix(i), answer.maps[0], mapper.theory) == ()
     assert (

@@ -58,7 +58,7 @@ def with_toy(toy: Toy, theory: Theory) -> Theory:
 
 @pytest.mark.parametrize("name", THEORIES)
 @pytest.mark.parametrize("toy", TOYS, ids=lambda toy: toy.rules.name)
-@settings(max_examples=3)
+@settings(max_examples=2)
 @given(data=st.data())
 def test_an_axiom_that_nothing_knows_is_obeyed(name: str, toy: Toy, data: st.DataObject) -> None:
     """In one go and step by step, against the brute force; with first prefixes so short that replay

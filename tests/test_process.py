@@ -140,7 +140,7 @@ def test_what_is_left_of_the_memory_is_that_of_the_process() -> None:
 
 
 def test_a_guess_is_the_same_in_another_process() -> None:
-    trace = maze(3, 3, steps=150, seed=1, stars=True).trace
+    trace = maze(2, 2, steps=60, seed=1, stars=True).trace
     theory = settle(trace).theory
     streets, chart = Paths(trace, theory), Chart.framed(trace, Log(trace, theory))
     assert chart.misfits.any()  # which does not go along
