@@ -72,6 +72,26 @@ def test_a_search_that_is_stopped_gives_the_map_of_least_cost() -> None:
     assert truth.is_true(solution.maps[0], known)
 
 
+def test_a_broad_beam_and_a_small_misfit_make_sure() -> None:
+    (known,) = truth.mazes(4, 60, [701], DRIFTING)
+    weighed = solve(known.trace, time_limit=3).weighed
+    assert weighed is not None
+    assert weighed.searched
+    assert not weighed.proven
+    assert weighed.broken == pytest.approx(0.0, abs=0.01)
+    assert weighed.confidence > 0.95
+
+
+def test_a_cheaper_map_that_breaks_axioms_makes_unsure() -> None:
+    """Travels lead around a ring without a turn, and a path is no circle."""
+    ring = Trace.from_steps("abcdabcd", ["travel"] * 7, displacements=[(10, 0, math.pi / 2)] * 7)
+    weighed = solve(ring, time_limit=5).weighed
+    assert weighed is not None
+    assert weighed.broken > 16
+    assert weighed.confidence < 0.05
+    assert "a map that breaks axioms costs" in weighed.sentence
+
+
 def test_an_action_cannot_lead_to_two_dstates() -> None:
     trace = Trace.from_steps("abab", ["travel", "around", "travel"])
     theory = settle(trace, Theory(boundary="none")).theory

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+from typing import TYPE_CHECKING
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import each_looking, heeding
@@ -24,6 +25,9 @@ from ssh_abduction.solver.guesses.tree import Sketch
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
 from ssh_abduction.theory.speedups import Speedups, row
+
+if TYPE_CHECKING:
+    from ssh_abduction.solver.guesses.beam import Beam
 
 _log = log_of(__name__)
 
@@ -64,10 +68,10 @@ class Candidates:
         if self._task.speedups.greedy and self._task.theory.level == "causal":
             self.offer(answer_maps.causal_map(self._task.log.merged(), self._task.trace))
 
-    def by_displacements(self, width: int) -> Iterator[SSHMap]:
-        """Maps that a beam of hypotheses about the displacements finds, the best one first.
+    def beam(self, width: int) -> Beam | None:
+        """A beam of hypotheses about the displacements; None if there can be none.
 
-        Nothing is yielded without the speed-up `greedy`, or if the trace has no displacements or
+        There is none without the speed-up `greedy`, or if the trace has no displacements, or if
         the theory has faults.
 
         Args:
@@ -80,10 +84,13 @@ class Candidates:
             or not self._task.speedups.greedy
             or not self._judging.can_accept
         ):
-            return
+            return None
         from ssh_abduction.solver.guesses.beam import Beam  # loads numpy
 
-        beam = Beam(self._task.problem, self._task.log, width)
+        return Beam(self._task.problem, self._task.log, width)
+
+    def maps_of(self, beam: Beam) -> Iterator[SSHMap]:
+        """The maps that a beam finds, the best one first."""
         yield from filter(self._judging.accepts, map(self._with_unknown_views, beam.maps()))
 
     def sketch(self, seconds: float = math.inf) -> None:
@@ -169,8 +176,9 @@ class Candidates:
 
     def _offer_beam(self, width: int) -> None:
         """Offer the maps that a beam of hypotheses about the displacements finds."""
-        for ssh_map in self.by_displacements(width):
-            self.offer(ssh_map)
+        if beam := self.beam(width):
+            for ssh_map in self.maps_of(beam):
+                self.offer(ssh_map)
 
     def _offer_gated(self, *, homing: bool) -> None:
         """Offer a sketch for places with gateways at any angles, if there is one.

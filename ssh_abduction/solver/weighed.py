@@ -16,6 +16,8 @@ from typing import Any
 from ssh_abduction.data.fields import FieldReader
 
 EQUAL = 1e-6  # costs in nats that differ by less are equal
+# The price of breaking axioms, in nats. A map that breaks them is said if it costs SAID less.
+BROKEN, SAID = 12.0, 1.0
 MOST = 700.0  # exp of more nats is too large for a number
 
 
@@ -51,16 +53,19 @@ class Weighed:
         bound: A proven lower bound on the cost of every map, in nats.
         within: All maps that cost less than this many nats more than the best one are in `rivals`.
             0 if it is not proven that no map costs less.
-        smallest: Whether the best map is proven to be the smallest one by count, and its misfit is
-            not improbable. Such a map is seldom false, also if it is not proven to cost least.
         rivals: The maps that cost little more than the best one, the best one first. Estimated
             ones come last.
+        searched: Whether a broad beam of hypotheses ended with the best map, and its misfit is not
+            improbable. Such a map is seldom false, also if it is not proven to cost least.
+        broken: How many nats less a map costs that breaks axioms; 0 if none costs less than the
+            best map, -inf if none was sought.
     """
 
     bound: float
     within: float
     rivals: tuple[Rival, ...]
-    smallest: bool = False
+    searched: bool = False
+    broken: float = -math.inf
 
     @property
     def nats(self) -> float:
@@ -82,12 +87,14 @@ class Weighed:
     def confidence(self) -> float:
         """The probability of the best map among its rivals.
 
-        If it is neither proven to be the best nor the `smallest`, a map at the bound counts as one
-        more rival. Then the confidence is small, as such a map may cost much less.
+        If it is neither proven to be the best nor `searched`, a map at the bound counts as one
+        more rival. Then the confidence is small, as such a map may cost much less. A map that
+        breaks axioms is a rival, too, at a price.
         """
-        is_likely = self.proven or self.smallest
+        is_likely = self.proven or self.searched
         unknown = 0.0 if is_likely else math.exp(min(self.nats - self.bound, MOST))
-        return 1 / (1 / self.weights[0] + unknown)
+        broken = math.exp(min(self.broken - BROKEN, MOST))
+        return 1 / (1 / self.weights[0] + unknown + broken)
 
     def probability(self, first: int, second: int, of: str = "dstate") -> float:
         """The probability that two steps are at one dstate, or at one place, by the known rivals.
@@ -126,12 +133,13 @@ class Weighed:
         """How probable the best map is, and which of its joins is least sure, in words."""
         told = (
             f"the best map has probability {_percent(self.confidence)}"
-            if self.proven
-            else f"the best map has probability {_percent(self.confidence)}, as it is the smallest "
-            "one and closes well"
-            if self.smallest
+            if self.proven or self.searched
             else f"a map that costs {self.nats - self.bound:.1f} nats less may exist"
         )
+        if self.broken > SAID:
+            told += f"; a map that breaks axioms costs {self.broken:.1f} nats less"
+        elif self.searched and not self.proven:
+            told += ", without a proof"
         if not self.joins:
             return f"{told}; the best map joins no two visits"
         first, second, probability = self.joins[0]
@@ -146,7 +154,8 @@ class Weighed:
             "nats": round(self.nats, 6),
             "bound": round(self.bound, 6),
             "within": round(self.within, 6),
-            "smallest": self.smallest,
+            "searched": self.searched,
+            **({"broken": round(self.broken, 6)} if math.isfinite(self.broken) else {}),
             "confidence": round(self.confidence, 6),
             "rivals": [rival.to_dict() for rival in self.rivals],
         }
@@ -171,7 +180,8 @@ class Weighed:
             _rival(read, rival, f"weighed.rivals[{i}]", steps) for i, rival in enumerate(written)
         )
         bound, within = (_number(read, record, name, "weighed") for name in ("bound", "within"))
-        return cls(bound, within, rivals, record.get("smallest") is True)
+        broken = _number(read, record, "broken", "weighed") if "broken" in record else -math.inf
+        return cls(bound, within, rivals, record.get("searched") is True, broken)
 
 
 def _percent(probability: float) -> str:

@@ -61,10 +61,12 @@ RIVALS = 50
 IMPROBABLE = 0.01
 # Without a time limit, give the proof up when no better map was found for this many seconds, and
 # this many times as long as it took to find the best one.
-PATIENCE, MORE = 20.0, 10.0
+PATIENCE, MORE = 10.0, 5.0
 # Guess maps by beams of hypotheses of these widths. Each may take time until this share of the time
 # limit is over.
 WIDTHS = {1: 0.8, 4: 0.5, 16: 0.4}
+# A beam of this width or more ends with the map of least cost, nearly always.
+BROAD = 4
 # Estimating rivals may take this many seconds. A rival that costs CERTAIN nats more than the best
 # map does not count: a million of them make 0.005 of a doubt.
 ESTIMATING, CERTAIN = 0.5, 19.0
@@ -107,7 +109,9 @@ class Weighing:
         self.bound = 0.0
         self.proven = False
         self._of_labels: OfLabels | None = None
-        self._counted: tuple[int, ...] | None = None  # the counts of the minimal maps, if proven
+        # The cost of the best map of the last broad beam, and the cost that the beam gave it.
+        self._searched = math.inf, math.inf
+        self._broken = -math.inf  # how many nats less a map costs that breaks axioms
         self._improved = 0.0  # when the best map was found
 
     @property
@@ -129,11 +133,17 @@ class Weighing:
             self.keep_best()
         for width, share in WIDTHS.items():
             watch.end_stage_after(begun + share * left)
+            if (beam := parts.candidates.beam(width)) is None:
+                break
             with suppress(StageTimeError):
-                for ssh_map in parts.candidates.by_displacements(width):
-                    self.add(ssh_map)
-                    self.keep_best()
-                    parts.report()
+                found = [self.add(ssh_map) for ssh_map in parts.candidates.maps_of(beam)]
+                if width >= BROAD:
+                    self._searched = min(found, default=math.inf), beam.nats
+                self.keep_best()
+                parts.report()
+        with suppress(StageTimeError):
+            if self._searched[1] < math.inf and (beam := parts.candidates.beam(max(WIDTHS))):
+                self._broken = self._searched[1] - beam.nats_without_axioms()
         watch.end_stage_after(math.inf)
 
     def search(self, of_labels: OfLabels) -> None:
@@ -146,8 +156,6 @@ class Weighing:
             LimitError: A limit is over. What was found so far is kept.
         """
         parts, self._of_labels = self._parts, of_labels
-        if parts.known.status is Status.OPTIMAL:
-            self._counted = parts.known.cost
         parts.known.status = Status.UNKNOWN  # what was proven is about counts
         self._improved = parts.watch.elapsed()
         parts.watch.use_reserve()
@@ -300,14 +308,16 @@ class Weighing:
             bound=self.bound,
             within=self._within if self.proven else 0.0,
             rivals=(*found, *self._estimated(found[0], set(rivals))),
-            smallest=self._is_smallest_and_closes(),
+            searched=self._is_searched_and_closes(),
+            broken=self._broken,
         )
 
-    def _is_smallest_and_closes(self) -> bool:
-        """Whether counting has proven the best map minimal, and its misfit is not improbable."""
-        best = self.candidates[0].map
-        if Cost.of(best).preferred_by(self._parts.task.theory) != self._counted:
+    def _is_searched_and_closes(self) -> bool:
+        """Whether a broad beam ended with the best map, and its misfit is not improbable."""
+        is_best = self._searched[0] <= self.candidates[0].nats + EQUAL
+        if not is_best or not math.isfinite(self._broken):
             return False
+        best = self.candidates[0].map
         returns = self._misfit.returns_of(best)
         square = self._misfit.of_returns(returns) - self._misfit.of_returns([])
         freedom = sum(3 if found.of == "dstate" else 2 for found in returns)

@@ -23,15 +23,19 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
+from functools import lru_cache
+from itertools import islice, product
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ssh_abduction.checker.checker import violations
+from ssh_abduction.data.gateways import rotations
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import Odometry
+from ssh_abduction.data.star import Star
+from ssh_abduction.data.trace import Step
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.fit import noises
 from ssh_abduction.solver.guesses.completing import completed
@@ -54,7 +58,7 @@ UNKNOWN = (1e3, 1e3, 3.0)
 SCALE, BEND = 0, 1
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Hypothesis:
     """What a robot may have visited.
 
@@ -63,6 +67,7 @@ class Hypothesis:
         places: The place of each dstate.
         shows: For each dstate, a number for what is seen there.
         links: For each dstate and action, the dstate that it leads to.
+        sights: For each place, what its first step shows of it.
         position: For each place, the index of its x in the means; y is the next one.
         heading: For each dstate, the index of its heading in the means.
         mean: The means in metres, radians and standard deviations.
@@ -74,6 +79,7 @@ class Hypothesis:
     places: list[int]
     shows: list[int]
     links: dict[tuple[int, int], int]
+    sights: list[Star | tuple[bool, ...] | None]
     position: list[int]
     heading: list[int]
     mean: Array
@@ -99,7 +105,11 @@ class _Extension:
 
 
 class Beam:
-    """The search for hypotheses of little cost."""
+    """The search for hypotheses of little cost.
+
+    Attributes:
+        nats: The cost of the best hypothesis of the whole trace; inf before there is one.
+    """
 
     def __init__(self, problem: Problem, log: Log, width: int) -> None:
         """Search nothing yet.
@@ -122,6 +132,8 @@ class Beam:
         self._sigma = odometry.scale, odometry.bend
         steps = [t for t in range(1, len(trace)) if trace.steps[t].displacement is not None]
         self._noise = dict(zip(steps, noises(trace, steps), strict=True))
+        self.nats = math.inf
+        self._sights = [self._sight(step) for step in trace.steps]
 
     def maps(self) -> Iterator[SSHMap]:
         """The maps of the hypotheses of the whole trace that agree with the axioms, by their cost.
@@ -144,9 +156,28 @@ class Beam:
             if not beam:
                 return
             kept.append(beam)
+        self.nats = float(kept[-1][0].nats)
         for found in kept[-1]:
             if (ssh_map := self._map(found, len(self._trace))) is not None:
                 yield ssh_map
+
+    def nats_without_axioms(self) -> float:
+        """The cost of the best hypothesis if the checker does not look; inf if none is left.
+
+        Actions still lead to one dstate, and stars at one place still agree.
+        """
+        beam = [self._first()]
+        while beam and (t := len(beam[0].labels)) < len(self._trace):
+            options = self._options_of(beam, t, joins=True)
+            beam = list(islice((self._child(option, t) for option in options), self._width))
+        return float(beam[0].nats) if beam else math.inf
+
+    def _sight(self, step: Step) -> Star | tuple[bool, ...] | None:
+        """What a step shows of its place, in any direction: its star, or nothing."""
+        if self._bare.star == "gateways":
+            return step.gateways or Star(())
+        star = step.openings if self._bare.star in ("pattern", "frame") else None
+        return None if star is None else min(star[k:] + star[:k] for k in range(4))
 
     def _extended(self, beam: list[Hypothesis], end: int) -> list[Hypothesis]:
         """Extend a beam to a number of steps, and check it then."""
@@ -175,7 +206,16 @@ class Beam:
         mean, covariance = np.zeros(5), np.zeros((5, 5))
         covariance[[SCALE, BEND], [SCALE, BEND]] = 1.0
         return Hypothesis(
-            [0], [0], [self._log.seen[0]], {}, [2], [4], mean, covariance, self._price
+            [0],
+            [0],
+            [self._log.seen[0]],
+            {},
+            self._sights[:1],
+            [2],
+            [4],
+            mean,
+            covariance,
+            self._price,
         )
 
     def _map(self, found: Hypothesis, since: int) -> SSHMap | None:
@@ -250,7 +290,11 @@ class Beam:
         if stays:
             places = [there]
         else:
-            places = [p for p in range(len(moved.position)) if p != there or not self._leaves]
+            places = [
+                place
+                for place, sight in enumerate(moved.sights)
+                if (place != there or not self._leaves) and _agree(sight, self._sights[t])
+            ]
         dstate, new_place = (self._price, self._price_of_place) if joins else (0.0, 0.0)
         options = []
         if not stays:
@@ -314,8 +358,7 @@ class Beam:
         n = len(moved.mean) - 3
         mean, covariance = moved.mean, moved.covariance
         position, heading, places, shows = moved.position, moved.heading, moved.places, moved.shows
-        last = [n, n + 1, n + 2]
-        keep = [*range(n)]
+        last, keep, sights = [n, n + 1, n + 2], [*range(n)], moved.sights
         if option.place is not None:
             rows = [position[option.place], position[option.place] + 1]
             rows += [] if option.dstate is None else [heading[option.dstate]]
@@ -323,7 +366,7 @@ class Beam:
             keep += last[len(rows) :]
         else:
             keep += last
-            position = [*position, n]
+            position, sights = [*position, n], [*sights, self._sights[t]]
         place = len(moved.position) if option.place is None else option.place
         there = option.dstate
         if there is None:
@@ -335,12 +378,30 @@ class Beam:
             places,
             shows,
             {**moved.links, (moved.labels[-1], self._log.actions[t - 1]): there},
+            sights,
             position,
             heading,
             mean[keep],
             covariance[np.ix_(keep, keep)],
             option.nats,
         )
+
+
+def _agree(first: Star | tuple[bool, ...] | None, second: Star | tuple[bool, ...] | None) -> bool:
+    """Whether two sights may be of one place."""
+    if isinstance(first, Star) and isinstance(second, Star):
+        return _may_fit(first, second)
+    return first == second
+
+
+@lru_cache(maxsize=2**14)
+def _may_fit(first: Star, second: Star) -> bool:
+    """Whether two stars agree with some shift of their gateways."""
+    return any(
+        rotations(frame, other, shift)
+        for frame, other in product(first.frames, second.frames)
+        for shift in range(max(frame.slots, 1))
+    )
 
 
 def _conditioned(
