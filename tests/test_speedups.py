@@ -151,12 +151,12 @@ CIRCUITS = Trace.from_steps(
     [f"v{i % 4}" for i in range(24)], [("right", "travel")[i % 2] for i in range(23)]
 )
 CASES = {
-    "causal": (moore(6, 2, steps=40, seed=1).trace, Theory.causal()),
+    "causal": (moore(6, 2, steps=32, seed=1).trace, Theory.causal()),
     "topological": (CIRCUITS, Theory.topological()),
     "circumscriptive": (CIRCUITS, Theory.circumscriptive()),
-    "framed": (maze(3, 3, steps=26, seed=0, stars=True).trace, Theory.topological()),
-    "frameless": (maze(2, 2, steps=22, seed=1).trace, Theory.topological()),
-    "pattern": (maze(2, 2, steps=16, seed=0, stars=True).trace, Theory(star="pattern")),
+    "framed": (maze(3, 3, steps=22, seed=0, stars=True).trace, Theory.topological()),
+    "frameless": (maze(2, 2, steps=18, seed=1).trace, Theory.topological()),
+    "pattern": (maze(2, 2, steps=13, seed=0, stars=True).trace, Theory(star="pattern")),
 }
 
 

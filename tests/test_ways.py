@@ -61,7 +61,7 @@ def bare_theories(draw: st.DrawFn) -> Theory:
 def test_the_maps_of_the_plain_encoding(data: st.DataObject) -> None:
     """Told of paths that an answer contradicts, or only of links that do not go together; with few
     names at first; a minimal map known, or not."""
-    trace = data.draw(traces(max_steps=8), label="trace").without_stars().without_displacements()
+    trace = data.draw(traces(max_steps=7), label="trace").without_stars().without_displacements()
     theory = data.draw(bare_theories(), label="theory")
     contrary = data.draw(st.sampled_from([0, 1, ways.CONTRARY]), label="contrary")
     spares = data.draw(st.sampled_from([0, 2]), label="spare names")
