@@ -73,7 +73,7 @@ def test_solver_and_checker_agree_with_matrices_written_out(data: st.DataObject)
     agree(trace, theory)
 
 
-@settings(max_examples=5)
+@settings(max_examples=3)
 @given(
     st.integers(0, 10_000),
     st.integers(3, 6),

@@ -190,7 +190,7 @@ def test_all_ways_are_listed_whichever_views_need_more_names() -> None:
 def test_a_causal_maze_is_guessed_by_its_turns() -> None:
     """Annealing, from views and turns alone, comes near what the robot was in; from there to the
     proof that no fewer dstates will do."""
-    walk = maze(3, 3, steps=900, seed=1)
+    walk = maze(3, 3, steps=600, seed=1)
     log = Log(walk.trace, CAUSAL)
     chart = Chart.turned(walk.trace, log, len(log.seen))
     labels = annealed(chart).labels(chart)
