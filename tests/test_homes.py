@@ -14,6 +14,7 @@ from ssh_abduction.solver.asp.facts.paths_lp import Segments
 from ssh_abduction.solver.engines import frameless_paths as frameless
 from ssh_abduction.solver.engines.frameless_paths import PlacesAndPaths
 from ssh_abduction.solver.engines.homes import fewest_paths, homes_of
+from ssh_abduction.solver.engines.paths import pairwise_distinct
 from ssh_abduction.theory.speedups import SPEEDUPS, Speedups
 
 PLAIN = Speedups.without(SPEEDUPS)
@@ -123,3 +124,8 @@ def test_a_long_corridor_needs_no_search_for_places() -> None:
     assert (found.status, found.complete, found.count) == (Status.OPTIMAL, True, 1)
     assert found.cost is not None
     assert (found.cost.dstates, found.cost.places, found.cost.paths) == (80, 40, 1)
+
+
+def test_a_member_that_is_distinct_from_itself_does_not_hang_the_search() -> None:
+    """Labels that break an axiom may tell so. clingo then finds no map with them."""
+    assert pairwise_distinct([4, 5], [(4, 4), (4, 5), (5, 4)]) == [4, 5]

@@ -353,12 +353,13 @@ def pairwise_distinct(members: Sequence[int], pairs: Iterable[tuple[int, int]]) 
 
     Args:
         members: All segments or places.
-        pairs: The pairs that are not one.
+        pairs: The pairs that are not one. A member that is paired with itself contradicts the
+            axioms. clingo will find that out.
     """
     number = {member: i for i, member in enumerate(members)}
     rivals = np.zeros((len(members), len(members)), dtype=bool)
     for g, h in pairs:
-        rivals[number[g], number[h]] = True
+        rivals[number[g], number[h]] = g != h
     return [members[i] for i in large_clique(rivals)]
 
 
