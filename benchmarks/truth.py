@@ -258,17 +258,31 @@ def joins(solution: Solution, known: Known) -> tuple[tuple[float, bool], ...]:
     return tuple(found)
 
 
-def reliability(found: Sequence[tuple[float, bool]]) -> tuple[float, float]:
-    """The expected calibration error over ten bins, and the Brier score, of joins."""
+def binned(found: Sequence[tuple[float, bool]]) -> dict[int, list[tuple[float, bool]]]:
+    """Sort predictions into ten bins by their probability: 0 for 0 to 0.1, 9 for 0.9 to 1."""
     bins: dict[int, list[tuple[float, bool]]] = {}
-    for probability, true in found:
+    for probability, true in sorted(found):
         bins.setdefault(min(int(10 * probability), 9), []).append((probability, true))
+    return bins
+
+
+def reliability(found: Sequence[tuple[float, bool]]) -> tuple[float, float]:
+    """The expected calibration error over ten bins, and the Brier score, of predictions."""
     error = sum(
         abs(sum(p for p, _ in members) - sum(true for _, true in members))
-        for members in bins.values()
+        for members in binned(found).values()
     )
     brier = sum((p - true) ** 2 for p, true in found)
     return error / len(found), brier / len(found)
+
+
+def diagram(found: Sequence[tuple[float, bool]]) -> str:
+    """The reliability diagram as text: for each bin its size, mean probability and true share."""
+    return ", ".join(
+        f"{number / 10:.1f}: {len(members)} at {statistics.mean(p for p, _ in members):.3f}, "
+        f"{statistics.mean(true for _, true in members):.3f} true"
+        for number, members in binned(found).items()
+    )
 
 
 def share_all(solution: Solution) -> bool:
@@ -311,6 +325,8 @@ def report(traces: Iterator[Known], theory: Theory, limit: float) -> str:
         told += [
             f"sure: {len(sure)} of {count}",
             f"wrong and sure: {sum(not one.best for one in sure)} of {count}",
+            "confidence: "
+            + diagram([(one.confidence, one.best) for one in found if one.confidence is not None]),
         ]
     all_joins = [join for one in found for join in one.joins]
     if all_joins:
@@ -318,7 +334,7 @@ def report(traces: Iterator[Known], theory: Theory, limit: float) -> str:
         wrong = sum(not true for _, true in all_joins)
         told.append(
             f"{len(all_joins)} joins, {wrong} of them false: expected calibration error "
-            f"{error:.3f}, Brier score {brier:.3f}"
+            f"{error:.3f}, Brier score {brier:.3f} ({diagram(all_joins)})"
         )
     return "; ".join([*told, f"median {median:.2f} s"])
 

@@ -96,7 +96,8 @@ def test_the_table_says_which_maps_are_true(capsys: pytest.CaptureFixture[str]) 
     assert "| ACES3, 0 | 23 | 22, 9 | optimal | 19, 10, 4 | 0 of 4 |" in capsys.readouterr().out
     said = truth.report(truth.chosen(options), Theory.topological(), 30)
     assert said.startswith("all best maps are true, and proven: 1 of 1; the first map is")
-    assert "; wrong and sure: 0 of 1; 6 joins, 0 of them false" in said
+    assert "; wrong and sure: 0 of 1; confidence: 0.9: 1 at " in said
+    assert "; 6 joins, 0 of them false" in said
     assert "| 22, 9, 6 | 1 of 1 |" in capsys.readouterr().out
 
 
@@ -104,6 +105,10 @@ def test_joins_are_reliable_where_their_probabilities_are_their_shares() -> None
     half = [(0.5, True), (0.5, False)]
     assert truth.reliability(half) == (0.0, 0.25)
     assert truth.reliability([(1.0, False)]) == (1.0, 1.0)
+    assert (
+        truth.diagram([*half, (0.95, True)])
+        == "0.5: 2 at 0.500, 0.500 true, 0.9: 1 at 0.950, 1.000 true"
+    )
     assert truth.reliability([*half, (0.9, True), (0.9, True)]) == pytest.approx((0.05, 0.13))
 
 
