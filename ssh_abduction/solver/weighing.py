@@ -64,7 +64,7 @@ IMPROBABLE = 0.01
 PATIENCE, MORE = 10.0, 5.0
 # Guess maps by beams of hypotheses of these widths. Each may take time until this share of the time
 # limit is over.
-WIDTHS = {1: 0.8, 4: 0.5, 16: 0.4}
+WIDTHS = {1: 0.8, 4: 0.6, 16: 0.4}
 # A beam of this width or more ends with the map of least cost, nearly always.
 BROAD = 4
 # Estimating rivals may take this many seconds. A rival that costs CERTAIN nats more than the best
@@ -141,6 +141,7 @@ class Weighing:
                     self._searched = min(found, default=math.inf), beam.nats
                 self.keep_best()
                 parts.report()
+        watch.end_stage_after(begun + WIDTHS[BROAD] * left)
         with suppress(StageTimeError):
             if self._searched[1] < math.inf and (beam := parts.candidates.beam(max(WIDTHS))):
                 self._broken = self._searched[1] - beam.nats_without_axioms()
