@@ -234,7 +234,7 @@ def test_maps_that_a_search_beside_shows_to_be_minimal(
     assert found.complete
 
 
-@pytest.mark.parametrize("limit", [0.3, 0.6])
+@pytest.mark.parametrize("limit", [0.5, 1])
 def test_a_limit_ends_the_search_beside(limit: float) -> None:
     """While it guesses, or while it asks clingo. What is left is a map, and a bound."""
     trace = maze(10, 10, steps=4000, seed=2, stars=True).trace.prefix(400)

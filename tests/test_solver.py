@@ -277,7 +277,7 @@ def test_nothing_preferred_means_all_consistent_maps() -> None:
 
 def test_time_limit_leaves_the_best_map_and_its_bound() -> None:
     trace = too_hard()
-    solution = solve(trace, Theory.causal(), time_limit=0.4)
+    solution = solve(trace, Theory.causal(), time_limit=1)
     assert solution.stopped == "time limit"
     assert solution.status is Status.FEASIBLE
     assert solution.count == 1
