@@ -40,8 +40,9 @@ SKETCH_SHARE = 0.4
 # The sketch that succeeds most often may take this many seconds even if less time is left.
 # Otherwise a slow machine finds no map.
 SUREST = 1.5
-# The width of a broad beam of hypotheses.
-BROAD = 4
+# The width of a broad beam of hypotheses. A beam is made of at most LONGEST steps: its time grows
+# with the cube of their number.
+BROAD, LONGEST = 4, 2000
 
 
 class Candidates:
@@ -71,8 +72,8 @@ class Candidates:
     def beam(self, width: int) -> Beam | None:
         """A beam of hypotheses about the displacements; None if there can be none.
 
-        There is none without the speed-up `greedy`, or if the trace has no displacements, or if
-        the theory has faults.
+        There is none without the speed-up `greedy`, or if the trace is long or has no
+        displacements, or if the theory has faults.
 
         Args:
             width: The number of hypotheses.
@@ -81,6 +82,7 @@ class Candidates:
         if (
             theory.displacement != "use"
             or theory.has_faults
+            or len(self._task.trace) > LONGEST
             or not self._task.speedups.greedy
             or not self._judging.can_accept
         ):

@@ -48,6 +48,8 @@ Array: TypeAlias = NDArray[np.float64]
 CHECKED_EVERY = 8
 # If no hypothesis is left, look for this many times as many.
 WIDER = 2
+# Of the beams at earlier looks, this many hypotheses are kept.
+SPARE = 2
 # An extension that costs this many nats more than the best one of its hypothesis is not made.
 DEAREST = 20.0
 # Added to variances, in square metres and square radians, so that no matrix is singular.
@@ -155,6 +157,7 @@ class Beam:
                 back = min(2 * back, len(kept))
             if not beam:
                 return
+            kept[-1] = kept[-1][:SPARE]  # saves memory
             kept.append(beam)
         self.nats = float(kept[-1][0].nats)
         for found in kept[-1]:
