@@ -8,8 +8,10 @@ folder, one drive for each seed, and these logs are added. `ssh-abduction map` m
 events (visits according to a mapper) and its first map are compared with the truth. The same is
 done with skeletons of occupancy grids. One grid has the scans at their corrected poses, which a
 robot does not have. The skeleton of this grid is judged without and with nodes at doors. The other
-grid has the scans at the poses of the odometry, which any robot has. The truth of a simulated log
-NAME.log is in NAME.truth.json beside the log. Rows that are stored are not measured again.
+grid has the scans at the poses of the odometry, which any robot has. The method `pairs` counts
+which pairs of visits and of travels the map joins, and which it should (`courses.py`). The truth of
+a simulated log NAME.log is in NAME.truth.json beside the log. Rows that are stored are not measured
+again.
 """
 
 from __future__ import annotations
@@ -28,12 +30,13 @@ from time import process_time
 from typing import Any
 
 import numpy as np
-from pages import print_rows
+from courses import counts_of
+from pages import print_rows, seeds_from
 from skeleton import lay, poses_of, skeleton_of
 from visited import Events, Truth, judged, truth_of
 
 from perception.readers.logs import read_log
-from ssh_abduction import Trace
+from ssh_abduction import SSHMap, Trace
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.maps import maps_of
 
@@ -44,12 +47,19 @@ SKELETONS = {
     "skeleton with doors": ("corrected", True),
     "skeleton, odometry": ("odometry", False),
 }
-METHODS = (OURS, *SKELETONS)
+# Pairs of visits and of travels in the map of `ssh-abduction`, and partings.
+PAIRS = "pairs"
+METHODS = (OURS, PAIRS, *SKELETONS)
 HEAD = (
     "| log | mapper | places | events | events: precision, recall | passes noticed | "
     "accuracy | edges: precision, recall | pairs: joined, returns | pairs: precision, "
     "recall | CPU s |",
     "|---|---|---|---|---|---|---|---|---|---|---|",
+)
+HEAD_OF_PAIRS = (
+    "| log | visits | places | visit pairs: right of joined (2 m) | found of true (1 m) | "
+    "travel pairs: right of joined | found of true | partings with a visit | s |",
+    "|---|---|---|---|---|---|---|---|---|",
 )
 SIMULATED = (
     "| mapper | logs | mapped | isomorphic | places right | doors noticed | passes "
@@ -69,18 +79,18 @@ def sidecar(log: Path) -> Path | None:
     return beside if beside.exists() else None
 
 
-def driven(plans: Path, seeds: int, runs: Path) -> Iterator[Path]:
-    """Yield a log for each floor plan of a folder and each seed from 1.
+def driven(plans: Path, seeds: Sequence[int], runs: Path) -> Iterator[Path]:
+    """Yield a log for each floor plan of a folder and each seed.
 
     A log that does not exist is simulated: a round of 200 m with the default odometer.
 
     Args:
         plans: Folder of the floor plans.
-        seeds: Number of seeds.
+        seeds: Seeds of the drives through each plan.
         runs: Folder for the logs.
     """
     runs.mkdir(parents=True, exist_ok=True)
-    for plan, seed in product(sorted(plans.glob("*.xml")), range(1, seeds + 1)):
+    for plan, seed in product(sorted(plans.glob("*.xml")), seeds):
         log = runs / f"{plan.stem.removesuffix('_updated')}-{seed}.log"
         if not log.exists():
             command = [
@@ -107,8 +117,8 @@ def by_skeleton(log: Path, kind: str, doors: bool) -> Events:
     return Events(tuple(scan for scan, _ in passed), tuple(node for _, node in passed))
 
 
-def by_map(log: Path, runs: Path) -> Events:
-    """Return the events of `ssh-abduction map` on a log, with their places in its first map.
+def mapped(log: Path, runs: Path) -> tuple[Trace, SSHMap | None]:
+    """Return the trace that `ssh-abduction map` made of a log, and its first map; None without one.
 
     The command is run unless its results exist.
 
@@ -117,7 +127,7 @@ def by_map(log: Path, runs: Path) -> Events:
         runs: Folder with a folder of results for each log.
 
     Raises:
-        OSError, ValueError: There is no map.
+        OSError, ValueError: There is no trace.
     """
     folder = runs / name_of(log)
     if not (folder / "maps.json").exists():
@@ -142,9 +152,51 @@ def by_map(log: Path, runs: Path) -> Events:
                 or f"map ended with {done.returncode}"
             )
     maps = maps_of(read_json(folder / "maps.json"), str(folder / "maps.json"))
-    if not maps:
+    return Trace.load(folder / "trace.jsonl"), maps[0] if maps else None
+
+
+def by_map(log: Path, runs: Path) -> Events:
+    """Return the events of `ssh-abduction map` on a log, with their places in its first map.
+
+    Raises:
+        OSError, ValueError: There is no map.
+    """
+    trace, ssh_map = mapped(log, runs)
+    if ssh_map is None:
         raise ValueError("no map")
-    return Events.of(Trace.load(folder / "trace.jsonl"), maps[0])
+    return Events.of(trace, ssh_map)
+
+
+def known_truth(log: Path) -> Truth | None:
+    """Find the truth of a log; None if it has neither corrected poses nor a file of truth."""
+    try:
+        return truth_of(log, sidecar(log))
+    except ValueError as error:
+        print(f"{name_of(log)}: judged without a truth: {error}", file=sys.stderr)
+        return None
+
+
+def pairs_row(log: Path, truth: Truth | None, runs: Path) -> dict[str, Any]:
+    """Make the row of a log in the table of pairs. Without a truth it has only counts of the map.
+
+    Args:
+        log: The log.
+        truth: Its truth; None if the log has no corrected poses.
+        runs: Folder with a folder of results for each log.
+    """
+    row: dict[str, Any] = {
+        "log": name_of(log),
+        "method": PAIRS,
+        "simulated": sidecar(log) is not None,
+    }
+    try:
+        trace, ssh_map = mapped(log, runs)
+    except (OSError, ValueError) as error:
+        return row | {"failed": str(error)}
+    run = read_json(runs / name_of(log) / "run.json")
+    row |= {"visits": run["visits"], "seconds": sum(run["seconds"].values())}
+    row |= {"status": run["status"], "places": None if ssh_map is None else len(ssh_map.places)}
+    return row if truth is None else row | counts_of(trace, ssh_map, truth.poses)
 
 
 def row_of(log: Path, method: str, truth: Truth, runs: Path) -> dict[str, Any]:
@@ -200,6 +252,42 @@ def lines_of(row: dict[str, Any]) -> Iterator[str]:
         counts = f"{pairs['joined']}, {pairs['returns']}"
         rates = shown(pairs["precision"], pairs["recall"])
         yield f"| by relations | {row['method']} | | | | | | | {counts} | {rates} | |"
+
+
+def pairs_line(row: dict[str, Any]) -> str:
+    """Make the row of a log, or the sum of many, in the table of pairs."""
+    if "failed" in row:
+        return f"| {row['log']} | {row['failed']} | | | | | | | |"
+    cells = [row["log"], row["visits"], "no map" if row["places"] is None else row["places"]]
+    if "visit_pairs" not in row:
+        return "| " + " | ".join(map(str, [*cells, "–", "–", "–", "–", "–"])) + seconds_cell(row)
+    pairs, travels, parted = row["visit_pairs"], row["travel_pairs"], row["partings"]
+    for part, whole in (
+        (pairs["right"], pairs["joined"]),
+        (pairs["found"], pairs["true"]),
+        (travels["right"], travels["joined"]),
+        (travels["right"], travels["true"]),
+        (parted["noticed"], parted["all"]),
+    ):
+        cells.append(f"{part} of {whole}")
+    return "| " + " | ".join(map(str, cells)) + seconds_cell(row)
+
+
+def seconds_cell(row: dict[str, Any]) -> str:
+    return f" | {row['seconds']:.0f} |"
+
+
+def total(rows: Sequence[dict[str, Any]], name: str) -> dict[str, Any]:
+    """Add up the rows of logs with a truth, to a row with a name."""
+    whole: dict[str, Any] = {"log": f"**{name}**"}
+    rows = [row for row in rows if "visit_pairs" in row]
+    for key in ("visits", "seconds"):
+        whole[key] = sum(row[key] for row in rows)
+    whole["places"] = sum(row["places"] or 0 for row in rows)
+    for key in ("visit_pairs", "travel_pairs", "partings"):
+        names = rows[0][key] if rows else ()
+        whole[key] = {part: sum(row[key][part] for row in rows) for part in names}
+    return whole
 
 
 def simulated_line(method: str, rows: Sequence[dict[str, Any]]) -> str:
@@ -294,7 +382,11 @@ def main() -> None:
         "--plans", type=Path, metavar="FOLDER", help="floor plans (.xml) to simulate drives in"
     )
     parser.add_argument(
-        "--seeds", type=int, default=5, metavar="N", help="drives through each plan (default: 5)"
+        "--seeds",
+        type=seeds_from,
+        default=seeds_from("1-5"),
+        metavar="FIRST-LAST",
+        help="seeds of the drives through each plan (default: 1-5)",
     )
     parser.add_argument(
         "--out",
@@ -334,14 +426,28 @@ def main() -> None:
         options.logs, driven(options.plans, options.seeds, options.runs) if options.plans else ()
     ):
         wanted = [method for method in options.methods if (name_of(log), method) not in known]
-        truth = truth_of(log, sidecar(log)) if wanted else None
+        truth = known_truth(log) if wanted else None
         for method in wanted:
-            assert truth is not None
-            rows.append(row_of(log, method, truth, options.runs))
+            if method == PAIRS:
+                rows.append(pairs_row(log, truth, options.runs))
+            elif truth is not None:
+                rows.append(row_of(log, method, truth, options.runs))
+            else:
+                continue
             with options.out.open("a") as file:
                 print(json.dumps(rows[-1]), file=file)
     if options.figure:
         draw(options.figure, options.logs, options.runs)
+    pairs = [row for row in rows if row["method"] == PAIRS]
+    rows = [row for row in rows if row["method"] != PAIRS]
+    if pairs:
+        print_rows(
+            [*HEAD_OF_PAIRS, *map(pairs_line, [*pairs, total(pairs, "all")])],
+            options.page,
+            r"\| log \| visits",
+        )
+    if not rows:
+        return
     real = sorted(
         (row for row in rows if not row["simulated"]),
         key=lambda row: (row["log"], METHODS.index(row["method"])),

@@ -8,6 +8,7 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+import courses
 import networkx as nx
 import numpy as np
 import pytest
@@ -29,7 +30,8 @@ from visited import (
 
 from perception.readers.scans import Laser, RobotLog, Scan
 from simulator.laser import BEAMS, BEARINGS, meetings
-from ssh_abduction import Trace, evaluate, solve
+from ssh_abduction import SSHMap, Trace, evaluate, solve
+from ssh_abduction.data import Action, DState, Step
 
 ROOT = Path(__file__).parent.parent
 LOGS = ROOT.parent / "shared" / "data" / "logs"
@@ -240,3 +242,58 @@ def test_the_skeleton_of_a_crossing_has_five_nodes() -> None:
 @pytest.mark.skipif(not LOGS.exists(), reason="needs ../shared/data")
 def test_the_corrected_poses_of_aces_pass_the_nine_places_in_the_known_order() -> None:
     assert len(truth_of(LOGS / "aces-corrected.log.gz").visits) == 15
+
+
+def line(*corners: tuple[float, float], spacing: float = 0.25) -> np.ndarray:
+    """Points on the straight lines between corners."""
+    return courses.resampled(np.array(corners, float), spacing)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "one"),
+    [
+        pytest.param([(0, 0), (8, 0)], [(0, 0.5), (8, 0.5)], True, id="beside each other"),
+        pytest.param([(0, 0), (8, 0)], [(8, 0.5), (0, 0.5)], True, id="in opposite directions"),
+        pytest.param([(0, 0), (8, 0)], [(0, 0), (4, 3), (8, 0)], False, id="around something"),
+        pytest.param([(0, 0), (8, 0)], [(0, 0), (4, 0)], False, id="only half of the way"),
+    ],
+)
+def test_courses_are_one_if_they_are_near_each_other_everywhere(
+    first: list[tuple[float, float]], second: list[tuple[float, float]], one: bool
+) -> None:
+    assert courses.is_one(line(*first), line(*second)) is one
+
+
+@pytest.mark.parametrize(
+    ("way", "parted"),
+    [
+        pytest.param([(0, 0), (20, 0), (20, 20), (10, 20), (10, -20)], [], id="a crossing"),
+        pytest.param(
+            [(0, 0), (20, 0), (20, 10), (0, 10), (0, 0), (12, 0), (12, -10)], [(12, 0)], id="a fork"
+        ),
+        pytest.param([(0, 0), (20, 0), (0, 0)], [], id="there and back"),
+    ],
+)
+def test_a_drive_parts_where_its_second_pass_leaves_the_first(
+    way: list[tuple[float, float]], parted: list[tuple[float, float]]
+) -> None:
+    found = courses.partings(line(*way))
+    assert len(found) == len(parted)
+    assert all(math.dist(a, b) < 1.0 for a, b in zip(found, parted, strict=True))
+
+
+def test_pairs_of_visits_and_of_travels_are_counted() -> None:
+    """A robot drives twice around a square. The map joins the visits of the first corner only."""
+    corners = [(0, 0), (10, 0), (10, 10), (0, 10)] * 2 + [(0, 0)]
+    poses = np.array([(x, y, 0.0) for x, y in corners])
+    steps = [
+        Step(view, Action.of("travel"), truth={"pose": pose}, extra={"scan": t})
+        for t, (view, pose) in enumerate(zip("abcdefgha", poses.tolist(), strict=True))
+    ]
+    trace = Trace((*steps[:-1], replace(steps[-1], action=None)))
+    labels = (0, 1, 2, 3, 0, 4, 5, 6, 0)
+    dstates = tuple(DState(i, view, i, None, None) for i, view in enumerate("abcdfgh"))
+    counts = courses.counts_of(trace, SSHMap(labels, dstates, (), tuple(range(7))), poses)
+    assert counts["visit_pairs"] == {"joined": 3, "right": 3, "true": 6, "found": 3}
+    assert counts["travel_pairs"] == {"joined": 0, "right": 0, "true": 4}
+    assert courses.counts_of(trace, None, poses)["visit_pairs"]["joined"] == 0

@@ -1,0 +1,190 @@
+"""Finds the junctions of the skeleton of a local map.
+
+The skeleton is the set of the points that are as far as possible from all obstacles around them. It
+has a junction where ways part. A junction has a disc, which reaches to the nearest obstacle, and a
+branch for each way. A way into a niche has a branch, too. So a branch that ends soon after it
+leaves the disc is removed. Junctions whose discs hold each other's middle are one.
+
+References:
+    Thrun 1998, "Learning metric-topological maps for indoor mobile robot navigation".
+    Shaked & Bruckstein 1998, "Pruning medial axes".
+    Beeson, Modayil & Kuipers 2010, "Factoring the mapping problem".
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from perception.places.local_map import CELL, Bools, Patch
+from perception.places.thinning import Edge, Graph, Node, thinned
+from perception.places.track import Array
+
+# Obstacles that stand free and cover less than this many square metres are furniture.
+FURNITURE = 4.0
+# A branch counts if it leads at least OUT metres out of the disc of its junction, and at least SHARE
+# of the radius of the disc.
+OUT, SHARE = 0.75, 0.5
+# Junctions are one up to ONE metres from each other, even if their discs are smaller. The free space
+# between is nowhere narrower than NARROW of the smaller disc.
+ONE, NARROW = 0.6, 0.75
+
+_EIGHT = np.ones((3, 3), bool)
+
+
+@dataclass(frozen=True, eq=False)
+class Junction:
+    """A point of a local map where ways part.
+
+    Attributes:
+        middle: (x, y) in metres, in the frame of the track.
+        radius: Distance from the middle to the nearest obstacle, in metres.
+        branches: (n, 2) x and y of points along each way, beginning in the disc.
+    """
+
+    middle: Array
+    radius: float
+    branches: tuple[Array, ...]
+
+
+def junctions(patch: Patch, room: float) -> list[Junction]:
+    """Find the junctions of the skeleton of a local map.
+
+    Args:
+        patch: The local map.
+        room: Half the width of the robot in metres.
+    """
+    mask = passable(patch, room)
+    # The middle of the robot is `room` away from obstacles, so the disc of a cell is larger.
+    distance = _distances(mask) + room / CELL
+    graph = pruned(thinned(mask, distance))
+    return [
+        Junction(
+            patch.position(node.at),
+            node.radius * CELL,
+            tuple(patch.position(branch) for branch in branches),
+        )
+        for node, branches in merged(graph, distance)
+    ]
+
+
+def passable(patch: Patch, room: float) -> Bools:
+    """Find the cells that the middle of the robot can reach, as if there were no furniture.
+
+    Args:
+        patch: The local map.
+        room: Half the width of the robot in metres.
+    """
+    trail = np.asarray(ndimage.binary_dilation(patch.trail, _EIGHT))
+    fits = (patch.free & (patch.room >= room)) | trail
+    fits = ndimage.binary_opening(fits, _EIGHT) | trail
+    parts, _ = ndimage.label(fits, _EIGHT)
+    reached = np.isin(parts, np.setdiff1d(parts[trail], [0]))
+    holes, count = ndimage.label(~reached)
+    sizes = ndimage.sum_labels(~reached, holes, np.arange(count + 1)) * CELL**2
+    small = sizes < FURNITURE
+    small[0] = False
+    for side in (holes[0], holes[-1], holes[:, 0], holes[:, -1]):
+        small[side] = False
+    return np.asarray(reached | small[holes])
+
+
+def _distances(mask: Bools) -> Array:
+    return np.asarray(ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1])
+
+
+def pruned(graph: Graph) -> Graph:
+    """Remove the branches that lead nowhere, beginning with the one that leads out least."""
+    while True:
+        degrees = graph.degrees
+        short = [
+            (out, number)
+            for number, edge in enumerate(graph.edges)
+            for one in (edge, edge.reverse)
+            if (out := _out(one, graph.nodes, degrees)) is not None
+        ]
+        if not short:
+            return graph
+        graph = graph.without(graph.edges[min(short)[1]])
+
+
+def _out(edge: Edge, nodes: Mapping[int, Node], degrees: Mapping[int, int]) -> float | None:
+    """By how many metres a dead end leads out of the disc of its junction.
+
+    Args:
+        edge: The edge from the junction to the dead end.
+        nodes: The nodes.
+        degrees: The number of edges of each node.
+
+    Returns:
+        None if the edge is no dead end, or leads far enough.
+    """
+    junction, end = (nodes[node] for node in edge.ends)
+    if degrees[edge.ends[0]] < 3 or degrees[edge.ends[1]] > 1 or end.cut:
+        return None
+    out = (edge.length + end.radius - junction.radius) * CELL
+    return out if out < max(OUT, SHARE * junction.radius * CELL) else None
+
+
+def merged(graph: Graph, distance: Array) -> list[tuple[Node, list[Array]]]:
+    """Merge junctions in one open space.
+
+    Args:
+        graph: The skeleton.
+        distance: (rows, columns) distance of each cell to the nearest obstacle, in cells.
+
+    Returns:
+        Each junction with its branches: (n, 2) rows and columns each. The radius of a merged
+        junction is that of its largest disc.
+    """
+    degrees = graph.degrees
+    head = {node: node for node in graph.nodes if degrees[node] > 2}
+    for edge in sorted(graph.edges, key=lambda edge: edge.length):
+        if all(node in head for node in edge.ends):
+            first, second = (head[node] for node in edge.ends)
+            if first != second and _are_one(edge, (first, second), graph.nodes, distance):
+                large = max(first, second, key=lambda node: graph.nodes[node].radius)
+                for node in [node for node in head if head[node] in (first, second)]:
+                    head[node] = large
+    found = []
+    for large in sorted(set(head.values())):
+        group = [node for node in head if head[node] == large]
+        at = np.mean([graph.nodes[node].at for node in group], axis=0)
+        radius = graph.nodes[large].radius
+        found.append((Node(at, radius), _branches(graph, set(group), radius)))
+    return found
+
+
+def _are_one(
+    edge: Edge, heads: tuple[int, int], nodes: Mapping[int, Node], distance: Array
+) -> bool:
+    """Check whether the junctions of an edge are in one open space.
+
+    Args:
+        edge: The edge.
+        heads: The junctions with the largest discs of those that are one with either end.
+        nodes: The nodes.
+        distance: (rows, columns) distance of each cell to the nearest obstacle, in cells.
+    """
+    first, second = (nodes[node] for node in heads)
+    rows, columns = np.rint(edge.cells).astype(int).T
+    narrowest = distance[rows, columns].min()
+    far = max(edge.length, math.dist(first.at, second.at))
+    return bool(
+        far <= max(first.radius, second.radius, ONE / CELL)
+        and narrowest >= NARROW * min(nodes[node].radius for node in edge.ends)
+    )
+
+
+def _branches(graph: Graph, group: set[int], radius: float) -> list[Array]:
+    """The lines that lead from a group of junctions, without the short lines within the group."""
+    found = []
+    for edge in graph.edges:
+        inside = [node in group for node in edge.ends]
+        if not all(inside) or edge.length >= 2 * radius + 1 / CELL:
+            found += [edge.cells] * inside[0] + [edge.cells[::-1]] * inside[1]
+    return found
