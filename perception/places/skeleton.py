@@ -26,11 +26,11 @@ from perception.places.track import Array
 
 # Obstacles that stand free and cover less than this many square metres are furniture.
 FURNITURE = 4.0
-# A branch counts if it leads at least OUT metres out of the disc of its junction, and at least SHARE
-# of the radius of the disc.
+# A branch counts if it leads at least OUT metres out of the disc of its junction, and at least a
+# share of SHARE of the radius of the disc.
 OUT, SHARE = 0.75, 0.5
-# Junctions are one up to ONE metres from each other, even if their discs are smaller. The free space
-# between is nowhere narrower than NARROW of the smaller disc.
+# Junctions are one up to ONE metres from each other, even if their discs are smaller. The free
+# space between them is nowhere narrower than a share of NARROW of the smaller disc.
 ONE, NARROW = 0.6, 0.75
 
 _EIGHT = np.ones((3, 3), bool)

@@ -24,8 +24,10 @@ from perception.places.track import Array
 
 _EIGHT = np.ones((3, 3), bool)
 # Steps to the eight neighbours of a cell, those with a common side first.
-_STEPS = sorted(set(product((-1, 0, 1), repeat=2)) - {(0, 0)}, key=lambda step: step[0] * step[1])
-_STEPS.sort(key=lambda step: abs(step[0]) + abs(step[1]))
+_STEPS = sorted(
+    set(product((-1, 0, 1), repeat=2)) - {(0, 0)},
+    key=lambda step: (abs(step[0]) + abs(step[1]), step),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +138,8 @@ def _parts(mask: Bools) -> Iterator[NDArray[np.int64]]:
     """The connected parts of a mask, each as its cells: (n, 2) rows and columns."""
     labels, _ = ndimage.label(mask, _EIGHT)
     for number, box in enumerate(ndimage.find_objects(labels), 1):
-        yield np.argwhere(labels[box] == number) + [box[0].start, box[1].start]
+        corner = np.array([box[0].start, box[1].start])
+        yield np.argwhere(labels[box] == number) + corner
 
 
 def _in_order(cells: NDArray[np.int64]) -> list[Cell]:
@@ -155,9 +158,7 @@ def _in_order(cells: NDArray[np.int64]) -> list[Cell]:
     return line
 
 
-def _add_line(
-    graph: Graph, line: list[Cell], forks: NDArray[np.int32], distance: Array
-) -> None:
+def _add_line(graph: Graph, line: list[Cell], forks: NDArray[np.int32], distance: Array) -> None:
     """Add a line to a graph, with a node at each of its ends that is at no junction."""
     touched = [_forks_beside(forks, line[0]), _forks_beside(forks, line[-1])]
     if len(line) == 1:  # Both ends are at one cell.
