@@ -367,7 +367,7 @@ def test_of_many_pairs_so_many_are_printed_and_all_are_counted() -> None:
 
 def test_maps_that_differ_in_directions_along_paths_alone_are_told_apart() -> None:
     trace = maze(3, 3, steps=40, seed=4242, stars=True, follow=True, odometry=Odometry()).trace
-    solution = solve(trace, max_maps=None)
+    solution = solve(trace, Theory(weigh="count"), max_maps=None)
     pairs = [
         (m, n)
         for m, n in combinations(solution.maps, 2)
