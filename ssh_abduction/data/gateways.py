@@ -28,6 +28,9 @@ from ssh_abduction.data.star import SPREAD, Frame, Star
 from ssh_abduction.data.trace import Action, Trace
 from ssh_abduction.runtime.clock import look_at_clock
 
+# Stands for the half of gateway_path that allows opposite dstates to be on paths that are not one.
+COURSE = "course"
+
 
 @dataclass(frozen=True)
 class Sight:
@@ -172,7 +175,7 @@ class Facing:
     """How the dstates of a map face in the frames of their places.
 
     Attributes:
-        headings: For each dstate, its heading in degrees.
+        headings: For each dstate, its heading, if it is known.
         opposite: Pairs of dstates at one place that face opposite ways.
         ends: Pairs of a dstate and a direction, 0 (ahead) or 180 (behind), in which no gateway
             leads on.
@@ -184,11 +187,11 @@ class Facing:
 
 
 def facing(trace: Trace, ssh_map: SSHMap, axioms: Collection[str]) -> Facing | None:
-    """Fit the stars of a map without paths.
+    """Fit the stars of a map in which some paths are not yet known to be one.
 
     Args:
         trace: The trace, with stars.
-        ssh_map: A map of the trace. Its headings and paths are ignored.
+        ssh_map: A map of the trace. Its headings are ignored.
         axioms: Names of the axioms that hold.
 
     Returns:
@@ -196,15 +199,14 @@ def facing(trace: Trace, ssh_map: SSHMap, axioms: Collection[str]) -> Facing | N
     """
     sights, turns = sights_of(trace, ssh_map, lambda s: ())
     found = Facing({}, [], [])
+    held = {COURSE, *axioms} - {"gateway_end"}
     for seen in by_place(sights).values():
-        fitted = fit(seen, turns, set(axioms) - {"gateway_path", "gateway_end"}, as_shown=False)
+        fitted = fit(seen, turns, held, as_shown=False)
         if fitted is None:
             return None
         read = list(zip(seen, fitted, strict=True))
-        for sight, (frame, shift) in read:
+        for sight in seen:
             s = sight.dstate.id
-            if sight.shows:
-                found.headings[s] = _middle(rotations(fitted[0][0], frame, shift))
             found.ends.extend(
                 (s, towards)
                 for towards in (0, 180)
@@ -323,13 +325,12 @@ def _allowed(
             return False
     if "gateway_dstate" in axioms and s.id != x.id and alike and (sure or 0 not in found):
         return False
-    if "gateway_path" in axioms and s.path is not None and x.path is not None:
+    if {"gateway_path", COURSE} & set(axioms) and s.path is not None and x.path is not None:
         same = s.path == x.path and s.direction == x.direction
         reverse = s.path == x.path and s.direction != x.direction
         for way, on_course, towards in ((alike, same, 0), (opposite, reverse, 180)):
-            if (on_course and not way) or (
-                way and not on_course and (sure or towards not in found)
-            ):
+            off_course = COURSE not in axioms and way and not on_course
+            if (on_course and not way) or (off_course and (sure or towards not in found)):
                 return False
     return True
 

@@ -20,7 +20,6 @@ from ssh_abduction.solver import choosing
 from ssh_abduction.solver.asp.facts import answer_maps
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.engines.base import Found, Task
-from ssh_abduction.solver.guesses.gated import gated_map
 from ssh_abduction.solver.guesses.tree import Sketch
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
@@ -70,18 +69,17 @@ class Candidates:
             self.offer(answer_maps.causal_map(self._task.log.merged(), self._task.trace))
 
     def beam(self, width: int) -> Beam | None:
-        """A beam of hypotheses about the displacements; None if there can be none.
+        """A beam of hypotheses about dstates and places; None if there can be none.
 
-        There is none without the speed-up `greedy`, or if the trace is long or has no
-        displacements, or if the theory has faults.
+        There is none without the speed-up `greedy`, or if the trace is long. If it has neither
+        displacements nor stars at any angles, `guesses/tree.py` makes better maps.
 
         Args:
             width: The number of hypotheses.
         """
         theory = self._task.theory
         if (
-            theory.displacement != "use"
-            or theory.has_faults
+            (theory.displacement != "use" and theory.star != "gateways")
             or len(self._task.trace) > LONGEST
             or not self._task.speedups.greedy
             or not self._judging.can_accept
@@ -169,8 +167,7 @@ class Candidates:
         known = self._known.partial if trace is self._trace else None
         beams = [partial(self._offer_beam, width) for width in (BROAD, 1)]
         if theory.star == "gateways":
-            gated = [partial(self._offer_gated, homing=homing) for homing in (True, False)]
-            return [*beams, *gated]
+            return [*beams]
         sketches = Sketch.all_of(trace.steps[0], theory)
         if known is not None:
             sketches.insert(0, Sketch.beyond(known, trace.prefix(len(known.labels)), theory))
@@ -181,18 +178,6 @@ class Candidates:
         if beam := self.beam(width):
             for ssh_map in self.maps_of(beam):
                 self.offer(ssh_map)
-
-    def _offer_gated(self, *, homing: bool) -> None:
-        """Offer a sketch for places with gateways at any angles, if there is one.
-
-        Args:
-            homing: Whether a travel may lead back to the place it came from.
-        """
-        ssh_map = gated_map(
-            self._task.trace, self._task.theory, homing=homing, pairs=self._task.log.pairs
-        )
-        if ssh_map is not None:
-            self.offer(ssh_map)
 
     def _go_on_to_end(self, sketch: Sketch) -> None:
         """Extend a sketch to the end of the trace and offer it, unless a step contradicts it."""

@@ -128,7 +128,8 @@ class Weighing:
         """Find some maps of little cost without clingo, in a share of the time."""
         parts, watch = self._parts, self._parts.watch
         begun, left = watch.elapsed(), watch.left()
-        if len(parts.task.trace) > FEW_STEPS:
+        is_long = len(parts.task.trace) > FEW_STEPS
+        if is_long and left > 0 and parts.task.theory.star != "gateways":
             parts.candidates.sketch(0.0)  # only the surest sketch has time
             self.keep_best()
         for width, share in WIDTHS.items():

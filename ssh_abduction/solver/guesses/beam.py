@@ -117,13 +117,13 @@ class Beam:
         """Search nothing yet.
 
         Args:
-            problem: A trace with displacements, and a theory without faults.
+            problem: A trace and a theory. The maps have no faults, also if the theory allows them.
             log: The trace as integers.
             width: How many hypotheses are kept.
         """
         trace, theory = problem.trace, problem.theory
         self._trace, self._log, self._width, self._problem = trace, log, width, problem
-        self._bare = theory.replace(displacement="none", weigh="count")
+        self._bare = theory.without_faults().replace(displacement="none", weigh="count")
         self._has_places = theory.level == "topological"
         self._stays = self._has_places and "turn_stays" in theory.hard
         self._leaves = self._has_places and "travel_leaves" in theory.hard

@@ -65,21 +65,31 @@ def completed(
         return SSHMap(tuple(labels), dstates, listed).renumbered()
     dstates = tuple(DState(s, views[s], place=places[s]) for s in range(len(views)))
     bare = SSHMap(tuple(labels), dstates, listed, tuple(sorted(set(places))))
-    framed = _facing(bare, trace, theory, facing)
-    courses = _courses(bare, trace, theory, framed.opposite) if framed else None
-    orders = _orders(bare, trace, courses, framed.ends) if framed and courses is not None else None
-    if framed is None or courses is None or orders is None:
-        return None
-    dstates = tuple(
-        replace(
-            s,
-            path=courses.get(s.id, (None, None))[0],
-            direction=courses.get(s.id, (None, None))[1],
-            heading=framed.headings.get(s.id),
-        )
-        for s in dstates
+    courses = _courses(bare, trace, theory, ())
+    facing_of = None if courses is None else _facing(_on(bare, courses), trace, theory, facing)
+    courses = _courses(bare, trace, theory, facing_of.opposite) if facing_of else None
+    orders = (
+        _orders(bare, trace, courses, facing_of.ends) if facing_of and courses is not None else None
     )
-    return replace(bare, dstates=dstates, paths=orders).renumbered()
+    if facing_of is None or courses is None or orders is None:
+        return None
+    found = replace(_on(bare, courses, facing_of.headings), paths=orders)
+    if theory.star == "gateways":
+        turned = gateways.turned(trace, found, theory.axioms)
+        return None if turned is None else turned.renumbered()
+    return found.renumbered()
+
+
+def _on(
+    ssh_map: SSHMap, courses: Mapping[int, _Course], headings: Mapping[int, int] | None = None
+) -> SSHMap:
+    """The map with the courses and headings of its dstates."""
+    dstates = []
+    for s in ssh_map.dstates:
+        path, direction = courses.get(s.id, (None, None))
+        heading = (headings or {}).get(s.id)
+        dstates.append(replace(s, path=path, direction=direction, heading=heading))
+    return replace(ssh_map, dstates=tuple(dstates))
 
 
 def _facing(
