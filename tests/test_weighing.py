@@ -213,3 +213,15 @@ def test_the_checker_and_the_solver_have_one_misfit(data: st.DataObject) -> None
 def test_a_robot_that_drives_counts() -> None:
     with pytest.raises(TheoryError, match="weigh: expected count while a robot drives"):
         OnlineMapper("a", Theory(weigh="cost"))
+
+
+def test_each_map_is_listed_once() -> None:
+    """Two side corridors may be on one path, in two ways. So several maps have the least cost."""
+    go, left, back = (10.0, 0.0, 0.0), (0.0, 0.0, math.pi / 2), (0.0, 0.0, math.pi)
+    side = [("left", left), ("travel", go), ("around", back), ("travel", go), ("left", left)]
+    drive = [*side, ("travel", go), *side, ("travel", go), ("around", back), ("travel", go)]
+    actions, displacements = zip(*[*drive, ("travel", go)], strict=True)
+    trace = Trace.from_steps("a" * (len(actions) + 1), actions, displacements=displacements)
+    solution = solve(trace, Theory.topological().replace(star="none", boundary="none"))
+    assert solution.status is Status.OPTIMAL
+    assert 1 < len(solution.maps) == len(set(solution.maps))

@@ -201,10 +201,13 @@ class Weighing:
         """The maps of least cost, and then those that cost up to `within` nats more."""
         parts, theory = self._parts, self._parts.task.theory
         complete = True
+        listed: set[SSHMap] = set()  # Candidates with the same dstates and places list one another.
         for candidate in self.minimal():
             maps, proven = self._with_other_paths(candidate.map)
             complete &= proven
-            yield from ((ssh_map, Cost.of(ssh_map).preferred_by(theory)) for ssh_map in maps)
+            new = [ssh_map for ssh_map in maps if ssh_map not in listed]
+            listed.update(new)
+            yield from ((ssh_map, Cost.of(ssh_map).preferred_by(theory)) for ssh_map in new)
         parts.rivals.listed = complete
         most = self.candidates[0].nats + parts.limits.within if self.candidates else 0.0
         for candidate in self.candidates[len(self.minimal()) :]:
