@@ -364,11 +364,11 @@ def test_where_a_worker_is_killed_all_logs_are_mapped_and_none_twice(
         main(
             [
                 "simulate",
-                "notched-rectangle",
+                "taylor-hall",
                 "--format",
                 "carmen",
                 "--set",
-                "every=0.5",
+                "every=0.8",
                 "-q",
                 "-o",
                 quick,
@@ -393,7 +393,7 @@ def test_where_a_worker_is_killed_all_logs_are_mapped_and_none_twice(
         "1",
     ]
     capsys.readouterr()
-    for said in ("1 place", "done already"):
+    for said in ("5 places", "done already"):
         assert main(command) == 0
         assert [line.partition(",")[0] for line in capsys.readouterr().out.splitlines()] == [
             f"{quick}: {said}",

@@ -17,7 +17,7 @@ from ssh_abduction.cli.import_log import named_after
 from ssh_abduction.cli.mapping import MapAnswer, MapQuestion
 from ssh_abduction.cli.run_folders import FILES, RUN, digest, folders_of, is_done, write_run
 
-QUESTION = MapQuestion(None, {}, (None, None, None), None, None, None, None, 300, False)
+QUESTION = MapQuestion(None, {}, (None, None, None), 0.5, None, 300, False)
 LONG = "n" * 251
 
 

@@ -212,5 +212,5 @@ def test_maps_of_logs_say_it_too() -> None:
     done = MagicMock(
         solution=solution, imported=imported, seconds={}, notes=(), files=lambda: dict(files)
     )
-    question = MapQuestion(None, {}, {}, None, None, None, None, 0, ladder=False)
+    question = MapQuestion(None, {}, {}, 0.5, None, 0, ladder=False)
     assert told in question._told(0, "a.log", log, done, None).line

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 import shutil
@@ -14,12 +13,10 @@ import numpy as np
 import pytest
 from coarse import every_second_beam
 from test_plans import DOORS, MIDDLES, plan_of, xml
+from visited import Truth
 
 from perception.errors import LogError
-from perception.places.doors import Door, visits_of
 from perception.places.importing import Imported, import_log
-from perception.places.local_map import CELL, distances
-from perception.places.scale import Scale
 from perception.places.track import Track, follow
 from perception.readers.logs import read_log
 from perception.readers.scans import Laser, RobotLog, Scan
@@ -34,7 +31,7 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.evaluation import evaluate_visits
 from ssh_abduction.robot_logs import log_maps
 from ssh_abduction.robot_logs.log_maps import SPEED, map_log, seconds_left
-from ssh_abduction.solver import Solution, Status
+from ssh_abduction.solver import Solution
 from ssh_abduction.solver.asp import workers
 
 LINES = 390  # Three for each scan.
@@ -109,7 +106,6 @@ def test_scans_mend_the_odometry(hall: Path) -> None:
 
 def test_a_drive_becomes_a_trace_of_the_places_it_passed(runs: Path) -> None:
     trace = Trace.load(runs / "hall" / "trace.jsonl")
-    assert trace.extra["right_angles"] is True
     # Each visit has one step or two: the robot goes on straight, or it turns.
     visits = [step.extra["visit"] for step in trace]
     assert visits == sorted(visits)
@@ -174,19 +170,8 @@ def test_a_log_of_a_robot_that_stands_or_passes_nothing_is_an_error() -> None:
         Scan(np.where(corridor >= 30, np.inf, corridor), laser, (0.5 * i, 0.0, 0.0))
         for i in range(30)
     ]
-    with pytest.raises(LogError, match="expected a way past junctions, corners or dead ends"):
+    with pytest.raises(LogError, match="expected a way past junctions or turning points"):
         import_log(RobotLog(tuple(onward), source="corridor.log"))
-
-
-def test_waves_go_around_walls() -> None:
-    room = np.ones((41, 41), bool)
-    room[20, :35] = False
-    seed = np.zeros_like(room)
-    seed[10, 5] = True
-    found = distances(room, seed, 20.0)
-    assert found[10, 35] == pytest.approx(30 * CELL, rel=0.1)
-    assert found[30, 5] > 2 * 29 * CELL  # Through the gap at the right end.
-    assert math.isinf(distances(room, seed, 1.0)[10, 35])
 
 
 def test_a_run_is_done_once_and_bad_logs_do_not_stop_the_others(
@@ -227,7 +212,7 @@ def test_a_run_is_done_once_and_bad_logs_do_not_stop_the_others(
         (["--set", "level=causal"], "none", "none"),
     ],
 )
-def test_flags_are_laid_over_the_theory_that_suits_the_walls(
+def test_flags_are_laid_over_the_theory_for_logs(
     hall: Path,
     flags: list[str],
     star: str,
@@ -235,7 +220,7 @@ def test_flags_are_laid_over_the_theory_that_suits_the_walls(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    trace = replace(Trace.from_steps("ab", ["travel"]), extra={"right_angles": False})
+    trace = Trace.from_steps("ab", ["travel"])
 
     def solve(_: log_maps.LogMapping, __: Trace, theory: Theory, **___: object) -> None:
         raise AbductionError(f"star={theory.star}, boundary={theory.boundary}")
@@ -261,7 +246,7 @@ def test_a_log_has_a_twentieth_of_its_drive_to_be_mapped_in_less_what_the_import
     imported = Imported(
         Trace.from_steps("aa", ["travel"]),
         track,
-        Scale(1.0, 5.0),
+        0.5,
         (),
         {"track": 0.5, "places": 1.0},
     )
@@ -292,31 +277,6 @@ def test_what_cannot_be_is_said_before_a_log_is_read(
     assert said in capsys.readouterr().err
 
 
-def test_a_log_whose_stars_no_map_fits_is_mapped_without(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The corridor is open ahead, and still at the robot's right after it turned around."""
-    trace = replace(
-        Trace.from_steps(
-            "aba", ["travel", "around"], stars=[(1, 0, 0, 0), (0, 0, 1, 0), (0, 1, 0, 0)]
-        ),
-        extra={"right_angles": True},
-    )
-    imported = SimpleNamespace(
-        trace=trace, track=SimpleNamespace(way=[1.0]), visits=(), seconds={}, notes=()
-    )
-    monkeypatch.setattr(log_maps, "import_log", lambda *_: imported)
-    log = RobotLog((Scan(np.ones(3), Laser(-1.0, 1.0, 3, 30.0), (0.0, 0.0, 0.0)),), source="x")
-    done, asked = (
-        map_log(log, with_ladder=False),
-        map_log(log, choices={"star": "frame"}, with_ladder=False),
-    )
-    assert (done.solution.status, done.solution.theory.star, done.notes) == (
-        Status.OPTIMAL,
-        "none",
-        (log_maps.NO_STARS,),
-    )
-    assert (asked.solution.status, asked.notes) == (Status.UNSATISFIABLE, ())
-
-
 def test_two_runs_are_compared(
     runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -325,16 +285,14 @@ def test_two_runs_are_compared(
     assert main(["compare", str(folder), str(other)]) == 0
     assert "the two runs have the same settings" in capsys.readouterr().out
     run = json.loads((other / "run.json").read_text())
-    run["scale"]["radius"] = 9.0
+    run["width"] = 0.9
     (other / "run.json").write_text(json.dumps(run))
     (other / "trace.jsonl").write_text("")
     assert main(["compare", str(folder), str(other)]) == 0
-    assert "scale.radius: " in capsys.readouterr().out
+    assert "width: " in capsys.readouterr().out
     assert main(["compare", str(folder), str(other), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
-    assert told == {
-        "runs": {"scale.radius": [pytest.approx(5.6, abs=1), 9.0]}
-    }  # And no more, as their traces differ.
+    assert told == {"runs": {"width": [0.5, 0.9]}}  # And no more, as their traces differ.
     assert main(["compare", str(folder), str(folder), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["runs"] == {}
@@ -344,9 +302,9 @@ def test_two_runs_are_compared(
 def test_a_process_of_its_own_maps_a_log_and_one_that_is_killed_loses_its_log_alone(
     hall: Path, tmp_path: Path
 ) -> None:
-    question = MapQuestion(None, {}, {}, None, None, None, 1000.0, 1, False)
+    question = MapQuestion(None, {}, {}, 0.5, 1000.0, 1, False)
     small = tmp_path / "small.log"
-    small.write_text("\n".join(hall.read_text().splitlines()[:75]) + "\n")
+    small.write_text("\n".join(hall.read_text().splitlines()[:150]) + "\n")
     (answer,) = answers_here(question, [str(small)], 2, StopFlag())
     assert answer.code in (0, 10)
     assert dict(answer.files)["run.json"]
@@ -355,115 +313,31 @@ def test_a_process_of_its_own_maps_a_log_and_one_that_is_killed_loses_its_log_al
 
 
 @pytest.mark.skipif(not REAL.exists(), reason="real logs are not part of the project")
-def test_the_building_of_the_paper_comes_out_of_its_raw_log() -> None:
-    done = map_log(
-        read_log(REAL / "aces-corrected.log.gz"), Theory.topological(), with_ladder=False
-    )
-    columns, rows = {"W": -20.0, "C": -1.0, "E": 22.5}, {"N": -0.5, "M": -19.0, "S": -39.0}
-    first = {
-        step.extra["visit"]: step.truth["pose"] for step in reversed(done.imported.trace.steps)
-    }
-    at = [
-        min(rows, key=lambda r: abs(rows[r] - y)) + min(columns, key=lambda c: abs(columns[c] - x))
-        for x, y, _ in map(first.get, sorted(first))
-    ]
-    assert at == [
-        "NC",
-        "NE",
-        "ME",
-        "SE",
-        "SC",
-        "SW",
-        "MW",
-        "NW",
-        "NC",
-        "MC",
-        "SC",
-        "MC",
-        "MW",
-        "MC",
-        "ME",
-    ]
-    assert (done.solution.count, done.solution.cost.places, done.solution.cost.paths) == (1, 9, 6)
+def test_each_visit_to_a_crossing_of_the_building_of_the_paper_is_noticed() -> None:
+    log = read_log(REAL / "aces-corrected.log.gz")
+    truth = Truth.of_aces(np.array([scan.corrected for scan in log.scans]))
+    scans = [int(step.extra["scan"]) for step in import_log(log).trace]
+    assert {visit for visit in truth.matched(scans) if visit is not None} == {*range(15)}
 
 
-@pytest.mark.parametrize(
-    ("middles", "expected"),
-    [
-        ([], []),
-        ([0.0], [0.0]),
-        ([0.0, 5.0, 9.0], [0.0, 5.0, 9.0]),
-        ([0.0, 5.0, 5.2, 9.0], [0.0, 5.0, 9.0]),  # In and out by one door.
-        ([5.0, 5.8, 5.0], [5.0]),  # A narrow part behind the first door of a log.
-        ([0.0, 5.0, 5.8, 5.1, 9.0], [0.0, 5.0, 9.0]),  # And behind another one.
-        (
-            [0.0, 5.0, 6.2, 5.1, 9.0],
-            [0.0, 5.0, 6.2, 5.1, 9.0],
-        ),  # Another door, a little farther behind it.
-    ],
-)
-def test_passes_through_one_door_in_a_row_are_one_visit(
-    middles: list[float], expected: list[float]
-) -> None:
-    """Doors in a line, each wider than the last: the first of one door tells its middle."""
-    track = Track(np.array([(x, 0.0, 0.0) for x in range(20)], dtype=float), np.zeros((20, 3, 3)))
-    doors = [
-        Door(2 * k + 1, np.array([x, 0.0]), 1.0 + k / 100, 2.0 * k) for k, x in enumerate(middles)
-    ]
-    visits = visits_of(track, doors)
-    assert [float(visit.middle[0]) for visit in visits] == expected
-    assert all(before.end <= after.begin for before, after in itertools.pairwise(visits))
-    assert [visit.arrived is None for visit in visits] == [k == 0 for k in range(len(visits))]
-    assert [visit.left is None for visit in visits] == [
-        k == len(visits) - 1 for k in range(len(visits))
-    ]
-
-
-@pytest.mark.parametrize("command", [["import"], ["map"]])
-def test_doors_have_no_scale(
+@pytest.mark.parametrize("command", [["import"], ["map", "--set", "ladder=false"]])
+def test_options_of_the_old_detector_have_no_effect_and_say_so(
     hall: Path, command: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert (
-        main(
-            [
-                *command,
-                str(hall),
-                "-o",
-                str(hall.with_name("none")),
-                "--places",
-                "doors",
-                "--set",
-                "radius=5",
-            ]
-        )
-        == 1
-    )
-    assert "radius: expected none with --places doors, got 5" in capsys.readouterr().err
+    old = ["--places", "doors", "--gateway=0.8", "--set", "radius=5"]
+    missing = str(hall.with_name("missing.log"))
+    assert main([*command, missing, "-o", str(hall.with_name("none")), *old]) == 1
+    told = capsys.readouterr().err
+    for name in ("--places", "--gateway", "--radius"):
+        assert f"{name} has no effect any more: places are the junctions" in told
+    assert "--width METRES" in told
 
 
-def test_where_a_building_has_rooms_its_doors_are_the_places(tmp_path: Path) -> None:
-    """A robot drives around four rooms in a ring."""
+def test_the_rooms_of_a_building_are_told_apart(tmp_path: Path) -> None:
+    """A robot drives around four rooms in a ring, and the map has a place in each of them."""
     middles = {room: middle for room, middle in MIDDLES.items() if room != "closet"}
     drive = record_plan(plan_of(tmp_path, xml(DOORS[:4], middles=middles)), seed=1, metres=36)
-    done = map_log(
-        RobotLog(tuple(scans_of(drive)), source="ring"),
-        max_maps=1,
-        time_limit=60,
-        with_ladder=False,
-    )
-    passed = [
-        door
-        for door, _ in itertools.groupby(crossing["door"] for crossing in drive.truth["crossings"])
-    ]
-    assert done.imported.scale.doors
-    assert len(done.imported.visits) == len(passed)
-    trace, (best, *_) = done.imported.trace, done.solution.maps
-    arrived = [t for t in range(len(trace)) if t == 0 or trace.actions[t - 1].kind == "travel"]
-    places = [best.dstates[best.labels[t]].place for t in arrived]
-    assert len(set(zip(passed, places, strict=True))) == len(set(passed)) == len(set(places))
-    no_doors = RobotLog(done.log.scans[: done.imported.visits[0].begin - 5], source="room")
-    with pytest.raises(LogError, match=r"expected a way through doors, .*--places junctions"):
-        import_log(no_doors, doors=True)
-    begin = RobotLog(done.log.scans[: done.imported.visits[1].end + 20], source="begin")
-    assert import_log(begin).scale.doors
-    assert not import_log(begin, gateway=0.8).scale.doors  # This scale is one of junctions.
+    log = RobotLog(tuple(scans_of(drive)), source="ring")
+    done = map_log(log, max_maps=1, time_limit=60, with_ladder=False)
+    (judged,) = evaluate_visits(done.solution.maps[:1], done.imported.trace).maps
+    assert judged.places.precision == 1.0

@@ -177,11 +177,11 @@ def test_map_that_is_interrupted_says_so_and_is_done_again(
         main(
             [
                 "simulate",
-                "notched-rectangle",
+                "taylor-hall",
                 "--format",
                 "carmen",
                 "--set",
-                "every=0.5",
+                "every=0.8",
                 "-q",
                 "-o",
                 str(log),

@@ -1,99 +1,89 @@
-"""Finds the distinctive places that a robot passes: junctions, corners, dead ends, turning points.
+"""Finds the distinctive places that a robot passes: junctions, and points where it turned around.
 
-Milestones are scans about half a metre apart on the trajectory. At each of them, the local map
-gives the exits and the point where they meet. If three or more exits meet there, or if the corridor
-bends, the milestone votes for a place with its middle at that point. If at least half of the nearby
-milestones vote for a point, it is a place. Each time that the robot passes it is a visit.
+Milestones are scans a metre apart on the trajectory. The local map of each milestone has a
+skeleton with junctions. Junctions near each other at successive milestones are one chain. If the
+robot drives through the disc of a chain, and half of the local maps nearby show its junction, then
+this is a visit. The robot comes and leaves where its trajectory crosses the disc.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy import ndimage
 
-from perception.places.gateways import MERGED, Outlook, apart, nearest, outlook, parting
-from perception.places.local_map import CELL, Bools, Cell, LocalMaps, Patch
-from perception.places.scale import EVERY, Scale, milestones
-from perception.places.track import Array, Track, surfaces
+from perception.places.local_map import LocalMaps
+from perception.places.skeleton import Junction, junctions
+from perception.places.track import Array, Track
+from perception.places.visits import Visit, Way, apart
 from perception.readers.scans import RobotLog
 
-# Two exits that are opposite to within this, in radians, are one corridor and no place.
-BEND = math.radians(40)
-# Largest distance in metres from the robot to a drivable cell of the local map.
-ASTRAY = 1.5
-# Shares of the radius. SAME: largest distance between votes for one middle. PASSING: largest
-# distance at which the robot passes a place. ASKED: milestones this near are counted for the
-# support.
-SAME, PASSING, ASKED = 0.5, 0.6, 0.8
-# Smallest number of votes for a place, and smallest share of the nearby milestones that vote for
-# it.
-VOTES, AGREED = 3, 0.5
-# The robot turned around if its direction of motion changed by more than this, in radians.
-REVERSED = math.radians(135)
-# The robot left a path if its direction between two places changed by more than this, in radians.
-BENT = math.radians(65)
-
-
-@dataclass(frozen=True, slots=True)
-class Way:
-    """An exit of a place.
-
-    Attributes:
-        bearing: Direction in radians, counterclockwise in the frame of the track.
-        sure: Whether the exit certainly is a gateway. An uncertain exit is narrow, or leads into
-            unknown space.
-    """
-
-    bearing: float
-    sure: bool = True
+# The usual width of a robot in metres. It has to fit through the doors that the robot uses.
+WIDTH = 0.5
+# Milestones are EVERY metres apart. Their local maps have the scans of WINDOW metres before and
+# after them, and reach HALF metres to each side.
+EVERY, WINDOW, HALF = 1.0, 8.0, 8.0
+# Junctions farther than this from the robot, in metres, are too uncertain.
+SEEN = 5.0
+# Junctions are one place within SAME metres, or within this share of the smaller radius.
+SAME, SHARE = 0.6, 0.5
+# A chain ends if so many milestones in a row do not show it. Its middle is the median of so many.
+GAP, RECENT = 4, 9
+# The robot visits a place within this distance in metres, even if its disc is smaller. It has left
+# at LEFT metres outside of the disc.
+PASSING, LEFT = 0.75, 0.5
+# Milestones within BESIDE metres along the trajectory are asked about a place. At least a share of
+# AGREED has to show it.
+BESIDE, AGREED = 3.0, 0.5
+# The robot turned around if its directions of motion STRIDE metres before and after differ by more
+# than REVERSED radians, more than ALONE metres from other visits along the trajectory.
+STRIDE, REVERSED, ALONE = 1.0, math.radians(135), 1.5
+# Two ways out whose bearings differ by less than this, in radians, are one.
+MERGED = math.radians(45)
+# The bearing of a way is taken at so many metres outside of the disc, whose radius is at least
+# SMALL metres.
+RIM, SMALL = 0.5, 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Visit:
-    """A stay at a distinctive place.
+class _Sighting:
+    """A junction in the local map of a milestone, which is counted from 0."""
 
-    Attributes:
-        scan: Index of the scan nearest to the middle.
-        middle: (x, y) middle of the place in metres, in the frame of the track.
-        begin: Index of the first scan of the stay.
-        end: Index of the last scan of the stay.
-        ways: Exits, counterclockwise.
-        arrived: Index in `ways` of the exit by which the robot came; None at the beginning of the
-            log.
-        left: Index in `ways` of the exit by which the robot left; None at the end of the log.
-        axis: Main direction of the walls, in radians modulo a quarter turn.
-        straight: How well the walls agree with the axis, from 0 to 1.
-        support: Share of the nearby milestones that vote for the place, from 0 to 1.
-    """
-
-    scan: int
-    middle: Array
-    begin: int
-    end: int
-    ways: tuple[Way, ...] = ()
-    arrived: int | None = None
-    left: int | None = None
-    axis: float = 0.0
-    straight: float = 0.0
-    support: float = 1.0
-
-    def later(self, scans: int) -> Visit:
-        """Copy the visit, with its indices of scans increased by `scans`."""
-        return replace(self, scan=self.scan + scans, begin=self.begin + scans, end=self.end + scans)
+    milestone: int
+    junction: Junction
 
 
-@dataclass(frozen=True, eq=False)
-class _Vote:
-    """The vote of a milestone for a place with this middle."""
+@dataclass(eq=False)
+class _Chain:
+    """Sightings of one junction at successive milestones."""
 
-    scan: int
-    middle: Array
+    sightings: list[_Sighting] = field(default_factory=list)
+
+    @property
+    def first(self) -> int:
+        return self.sightings[0].milestone
+
+    @property
+    def last(self) -> int:
+        return self.sightings[-1].milestone
+
+    def middle(self, recent: int = 0) -> Array:
+        """The median of the middles: (2,) metres; of the most recent ones only, if not 0."""
+        return _middle(self.sightings[-recent:])
+
+    def radius(self, recent: int = 0) -> float:
+        """The median of the radii in metres; of the most recent ones only, if not 0."""
+        radii = [sighting.junction.radius for sighting in self.sightings[-recent:]]
+        return float(np.median(radii))
 
 
-def find_visits(log: RobotLog, track: Track, scale: Scale) -> tuple[Visit, ...]:
+def _middle(sightings: Sequence[_Sighting]) -> Array:
+    return np.asarray(np.median([one.junction.middle for one in sightings], axis=0))
+
+
+def find_visits(log: RobotLog, track: Track, width: float = WIDTH) -> tuple[Visit, ...]:
     """Find the visits to distinctive places in a log, in order.
 
     Each unbroken part of the track is searched separately. Corrected poses are not read.
@@ -101,317 +91,276 @@ def find_visits(log: RobotLog, track: Track, scale: Scale) -> tuple[Visit, ...]:
     Args:
         log: The scans.
         track: Their poses.
-        scale: Width of gateways, and radius of places.
+        width: Width of the robot in metres.
     """
     return tuple(
         visit.later(begin)
         for begin, end in track.spans
         for visit in _visits_of_span(
-            replace(log, scans=log.scans[begin:end]), track.part(begin, end), scale
+            replace(log, scans=log.scans[begin:end]), track.part(begin, end), width
         )
     )
 
 
-def _visits_of_span(log: RobotLog, track: Track, scale: Scale) -> tuple[Visit, ...]:
-    """Find the visits in a log whose track is unbroken."""
-    maps = LocalMaps(log.scans, track, scale.window)
-    asked = milestones(track, EVERY)
-    votes = [vote for i in asked if (vote := _vote(maps, track, scale, i)) is not None]
-    found = _supported(votes, asked, track, scale)
-    found = _one_for_each_pass(_with_turnings(found, track, scale), scale)
-    found = _with_bends(found, track, scale)
-    return tuple(_described(visit, log, track, scale, maps) for visit in found)
+def milestones(track: Track, every: float) -> list[int]:
+    """Choose scans along the trajectory, one after each `every` metres or more.
 
-
-def _vote(maps: LocalMaps, track: Track, scale: Scale, i: int) -> _Vote | None:
-    """The vote of milestone i (the index of a scan); None if it sees no place."""
-    patch = maps.around(i, track.poses[i, :2], scale.half)
-    open_cells, here = _start(patch, track.poses[i, :2], scale.gateway)
-    if here is None:
-        return None
-    seen = outlook(open_cells, here, scale.radius)
-    if len(seen.exits) < 2:
-        return None
-    middle = parting(patch, open_cells, seen, scale.radius)
-    if not is_decisive(outlook(open_cells, middle, scale.radius)):
-        return None
-    return _Vote(i, patch.position(middle))
-
-
-def is_decisive(seen: Outlook) -> bool:
-    """Check whether the exits show a place: at least three exits, or two that are not opposite."""
-    bearings = seen.bearings
-    return len(bearings) > 2 or (len(bearings) == 2 and math.pi - apart(*bearings) > BEND)
-
-
-def _supported(votes: list[_Vote], asked: list[int], track: Track, scale: Scale) -> list[Visit]:
-    """Group votes for about the same middle, and make a visit of each group with enough support.
-
-    Votes from different passes of the robot are in different groups.
+    Returns:
+        Indices of scans, ascending; the first is 0.
     """
-    groups: list[list[_Vote]] = []
-    for vote in votes:
-        # Only recent groups are candidates: an earlier group is another pass of the place.
-        for group in groups[:-4:-1]:
-            last = track.way[vote.scan] - track.way[group[-1].scan]
-            if last < scale.radius and math.dist(vote.middle, _middle(group)) < SAME * scale.radius:
-                group.append(vote)
-                break
-        else:
-            groups.append([vote])
-    found = []
-    for group in groups:
-        middle = _middle(group)
-        begin, end = _stay(track, middle, group[len(group) // 2].scan, scale.radius)
-        near = [
-            i
-            for i in asked
-            if begin <= i <= end and math.dist(track.poses[i, :2], middle) < ASKED * scale.radius
-        ]
-        support = sum(vote.scan in near for vote in group) / max(len(near), 1)
-        scan = begin + int(np.hypot(*(track.poses[begin : end + 1, :2] - middle).T).argmin())
-        if (
-            len(group) >= VOTES
-            and support >= AGREED
-            and math.dist(track.poses[scan, :2], middle) < PASSING * scale.radius
-        ):
-            found.append(Visit(scan, middle, begin, end, support=support))
-    return sorted(found, key=lambda visit: visit.scan)
-
-
-def _middle(group: list[_Vote]) -> Array:
-    return np.asarray(np.median([vote.middle for vote in group], axis=0))
-
-
-def _stay(track: Track, middle: Array, scan: int, radius: float) -> tuple[int, int]:
-    """The first and last scan of a stay at a place, around a scan at that place.
-
-    The stay extends from the given scan to both sides, as long as the next scan is within the
-    radius of the middle or nearer to the middle than the scan before.
-    """
-    near = np.hypot(*(track.poses[:, :2] - middle).T)
-    begin = end = scan
-    while begin > 0 and (near[begin - 1] < radius or near[begin - 1] < near[begin]):
-        begin -= 1
-    while end < len(near) - 1 and (near[end + 1] < radius or near[end + 1] < near[end]):
-        end += 1
-    return begin, end
-
-
-def _one_for_each_pass(found: list[Visit], scale: Scale) -> list[Visit]:
-    """Merge consecutive visits whose middles are too close for two places.
-
-    The visit with the largest support times length is kept, and covers the stays of all.
-    """
-    kept: list[Visit] = []
-    for visit in found:
-        if kept and math.dist(kept[-1].middle, visit.middle) < PASSING * scale.radius:
-            last = kept[-1]
-            best = max((last, visit), key=lambda one: (one.end - one.begin) * one.support)
-            kept[-1] = replace(
-                best, begin=min(last.begin, visit.begin), end=max(last.end, visit.end)
-            )
-        else:
-            kept.append(visit)
+    kept = [0]
+    for i, way in enumerate(track.way):
+        if way - track.way[kept[-1]] >= every:
+            kept.append(i)
     return kept
 
 
-def _with_turnings(found: list[Visit], track: Track, scale: Scale) -> list[Visit]:
+def _visits_of_span(log: RobotLog, track: Track, width: float) -> list[Visit]:
+    """Find the visits in a log whose track is unbroken."""
+    asked = np.array(milestones(track, EVERY))
+    maps = LocalMaps(log.scans, track, WINDOW)
+    chains = _chains(_seen_at(maps, track, int(i), width) for i in asked)
+    found = [
+        visit
+        for chain in chains
+        if len(chain.sightings) > 1
+        for visit in _passes(chain, track, asked)
+    ]
+    found = _one_for_each_pass(sorted(found, key=lambda visit: visit.scan))
+    return _one_for_each_stay(
+        [_with_gateways(visit, track) for visit in _with_turnings(found, track)]
+    )
+
+
+def _seen_at(maps: LocalMaps, track: Track, scan: int, width: float) -> list[Junction]:
+    """The junctions near the robot in the local map of a scan, the largest first."""
+    here = track.poses[scan, :2]
+    found = junctions(maps.around(scan, here, HALF), width / 2)
+    near = [junction for junction in found if math.dist(junction.middle, here) <= SEEN]
+    return sorted(near, key=lambda junction: -junction.radius)
+
+
+def _chains(seen: Iterator[list[Junction]]) -> list[_Chain]:
+    """Chain the junctions that successive milestones see.
+
+    Args:
+        seen: The junctions of each milestone, the largest first.
+    """
+    chains: list[_Chain] = []
+    for milestone, found in enumerate(seen):
+        open_chains = [chain for chain in chains if milestone - chain.last <= GAP]
+        for junction in found:
+            near = [
+                (far, number)
+                for number, chain in enumerate(open_chains)
+                if chain.last < milestone and (far := _distance(chain, junction)) is not None
+            ]
+            if near:
+                chain = open_chains[min(near)[1]]
+            else:
+                chain = _Chain()
+                chains.append(chain)
+            chain.sightings.append(_Sighting(milestone, junction))
+    return chains
+
+
+def _distance(chain: _Chain, junction: Junction) -> float | None:
+    """The distance of a junction from a chain in metres; None if it is too far for one place."""
+    far = math.dist(chain.middle(RECENT), junction.middle)
+    near = max(SAME, SHARE * min(chain.radius(RECENT), junction.radius))
+    return far if far < near else None
+
+
+def _passes(chain: _Chain, track: Track, asked: Array) -> Iterator[Visit]:
+    """Make a visit of each time that the robot drives through the disc of a chain.
+
+    Args:
+        chain: The sightings.
+        track: Trajectory of the robot.
+        asked: (n,) the scans of the milestones.
+    """
+    way, positions = track.way, track.poses[:, :2]
+    first = max(int(np.searchsorted(way, way[asked[chain.first]] - GAP * EVERY)), 0)
+    last = int(np.searchsorted(way, way[asked[chain.last]] + GAP * EVERY, side="right"))
+    middle, radius = chain.middle(), chain.radius()
+    far = np.hypot(*(positions[first:last] - middle).T)
+    for begin, end in _stays(far, max(PASSING, radius)):
+        scan = first + begin + int(far[begin : end + 1].argmin())
+        near = {
+            number
+            for number in np.flatnonzero(np.abs(way[asked] - way[scan]) <= BESIDE)
+            if math.dist(positions[asked[number]], middle) < SEEN - 0.5
+        }
+        mine = [sighting for sighting in chain.sightings if sighting.milestone in near]
+        if mine and len(mine) >= AGREED * len(near):
+            yield Visit(
+                scan,
+                _middle(mine),
+                first + begin,
+                first + end,
+                radius,
+                _ways(mine, radius),
+                support=len(mine) / len(near),
+            )
+
+
+def _stays(far: Array, radius: float) -> Iterator[tuple[int, int]]:
+    """Find the parts of a trajectory that are in a disc.
+
+    Args:
+        far: (n,) distance from the middle of the disc in metres.
+        radius: Radius of the disc in metres.
+
+    Yields:
+        The first and the last index of each part. The robot stays until it is LEFT metres outside.
+    """
+    begin = None
+    for i, distance in enumerate(far.tolist()):
+        if begin is None and distance <= radius:
+            begin = i
+        elif begin is not None and distance > radius + LEFT:
+            yield begin, i
+            begin = None
+    if begin is not None:
+        yield begin, len(far) - 1
+
+
+def _ways(sightings: Sequence[_Sighting], radius: float) -> tuple[Way, ...]:
+    """The ways out of a place that its sightings show; sure if half of the sightings show them."""
+    groups: list[list[float]] = []
+    for sighting in sightings:
+        for bearing in _bearings(sighting.junction, radius):
+            near = [group for group in groups if apart(_mean(group), bearing) < MERGED]
+            if near:
+                min(near, key=lambda group: apart(_mean(group), bearing)).append(bearing)
+            else:
+                groups.append([bearing])
+    ways = [Way(_mean(group), len(group) >= AGREED * len(sightings)) for group in groups]
+    return tuple(sorted(ways, key=lambda way: way.bearing))
+
+
+def _mean(bearings: Sequence[float]) -> float:
+    """The mean direction of bearings, in radians."""
+    return float(np.angle(np.exp(1j * np.asarray(bearings)).sum()))
+
+
+def _bearings(junction: Junction, radius: float) -> Iterator[float]:
+    """The directions, in radians, in which the branches of a junction cross its disc."""
+    for branch in junction.branches:
+        far = np.hypot(*(branch - junction.middle).T)
+        outside = np.flatnonzero(far >= max(radius, SMALL) + RIM)
+        x, y = branch[outside[0] if len(outside) else -1] - junction.middle
+        yield math.atan2(y, x)
+
+
+def _one_for_each_pass(found: Sequence[Visit]) -> list[Visit]:
+    """Keep one of successive visits that overlap and are too close for two places.
+
+    The visit with the largest support times radius is kept.
+    """
+    kept: list[Visit] = []
+    for visit in found:
+        last = kept[-1] if kept else None
+        if last is None or not _overlap(last, visit):
+            kept.append(visit)
+        elif visit.support * visit.radius > last.support * last.radius:
+            kept[-1] = replace(visit, begin=min(visit.begin, last.begin))
+    return kept
+
+
+def _overlap(first: Visit, second: Visit) -> bool:
+    """Check whether two successive visits are to one place."""
+    return _are_near(first, second) and second.begin <= first.end + 2
+
+
+def _are_near(first: Visit, second: Visit) -> bool:
+    near = max(SAME, SHARE * max(first.radius, second.radius))
+    return math.dist(first.middle, second.middle) < near
+
+
+def _one_for_each_stay(found: Sequence[Visit]) -> list[Visit]:
+    """Join successive visits to one place: the robot left its disc, but went to no other place."""
+    kept: list[Visit] = []
+    for visit in found:
+        last = kept[-1] if kept else None
+        if last is None or not _are_near(last, visit):
+            kept.append(visit)
+        else:
+            ways = list(last.ways)
+            left = None if visit.left is None else _taken(ways, visit.ways[visit.left].bearing)
+            kept[-1] = _in_order(replace(last, end=visit.end, ways=tuple(ways), left=left))
+    return kept
+
+
+def _with_turnings(found: Sequence[Visit], track: Track) -> list[Visit]:
     """Add a visit at each point far from other visits where the robot turned around."""
-    positions, way = track.poses[:, :2], track.way
-    # Compare the direction of motion before and after each scan, over a third of the radius.
-    stride = scale.radius / 3
-    turned: list[tuple[float, int]] = []
-    for i in range(len(way)):
-        before, after = np.searchsorted(way, way[i] - stride), np.searchsorted(way, way[i] + stride)
-        if before > 0 or way[i] >= stride:
-            if after >= len(way):
-                break
-            there, back = positions[i] - positions[before], positions[after] - positions[i]
-            if min(math.hypot(*there), math.hypot(*back)) > stride / 2:
-                angle = apart(math.atan2(there[1], there[0]), math.atan2(back[1], back[0]))
-                if angle > REVERSED:
-                    turned.append((angle, i))
     visits = list(found)
     # Begin with the sharpest turn. Other turns near it belong to the same turning point.
-    for _, i in sorted(turned, reverse=True):
+    for _, i in sorted(_turns(track), reverse=True):
         if all(
-            math.dist(visit.middle, positions[i]) > scale.radius
-            for visit in visits
-            if abs(way[visit.scan] - way[i]) < 3 * scale.radius
+            abs(track.way[visit.scan] - track.way[i]) > max(ALONE, visit.radius) for visit in visits
         ):
-            begin, end = _stay(track, positions[i], i, scale.radius / 2)
-            visits.append(Visit(i, positions[i], begin, end, support=0.0))
+            visits.append(Visit(i, track.poses[i, :2].copy(), i, i, support=0.0))
     return sorted(visits, key=lambda visit: visit.scan)
 
 
-def _with_bends(found: list[Visit], track: Track, scale: Scale) -> list[Visit]:
-    """Add a visit between two visits if the robot turned back or changed direction between them.
-
-    Then a path between two neighbouring places leads straight on.
-    """
-    positions = track.poses[:, :2]
-    visits: list[Visit] = []
-    for visit in found:
-        if visits:
-            last = visits[-1]
-            went, came = (
-                _crossing(track, last, scale.radius, 1),
-                _crossing(track, visit, scale.radius, -1),
-            )
-            if went is not None and came is not None and visit.begin > last.end:
-                directions = went - last.middle, visit.middle - came
-                turned = apart(*(math.atan2(y, x) for x, y in directions))
-                between = positions[last.end : visit.begin + 1]
-                # The robot turned where it was farthest from the straight line between the two
-                # places. If it came back, it turned where it was farthest from both places.
-                line = visit.middle - last.middle
-                length = math.hypot(*line)
-                off = np.hypot(*(between - last.middle).T) + np.hypot(*(between - visit.middle).T)
-                if turned < REVERSED and length > 0:
-                    off = np.abs((between - last.middle) @ np.array([-line[1], line[0]])) / length
-                i = last.end + int(off.argmax())
-                far = min(math.dist(positions[i], one.middle) for one in (last, visit))
-                if turned > BENT and far > scale.radius:
-                    begin, end = _stay(track, positions[i], i, scale.radius / 2)
-                    visits.append(
-                        Visit(
-                            i,
-                            positions[i],
-                            max(begin, last.end + 1),
-                            min(end, visit.begin - 1),
-                            support=0.0,
-                        )
-                    )
-        visits.append(visit)
-    return visits
+def _turns(track: Track) -> Iterator[tuple[float, int]]:
+    """The scans at which the robot turned around, each after the angle in radians."""
+    positions, way = track.poses[:, :2], track.way
+    for i in range(int(np.searchsorted(way, STRIDE)), len(way)):
+        before, after = np.searchsorted(way, way[i] - STRIDE), np.searchsorted(way, way[i] + STRIDE)
+        if after >= len(way):
+            return
+        there, back = positions[i] - positions[before], positions[after] - positions[i]
+        if min(math.hypot(*there), math.hypot(*back)) > STRIDE / 3:
+            angle = apart(math.atan2(there[1], there[0]), math.atan2(back[1], back[0]))
+            if angle > REVERSED:
+                yield angle, i
 
 
-def _described(visit: Visit, log: RobotLog, track: Track, scale: Scale, maps: LocalMaps) -> Visit:
-    """Complete a visit: its exits, the exits that the robot took, and the direction of walls."""
-    patch = maps.around(visit.scan, visit.middle, scale.half)
-    ways = _ways(patch, visit.middle, scale)
-    ways, arrived = _taken(ways, _crossing(track, visit, scale.radius, -1), visit.middle)
-    ways, left = _taken(ways, _crossing(track, visit, scale.radius, 1), visit.middle)
-    order = sorted(range(len(ways)), key=lambda k: ways[k].bearing)
-    axis, straight = _walls(log, track, visit)
-    return replace(
-        visit,
-        ways=tuple(ways[k] for k in order),
-        arrived=None if arrived is None else order.index(arrived),
-        left=None if left is None else order.index(left),
-        axis=axis,
-        straight=straight,
-    )
+def _with_gateways(visit: Visit, track: Track) -> Visit:
+    """Complete a visit by the ways that the robot took: those by which it crossed the disc."""
+    ways, numbers = list(visit.ways), []
+    for side in (-1, 1):
+        bearing = _crossing(track, visit, side)
+        numbers.append(None if bearing is None else _taken(ways, bearing))
+    return _in_order(replace(visit, ways=tuple(ways), arrived=numbers[0], left=numbers[1]))
 
 
-def _ways(patch: Patch, middle: Array, scale: Scale) -> list[Way]:
-    """The exits seen from the middle of a place: first certain, then uncertain gateways."""
-    sure = _outlook(patch, middle, scale.gateway, scale.radius)
-    ways = [Way(bearing) for bearing in (sure.bearings if sure else ())]
-    doubtful = _outlook(patch, middle, scale.doubtful, scale.radius)
-    if doubtful is None:
-        return ways
-    for bearing in (*doubtful.bearings, *_unseen(patch, doubtful, scale)):
-        if all(apart(bearing, way.bearing) > MERGED for way in ways):
-            ways.append(Way(bearing, sure=False))
-    return ways
+def _in_order(visit: Visit) -> Visit:
+    """The visit with its ways in counterclockwise order."""
+    order = sorted(range(len(visit.ways)), key=lambda k: visit.ways[k].bearing)
+    arrived, left = (None if k is None else order.index(k) for k in (visit.arrived, visit.left))
+    ways = tuple(visit.ways[k] for k in order)
+    return replace(visit, ways=ways, arrived=arrived, left=left)
 
 
-def _start(patch: Patch, position: Array, width: float) -> tuple[Bools, Cell | None]:
-    """The mask of drivable cells for a width, and the drivable cell nearest to a position.
-
-    The cell is None if it is more than ASTRAY metres away.
-    """
-    open_cells = patch.drivable(width)
-    return open_cells, nearest(open_cells, patch.cell(position), ASTRAY)
-
-
-def _outlook(patch: Patch, middle: Array, width: float, radius: float) -> Outlook | None:
-    """The exits of at least this width, seen from a middle; None if no drivable cell is near."""
-    open_cells, here = _start(patch, middle, width)
-    return None if here is None else outlook(open_cells, here, radius)
+def _taken(ways: list[Way], bearing: float) -> int:
+    """Mark the way that the robot took as sure, or add it, and return its index."""
+    near = [k for k in range(len(ways)) if apart(ways[k].bearing, bearing) < MERGED]
+    if not near:
+        ways.append(Way(bearing))
+        return len(ways) - 1
+    k = min(near, key=lambda k: apart(ways[k].bearing, bearing))
+    ways[k] = replace(ways[k], sure=True)
+    return k
 
 
-def _unseen(patch: Patch, seen: Outlook, scale: Scale) -> list[float]:
-    """Bearings, in radians, at which drivable space borders on unobserved space.
-
-    A border counts if it is at least a gateway wide.
-    """
-    unknown = ~patch.free & ~patch.occupied
-    # Cells next to a wall also border on the unknown space behind the wall. So only cells away from
-    # walls count.
-    border = (
-        ndimage.binary_dilation(unknown, iterations=2)
-        & patch.free
-        & (patch.room > scale.doubtful / 2)
-    )
-    border &= ndimage.binary_dilation(
-        np.isfinite(seen.reached), iterations=round(scale.doubtful / CELL)
-    )
-    parts, count = ndimage.label(border, np.ones((3, 3), bool))
-    found = []
-    for k in range(1, count + 1):
-        cells = np.argwhere(parts == k)
-        if np.ptp(cells, axis=0).max() * CELL >= scale.gateway:
-            row, column = cells.mean(axis=0) - seen.middle
-            if math.hypot(row, column) * CELL > scale.gateway:
-                found.append(math.atan2(column, row))
-    return found
-
-
-def _crossing(track: Track, visit: Visit, radius: float, side: int) -> Array | None:
-    """The point (x, y) at which the robot crosses the radius of a place.
+def _crossing(track: Track, visit: Visit, side: int) -> float | None:
+    """The direction in radians in which the robot crosses the disc of a place.
 
     Args:
         track: Trajectory of the robot.
         visit: Visit to the place.
-        radius: Metres.
-        side: -1 for entering the place, 1 for leaving it.
+        side: -1 for entering the disc, 1 for leaving it.
 
     Returns:
-        Metres, in the frame of the track; None if the log begins or ends before that point.
+        None if the log begins or ends in the disc.
     """
-    positions = track.poses[:, :2]
-    i = visit.begin if side < 0 else visit.end
-    near = math.dist(positions[i], visit.middle)
-    last = 0 if side < 0 else len(positions) - 1
-    while near < 0.9 * radius:
-        if i == last:
-            return positions[i] if near > 0.5 * radius else None
+    i = visit.scan
+    while 0 <= i < len(track.poses):
+        x, y = track.poses[i, :2] - visit.middle
+        if math.hypot(x, y) >= max(visit.radius, SMALL) + RIM:
+            return math.atan2(y, x)
         i += side
-        near = math.dist(positions[i], visit.middle)
-    return np.asarray(positions[i])
-
-
-def _taken(ways: list[Way], crossing: Array | None, middle: Array) -> tuple[list[Way], int | None]:
-    """Mark the exit that the robot took as certain. Add one if none was seen in its direction.
-
-    Returns:
-        The exits, and the index of the exit that the robot took. The index is None if `crossing`,
-        the point where the robot crossed the radius, is None.
-    """
-    if crossing is None:
-        return ways, None
-    bearing = math.atan2(*(crossing - middle)[::-1])
-    k = min(range(len(ways)), key=lambda k: apart(ways[k].bearing, bearing), default=None)
-    if k is None or apart(ways[k].bearing, bearing) > 2 * MERGED:
-        return [*ways, Way(bearing)], len(ways)
-    return [replace(way, sure=True) if i == k else way for i, way in enumerate(ways)], k
-
-
-def _walls(log: RobotLog, track: Track, visit: Visit) -> tuple[float, float]:
-    """The main direction of the walls around a visit, and how well the walls agree with it.
-
-    Returns:
-        Radians modulo a quarter turn, and the agreement from 0 to 1.
-    """
-    # Angles that differ by quarter turns are equal after multiplication by four. So they can be
-    # averaged.
-    total, count = 0j, 0
-    for i in range(visit.begin, visit.end + 1):
-        _, normals = surfaces(log.scans[i])
-        angles = np.arctan2(normals[:, 1], normals[:, 0]) + track.poses[i, 2]
-        total += np.exp(4j * angles).sum()
-        count += len(angles)
-    return float(np.angle(total)) / 4, abs(total) / max(count, 1)
+    return None

@@ -1,7 +1,7 @@
 """Turns a robot's log into a trace: a step for each distinctive state (position and heading).
 
-The robot need not have stopped at distinctive states. If it passed a junction, corner or dead end,
-or turned around, the local map shows what it would have seen from the middle of the place. Kuipers
+The robot need not have stopped at distinctive states. If it passed a junction or turned around,
+the local map shows what it would have seen from the middle of the place. Kuipers
 & Beeson (2002) planned this: to localise without physical motion to the actual location.
 """
 
@@ -19,11 +19,10 @@ import numpy as np
 from perception.errors import ImageWarning, LogError
 from perception.places import jumps
 from perception.places.agreement import disagreement
-from perception.places.distinctive import Visit, find_visits
-from perception.places.doors import are_frequent, find_doors, is_wide, visits_of
-from perception.places.scale import Scale, suggested
+from perception.places.distinctive import WIDTH, find_visits
 from perception.places.tracing import to_trace
 from perception.places.track import Track, follow, turned_wrongly
+from perception.places.visits import Visit
 from perception.readers.scans import RobotLog
 from perception.reciprocal import ReciprocalTransformer
 from perception.views import ViewClusterer
@@ -51,51 +50,37 @@ class Imported:
         trace: One step for each distinctive state that the robot passed, with view, image, star
             (the exits as directions) and displacement from the previous step.
         track: Trajectory of the robot.
-        scale: Scale of the building.
+        width: Width of the robot in metres.
         visits: Stays at distinctive places, in order.
-        seconds: Processor time in seconds, by stage: track, scale, places, trace, views.
+        seconds: Processor time in seconds, by stage: track, places, trace, views.
         notes: Sentences on suspicious features of the odometry and the track.
     """
 
     trace: Trace
     track: Track
-    scale: Scale
+    width: float
     visits: tuple[Visit, ...]
     seconds: Mapping[str, float]
     notes: tuple[str, ...] = ()
 
 
-def import_log(
-    log: RobotLog,
-    gateway: float | None = None,
-    radius: float | None = None,
-    name: str | None = None,
-    doors: bool | None = None,
-) -> Imported:
+def import_log(log: RobotLog, width: float = WIDTH, name: str | None = None) -> Imported:
     """Import a log as a trace.
 
     Corrected poses become the truth for evaluation; nothing else reads them.
 
     Args:
         log: The log of one drive.
-        gateway: Smallest width of a gateway (a way out of a place) in metres; None estimates it
-            from the log.
-        radius: Distance in metres that an exit must lead from the middle of a place; None estimates
-            it.
+        width: Width of the robot in metres. Narrower parts of the free space are no ways.
         name: Name of the trace.
-        doors: Whether places are the doors that the robot drives through, instead of forks and
-            bends of corridors. None lets the log decide, unless `gateway` or `radius` is given:
-            these describe corridors, so places are forks and bends.
 
     Returns:
-        The trace, and the trajectory, scale, visits and notes that it was made from.
+        The trace, and the trajectory, visits and notes that it was made from.
 
     Raises:
         LogError: The robot passed no distinctive place or hardly moved, or the scans do not match.
     """
     seconds: dict[str, float] = {}
-    if doors is None and (gateway is not None or radius is not None):
-        doors = False
     if not any(((scan.ranges > 0) & (scan.ranges < scan.laser.reach)).any() for scan in log.scans):
         raise LogError(
             f"{named(log.source)}: expected scans that meet walls, got {len(log)} in which no "
@@ -115,34 +100,18 @@ def import_log(
             f"{named(log.source)}: expected a robot that drives, got a drive of "
             f"{track.way[-1]:.1f} m; take a longer log{_besides(notes)}"
         )
-    with _timed(seconds, "scale"):
-        found = suggested(log.scans, track)
-        scale = replace(
-            found,
-            gateway=found.gateway if gateway is None else gateway,
-            radius=found.radius if radius is None else radius,
-        )
     with _timed(seconds, "places"):
-        passed = find_doors(log, track) if doors or (doors is None and is_wide(scale)) else ()
-        scale = replace(scale, doors=are_frequent(passed, track) if doors is None else doors)
-        visits = visits_of(track, passed) if scale.doors else find_visits(log, track, scale)
-    if not visits and scale.doors:
-        raise LogError(
-            f"{named(log.source)}: expected a way through doors, got {track.way[-1]:.0f} m "
-            f"without any; look for junctions instead (--places junctions){_besides(notes)}"
-        )
+        visits = find_visits(log, track, width)
     if not visits:
         raise LogError(
-            f"{named(log.source)}: expected a way past junctions, corners or dead ends, got "
-            f"{track.way[-1]:.0f} m without any at a radius of "
-            f"{scale.radius:g} m; take a longer log, or a smaller radius "
-            f"(--set radius){_besides(notes)}"
+            f"{named(log.source)}: expected a way past junctions or turning points, got "
+            f"{track.way[-1]:.0f} m without any; take a longer log{_besides(notes)}"
         )
     with _timed(seconds, "trace"):
-        trace = to_trace(log, track, scale, visits, name)
+        trace = to_trace(log, track, visits, name)
     with _timed(seconds, "views"):
         trace = with_views(trace)
-    return Imported(trace, track, scale, visits, seconds, notes)
+    return Imported(trace, track, width, visits, seconds, notes)
 
 
 def tracked(log: RobotLog) -> tuple[RobotLog, Track, tuple[str, ...]]:

@@ -32,9 +32,6 @@ SIGHT = 12.0
 # A cell is occupied if at least this share of the scans that looked there hit something. So passing
 # people soon disappear.
 OCCUPIED = 0.25
-# Cells per step of a wave that alternates between four and eight neighbours, averaged over all
-# directions.
-STRIDE = 1.08
 
 _EIGHT = np.ones((3, 3), bool)
 
@@ -59,56 +56,9 @@ class Patch:
     corner: Array
 
     @cached_property
-    def clearance(self) -> Array:
-        """The distance from each cell to the nearest cell not free: (rows, columns), metres."""
-        return np.asarray(ndimage.distance_transform_edt(np.pad(self.free, 1))[1:-1, 1:-1]) * CELL
-
-    @cached_property
     def room(self) -> Array:
         """The distance from each cell to the nearest occupied cell: (rows, columns), metres."""
         return np.asarray(ndimage.distance_transform_edt(~self.occupied)) * CELL
-
-    @cached_property
-    def _met(self) -> Bools:
-        """Mask of cells at which a ray stops: occupied cells and their next neighbours."""
-        return np.asarray(ndimage.binary_dilation(self.occupied, np.ones((2, 2), bool)))
-
-    def free_along(self, begin: Array, directions: Array, most: float) -> Array:
-        """Measure the free distance from a position in several directions.
-
-        Args:
-            begin: (x, y) in metres, in the frame of the track.
-            directions: (..., 2) unit vectors.
-            most: Largest distance in metres.
-
-        Returns:
-            (...) metres to the first obstacle in each direction, at most `most`.
-        """
-        far = np.arange(0.0, most, CELL / 2)
-        cells = np.rint(
-            (begin + far[:, None] * directions[..., None, :] - self.corner) / CELL
-        ).astype(int)
-        met = self._met[cells[..., 0], cells[..., 1]]
-        return np.where(met.any(axis=-1), far[met.argmax(axis=-1)], most)
-
-    def drivable(self, width: float) -> Bools:
-        """Find the cells in which the middle of a vehicle can be.
-
-        Args:
-            width: Width of the vehicle in metres.
-
-        Returns:
-            Mask of the cells with enough room, and of those on the robot's own trail.
-        """
-        return np.asarray(
-            (self.clearance >= width / 2)
-            | ndimage.binary_dilation(self.trail, _EIGHT, iterations=2)
-        )
-
-    def cell(self, position: Array | Sequence[float]) -> Cell:
-        """Compute the cell (row, column) of a position (x, y); it may lie outside the patch."""
-        row, column = np.rint((np.asarray(position) - self.corner) / CELL).astype(int)
-        return int(row), int(column)
 
     def position(self, cell: Array | Cell) -> Array:
         """Compute the centre (x, y) of a cell in metres, in the frame of the track."""
@@ -233,39 +183,3 @@ class LocalMaps:
         """The indices in the torus of the cells of positions, ascending and each once."""
         rows, columns = (np.rint(values / CELL).astype(np.int64) % self._side for values in (x, y))
         return np.unique(rows * self._side + columns)
-
-
-def distances(open_cells: Bools, seeds: Bools, limit: float) -> Array:
-    """Compute the distance from each cell to the nearest seed, along open cells.
-
-    Waves spread from the seeds. They are octagons, not circles, so distances are off by up to 4 %.
-
-    Args:
-        open_cells: Mask of the cells that may be crossed.
-        seeds: Mask of the cells to start from.
-        limit: Largest distance in metres.
-
-    Returns:
-        (rows, columns) metres; infinite for cells beyond the limit, and for cells that cannot be
-        reached.
-    """
-    padded = np.pad(open_cells, 1)
-    width = padded.shape[1]
-    unreached = padded.reshape(-1)
-    wave = np.flatnonzero(np.pad(seeds, 1).reshape(-1) & unreached)
-    found = np.full(unreached.shape, np.inf)
-    found[wave], unreached[wave] = 0.0, False
-    last = np.empty(unreached.shape, np.int64)
-    four = np.array([-width, -1, 1, width])
-    eight = np.array([-width - 1, -width, -width + 1, -1, 1, width - 1, width, width + 1])
-    for count in range(math.ceil(limit / (STRIDE * CELL))):
-        cells = (wave[:, None] + (eight if count % 2 else four)).reshape(-1)
-        cells = cells[unreached[cells]]
-        unreached[cells] = False
-        numbers = np.arange(len(cells))
-        last[cells] = numbers
-        wave = cells[last[cells] == numbers]  # Keeps each cell once, faster than sorting.
-        if not len(wave):
-            break
-        found[wave] = (count + 1) * STRIDE * CELL
-    return found.reshape(padded.shape)[1:-1, 1:-1]

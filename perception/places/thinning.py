@@ -118,7 +118,7 @@ def thinned(mask: Bools, distance: Array) -> Graph:
     # The import takes a while, and only logs need it.
     from skimage.morphology import skeletonize
 
-    lines = np.asarray(skeletonize(mask), dtype=bool)
+    lines = np.asarray(skeletonize(mask), dtype=np.bool_)
     neighbours = ndimage.convolve(lines.astype(int), _EIGHT.astype(int), mode="constant") - 1
     forks, count = ndimage.label(lines & (neighbours > 2), _EIGHT)
     nodes = {k: _junction(np.argwhere(forks == k), distance) for k in range(1, count + 1)}

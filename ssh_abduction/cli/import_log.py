@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
 # Repeats perception.readers.logs, whose import would delay all verbs.
 FORMATS = ("carmen", "g2o", "ros1", "ros2", "mcap")
-PLACES = ("junctions", "doors")
+# Repeats perception.places.distinctive.
+WIDTH = 0.5
 # Endings of file names: first those of compression, then those of formats.
 ENDINGS = (
     ("gz", "bz2", "xz", "zst", "zstd", "lz4"),
@@ -48,7 +49,7 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def add_reading(parser: Parser) -> None:
-    """Add the options that say how to read a log, and the scale of the building."""
+    """Add the options that say how to read a log, and how wide the robot is."""
     group = parser.add_argument_group("reading logs")
     group.add_argument(
         "--format", choices=FORMATS, help="format of the log (default: guessed from its content)"
@@ -63,12 +64,12 @@ def add_reading(parser: Parser) -> None:
         ),
     )
     group.add_argument(
-        "--places",
-        choices=PLACES,
+        "--width",
+        type=metres,
+        metavar="METRES",
         help=(
-            "what counts as a place: points where ways part or bend (junctions), or doors that "
-            "the robot drives through (doors). Default: doors if most of the drive is through "
-            "wide rooms and many doors, and neither gateway nor radius is set; else junctions"
+            "width of the robot. Narrower parts of the free space are no ways for it (default: "
+            f"{WIDTH:g})"
         ),
     )
     parser.add_setting(
@@ -104,19 +105,6 @@ def add_reading(parser: Parser) -> None:
             "neighbouring beams are long, else unknown)"
         ),
         choices=MEANINGS,
-    )
-    parser.add_setting(
-        "gateway",
-        "the minimum width of a gateway, a way out of a place (default: chosen by the log)",
-        type=metres,
-        metavar="METRES",
-    )
-    parser.add_setting(
-        "radius",
-        "the minimum distance that a way out leads from the centre of a place (default: chosen by "
-        "the log)",
-        type=metres,
-        metavar="METRES",
     )
 
 
@@ -179,45 +167,17 @@ def run(options: argparse.Namespace) -> int:
             f"{named(options.output)}: cannot write the trace: its folder is not there; make it "
             "first"
         )
-    doors = doors_of(options)
     log = read(options.log, options)
     warn(log.warnings)
-    done = import_log(log, options.gateway, options.radius, named_after(options.log), doors)
+    done = import_log(log, options.width or WIDTH, named_after(options.log))
     warn(done.notes)
-    scale = done.scale
-    places = (
-        "doors"
-        if scale.doors
-        else (
-            f"distinctive places at a radius of {scale.radius:g} m, gateways from "
-            f"{scale.gateway:g} m"
-        )
-    )
     said = (
         f"{counted(len(log), 'scans')}, {done.track.way[-1]:.0f} m: "
-        f"{counted(len(done.visits), 'visits')} to {places}; {counted(len(done.trace), 'steps')}"
+        f"{counted(len(done.visits), 'visits')} to distinctive places; "
+        f"{counted(len(done.trace), 'steps')}"
     )
     write(done.trace, options.output, said)
     return 0
-
-
-def doors_of(options: argparse.Namespace) -> bool | None:
-    """Whether --places asks for doors; None if the option is missing, so that the log decides.
-
-    Raises:
-        AbductionError: Doors are asked for together with a gateway or radius, which is for
-            junctions.
-    """
-    if options.places is None:
-        return None
-    doors = bool(options.places == "doors")
-    for name, given in (("gateway", options.gateway), ("radius", options.radius)):
-        if doors and given is not None:
-            raise AbductionError(
-                f"{name}: expected none with --places doors, got {given:g}; it is about ways that "
-                "part, so leave it out, or ask for junctions"
-            )
-    return doors
 
 
 def named_after(path: str) -> str:

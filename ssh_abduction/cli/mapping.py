@@ -20,7 +20,7 @@ from ssh_abduction.checker.joins import sentence_of
 from ssh_abduction.cli import EXIT_ERROR, unwritten
 from ssh_abduction.cli.cluster_jobs import answers_on_cluster
 from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.import_log import doors_of, named_after, reading_of
+from ssh_abduction.cli.import_log import WIDTH, named_after, reading_of
 from ssh_abduction.cli.jobs import StopFlag, answers_here, final_code, in_a_line
 from ssh_abduction.cli.options import choices_of, theory_of
 from ssh_abduction.cli.outcome import exit_code, on_ctrl_c, warn
@@ -71,10 +71,7 @@ class MapQuestion:
         theory: The theory; None to choose it for each log.
         choices: The fields of the theory that the user set, by name.
         reading: The arguments of `read_log`, by name.
-        gateway: The minimum width of a gateway, in metres; None to choose it by the log.
-        radius: How far a way out must lead from the centre of a place, in metres; None to choose it
-            by the log.
-        doors: Whether doors are the places; None to decide by the log.
+        width: The width of the robot, in metres.
         limit: Seconds for the search for minimal maps; None for the default of `map_log`.
         maps: The largest number of maps to list; 0 for all.
         ladder: Whether to compute what each kind of evidence contributes.
@@ -83,9 +80,7 @@ class MapQuestion:
     theory: Theory | None
     choices: dict[str, Any]
     reading: dict[str, Any]
-    gateway: float | None
-    radius: float | None
-    doors: bool | None
+    width: float
     limit: float | None
     maps: int
     ladder: bool
@@ -99,9 +94,7 @@ class MapQuestion:
             "theory": theory,
             "choices": {name: laid_over[name] for name in self.choices},
             "reading": self.reading,
-            "gateway": self.gateway,
-            "radius": self.radius,
-            "doors": self.doors,
+            "width": self.width,
             "limit": self.limit,
             "maps": self.maps,
             "ladder": self.ladder,
@@ -197,9 +190,7 @@ class MapQuestion:
                     log,
                     self.theory,
                     choices=self.choices,
-                    gateway=self.gateway,
-                    radius=self.radius,
-                    doors=self.doors,
+                    width=self.width,
                     name=named_after(path),
                     time_limit=self.limit,
                     max_maps=self.maps or None,
@@ -295,9 +286,7 @@ def run(options: argparse.Namespace) -> int:
     question = MapQuestion(
         *_theory(options),
         reading_of(options),
-        options.gateway,
-        options.radius,
-        doors_of(options),
+        options.width or WIDTH,
         options.time_limit,
         options.maps,
         options.ladder,

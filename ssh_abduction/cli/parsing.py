@@ -17,6 +17,16 @@ REPLACED = {
     "theory-of": "theory",
     "localize": "run",
 }
+# Options that have no successor, by the option that a verb has now instead. They have no effect.
+# The sentence says why.
+WITHDRAWN = dict.fromkeys(
+    ("places", "gateway", "radius"),
+    (
+        "--width",
+        "places are the junctions of the free space and the points where the robot turned around; "
+        "the only length to set is the width of the robot, --width METRES",
+    ),
+)
 OTHER_VERBS = {"localize": "localise"}
 DRAWN = ("dot", "graphml", "svg")  # options of `show` in version 0.1.0, now `export --to`
 
@@ -225,7 +235,8 @@ class Parser(argparse.ArgumentParser):
             word = rest.pop(0)
             if word == "--":
                 return [*done, word, *rest]
-            done += verb._replacement(word, rest, notes) or [word]
+            replaced = verb._replacement(word, rest, notes)
+            done += [word] if replaced is None else replaced
         return done
 
     def _replacement(self, word: str, rest: list[str], notes: list[str]) -> list[str] | None:
@@ -239,6 +250,8 @@ class Parser(argparse.ArgumentParser):
         Returns:
             The words of the new form; None if `word` is no such option.
         """
+        if self._drops(word, rest, notes):
+            return []
         flag, equals, value = word.partition("=")
         name = flag[2:].replace("-", "_")
         if not flag.startswith("--") or flag in self.names:
@@ -259,6 +272,27 @@ class Parser(argparse.ArgumentParser):
             return ["--set", f"{name}={value}"]
         notes.append(_note(flag, f"--{new}"))
         return [f"--{new}={value}"]
+
+    def _drops(self, word: str, rest: list[str], notes: list[str]) -> bool:
+        """Drop an option that has no successor, with its value.
+
+        Args:
+            word: The option, or --set, perhaps with "=VALUE".
+            rest: The words behind it. The value, or NAME=VALUE behind --set, is removed.
+            notes: Gets a sentence if the option is dropped.
+
+        Returns:
+            Whether `word` is such an option.
+        """
+        is_set = word == "--set" and bool(rest)
+        flag, equals, _ = (f"--{rest[0]}" if is_set else word).partition("=")
+        now, why = WITHDRAWN.get(flag[2:].replace("-", "_"), ("", ""))
+        if not flag.startswith("--") or now not in self.names or flag in self.names:
+            return False
+        if is_set or (not equals and rest):
+            rest.pop(0)
+        notes.append(f"{printable(flag)} has no effect any more: {why}")
+        return True
 
     @property
     def verbs(self) -> Mapping[str, Parser]:

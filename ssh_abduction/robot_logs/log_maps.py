@@ -1,12 +1,9 @@
 """Find the minimal maps of a building from a robot's log, and make the files of its run folder.
 
-If the walls of a building meet at right angles, it is mapped by the topological theory with stars
-(a star is the set of openings seen at a place). In other buildings, openings are too often misread,
-and paths that bend have no defined sides. There the theory has neither stars nor sides, and
-displacements distinguish places. This theory is also used in two other cases:
-
-- Doors are the places. A path may then lead across a room in any direction.
-- No map fits the stars: the robot passed a junction unnoticed, or a star was misread.
+The default theory uses neither stars (a star is the set of ways out that are seen at a place) nor
+sides of paths. In real buildings a way out is too often misread, and paths that bend have no
+defined sides. Displacements distinguish places. A place may have two distinctive states in one
+direction, because the view is sometimes misread, too.
 """
 
 from __future__ import annotations
@@ -16,11 +13,12 @@ import json
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from statistics import median
 from typing import Any
 
+from perception.places.distinctive import WIDTH
 from perception.places.importing import Imported, import_log
 from perception.readers.scans import RobotLog
 from ssh_abduction.data.files import json_line
@@ -29,7 +27,7 @@ from ssh_abduction.page.html import view_page
 from ssh_abduction.robot_logs.log_report import report
 from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.runtime.logs import log_of
-from ssh_abduction.solver import Solution, Status, find_backbone
+from ssh_abduction.solver import Solution, find_backbone
 from ssh_abduction.theory.theory import Theory
 
 _log = log_of(__name__)
@@ -46,11 +44,6 @@ RUNG = 10.0
 SPEED = 0.5
 # At most this many minimal maps are listed. They are ranked by how well their loops close.
 MAPS = 300
-# A note, if no map fits the stars.
-NO_STARS = (
-    "No map fits the stars of the log: some star was misread, or a place was passed unnoticed. "
-    "So the log was mapped without stars and sides."
-)
 # A note, if somebody ended the run.
 INTERRUPTED = (
     "The run was interrupted: its map is the best one so far, "
@@ -60,8 +53,11 @@ INTERRUPTED = (
 # clock. It does not count as driving.
 GAP = 20.0
 
-# The theory for buildings where stars are unreliable.
-BARE = Theory.topological().replace(star="none", boundary="none")
+# The theory for logs. Stars and sides are unreliable there. So are views: a robot that faces one
+# way at one place may see two views. So a place may have two dstates in one direction of a path.
+BARE = Theory.topological().replace(
+    star="none", boundary="none", without=("one_dstate_per_course",)
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +93,7 @@ class LogMap:
 
     def to_dict(self) -> dict[str, Any]:
         """The contents of run.json as a dict: settings, counts, and the time of each stage."""
-        solution, scale, trace = self.solution, self.imported.scale, self.imported.trace
+        solution, trace = self.solution, self.imported.trace
         return {
             "format": "ssh-run",
             "version": 1,
@@ -110,8 +106,7 @@ class LogMap:
                 "damaged": len(self.log.damaged),
                 "notes": list(self.log.notes),
             },
-            "scale": asdict(scale),
-            "right_angles": trace.extra["right_angles"],
+            "width": self.imported.width,
             "theory": solution.theory.to_dict(),
             "notes": list(self.notes),
             "visits": len(self.imported.visits),
@@ -142,15 +137,6 @@ class LogMap:
         found["report.html"] = report(self.log, self.imported, solution, self.rungs, self.to_dict())
         found["run.json"] = f"{json.dumps(self.to_dict(), indent=2, ensure_ascii=False)}\n"
         return {name: text.encode() for name, text in found.items()}
-
-
-def theory_for(imported: Imported) -> Theory:
-    """Choose the theory for a building by its trace.
-
-    If the trace says that walls meet at right angles, it is Theory.topological(). Otherwise it is
-    BARE, which has neither stars nor sides.
-    """
-    return Theory.topological() if imported.trace.extra["right_angles"] else BARE
 
 
 def seconds_driven(log: RobotLog) -> float | None:
@@ -199,9 +185,7 @@ def map_log(
     theory: Theory | None = None,
     *,
     choices: Mapping[str, Any] | None = None,
-    gateway: float | None = None,
-    radius: float | None = None,
-    doors: bool | None = None,
+    width: float = WIDTH,
     name: str | None = None,
     time_limit: float | None = None,
     max_maps: int | None = MAPS,
@@ -215,15 +199,9 @@ def map_log(
 
     Args:
         log: The robot's log.
-        theory: The axioms. None chooses them by the log. If no map fits the chosen ones, the log is
-            mapped again without stars and sides, unless `choices` decide about these.
+        theory: The axioms. None is BARE, which has neither stars nor sides.
         choices: Values of fields of Theory, by name. They replace those of the theory.
-        gateway: The minimum width of a gateway in metres, as in perception.places.scale.Scale; None
-            chooses it by the log.
-        radius: How far a way out must lead from the centre of a place, in metres, as in
-            perception.places.scale.Scale; None chooses it by the log.
-        doors: Whether doors are the places, as in perception.places.importing.import_log; None
-            decides by the log.
+        width: The width of the robot in metres. Narrower parts of the free space are no ways.
         name: The name of the trace; None for no name.
         time_limit: Seconds for the search for minimal maps. None takes what the import leaves of a
             twentieth of the time that the robot drove, but at least 5.
@@ -239,12 +217,12 @@ def map_log(
     mapping = mapping or LogMapping()
 
     # 1. Trace: import the log.
-    imported = import_log(log, gateway, radius, name, doors)
+    imported = import_log(log, width, name)
     trace, seconds, notes = imported.trace, dict(imported.seconds), imported.notes
     _log.info("%d visits, %d steps", len(imported.visits), len(trace))
 
-    # 2. Theory and time, as they suit the log.
-    chosen = (theory or theory_for(imported)).replace(**choices or {})
+    # 2. Theory, and time as it suits the log.
+    chosen = (theory or BARE).replace(**choices or {})
     left = seconds_left(log, imported)
     allowed = time_limit
     if allowed is None:
@@ -257,16 +235,10 @@ def map_log(
             log, imported, solution, tuple(climbed), dict(seconds), allowed, said, interrupted
         )
 
-    # 3. Maps: solve the trace; without stars and sides if no map fits them.
+    # 3. Maps: solve the trace.
     mapping.tell = lambda: outcome(mapping.snapshot())
     begin = time.process_time()
     solution = mapping.solve(trace, chosen, time_limit=allowed, max_maps=max_maps)
-    may_relax = theory is None and not {"star", "boundary", "level"} & set(choices or ())
-    if solution.status is Status.UNSATISFIABLE and may_relax:
-        bare = BARE.replace(**choices or {})
-        if bare != chosen:
-            chosen, notes = bare, (*notes, NO_STARS)
-            solution = mapping.solve(trace, chosen, time_limit=allowed, max_maps=max_maps)
     mapping.tell = lambda: outcome(solution)
     seconds["maps"] = round(time.process_time() - begin, 3)
 

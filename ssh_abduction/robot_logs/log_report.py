@@ -262,25 +262,16 @@ def _faults(solution: Solution) -> str:
 
 def _settings(run: Mapping[str, Any]) -> str:
     """Make the table of the settings: what counts as a place, and the theory."""
-    scale = run["scale"]
     theory = ", ".join(
         f"{name} {value}"
         for name, value in run["theory"].items()
         if value not in (None, False, [], 0)
     )
-    if scale["doors"]:
-        told = "those that the robot drove through; a path leads across a room"
-        rows = [("places", "doors", told)]
-    else:
-        walls = "right angles" if run["right_angles"] else "any angles"
-        leads = "how far a way out must lead from the middle of a place"
-        rows = [
-            ("places", "junctions, corners, dead ends", "where ways part or bend"),
-            ("gateway", f"{scale['gateway']:g} m", "the least width of a way out that counts"),
-            ("radius", f"{scale['radius']:g} m", leads),
-            ("walls", walls, "as the ways that the robot took suggest"),
-        ]
-    rows.append(("theory", theory, "the axioms, and the choices in them"))
+    rows = [
+        ("places", "junctions, turning points", "where the ways of the free space part"),
+        ("width", f"{run['width']:g} m", "of the robot; narrower parts are no ways"),
+        ("theory", theory, "the axioms, and the choices in them"),
+    ]
     return _table(("", "", ""), rows)
 
 

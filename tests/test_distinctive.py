@@ -1,0 +1,152 @@
+"""Distinctive places: junctions of skeletons, turning points, and the ways out of a place."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from perception.places.distinctive import _one_for_each_stay, find_visits
+from perception.places.local_map import CELL, Patch
+from perception.places.skeleton import junctions
+from perception.places.track import Track
+from perception.places.visits import Visit, Way, apart
+from perception.readers.scans import Laser, RobotLog, Scan
+from simulator.laser import meetings
+
+ROOM = 0.25  # half of the robot's width in metres
+BEARINGS = np.radians(np.arange(-180.0, 180.0, 2.0))
+Segments = list[tuple[float, float, float, float]]
+Box = tuple[float, float, float, float]
+
+
+def patch_of(*boxes: Box, solid: tuple[Box, ...] = ()) -> Patch:
+    """A local map of 16 x 16 m whose free space is boxes, each (x, y, x, y) in metres.
+
+    The robot drove along the middle of the first box.
+    """
+    at = np.arange(-80, 81) * CELL
+    x, y = np.meshgrid(at, at, indexing="ij")
+
+    def inside(box: Box) -> np.ndarray:
+        return (x >= box[0]) & (x <= box[2]) & (y >= box[1]) & (y <= box[3])
+
+    free = np.any([inside(box) for box in boxes], axis=0)
+    for box in solid:
+        free &= ~inside(box)
+    left, low, right, high = boxes[0]
+    middle = (low + high) / 2
+    trail = (np.abs(y - middle) < CELL / 2) & (x >= left) & (x <= right)
+    return Patch(free, ~free, trail & free, np.array([-8.0, -8.0]))
+
+
+CORRIDOR = (-8.0, -1.0, 8.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("patch", "bearings"),
+    [
+        pytest.param(patch_of(CORRIDOR), [], id="corridor"),
+        pytest.param(patch_of(CORRIDOR, (-1, -8, 1, 8)), [-180, -90, 0, 90], id="crossing"),
+        pytest.param(patch_of(CORRIDOR, (-1, 0, 1, 8)), [-180, 0, 90], id="fork"),
+        pytest.param(patch_of(CORRIDOR, (-0.5, 0, 0.5, 1.5)), [], id="niche"),
+        pytest.param(
+            patch_of((-8, -2, 8, 2), solid=((0.0, -0.4, 0.8, 0.4),)), [], id="free-standing desk"
+        ),
+        pytest.param(patch_of(CORRIDOR, (-0.2, 0, 0.2, 8)), [], id="gap too narrow for the robot"),
+        pytest.param(
+            patch_of(CORRIDOR, (-1.5, 0, 0.5, 8), (-0.5, -8, 1.5, 0)),
+            [-180, -90, 0, 90],
+            id="two forks in one space",
+        ),
+    ],
+)
+def test_junctions_are_where_ways_part(patch: Patch, bearings: list[float]) -> None:
+    found = junctions(patch, ROOM)
+    assert len(found) == bool(bearings)
+    for junction in found:
+        assert math.hypot(*junction.middle) < 1.0
+        assert 0.5 < junction.radius < 2.0
+        ways = [np.arctan2(*(branch[-1] - junction.middle)[::-1]) for branch in junction.branches]
+        assert len(ways) == len(bearings)
+        for bearing in np.radians(bearings):
+            assert min(apart(way, bearing) for way in ways) < math.radians(20)
+
+
+def log_of(walls: Segments, way: list[tuple[float, float]]) -> tuple[RobotLog, Track]:
+    """The log of a robot with an exact odometer that drives along a way between walls."""
+    laser = Laser(float(BEARINGS[0]), math.radians(2), len(BEARINGS), 20.0)
+    poses = []
+    for here, there in pairwise(way):
+        dx, dy = np.subtract(there, here)
+        parts = np.arange(0, 1, 0.2 / math.hypot(dx, dy))
+        poses += [(here[0] + k * dx, here[1] + k * dy, math.atan2(dy, dx)) for k in parts]
+    ranges = meetings(np.array(walls, float), np.array(poses), BEARINGS).min(axis=2)
+    scans = tuple(
+        Scan(found, laser, (float(x), float(y), float(heading)))
+        for found, (x, y, heading) in zip(ranges, poses, strict=True)
+    )
+    return RobotLog(scans, source="x"), Track(np.array(poses), np.zeros((len(poses), 3, 3)))
+
+
+# A corridor along x, 2 m wide, with a side corridor to the left at x = 10.
+FORK: Segments = [
+    (0, -1, 20, -1),
+    (0, -1, 0, 1),
+    (20, -1, 20, 1),
+    (0, 1, 9, 1),
+    (11, 1, 20, 1),
+    (9, 1, 9, 10),
+    (11, 1, 11, 10),
+    (9, 10, 11, 10),
+]
+
+
+def test_a_robot_visits_a_fork_each_time_that_it_passes_and_turns_around_at_a_dead_end() -> None:
+    log, track = log_of(FORK, [(1, 0), (18, 0), (10, 0), (10, 8)])
+    fork, end, again = find_visits(log, track)
+    assert math.dist(fork.middle, (10, 0)) < 0.5
+    assert math.dist(end.middle, (18, 0)) < 0.5
+    assert math.dist(again.middle, (10, 0)) < 0.5
+    assert (end.arrived, end.support) == (end.left, 0.0)
+
+    def degrees(visit: object, way: int | None) -> float:
+        return math.degrees(visit.ways[way].bearing)  # type: ignore[attr-defined, index]
+
+    for visit in (fork, again):
+        assert [round(math.degrees(way.bearing) / 90) % 4 for way in visit.ways] in (
+            [0, 1, 2],
+            [2, 0, 1],
+        )
+    assert abs(degrees(fork, fork.left)) < 15
+    assert abs(abs(degrees(fork, fork.arrived)) - 180) < 15
+    assert abs(degrees(again, again.arrived)) < 15
+    assert abs(degrees(again, again.left) - 90) < 15
+
+
+def test_a_robot_that_turns_around_in_a_disc_has_one_visit() -> None:
+    log, track = log_of(FORK, [(1, 0), (11, 0), (10, 0), (10, 8)])
+    assert [round(float(visit.middle[0])) for visit in find_visits(log, track)] == [10]
+
+
+def test_successive_visits_to_one_place_are_one() -> None:
+    """The robot leaves the disc to the east, and comes back and leaves to the north."""
+    west, east, north = Way(-math.pi), Way(0.0), Way(math.pi / 2)
+    middle = np.zeros(2)
+    first = Visit(5, middle, 3, 7, 1.0, (west, east), arrived=0, left=1)
+    second = Visit(12, middle + 0.2, 10, 14, 1.0, (east, north), arrived=0, left=1)
+    (stay,) = _one_for_each_stay([first, second])
+    assert (stay.begin, stay.end) == (3, 14)
+    assert [way.bearing for way in stay.ways] == [-math.pi, 0.0, math.pi / 2]
+    assert (stay.arrived, stay.left) == (0, 2)
+    far = replace(second, middle=middle + 2.0)
+    assert _one_for_each_stay([first, far]) == [first, far]
+
+
+def test_a_wide_robot_has_fewer_ways() -> None:
+    log, track = log_of(FORK, [(1, 0), (18, 0)])
+    assert len(find_visits(log, track, 0.5)) == 1
+    assert len(find_visits(log, track, 2.4)) == 0
