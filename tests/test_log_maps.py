@@ -30,7 +30,7 @@ from ssh_abduction.data.odometry import between
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.evaluation import evaluate_visits
 from ssh_abduction.robot_logs import log_maps
-from ssh_abduction.robot_logs.log_maps import SPEED, map_log, seconds_left
+from ssh_abduction.robot_logs.log_maps import SPEED, map_log, seconds_driven, seconds_left
 from ssh_abduction.solver import Solution
 from ssh_abduction.solver.asp import workers
 
@@ -253,6 +253,12 @@ def test_a_log_has_a_twentieth_of_its_drive_to_be_mapped_in_less_what_the_import
     assert seconds_left(RobotLog(timed, source="timed.log"), imported) == pytest.approx(
         100 / 20 - 1.5
     )
+    # A clock that once goes back by a second is used; one that often goes back is not.
+    long = tuple(Scan(np.ones(3), laser, (0.0, 0.0, 0.0), time=2.0 * i) for i in range(201))
+    for back, drove in ((1, 401.0), (5, None)):
+        times = {k: 2.0 * k - 3.0 for k in range(10, 10 + 10 * back, 10)}
+        clocked = tuple(replace(scan, time=times.get(i, scan.time)) for i, scan in enumerate(long))
+        assert seconds_driven(RobotLog(clocked, source="back.log")) == drove
     untimed = tuple(replace(scan, time=None) for scan in timed)
     assert seconds_left(RobotLog(untimed, source="untimed.log"), imported) == pytest.approx(
         5.0 / SPEED / 20 - 1.5

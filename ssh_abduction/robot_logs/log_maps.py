@@ -52,6 +52,8 @@ INTERRUPTED = (
 # A time between scans that exceeds the median by this factor is a gap in the log or a jump of its
 # clock. It does not count as driving.
 GAP = 20.0
+# A clock is unusable if more than this share of its steps goes back.
+BACK = 0.01
 
 # The theory for logs. Stars and sides are unreliable there. So are views: a robot that faces one
 # way at one place may see two views. So a place may have two dstates in one direction of a path.
@@ -142,16 +144,16 @@ class LogMap:
 def seconds_driven(log: RobotLog) -> float | None:
     """Compute the seconds that the robot drove, by the clock of a log.
 
-    Long gaps between scans do not count. Return None if the clock is missing, runs backwards, or
-    mostly stands still.
+    Long gaps between scans do not count, and neither do a few steps back. Return None if the clock
+    is missing, often runs backwards, or mostly stands still.
     """
     times = [scan.time for scan in log.scans if scan.time is not None]
     steps = [later - earlier for earlier, later in itertools.pairwise(times)]
-    runs_back = any(step < 0 for step in steps)
+    runs_back = sum(step < 0 for step in steps) > BACK * len(steps)
     if not steps or runs_back or sum(step > 0 for step in steps) < len(steps) / 2:
         return None
     usual = median(step for step in steps if step > 0)
-    return math.fsum(step for step in steps if step < GAP * usual) or None
+    return math.fsum(step for step in steps if 0 < step < GAP * usual) or None
 
 
 def seconds_left(log: RobotLog, imported: Imported) -> float:
