@@ -217,8 +217,11 @@ class _Follower:
                     if found is None:
                         breaks.append(i)
                 else:
+                    prior = self.trust.covariance(onward)
+                    # An odometer that misses a large turn mostly stands still.
+                    most = TURNED if 0 < math.hypot(*onward[:2]) < 2 * NEARBY else math.pi
                     pose, covariance, share = _matched(
-                        points, normals, recent, poses[-1], onward, self.trust.covariance(onward)
+                        points, normals, recent, poses[-1], onward, prior, most
                     )
                     doubtful = share < POOR and i in self.steps.doubtful
                     if (
@@ -338,11 +341,7 @@ def surfaces(scan: Scan) -> tuple[Array, Array]:
     points = np.stack([r * np.cos(laser.bearings), r * np.sin(laser.bearings)], axis=1)
     normals = np.full(points.shape, np.nan)
     # The farthest neighbours that still lie on one line with the point give the best normal.
-    for k in (
-        1,
-        2,
-        3,
-    ):
+    for k in (1, 2, 3):
         if len(points) <= 2 * k:
             break
         middle = slice(k, len(points) - k)
@@ -372,6 +371,7 @@ def _matched(
     last: Pose,
     onward: Pose,
     prior: Array,
+    most: float = math.pi,
 ) -> tuple[Pose, Array, float]:
     """Match a scan with the walls that previous scans saw.
 
@@ -382,6 +382,7 @@ def _matched(
         last: Pose of the previous scan.
         onward: Expected motion since the previous scan.
         prior: (3, 3) covariance of that motion.
+        most: By how much the heading may differ from the expected one, in radians.
 
     Returns:
         The pose; the covariance of the motion, in the frame of the robot at the previous scan; and
@@ -389,8 +390,7 @@ def _matched(
     """
     turn: Array = np.eye(3)
     turn[:2, :2] = _rotation(last[2])
-    walls = np.concatenate([wall for wall, _ in recent])
-    wall_normals = np.concatenate([normal for _, normal in recent])
+    walls, wall_normals = (np.concatenate(parts) for parts in zip(*recent, strict=True))
     guess: Array = np.array(moved(last, onward))
     weight: Array = np.asarray(np.linalg.inv(turn @ prior @ turn.T), np.float64)
     pose, information, share = guess, weight, 0.0
@@ -398,9 +398,10 @@ def _matched(
         kept = np.unique(np.linspace(0, len(points) - 1, min(len(points), POINTS)).astype(int))
         fit = _Fit(points[kept], normals[kept], walls, wall_normals, cKDTree(walls))
         share, pose, information = fit.improved(guess, weight)
-        # A poor match may have a wrong heading: try all headings.
+        # A poor match may have a wrong heading: try others.
         if share < POOR:
-            turned = [guess + np.array([0, 0, 2 * math.pi * k / HEADINGS]) for k in range(HEADINGS)]
+            turns = (wrapped(2 * math.pi * k / HEADINGS) for k in range(HEADINGS))
+            turned = [guess + np.array([0, 0, turn]) for turn in turns if abs(turn) <= most]
             best = max(
                 (fit.improved(other, weight) for other in turned), key=lambda found: found[0]
             )
