@@ -13,7 +13,7 @@ from strategies import theories, traces
 
 from ssh_abduction import OnlineMapper, SSHMap, Theory, solve
 from ssh_abduction.checker.checker import check
-from ssh_abduction.solver import choosing, prefixes
+from ssh_abduction.solver import choosing, fallback, prefixes
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError, Watch
 from ssh_abduction.solver.guesses.tree import Sketch
 from ssh_abduction.solver.prefixes import Prefixes
@@ -97,8 +97,8 @@ def test_a_sketch_with_frames_is_smaller(theory: Theory) -> None:
 def test_while_a_robot_drives_the_time_is_clingos() -> None:
     """The sketch is small enough. The robot was in 27 dstates."""
     trace = maze(3, 3, steps=120, seed=0).trace
-    mapper = OnlineMapper(trace.steps[0].view or "", time_limit=0.1)
-    with patch.object(choosing, "STEPWISE", -1.0):
+    mapper = OnlineMapper(trace.steps[0].view or "", time_limit=0.01)
+    with patch.object(choosing, "STEPWISE", -1.0), patch.object(fallback, "OVERTIME", 100.0):
         for action, step in zip(trace.actions, trace.steps[1:], strict=True):
             answer = mapper.observe(action, step.view or "")
     assert answer.cost
