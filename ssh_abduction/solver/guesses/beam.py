@@ -169,11 +169,15 @@ class Beam:
 
         Actions still lead to one dstate, and stars at one place still agree.
         """
-        beam = [self._first()]
-        while beam and (t := len(beam[0].labels)) < len(self._trace):
+        beam = self._onward([self._first()], len(self._trace))
+        return float(beam[0].nats) if beam else math.inf
+
+    def _onward(self, beam: list[Hypothesis], end: int) -> list[Hypothesis]:
+        """Extend a beam to a number of steps. Nothing is checked."""
+        for t in range(len(beam[0].labels), end):
             options = self._options_of(beam, t, joins=True)
             beam = list(islice((self._child(option, t) for option in options), self._width))
-        return float(beam[0].nats) if beam else math.inf
+        return beam
 
     def _sight(self, step: Step) -> Star | tuple[bool, ...] | None:
         """What a step shows of its place, in any direction: its star, or nothing."""
@@ -185,10 +189,8 @@ class Beam:
     def _extended(self, beam: list[Hypothesis], end: int) -> list[Hypothesis]:
         """Extend a beam to a number of steps, and check it then."""
         begun = len(beam[0].labels)
-        for t in range(begun, end):
-            options = self._options_of(beam, t, joins=True)
-            beam = list(islice((self._child(option, t) for option in options), self._width))
-        return [found for found in beam if self._map(found, begun) is not None]
+        longer = self._onward(beam, end)
+        return [found for found in longer if self._map(found, begun) is not None]
 
     def _checked(self, beam: list[Hypothesis], end: int, joins: bool = True) -> list[Hypothesis]:
         """Extend a beam to a number of steps, and check each hypothesis at each step.
