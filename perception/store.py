@@ -36,6 +36,8 @@ OURS = (
         f"{kind.__module__}.{kind.__qualname__}"
         for kind in (PlaceRecogniser, PanoramaTransformer, ReciprocalTransformer, ViewClusterer)
     ),
+    "perception.clusterings.Predictor",
+    "perception.clusterings.Tried",
     "perception.recognition.PlaceRecognizer",  # The name in files of version 0.1.0.
 )
 

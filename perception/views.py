@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from dataclasses import replace
 from typing import Any, Self
 
 import numpy as np
@@ -21,11 +22,12 @@ from sklearn.base import BaseEstimator, ClusterMixin, clone
 from sklearn.cluster import KMeans
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.mixture import BayesianGaussianMixture, GaussianMixture
-from sklearn.neighbors import KNeighborsClassifier, NearestNeighbors
+from sklearn.neighbors import KNeighborsClassifier
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted, validate_data
 from threadpoolctl import threadpool_limits
 
+from perception.clusterings import Predictor, Tried, labels_of, single, smallest_good, to_neighbour
 from perception.confidence import NOISE, confidence
 from perception.errors import ImageWarning, PerceptionError, equal_length
 from perception.quality import cluster_quality, sample_indices, spanning_tree, trimmed_quality
@@ -38,17 +40,6 @@ MANY = 5_000
 # The largest number of rounds of k-means for more than MANY images: once on the sample, and once on
 # all images from the best centres of the sample.
 ROUNDS = 30
-# There is a runner-up if trimmed M of the chosen k is below this multiple of the largest trimmed M
-# of the others. docs/measurements/reproduction.md has measurements.
-NEAR = 1.5
-# A larger k is also a runner-up if its trimmed M is at least this, because each of a few distant
-# views can hide several well-separated ones.
-APART = 2.3
-# Values of trimmed M within this factor of the largest count as equal, and the smallest k wins.
-EQUAL = 0.95
-# An image is isolated by its distance to this nearest neighbour, so that two or three images of one
-# strange thing are isolated.
-NEIGHBOURS = 3
 # More starts of k-means than this are an error, since each takes as long as the first.
 MOST_STARTS = 10_000
 # The value of `isolated` that `BootstrapLearner` uses when the theory allows wrong views.
@@ -88,20 +79,11 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
     Attributes:
         labels_: (n,) view of each fitted image; -1 for noise, which is an isolated image or one
             that the clusterer calls noise.
-        k_: Number of views without noise.
         confidence_: (n,) how surely each image belongs to its view, in [0, 1]; 0 for noise
             (`perception.confidence`).
-        quality_: Dict from each k that was tried to its M, without noise. It has one entry if k is
-            given or if the clusterer finds k itself.
-        trimmed_: Dict from each k that was tried to its trimmed M
-            (`perception.quality.trimmed_quality`).
-        labels_by_k_: Dict from each k that was tried to the view of each image, (n,).
-        runner_up_: Another k whose views may make a better map. If trimmed M of k_ is below 1.5
-            times the largest of the other k, it is the smallest other k that is at least 0.95 times
-            as good as the best of these. Otherwise it is the larger k with the largest trimmed M,
-            if that is at least 2.3. Otherwise it is None.
-        cluster_centers_: (k, d) centres of the views, if the clusterer has them.
-        clusterer_: The fitted clusterer; None if all images are equal.
+        clusterer_: The fitted clusterer.
+        tried_: The clusterings that were tried, which the properties below read.
+        predictor_: Gives views to new images.
     """
 
     def __init__(
@@ -139,42 +121,43 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         """
         self._check()
         images = validate_data(self, equal_length(X), dtype=np.float64, ensure_min_samples=2)
-        if (images == images[0]).all():
-            return self._one_view(images)
-        return (
-            self._fit_all(images) if self.isolated is None else self._fit_without_isolated(images)
-        )
-
-    def _fit_without_isolated(self, images: NDArray[np.float64]) -> Self:
-        """Fit to the images that are not isolated. The others become noise."""
-        far = _to_neighbour(images, images, 1)
-        self.reach_ = float(self.isolated or math.inf) * float(np.median(far))
-        inside = (far <= self.reach_) | (self.reach_ == 0)
-        # If all images that are left are equal, nothing distinguishes them. Isolate none instead.
-        if (images[inside] == images[inside][0]).all():
-            inside[:] = True
-        self._fit_all(images[inside])
-        self.labels_by_k_: dict[int, NDArray[np.intp]] = {
-            k: _with_noise(inside, labels) for k, labels in self.labels_by_k_.items()
-        }
-        self.labels_ = self.labels_by_k_[self.k_]
-        self.confidence_, self.inside_ = confidence(images, self.labels_), images[inside]
+        inside, reach = np.ones(len(images), bool), math.inf
+        if self.isolated is not None:
+            far = to_neighbour(images, images, 1)
+            reach = self.isolated * float(np.median(far))
+            inside = (far <= reach) | (reach == 0)
+            # If all images that are left are equal, nothing distinguishes them. Isolate none.
+            if (images[inside] == images[inside][0]).all():
+                inside[:] = True
+        self.clusterer_, tried = self._fitted(images[inside])
+        labels = {k: _with_noise(inside, found) for k, found in tried.labels.items()}
+        self.tried_ = replace(tried, labels=labels)
+        self.labels_ = labels[tried.k]
+        self.confidence_ = confidence(images, self.labels_)
+        model = self.clusterer_
+        if not hasattr(model, "predict"):
+            model = KNeighborsClassifier(1, algorithm="brute")
+            model.fit(images[inside], self.labels_[inside])
+        self.predictor_ = Predictor(model, images[inside] if self.isolated else images[:0], reach)
         return self
 
-    def _fit_all(self, images: NDArray[np.float64]) -> Self:
-        """Fit to images that are not all equal."""
+    def _fitted(self, images: NDArray[np.float64]) -> tuple[Any, Tried]:
+        """Return the fitted clusterer, and the clusterings that were tried."""
+        if (images == images[0]).all():
+            warnings.warn(
+                f"all {len(images)} images are equal: they are taken as one view",
+                ImageWarning,
+                stacklevel=3,
+            )
+            return single(KMeans(1, n_init=1, random_state=0).fit(images), images, self.trim)
         seed = int(check_random_state(self.random_state).randint(2**31 - 1))
-        if self.clusterer is not None and _count_parameter(self.clusterer) is None:
-            best = self._cluster(images, None, seed)
-            self._record_single(best, images)
-        elif self.k is not None:
-            if self.k > 1:
-                self._check_distinct(self.k, images)
-            best = self._cluster(images, self.k, seed)
-            self._record_single(best, images)
-        else:
-            best = self._search(images, seed)
-        return self._record_fit(best, images)
+        if self.k is None and (
+            self.clusterer is None or _count_parameter(self.clusterer) is not None
+        ):
+            return self._search(images, seed)
+        if self.k is not None and self.k > 1:
+            _check_distinct(self.k, images)
+        return single(self._cluster(images, self.k, seed), images, self.trim)
 
     def predict(self, X: ArrayLike) -> NDArray[np.intp]:
         """Predict the views of images.
@@ -188,16 +171,10 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         Returns:
             (n,) views; -1 for an image that is isolated from the fitted images.
         """
-        check_is_fitted(self)
-        images = validate_data(self, equal_length(X), dtype=np.float64, reset=False)
-        if self.clusterer_ is None:
-            return np.zeros(len(images), np.intp)
-        views = np.asarray(
-            (self.clusterer_ if self.nearest_ is None else self.nearest_).predict(images), np.intp
+        check_is_fitted(self, "predictor_")
+        return self.predictor_.views(
+            validate_data(self, equal_length(X), dtype=np.float64, reset=False)
         )
-        if self.isolated is not None and self.reach_ > 0:
-            views[_to_neighbour(images, self.inside_, 0) > self.reach_] = NOISE
-        return views
 
     def score(self, X: ArrayLike, y: Any = None) -> float:
         """Compute M of the views that are predicted for images, without noise.
@@ -217,58 +194,71 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         )
 
     @property
+    def k_(self) -> int:
+        """Number of views without noise."""
+        return self.tried_.k
+
+    @property
+    def quality_(self) -> dict[int, float]:
+        """M for each k that was tried, without noise.
+
+        It has one entry if k is given or if the clusterer finds k itself.
+        """
+        return self.tried_.quality
+
+    @property
+    def trimmed_(self) -> dict[int, float]:
+        """Trimmed M for each k that was tried (`perception.quality.trimmed_quality`)."""
+        return self.tried_.trimmed
+
+    @property
+    def labels_by_k_(self) -> dict[int, NDArray[np.intp]]:
+        """The view of each image for each k that was tried, (n,)."""
+        return self.tried_.labels
+
+    @property
+    def runner_up_(self) -> int | None:
+        """Another k whose views may make a better map.
+
+        If trimmed M of k_ is below 1.5 times the largest of the other k, it is the smallest other k
+        that is at least 0.95 times as good as the best of these. Otherwise it is the larger k with
+        the largest trimmed M, if that is at least 2.3. Otherwise it is None.
+        """
+        return self.tried_.runner_up
+
+    @property
     def runner_up_labels_(self) -> NDArray[np.intp] | None:
         """The view of each image for `runner_up_` views, (n,); None without a runner-up."""
         return None if self.runner_up_ is None else self.labels_by_k_[self.runner_up_]
 
-    def _record_single(self, best: Any, images: NDArray[np.float64]) -> None:
-        """Record the only clustering that was tried."""
-        labels = _labels(best, images)
-        inside = labels != NOISE
-        self.k_ = len(set(labels[inside].tolist()))
-        self.runner_up_: int | None = None
-        self.quality_ = {
-            self.k_: cluster_quality(images[inside], labels[inside]) if inside.any() else math.nan
-        }
-        self.trimmed_ = {
-            self.k_: trimmed_quality(images[inside], labels[inside], self.trim)
-            if inside.any()
-            else math.nan
-        }
-        self.labels_by_k_ = {self.k_: labels}
+    @property
+    def cluster_centers_(self) -> NDArray[np.float64]:
+        """(k, d) centres of the views, if the clusterer has them."""
+        return np.asarray(self.clusterer_.cluster_centers_)
 
-    def _search(self, images: NDArray[np.float64], seed: int) -> Any:
-        """Try each k, record the results in attributes, and return the clusterer of the best k."""
+    def _search(self, images: NDArray[np.float64], seed: int) -> tuple[Any, Tried]:
+        """Try each k. Return the clusterer of the best k, and the clusterings that were tried."""
         tree, chosen = spanning_tree(images), sample_indices(len(images))
         distances = cdist(images[chosen], images[chosen])
         most = min(20, len(images) - 1) if self.k_max is None else self.k_max
         most = min(max(most, self.k_min), tree.distinct)
-        self._check_distinct(self.k_min, images, tree.distinct)
-        self.quality_, self.trimmed_, self.labels_by_k_ = {}, {}, {}
+        _check_distinct(self.k_min, images, tree.distinct)
         fitted: dict[int, Any] = {}
+        found = Tried(0, {}, {}, {})
         for k in range(self.k_min, most + 1):
             tried = self._cluster(images, k, seed)
-            labels = _labels(tried, images)
+            labels = labels_of(tried, images)
             if fitted and len(set(labels.tolist())) < k:
                 continue  # A mixture left some of its components empty.
-            fitted[k], self.labels_by_k_[k] = tried, labels
-            self.quality_[k] = cluster_quality(images, labels, tree)
-            self.trimmed_[k] = trimmed_quality(images[chosen], labels[chosen], self.trim, distances)
-        self.k_ = (
-            _smallest_good(self.trimmed_)
+            fitted[k], found.labels[k] = tried, labels
+            found.quality[k] = cluster_quality(images, labels, tree)
+            found.trimmed[k] = trimmed_quality(images[chosen], labels[chosen], self.trim, distances)
+        best = (
+            smallest_good(found.trimmed)
             if self.by == "trimmed"
-            else max(self.quality_, key=self.quality_.__getitem__)
+            else max(found.quality, key=found.quality.__getitem__)
         )
-        self.runner_up_ = self._find_runner_up()
-        return fitted[self.k_]
-
-    def _find_runner_up(self) -> int | None:
-        """The number of views that may be better than the chosen one; None if there is none."""
-        others = {k: worth for k, worth in self.trimmed_.items() if k != self.k_}
-        if others and self.trimmed_[self.k_] < NEAR * max(others.values()):
-            return _smallest_good(others)
-        finer = {k: worth for k, worth in others.items() if k > self.k_ and worth >= APART}
-        return max(finer, key=finer.__getitem__, default=None)
+        return fitted[best], replace(found, k=best)
 
     def _cluster(self, images: NDArray[np.float64], k: int | None, seed: int) -> Any:
         """Fit a clusterer with k views. If k is None, the clusterer chooses the number."""
@@ -305,39 +295,6 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
                     images
                 )
             return KMeans(k, n_init=self.n_init, random_state=seed).fit(images)
-
-    def _record_fit(self, best: Any, images: NDArray[np.float64]) -> Self:
-        """Record the fitted clusterer and its labels."""
-        self.clusterer_ = best
-        self.labels_ = _labels(best, images)
-        self.confidence_ = confidence(images, self.labels_)
-        self.nearest_ = (
-            None
-            if hasattr(best, "predict")
-            else KNeighborsClassifier(1, algorithm="brute").fit(images, self.labels_)
-        )
-        if hasattr(best, "cluster_centers_"):
-            self.cluster_centers_ = best.cluster_centers_
-        elif hasattr(self, "cluster_centers_"):
-            del self.cluster_centers_
-        return self
-
-    def _one_view(self, images: NDArray[np.float64]) -> Self:
-        """Record that all images are one view."""
-        warnings.warn(
-            f"all {len(images)} images are equal: they are taken as one view",
-            ImageWarning,
-            stacklevel=3,
-        )
-        self.clusterer_ = self.nearest_ = None
-        self.labels_, self.k_, self.runner_up_ = np.zeros(len(images), np.intp), 1, None
-        self.quality_, self.trimmed_, self.labels_by_k_ = (
-            {1: math.nan},
-            {1: math.nan},
-            {1: self.labels_},
-        )
-        self.cluster_centers_, self.confidence_ = images[:1].copy(), np.ones(len(images))
-        return self
 
     def _check(self) -> None:
         """Raise PerceptionError if a setting is invalid or contradicts another."""
@@ -394,17 +351,6 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
                 "leave k out"
             )
 
-    def _check_distinct(
-        self, k: int, images: NDArray[np.float64], distinct: int | None = None
-    ) -> None:
-        """Raise PerceptionError if there are fewer different images than views."""
-        found = len(np.unique(images, axis=0)) if distinct is None else distinct
-        if found < k:
-            raise PerceptionError(
-                f"k: expected at most {found}, as there are {found} different images among "
-                f"{len(images)}, got {k}"
-            )
-
 
 def as_view_clusterer(clusterer: Any) -> ViewClusterer:
     """Wrap a scikit-learn clusterer in a ViewClusterer.
@@ -427,23 +373,14 @@ def as_view_clusterer(clusterer: Any) -> ViewClusterer:
     return checked if size is None else checked.set_params(k=clusterer.get_params()[size])
 
 
-def _to_neighbour(
-    images: NDArray[np.float64], among: NDArray[np.float64], itself: int
-) -> NDArray[np.float64]:
-    """The distance from each image to its third nearest neighbour, (n,).
-
-    If there are fewer neighbours, it is the distance to the farthest of them.
-
-    Args:
-        images: (n, d) images.
-        among: (m, d) possible neighbours.
-        itself: 1 if `among` contains the images themselves, otherwise 0.
-    """
-    number = min(NEIGHBOURS + itself, len(among))
-    distances, _ = (
-        NearestNeighbors(n_neighbors=number, algorithm="brute").fit(among).kneighbors(images)
-    )
-    return np.asarray(distances[:, -1])
+def _check_distinct(k: int, images: NDArray[np.float64], distinct: int | None = None) -> None:
+    """Raise PerceptionError if there are fewer different images than views."""
+    found = len(np.unique(images, axis=0)) if distinct is None else distinct
+    if found < k:
+        raise PerceptionError(
+            f"k: expected at most {found}, as there are {found} different images among "
+            f"{len(images)}, got {k}"
+        )
 
 
 def _with_noise(inside: NDArray[np.bool_], labels: NDArray[np.intp]) -> NDArray[np.intp]:
@@ -453,15 +390,6 @@ def _with_noise(inside: NDArray[np.bool_], labels: NDArray[np.intp]) -> NDArray[
     return every
 
 
-def _smallest_good(worth: dict[int, float]) -> int:
-    """The smallest k whose trimmed M is at least EQUAL times the largest.
-
-    Args:
-        worth: Trimmed M for each k.
-    """
-    return min(k for k in worth if not worth[k] < EQUAL * max(worth.values()))
-
-
 def _count_parameter(clusterer: Any) -> str | None:
     """The name of the setting for the number of clusters; None if the clusterer chooses it."""
     settings = clusterer.get_params()
@@ -469,11 +397,4 @@ def _count_parameter(clusterer: Any) -> str | None:
         return "n_clusters"
     return (
         "n_components" if isinstance(clusterer, GaussianMixture | BayesianGaussianMixture) else None
-    )
-
-
-def _labels(fitted: Any, images: NDArray[np.float64]) -> NDArray[np.intp]:
-    """The cluster of each fitted image, (n,). Mixtures have no labels_ and predict instead."""
-    return np.asarray(
-        fitted.labels_ if hasattr(fitted, "labels_") else fitted.predict(images), np.intp
     )

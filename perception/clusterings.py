@@ -1,0 +1,125 @@
+"""Holds what a clusterer found: the clusterings that it tried, and how it names new images."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.neighbors import NearestNeighbors
+
+from perception.confidence import NOISE
+from perception.quality import cluster_quality, trimmed_quality
+
+# There is a runner-up if trimmed M of the chosen k is below this multiple of the largest trimmed M
+# of the others. docs/measurements/reproduction.md has measurements.
+NEAR = 1.5
+# A larger k is also a runner-up if its trimmed M is at least this, because each of a few distant
+# views can hide several well-separated ones.
+APART = 2.3
+# Values of trimmed M within this factor of the largest count as equal, and the smallest k wins.
+EQUAL = 0.95
+# An image is isolated by its distance to this nearest neighbour, so that two or three images of one
+# strange thing are isolated.
+NEIGHBOURS = 3
+
+
+@dataclass(frozen=True)
+class Tried:
+    """The clusterings that a ViewClusterer tried, and its choice.
+
+    Attributes:
+        k: The chosen number of views.
+        quality: M for each k that was tried.
+        trimmed: Trimmed M for each k that was tried.
+        labels: The view of each image for each k that was tried, (n,).
+    """
+
+    k: int
+    quality: dict[int, float]
+    trimmed: dict[int, float]
+    labels: dict[int, NDArray[np.intp]]
+
+    @property
+    def runner_up(self) -> int | None:
+        """The number of views that may be better than the chosen one; None if there is none."""
+        others = {k: worth for k, worth in self.trimmed.items() if k != self.k}
+        if others and self.trimmed[self.k] < NEAR * max(others.values()):
+            return smallest_good(others)
+        finer = {k: worth for k, worth in others.items() if k > self.k and worth >= APART}
+        return max(finer, key=finer.__getitem__, default=None)
+
+
+@dataclass(frozen=True)
+class Predictor:
+    """Gives views to new images.
+
+    Attributes:
+        model: The fitted clusterer, or a classifier if the clusterer cannot predict.
+        inside: (m, d) the fitted images that are not isolated. It is empty if none can be.
+        reach: An image is isolated if its third nearest neighbour is farther than this.
+    """
+
+    model: Any
+    inside: NDArray[np.float64]
+    reach: float = math.inf
+
+    def views(self, images: NDArray[np.float64]) -> NDArray[np.intp]:
+        """Predict the view of each image, (n,); -1 for an isolated image."""
+        views = np.asarray(self.model.predict(images), np.intp)
+        if 0 < self.reach < math.inf:
+            views[to_neighbour(images, self.inside, 0) > self.reach] = NOISE
+        return views
+
+
+def single(fitted: Any, images: NDArray[np.float64], trim: float) -> tuple[Any, Tried]:
+    """The fitted clusterer, and its clustering as the only one that was tried."""
+    labels = labels_of(fitted, images)
+    inside = labels != NOISE
+    k = len(set(labels[inside].tolist()))
+    measures = (
+        (
+            cluster_quality(images[inside], labels[inside]),
+            trimmed_quality(images[inside], labels[inside], trim),
+        )
+        if inside.any()
+        else (math.nan, math.nan)
+    )
+    return fitted, Tried(k, {k: measures[0]}, {k: measures[1]}, {k: labels})
+
+
+def smallest_good(worth: dict[int, float]) -> int:
+    """The smallest k whose trimmed M is at least EQUAL times the largest.
+
+    Args:
+        worth: Trimmed M for each k.
+    """
+    return min(k for k in worth if not worth[k] < EQUAL * max(worth.values()))
+
+
+def labels_of(fitted: Any, images: NDArray[np.float64]) -> NDArray[np.intp]:
+    """The cluster of each fitted image, (n,). Mixtures have no labels_ and predict instead."""
+    return np.asarray(
+        fitted.labels_ if hasattr(fitted, "labels_") else fitted.predict(images), np.intp
+    )
+
+
+def to_neighbour(
+    images: NDArray[np.float64], among: NDArray[np.float64], itself: int
+) -> NDArray[np.float64]:
+    """The distance from each image to its third nearest neighbour, (n,).
+
+    If there are fewer neighbours, it is the distance to the farthest of them.
+
+    Args:
+        images: (n, d) images.
+        among: (m, d) possible neighbours.
+        itself: 1 if `among` contains the images themselves, otherwise 0.
+    """
+    number = min(NEIGHBOURS + itself, len(among))
+    distances, _ = (
+        NearestNeighbors(n_neighbors=number, algorithm="brute").fit(among).kneighbors(images)
+    )
+    return np.asarray(distances[:, -1])
