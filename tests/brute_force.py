@@ -160,7 +160,11 @@ def consistent_maps(trace: Trace, theory: Theory) -> Iterator[tuple[Key, Counts]
         if theory.level == "causal":
             yield (labels, (None,) * dstates, (None,) * dstates), Counts(dstates, 0, 0, 0)
             continue
-        links = frozenset(zip(labels, trace.actions, labels[1:], strict=False))
+        links = frozenset(
+            (s, action, x)
+            for s, action, x in zip(labels, trace.actions, labels[1:], strict=False)
+            if action.kind != "start"  # nothing links two drives
+        )
         for places in _placings(labels, links, stars, on):
             if "asserted" in on and not _as_asserted(labels, places, theory):
                 continue
@@ -243,6 +247,7 @@ def _stars_alike(trace: Trace, labels: Labels) -> bool:
 def _labellings(trace: Trace, on: Axioms) -> Iterator[Labels]:
     """The equalities of the steps: the dstate of each step, numbered by first visit."""
     views, actions = trace.views, [a.name for a in trace.actions]
+    starts = {t for t, action in enumerate(trace.actions, 1) if action.kind == "start"}
 
     def allowed(labels: Labels) -> bool:
         last = len(labels) - 1
@@ -256,7 +261,10 @@ def _labellings(trace: Trace, on: Axioms) -> Iterator[Labels]:
                 return False
             # C2: the same action done in the same dstate leads to the same dstate.
             same_start = (
-                i > 0 and labels[i - 1] == labels[last - 1] and actions[i - 1] == actions[last - 1]
+                i > 0
+                and labels[i - 1] == labels[last - 1]
+                and actions[i - 1] == actions[last - 1]
+                and not {i, last} & starts
             )
             if "deterministic" in on and same_start and labels[i] != labels[last]:
                 return False

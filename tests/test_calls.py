@@ -95,6 +95,7 @@ RIGHT_BY_NAME: dict[str, set[str]] = {
     "where": TEXTS,
     "name": TEXTS,
     "images": TEXTS,
+    "drive": TEXTS,
     "source": TEXTS,
     "view": {"-1", "empty text", "nonsense", "folder"},
     "action": {"nonsense", "folder"},
@@ -171,6 +172,7 @@ RIGHT: dict[str, set[str]] = {
 # The package makes these values: nobody needs their constructors, which take what they are given.
 # Their methods are swept.
 MADE_BY_THE_PACKAGE = {
+    "Drive",
     "Fault",
     "MapPath",
     "Star",
@@ -373,6 +375,7 @@ def good(call: str, parameter: inspect.Parameter) -> Any:
         "World.named.name": "notched-rectangle",
         "ViewClusterer.k_max": 3,
         "ViewClusterer.n_init": 1,
+        "by_drive.values": trace.views,
         "difference.first": ssh_map,
         "difference.other": ssh_map,
         "evaluate.maps": solution.maps,
@@ -381,6 +384,7 @@ def good(call: str, parameter: inspect.Parameter) -> Any:
         "fault_front.most": 1,
         "fault_front.theory": Theory.causal(),
         "fault_front.trace": made["faulty"],
+        "together.traces": [trace],
         "tour.steps": 2,
         "compare.maps": solution,
         "next_experiment.maps": solution,

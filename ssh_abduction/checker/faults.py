@@ -55,7 +55,7 @@ def _what_is_wrong(m: Reading, fault: Fault) -> str | None:
     if (
         step is None
         or (kind == "misread" and step.view is None)
-        or (kind == "slipped" and step.action is None)
+        or (kind == "slipped" and (step.action is None or step.action.kind == "start"))
         or (kind == "jumped" and step.displacement is None)
     ):
         return f"The map disbelieves step {i} ({kind}), where there is nothing to disbelieve."

@@ -63,7 +63,12 @@ class Reading:
                 self.views.setdefault((label, step.view), i)
             if with_stars and ("misseen", i) not in doubted and step.openings is not None:
                 self.stars.setdefault((label, step.openings), i)
-            if step.action is not None and i + 1 < len(labels) and ("slipped", i) not in doubted:
+            if (
+                step.action is not None
+                and step.action.kind != "start"  # the next step is of another drive
+                and i + 1 < len(labels)
+                and ("slipped", i) not in doubted
+            ):
                 self.links.setdefault((label, step.action.name, labels[i + 1]), i)
 
     def once(self, compute: Callable[[Reading], _T]) -> _T:

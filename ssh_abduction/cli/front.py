@@ -24,10 +24,11 @@ def run(options: argparse.Namespace) -> int:
         The exit code: 0 if the search was completed; 20 if no map has so few faults; 10 if the
         search was stopped.
     """
-    if len(options.traces) > 1 or options.jobs is not None or options.scheduler is not None:
+    several = len(options.traces) > 1 or options.together
+    if several or options.jobs is not None or options.scheduler is not None:
         raise AbductionError(
-            "--front: expected one trace, got several, or --jobs or --scheduler; ask for each "
-            "trace by itself"
+            "--front: expected one trace, got several, or --together, --jobs or --scheduler; ask "
+            "for each trace by itself"
         )
     front = fault_front(
         Trace.load(options.traces[0]),

@@ -6,7 +6,8 @@ import argparse
 import contextlib
 import logging
 import sys
-from collections.abc import Callable, Iterator
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -28,6 +29,8 @@ from ssh_abduction.cli.outcome import (
     warnings_of,
 )
 from ssh_abduction.cli.text import by_displacements, compared, describe, describe_backbone, headline
+from ssh_abduction.data.drives import sentence_of, together
+from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.no_map import Explanation
@@ -79,6 +82,14 @@ def add_parser(verbs: Verbs) -> None:
         "--json",
         action="store_true",
         help="print the solution as JSON; for many traces, one line each",
+    )
+    parser.add_argument(
+        "--together",
+        action="store_true",
+        help="the traces are drives through one building: find their joint maps",
+    )
+    parser.add_argument(
+        "-o", "--output", metavar="FILE", help="also write the solution to this file, as JSON"
     )
     front = (
         "report the fewest dstates of a map with at most 0, 1, … K faults (steps treated as "
@@ -133,11 +144,22 @@ def run(options: argparse.Namespace) -> int:
         from ssh_abduction.cli import front
 
         return front.run(options)
-    if len(options.traces) > 1 or options.jobs is not None or options.scheduler is not None:
+    many = options.jobs is not None or options.scheduler is not None
+    if options.together and many:
+        raise AbductionError(
+            "--together: expected one search for all traces, got --jobs or --scheduler; leave "
+            "them out"
+        )
+    if many or (len(options.traces) > 1 and not options.together):
+        if options.output is not None:
+            raise AbductionError(
+                "--output: expected one trace, or --together, got many traces; take --json, which "
+                "prints a line for each"
+            )
         from ssh_abduction.cli import batch
 
         return batch.run(options)
-    trace = Trace.load(options.traces[0])
+    trace = _joint(options.traces) if options.together else Trace.load(options.traces[0])
     theory = theory_of(options)
     theory.check_steps(trace)
     with contextlib.ExitStack() as until_printed:
@@ -164,7 +186,18 @@ def run(options: argparse.Namespace) -> int:
         solution = search.solution(tuple(printed.kept))
         guard.say(partial(printed.end, solution, explanation))
         warn(warnings_of(search, solution))
+        if options.output is not None:
+            solution.save(options.output)
     return exit_code(solution)
+
+
+def _joint(paths: Sequence[str]) -> Trace:
+    """Load several traces and join them. What is odd about them is printed on stderr."""
+    with warnings.catch_warnings(record=True) as odd:
+        warnings.simplefilter("always")
+        trace = together([Trace.load(path) for path in paths])
+    warn([str(warning.message) for warning in odd])
+    return trace
 
 
 class _Text:
@@ -304,6 +337,12 @@ def _lines(
 ) -> Iterator[str]:
     yield headline(solution, search.count, explanation)
     yield from by_displacements(solution)
+    if (
+        joined := solution.drives
+        and solution.maps
+        and sentence_of(solution.drives, solution.maps[0])
+    ):
+        yield joined
     if solution.weighed is None and solution.sureness:  # else the headline says it
         yield solution.sureness
     if solution.status is Status.UNSATISFIABLE:

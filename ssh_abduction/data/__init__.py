@@ -9,6 +9,7 @@ from ssh_abduction import lazy_names
 TYPE_CHECKING = False
 
 if TYPE_CHECKING:
+    from ssh_abduction.data.drives import Drive, by_drive, drives_of, together
     from ssh_abduction.data.errors import (
         AbductionError,
         LocaliserError,
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from ssh_abduction.data.trace import Action, Step, Trace
 
 _HOMES = {  # module: the names that this package exports from it
+    "drives": ("Drive", "by_drive", "drives_of", "together"),
     "errors": (
         "AbductionError",
         "LocaliserError",
@@ -53,6 +55,7 @@ __all__ = [
     "AbductionError",
     "Action",
     "DState",
+    "Drive",
     "Fault",
     "Fit",
     "LocaliserError",
@@ -68,6 +71,9 @@ __all__ = [
     "TheoryError",
     "Trace",
     "TraceError",
+    "by_drive",
+    "drives_of",
+    "together",
 ]
 
 __getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)

@@ -138,6 +138,31 @@ class SSHMap:
             )
         return self.dstates[self.labels[step]].place
 
+    @property
+    def pieces(self) -> tuple[tuple[int, ...], ...]:
+        """The ids of the dstates of each piece, in order of first visit.
+
+        Links and common places connect the dstates of a piece. The map of one drive has one piece,
+        unless an action slipped. A joint map may have one for each drive.
+        """
+        beside: dict[int, list[int]] = {s.id: [] for s in self.dstates}
+        at: dict[int, int] = {}  # the first dstate at each place
+        pairs = [(s, x) for s, _, x in self.links]
+        pairs += [(at.setdefault(s.place, s.id), s.id) for s in self.dstates if s.place is not None]
+        for one, other in pairs:
+            beside[one].append(other)
+            beside[other].append(one)
+        pieces = []
+        while beside:
+            reached = {min(beside)}
+            waiting = list(reached)
+            while waiting:
+                new = set(beside.pop(waiting.pop())) - reached
+                reached |= new
+                waiting += new
+            pieces.append(tuple(sorted(reached)))
+        return tuple(pieces)
+
     def without_headings(self) -> SSHMap:
         """Return the same map without headings, for a theory in which places have no frames."""
         return replace(self, dstates=tuple(replace(s, heading=None) for s in self.dstates))
@@ -208,6 +233,8 @@ class SSHMap:
             "paths": [{"id": p.id, "order": list(p.order)} for p in self.paths],
         }
         # Fields that most maps lack are written only if they are there.
+        if len(pieces := self.pieces) > 1:
+            data["pieces"] = [list(piece) for piece in pieces]
         if self.excused:
             data["excused"] = [list(pair) for pair in self.excused]
         if self.faults:

@@ -60,6 +60,7 @@ class Trace:
         odometry: The noise of displacements without a covariance; None for the defaults.
         extra: Fields of the file's header that this package does not know.
         source: The file that the trace was read from.
+        drive: The name of the first drive, in a trace of several drives (`data/drives.py`).
     """
 
     steps: tuple[Step, ...]
@@ -68,6 +69,7 @@ class Trace:
     odometry: Odometry | None = None
     extra: Mapping[str, Any] = field(default_factory=dict, hash=False)
     source: str | None = field(default=None, compare=False)
+    drive: str | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.steps, tuple) or not all(
@@ -82,7 +84,7 @@ class Trace:
                 f"{named(self.source or 'trace')}: expected at least one step, got none; "
                 f"add what the robot saw first"
             )
-        for name in ("name", "images", "source"):
+        for name in ("name", "images", "source", "drive"):
             if getattr(self, name) is not None:
                 a_text(name, getattr(self, name), TraceError, mend="give a text, or leave it out")
         if self.odometry is not None:
@@ -114,6 +116,8 @@ class Trace:
                     f"{self.at(i)}: action: expected none on the last step, "
                     f"got {brief(action.name)}; remove it, or add the step that it led to"
                 )
+            if action.starts:
+                self._check_start(i, action.name, types)
             first, known = types.setdefault(action.name, (i, action))
             if known != action:
                 raise TraceError(
@@ -121,6 +125,19 @@ class Trace:
                     f"turn {action.turn} here but kind {known.kind}, turn {known.turn} "
                     f"on {self.at(first)}; give the two different names, or the same kind"
                 )
+
+    def _check_start(self, i: int, name: str, known: Collection[str]) -> None:
+        """Check the start of the drive `name` after step i. `known` has earlier names."""
+        if name in known or name == self.drive:
+            raise TraceError(
+                f"{self.at(i)}: action: expected a new name for this drive, got {brief(name)}, the "
+                "name of an earlier drive or action; rename it"
+            )
+        if (moved := self.steps[i + 1].displacement) is not None:
+            raise TraceError(
+                f"{self.at(i + 1)}: displacement: expected none on the first step of a drive, got "
+                f"{brief(moved)}; leave it out"
+            )
 
     def __len__(self) -> int:
         """The number of steps, which is one more than the number of actions."""
@@ -166,6 +183,7 @@ class Trace:
             self,
             steps=(replace(here[0], displacement=None, covariance=None), *here[1:]),
             source=None,
+            drive=next((a.name for a in self.actions[start - 1 :: -1] if a.starts), self.drive),
         )
 
     def __repr__(self) -> str:
@@ -425,7 +443,8 @@ class Trace:
 
     def to_lines(self) -> Iterator[str]:
         """Yield the lines of the trace as a file: the header, then one line for each step."""
-        header = {"format": FORMAT, "version": VERSION, "name": self.name, "images": self.images}
+        named_by = {name: getattr(self, name) for name in ("name", "images", "drive")}
+        header = {"format": FORMAT, "version": VERSION, **named_by}
         odometry = {} if self.odometry is None else {"odometry": self.odometry.to_json()}
         yield _dump(
             {**{k: v for k, v in header.items() if v is not None}, **odometry, **self.extra}

@@ -40,7 +40,7 @@ _STEP_FIELDS = (
     "truth",
     "confidence",
 )
-_HEADER_FIELDS = ("format", "version", "name", "images", "odometry")
+_HEADER_FIELDS = ("format", "version", "name", "images", "odometry", "drive")
 
 
 def read_trace(file: BinaryIO, source: str) -> dict[str, Any]:
@@ -51,7 +51,7 @@ def read_trace(file: BinaryIO, source: str) -> dict[str, Any]:
         source: The name of the file in messages.
 
     Returns:
-        A dict of arguments of Trace: steps, name, images, odometry and extra.
+        A dict of arguments of Trace: steps, name, images, odometry, drive and extra.
 
     Raises:
         TraceError: If the file is malformed. The error names the file, the line and the field.
@@ -92,7 +92,7 @@ def read_trace(file: BinaryIO, source: str) -> dict[str, Any]:
         )
     return {
         "steps": tuple(steps),
-        **{name: header.get(name) for name in ("name", "images", "odometry")},
+        **{name: header.get(name) for name in ("name", "images", "odometry", "drive")},
         "extra": {k: v for k, v in header.items() if k not in _HEADER_FIELDS},
     }
 
@@ -176,7 +176,7 @@ def _header(record: Mapping[str, Any], where: str) -> dict[str, Any]:
             f"{where}: version: expected {VERSION}, got {brief(version)}; "
             f"convert the file, or take a newer ssh-abduction"
         )
-    for key in ("name", "images"):
+    for key in ("name", "images", "drive"):
         if not isinstance(record.get(key), str | None):
             raise TraceError(
                 f"{where}: {key}: expected a text, got {brief(record[key])}; "

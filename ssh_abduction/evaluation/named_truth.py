@@ -231,8 +231,8 @@ class _Truth:
                     )
 
     def dstate_hops(self) -> list[int]:
-        """List the steps with a known true dstate at this step and at the next one."""
-        return _hops(self.dstates)
+        """List the steps with a known true dstate at this step and at the next one of the drive."""
+        return [t for t in _hops(self.dstates) if not self.trace.actions[t].starts]
 
     def place_hops(self) -> list[int]:
         """List the steps before a travel with a known true place at this step and the next one."""

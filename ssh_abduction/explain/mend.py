@@ -232,7 +232,7 @@ class TraceQuestion(Question[TraceExplanation]):
             yield t, "view", repr(step.view), self._with_views(t)
             if step.star is not None and theory.star != "none":
                 yield t, "star", _star(step), self._with_stars(t)
-            if t < stretch[-1] and step.action is not None:
+            if t < stretch[-1] and step.action is not None and not step.action.starts:
                 yield t, "action", repr(step.action.name), self._with_actions(t)
             if t > stretch[0] and step.displacement is not None and theory.displacement == "use":
                 unknown = _with_step(trace, t, replace(step, displacement=None, covariance=None))
@@ -274,7 +274,7 @@ class TraceQuestion(Question[TraceExplanation]):
 
     def _with_actions(self, t: int) -> Iterator[tuple[str | None, Trace, Theory]]:
         step = self.trace.steps[t]
-        known = {action.name: action for action in self.trace.actions}
+        known = {action.name: action for action in self.trace.actions if not action.starts}
         if self.theory.level == "topological":
             kinds = {(action.kind, action.turn) for action in known.values()}
             known |= {

@@ -87,6 +87,7 @@ def transitions(ssh_map: SSHMap, trace: Trace | None) -> dict[str, Links]:
         counts.update(
             (x, action.name, y)
             for x, action, y in zip(labels, trace.actions, labels[1:], strict=False)
+            if not action.starts
         )
     tried = {(x, action) for x, action, _ in counts}
     counts.update({link for link in ssh_map.links if link[:2] not in tried})

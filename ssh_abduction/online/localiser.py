@@ -181,8 +181,8 @@ class Localiser:
     def beliefs(self, trace: Trace) -> Iterator[Belief]:
         """Yield the belief after each step of another trace.
 
-        Before its first step, all dstates are equally likely. A localiser with a recogniser reads
-        the images of the trace and ignores its views.
+        Before the first step of each drive, all dstates are equally likely. A localiser with a
+        recogniser reads the images of the trace and ignores its views.
 
         Raises:
             TraceError: No step has a view, and there is no recogniser.
@@ -192,7 +192,11 @@ class Localiser:
         belief = self._weighed(self.prior, next(observed))
         yield belief
         for action, seen in zip(trace.actions, observed, strict=True):
-            belief = self._after(belief, action.name, seen)
+            belief = (
+                self._weighed(self.prior, seen)
+                if action.starts
+                else self._after(belief, action.name, seen)
+            )
             yield belief
 
     def _observed(self, trace: Trace) -> Iterator[Observation | None]:

@@ -228,6 +228,11 @@ class OnlineMapper:
     def _append(self, action: Action, step: Step) -> None:
         """Append a step to the trace. Raises TraceError if it does not fit."""
         last, number = replace(self._steps[-1], action=action), len(self._steps)
+        if action.starts:
+            raise TraceError(
+                f"step {number - 1}: action: expected an action of the robot, got the start "
+                "of a drive; solve several traces together when the robot has stopped"
+            )
         known = self._actions.get(action.name, action)
         if known != action:
             raise TraceError(

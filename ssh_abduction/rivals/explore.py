@@ -182,7 +182,8 @@ class Laboratory:
             _to_known_views(links_of(ssh_map, i), ssh_map) for i, ssh_map in enumerate(rivals)
         ]
         self.stopped: Stop | None = None
-        known = {action.name: action for action in (*actions, *(trace.actions if trace else ()))}
+        done = [action for action in (trace.actions if trace else ()) if not action.starts]
+        known = {action.name: action for action in (*actions, *done)}
         names = sorted(
             {action for ssh_map in rivals for _, action, _ in ssh_map.links}
             | {action.name for action in actions}
@@ -440,6 +441,7 @@ def _check(maps: Sequence[SSHMap], trace: Trace | None) -> None:
                 )
             if (
                 step.action
+                and not step.action.starts
                 and (labels[t], step.action.name, labels[t + 1]) not in links
                 and (t, "slipped") not in wrong
             ):

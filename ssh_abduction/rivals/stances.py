@@ -73,7 +73,8 @@ class Stances:
         can: Can | None,
     ) -> None:
         self._links = links_of(ssh_map, 0)
-        self._actions = {action.name: action for action in (*actions, *trace.actions)}
+        known = (*actions, *trace.actions)
+        self._actions = {action.name: action for action in known if not action.starts}
         self._can = can
         self._implies = theory.star == "frame" and theory.hard >= OF_FRAMES
         first: dict[int, Step] = {}

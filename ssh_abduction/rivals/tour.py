@@ -137,6 +137,7 @@ def with_doubted_returns(ssh_map: SSHMap, trace: Trace, margin: int) -> SSHMap:
                 {
                     (one, action.name, other)
                     for (one, other), action in zip(pairwise(labels), trace.actions, strict=True)
+                    if not action.starts
                 }
             )
         ),

@@ -9,10 +9,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 
 from ssh_abduction.data.checks import an_instance
+from ssh_abduction.data.drives import together
 from ssh_abduction.data.errors import SolverError
 from ssh_abduction.data.maps import check_of_trace
 from ssh_abduction.data.trace import Trace, checked_trace
@@ -35,7 +36,7 @@ from ssh_abduction.theory.theory import Theory, checked_theory
 
 @renamed_parameters("limit", "maps", "memory")
 def solve(
-    trace: Trace,
+    trace: Trace | Sequence[Trace],
     theory: Theory | None = None,
     *,
     time_limit: float | None = None,
@@ -50,7 +51,8 @@ def solve(
     Ctrl-C ends the search like a limit does. To get maps one by one, use `Search`.
 
     Args:
-        trace: The trace.
+        trace: The trace; or several traces of one building, for their joint maps
+            (`data.together`). `data.by_drive` splits the labels of a joint map.
         theory: The axioms and the preference; Theory.topological() by default.
         time_limit: Seconds of wall-clock time. At this limit the best answer so far is returned.
         max_maps: List at most this many maps; None lists all. After the last one, the search goes
@@ -76,9 +78,10 @@ def solve(
         Kuipers & Beeson 2002, "Bootstrap Learning for Place Recognition", step 2.
     """
     theory = checked_theory(theory)
-    theory.check_steps(checked_trace(trace))
+    joint = together(trace) if isinstance(trace, list | tuple) else checked_trace(trace)
+    theory.check_steps(joint)
     search = Search(
-        trace,
+        joint,
         theory,
         time_limit=time_limit,
         max_maps=max_maps,

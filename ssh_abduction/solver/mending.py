@@ -237,7 +237,10 @@ class Mending:
             visits = Counter(before.map.labels)
             rare = [t for t, label in enumerate(before.map.labels) if visits[label] <= RARE]
             suspected = dict.fromkeys(
-                k for t in rare for k in range(t - 1, t - 1 - BEFORE, -1) if k >= 0
+                k
+                for t in rare
+                for k in range(t - 1, t - 1 - BEFORE, -1)
+                if k >= 0 and not mended.actions[k].starts
             )
             for k in list(suspected)[:SUSPECTED]:
                 steps = list(mended.steps)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ssh_abduction.checker.joins import Join
+from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.errors import MapError, TheoryError
 from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.solver.sharing import Backbone
@@ -31,6 +32,7 @@ class Recorded:
         warnings: Sentences that say what makes the trace suspicious.
         explanation: Why there is no map, as in the file; None if the file does not say.
         joins: The joins of the first map that rest on minimality alone.
+        drives: The drives of the trace; empty if it has one.
     """
 
     certificate: Certificate | None
@@ -38,6 +40,7 @@ class Recorded:
     warnings: tuple[str, ...]
     explanation: Mapping[str, Any] | None
     joins: tuple[Join, ...]
+    drives: tuple[Drive, ...]
 
     @classmethod
     def of(cls, read: FieldReader, record: Mapping[str, Any], steps: int) -> Recorded:
@@ -68,6 +71,7 @@ class Recorded:
             if record.get("explanation") is None
             else read.mapping(record["explanation"], "explanation"),
             joins=joins_in(read, record, steps),
+            drives=drives_in(read, record, steps),
         )
 
 
@@ -109,6 +113,23 @@ def backbone_in(read: FieldReader, record: Mapping[str, Any], steps: int) -> Bac
     if record.get("backbone") is None:
         return None
     return Backbone.from_dict(record["backbone"], steps, f"{read.where}: backbone")
+
+
+def drives_in(read: FieldReader, record: Mapping[str, Any], steps: int) -> tuple[Drive, ...]:
+    """Read the drives of the trace, which follow each other. Raises MapError."""
+
+    def drive(value: Any, name: str) -> Drive:
+        written = read.mapping(value, name)
+        if not isinstance(written.get("name"), str):
+            raise read.wrong(f"{name}.name", "a text", written.get("name"))
+        first, stop = (read.integer(written.get(key), f"{name}.{key}") for key in ("first", "stop"))
+        return Drive(written["name"], first, stop)
+
+    found = read.each(record, "drives", drive, optional=True)
+    bounds = [0, *(drive.stop for drive in found)]
+    if found and ([d.first for d in found] != bounds[:-1] or bounds != sorted({*bounds, steps})):
+        raise read.wrong("drives", f"drives that follow each other up to step {steps}", bounds)
+    return found
 
 
 def joins_in(read: FieldReader, record: Mapping[str, Any], steps: int) -> tuple[Join, ...]:

@@ -13,6 +13,7 @@ from typing import Any
 from ssh_abduction.checker.claims import contradictions
 from ssh_abduction.checker.joins import Join, joins_by_minimality, sentence_of
 from ssh_abduction.data.checks import a_whole_number, one_of
+from ssh_abduction.data.drives import Drive, drives_of
 from ssh_abduction.data.errors import MapError, SolverError, brief, named
 from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.data.files import json_line
@@ -124,6 +125,12 @@ class Solution(MapSequence):
             "to clingo"
         )
         return cards.card(self.headline, *parts, cards.paragraph(took))
+
+    @property
+    def drives(self) -> tuple[Drive, ...]:
+        """The drives of the trace; empty if they are unknown."""
+        recorded = self.support.recorded.drives if self.support.recorded else ()
+        return recorded if self.trace is None else drives_of(self.trace)
 
     @property
     def headline(self) -> str:

@@ -96,6 +96,8 @@ def ending(solution: Solution, count: int, backbone: Backbone | None) -> dict[st
         },
     }
     end["summary"] = summary_of(solution, count, backbone)
+    if len(solution.drives) > 1:
+        end["drives"] = [asdict(drive) for drive in solution.drives]
     # Leave out fields that would say nothing.
     if backbone and not (solution.minimal_listed and count == 1):
         end["backbone"] = backbone.to_dict()

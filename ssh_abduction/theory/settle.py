@@ -107,6 +107,7 @@ def settle(trace: Trace, theory: Theory | None = None, known: Problem | None = N
         displacement=displacement,
         weigh=_weigh_of(theory, displacement),
         unknown_views=None in views,
+        several_drives=any(action.starts for action in trace.actions),
     )
     counts = ["dstates" if count == "tenths" else count for count in settled.priorities]
     prefer = tuple(c for c in counts if c in theory.prefer or c != "excuses")

@@ -230,8 +230,10 @@ GATEWAYS = frozenset(
     }
 )
 NOTHING: frozenset[str] = frozenset()
+# The start of a drive is an action that occurs once and is neither travel nor turn.
+DRIVES = "the field several_drives"
 # Axioms about links, observations and pairs of steps only. If a map satisfies them, so does the map
-# of its first steps.
+# of its first steps. Nothing links two drives, so they may be cut, too.
 SURVIVE_A_CUT = FRAMES | {
     "next_place",
     "all_on_paths",
@@ -246,6 +248,7 @@ SURVIVE_A_CUT = FRAMES | {
     "asserted same",
     "one_star",
     "one_pose",
+    DRIVES,
 }
 # Kinds of evidence about steps only: they say which steps are different dstates or at different
 # places, and which labels contradict each other.
@@ -283,7 +286,7 @@ TABLE = (
         "Causal theory: give the dstates names before clingo is asked.",
         _is_causal,
         CAUSAL,
-        _kept_by("names", and_also=PAIRS_OF_STEPS),
+        _kept_by("names", and_also=(*PAIRS_OF_STEPS, DRIVES)),
     ),
     Speedup(
         "named dstates with faults",
@@ -302,6 +305,7 @@ TABLE = (
                 "the field slipped",
                 "asserted same",
                 *PAIRS_OF_STEPS,
+                DRIVES,
             ),
         ),
     ),
@@ -328,7 +332,7 @@ TABLE = (
         "Places with frames: settle dstates, as visits that are one, before places and paths.",
         _has_frames,
         FRAMES,
-        _kept_by("visits", "sides_framed", "paths_framed", and_also=PAIRS_OF_STEPS),
+        _kept_by("visits", "sides_framed", "paths_framed", and_also=(*PAIRS_OF_STEPS, DRIVES)),
     ),
     Speedup(
         "ways",
@@ -337,7 +341,7 @@ TABLE = (
         "paths, with names.",
         _has_bare_places,
         PLACES,
-        _kept_by("names", "sides_frameless", "paths_frameless", and_also=PAIRS_OF_STEPS),
+        _kept_by("names", "sides_frameless", "paths_frameless", and_also=(*PAIRS_OF_STEPS, DRIVES)),
     ),
     Speedup(
         "clique",

@@ -67,7 +67,7 @@ SPOKEN_FOR = {
     *ASSERTIONS,
 }
 # The fields that the trace decides, not the user.
-SETTLED = ("returns", "unknown_views")
+SETTLED = ("returns", "unknown_views", "several_drives")
 
 
 @dataclass(frozen=True)
@@ -114,6 +114,7 @@ class Theory:
         without: Names of axioms to leave out, to see what they do.
         rules: Your own rules: paths of files that use the predicates of the encodings, or Rules.
         unknown_views: Whether the view of some step is unknown. It is set from the trace.
+        several_drives: Whether the trace has several drives. It is set from the trace.
         same: Pairs of steps known to be one dstate.
         different: Pairs of steps known to be different dstates.
         elsewhere: Pairs of steps known to be at different places.
@@ -146,6 +147,7 @@ class Theory:
     slipped: float = 0.0
     jumped: float = 0.0
     unknown_views: bool = False
+    several_drives: bool = False
     weigh: Literal["auto", "cost", "count"] = "auto"
     prices: tuple[float, float, float] = PRICES
 
@@ -339,7 +341,7 @@ class Theory:
             self.level == "topological"
             and step.action is not None
             and step.action.kind is None
-            and not step.action.slipped
+            and not step.action.unlinked
         ):
             raise TraceError(
                 f'{where}: action.kind: expected "travel" or "turn" in a topological theory, got '

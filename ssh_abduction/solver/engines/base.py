@@ -79,8 +79,8 @@ class Task:
             speedups: The speed-ups that are on; None for the default ones.
         """
         speedups = (speedups or Speedups()).that_hold_for(problem.theory)
-        # `sides` treats each link between visits as a travel, so no action may have slipped.
-        if speedups.sides and any(action.slipped for action in problem.trace.actions):
+        # `sides` treats each link between visits as a travel.
+        if speedups.sides and any(action.unlinked for action in problem.trace.actions):
             speedups = replace(speedups, sides=False)
         return Task(
             problem,

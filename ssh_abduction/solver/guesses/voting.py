@@ -46,7 +46,7 @@ class _Visit:
     Attributes:
         steps: The steps, each with the slot that it faces. The robot faces slot 0 when it arrives.
         leaves: The slot at which the visit ends and the name of the action that ends it; None for
-            the last visit, and if that action slipped.
+            the last visit of a drive, and if that action slipped.
     """
 
     steps: tuple[tuple[int, int], ...]
@@ -356,7 +356,7 @@ def _visits(trace: Trace) -> Iterator[_Visit]:
         if action.kind == "turn":
             steps.append((t + 1, (slot + QUARTERS[action.turn]) % 4))
         else:
-            yield _Visit(tuple(steps), None if action.slipped else (slot, action.name))
+            yield _Visit(tuple(steps), None if action.unlinked else (slot, action.name))
             steps = [(t + 1, 0)]
     yield _Visit(tuple(steps), None)
 

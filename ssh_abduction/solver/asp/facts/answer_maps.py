@@ -239,11 +239,13 @@ def links_of(
     Args:
         labels: The dstate of each step.
         trace: The trace.
-        faults: Steps and kinds of faults. An action that slipped makes no link.
+        faults: Steps and kinds of faults. An action that slipped makes no link, nor does the start
+            of a drive.
     """
-    slipped = {t for t, kind in faults if kind == "slipped"}
+    none = {t for t, kind in faults if kind == "slipped"}
+    none |= {t for t, action in enumerate(trace.actions) if action.starts}
     links = enumerate(zip(pairwise(labels), trace.actions, strict=False))
-    return tuple(sorted({(s, action.name, x) for t, ((s, x), action) in links if t not in slipped}))
+    return tuple(sorted({(s, action.name, x) for t, ((s, x), action) in links if t not in none}))
 
 
 def view_at(trace: Trace, step: int) -> str | int:

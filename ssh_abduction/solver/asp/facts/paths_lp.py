@@ -33,13 +33,13 @@ def paths_framed_facts(
         forbidden: Sets of equalities of steps. Evidence says that the equalities of a set do not
             all hold.
     """
-    slipped = {
+    unlinked = {
         chart.node_of[t]
         for t, action in enumerate(trace.actions[: len(chart.node_of) - 1])
-        if action.slipped
+        if action.unlinked
     }
     facts = [f"rotated({s},{x},{-action})." for s, action, x in chart.links if action < 0]
-    facts += [f"travelled({s},{x})." for s, _, x in chart.travels if s not in slipped]
+    facts += [f"travelled({s},{x})." for s, _, x in chart.travels if s not in unlinked]
     facts += [f"turned({s},{turn},{x})." for s, turn, x in chart.turns(trace)]
     facts += [f"excluded({s},{x})." for s, x in chart.excluded]
     visits = {(chart.facing[s][0], chart.facing[x][0]): (s, x) for s, x in chart.away}

@@ -61,8 +61,8 @@ def run_by_steps() -> Symbol:
 def most_paths(trace: Trace, theory: Theory, steps: int) -> int:
     """The greatest number of paths that a map of the first steps can have.
 
-    A path can begin only at the first step, and where a turn right or left (or an action that
-    slipped) ends.
+    A path can begin only at the first step of a drive, and where a turn right or left (or an action
+    that slipped) ends.
 
     Args:
         trace: The trace.
@@ -72,7 +72,7 @@ def most_paths(trace: Trace, theory: Theory, steps: int) -> int:
     if TRAVELS_AND_TURNS & theory.given_up:
         return steps
     return 1 + sum(
-        action.turn in ("right", "left") or action.slipped for action in trace.actions[: steps - 1]
+        action.turn in ("right", "left") or action.unlinked for action in trace.actions[: steps - 1]
     )
 
 
@@ -87,7 +87,9 @@ def trace_facts(problem: Problem, start: int, stop: int) -> str:
             facts += [
                 f"open({t},{slot})." for slot, is_open in enumerate(step.openings or ()) if is_open
             ]
-    done = {t: trace.actions[t] for t in range(max(start - 1, 0), stop - 1)}
+    led = {t: trace.actions[t] for t in range(max(start - 1, 0), stop - 1)}
+    facts += [f"starts({t + 1})." for t, action in led.items() if action.starts]
+    done = {t: action for t, action in led.items() if not action.starts}
     facts += [f"act({t},{constant(action.name)})." for t, action in done.items()]
     facts += [f"unlinked({t})." for t, action in done.items() if action.slipped]
     if theory.misread:

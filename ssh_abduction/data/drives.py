@@ -1,0 +1,245 @@
+"""Several drives through one building, as one trace.
+
+A *joint trace* has the steps of one drive after those of another. The last step of each drive but
+the last has an action of kind "start", which is named after the next drive. It is no action of the
+robot: nothing is known of how the first step of a drive relates to any step of another drive.
+
+>>> from ssh_abduction import Trace
+>>> monday = Trace.from_steps("ab", ["travel"], name="monday")
+>>> tuesday = Trace.from_steps("ba", ["travel"], name="tuesday")
+>>> joint = together([monday, tuesday])
+>>> joint.views, starts_of(joint), [drive.name for drive in drives_of(joint)]
+(('a', 'b', 'b', 'a'), (2,), ['monday', 'tuesday'])
+>>> by_drive(joint, joint.views)
+{'monday': ('a', 'b'), 'tuesday': ('b', 'a')}
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import TypeVar
+
+from ssh_abduction.data.action import Action
+from ssh_abduction.data.checks import a_list, a_text, all_instances
+from ssh_abduction.data.errors import TraceError, brief
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.odometry import Odometry
+from ssh_abduction.data.star import is_four
+from ssh_abduction.data.step import Step
+from ssh_abduction.data.trace import Trace, checked_trace
+
+T = TypeVar("T")
+
+ALONE = "drive 1"  # the name of the only drive of a trace without a name
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """A drive of a trace: the steps from `first` up to, but not including, `stop`.
+
+    Attributes:
+        name: The name of the drive.
+        first: Its first step.
+        stop: The step after its last one.
+    """
+
+    name: str
+    first: int
+    stop: int
+
+
+def starts_of(trace: Trace) -> tuple[int, ...]:
+    """List the steps, besides step 0, at which a drive starts."""
+    return tuple(t for t, action in enumerate(checked_trace(trace).actions, 1) if action.starts)
+
+
+def drives_of(trace: Trace) -> tuple[Drive, ...]:
+    """List the drives of a trace, in order. Most traces have one."""
+    starts = starts_of(trace)
+    first = trace.drive or trace.name or ALONE
+    names = [first, *(trace.actions[t - 1].name for t in starts)]
+    bounds = pairwise([0, *starts, len(trace)])
+    return tuple(Drive(name, *bound) for name, bound in zip(names, bounds, strict=True))
+
+
+def by_drive(trace: Trace, values: Sequence[T]) -> dict[str, tuple[T, ...]]:
+    """Split values, one for each step of a trace, by drives.
+
+    Args:
+        trace: The trace.
+        values: One value for each step, such as the labels of a map.
+
+    Returns:
+        For the name of each drive, the values of its steps.
+
+    Raises:
+        TraceError: There is not one value for each step.
+    """
+    checked_trace(trace)
+    listed = a_list("values", values, TraceError)
+    if len(listed) != len(trace):
+        raise TraceError(f"values: expected {len(trace)}, one a step, got {len(listed)}")
+    return {drive.name: tuple(listed[drive.first : drive.stop]) for drive in drives_of(trace)}
+
+
+def joined_drives(drives: Sequence[Drive], ssh_map: SSHMap) -> tuple[tuple[str, ...], ...]:
+    """Group the names of drives that a map joins: their steps are in one piece of the map."""
+    piece_of = {s: i for i, piece in enumerate(ssh_map.pieces) for s in piece}
+    groups: list[tuple[set[int], list[str]]] = []  # the pieces and the drives of each group
+    for drive in drives:
+        pieces = {piece_of[label] for label in ssh_map.labels[drive.first : drive.stop]}
+        names = [drive.name]
+        for group in [group for group in groups if group[0] & pieces]:
+            groups.remove(group)
+            pieces, names = group[0] | pieces, [*group[1], *names]
+        groups.append((pieces, names))
+    return tuple(tuple(names) for _, names in groups)
+
+
+def sentence_of(drives: Sequence[Drive], ssh_map: SSHMap) -> str:
+    """Say which drives a map joins, in words. Empty for a single drive."""
+    groups = joined_drives(drives, ssh_map)
+    if len(drives) < 2:
+        return ""
+    if len(groups) == 1:
+        return f"the map joins all {len(drives)} drives: {', '.join(groups[0])}"
+    told = "; ".join(", ".join(names) + (" alone" if len(names) == 1 else "") for names in groups)
+    return f"the map is in {len(groups)} pieces that share no place: {told}"
+
+
+def together(traces: Iterable[Trace], names: Iterable[str] | None = None) -> Trace:
+    """Join several traces of one building to one trace, with a drive for each.
+
+    Args:
+        traces: The traces. The drives of a joint trace stay drives.
+        names: The names of the drives. By default these are the names of the traces, or of their
+            files, or "drive 1", "drive 2" and so on.
+
+    Returns:
+        The joint trace. Nothing is known of how its drives relate to each other.
+
+    Raises:
+        TraceError: There is no trace; two drives have one name; or the traces differ in what they
+            record, such as stars, displacements, the odometry, or the kind of an action.
+    """
+    parts = all_instances(
+        "traces", traces, Trace, TraceError, mend="make one with Trace.load or Trace.from_steps"
+    )
+    if not parts:
+        raise TraceError("traces: expected at least one trace, got none; give the traces to join")
+    called = _names(parts, names)
+    _check_alike(parts, called)
+    drives = [trace.steps[d.first : d.stop] for trace in parts for d in drives_of(trace)]
+    if len(drives) == 1:
+        return parts[0]
+    _warn_of_repeats(parts)
+    steps: list[Step] = []
+    for name, drive in zip(called, drives, strict=True):
+        if steps:
+            steps[-1] = replace(steps[-1], action=Action(name, "start"))
+        steps += [replace(drive[0], displacement=None, covariance=None), *drive[1:]]
+    return Trace(
+        tuple(steps),
+        name=" + ".join(called),
+        images=next((trace.images for trace in parts if trace.images), None),
+        odometry=next((trace.odometry for trace in parts if trace.odometry), None),
+        drive=called[0],
+    )
+
+
+def _names(traces: Sequence[Trace], names: Iterable[str] | None) -> list[str]:
+    """Return the names of all drives, or raise TraceError if two are the same."""
+    if names is None:
+        found: list[str] = []
+        for trace in traces:
+            drives = drives_of(trace)
+            alone = trace.drive or trace.name or (trace.source and Path(trace.source).stem)
+            found += [d.name for d in drives] if len(drives) > 1 else [alone or ""]
+        found = [name or f"drive {i + 1}" for i, name in enumerate(found)]
+    else:
+        found = [
+            a_text(f"names[{i}]", name, TraceError, mend="name the drive")
+            for i, name in enumerate(a_list("names", names, TraceError))
+        ]
+        count = sum(len(drives_of(trace)) for trace in traces)
+        if len(found) != count:
+            raise TraceError(f"names: expected {count}, one a drive, got {len(found)}")
+    twice = next((name for name, count in Counter(found).items() if count > 1 or not name), None)
+    if twice is not None:
+        raise TraceError(
+            f"names: expected a different name for each drive, got {brief(twice)} twice; "
+            "rename a trace or its file, or give names"
+        )
+    return found
+
+
+def _warn_of_repeats(traces: Sequence[Trace]) -> None:
+    """Warn if two traces have the same steps: most likely one file was given twice."""
+    first: dict[tuple[Step, ...], int] = {}
+    for i, trace in enumerate(traces):
+        if (known := first.setdefault(trace.steps, i)) != i:
+            warnings.warn(
+                f"traces {known + 1} and {i + 1} have the same steps; give each drive once",
+                stacklevel=3,
+            )
+
+
+def _check_alike(traces: Sequence[Trace], names: Sequence[str]) -> None:
+    """Raise TraceError if two traces differ in what they record."""
+    for what, read, mend in _RECORDED:
+        told = [read(trace) for trace in traces]
+        known = next((i for i, here in enumerate(told) if here is not None), 0)
+        for i, here in enumerate(told):
+            if here is not None and here != told[known]:
+                raise TraceError(
+                    f"{what}: expected the same in all traces, got {told[known]} in trace "
+                    f"{known + 1} and {here} in trace {i + 1}; {mend}"
+                )
+    actions: dict[str, tuple[int, Action]] = {}
+    for i, trace in enumerate(traces):
+        for action in dict.fromkeys(a for a in trace.actions if not a.starts):
+            first, other = actions.setdefault(action.name, (i, action))
+            if action != other or action.name in names:
+                other_use = "the name of a drive" if action.name in names else other.to_json()
+                raise TraceError(
+                    f"action: expected one meaning of {brief(action.name)} in all traces, got "
+                    f"{brief(other_use)} in trace {first + 1} and {brief(action.to_json())} in "
+                    f"trace {i + 1}; rename one of them"
+                )
+
+
+def _stars(trace: Trace) -> str:
+    stars = [step.star for step in trace.steps if step.star is not None]
+    if not stars:
+        return "no stars"
+    return "four openings" if all(is_four(star) for star in stars) else "bearings"
+
+
+def _displacements(trace: Trace) -> str | None:
+    if len(trace) - len(starts_of(trace)) == 1:  # a single step has no displacement
+        return None
+    return "displacements" if trace.has_displacements else "no displacements"
+
+
+def _odometry(trace: Trace) -> Odometry | None:
+    return trace.odometry or (Odometry() if trace.has_displacements else None)
+
+
+def _sidecar(trace: Trace) -> str | None:
+    """The file that images are in, if the steps name them by numbers."""
+    return trace.images if any(isinstance(step.image, int) for step in trace.steps) else None
+
+
+# What all traces must have alike: its name, a function that reads it (None if a trace does not
+# say), and what to do.
+_RECORDED: tuple[tuple[str, Callable[[Trace], object], str], ...] = (
+    ("star", _stars, "record stars in one way, or leave them out (Trace.without_stars)"),
+    ("displacement", _displacements, "add them, or leave them out (Trace.without_displacements)"),
+    ("odometry", _odometry, "give all traces one odometry"),
+    ("images", _sidecar, "put the images of all traces into one file"),
+)

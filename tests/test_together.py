@@ -1,0 +1,220 @@
+"""Several drives through one building, as one trace."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import pytest
+import test_weighing
+from brute_force import consistent_maps, key
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import FOREIGN, theories, traces
+from test_property import LIMIT, agree
+
+from ssh_abduction import Localiser, OnlineMapper, Solution, Theory, Trace, solve
+from ssh_abduction.checker.checker import check
+from ssh_abduction.cli import main
+from ssh_abduction.data import Action, Fault, MapError, TraceError, by_drive, drives_of, together
+from ssh_abduction.data.drives import sentence_of
+from ssh_abduction.solver import choosing, prefixes
+
+
+@st.composite
+def joint_traces(draw: st.DrawFn) -> Trace:
+    """Tiny traces of two or three drives."""
+    trace = draw(traces().filter(lambda trace: len(trace) > 1))
+    last = len(trace) - 1
+    starts = draw(st.sets(st.integers(1, last), min_size=1, max_size=min(2, last)))
+    steps = list(trace.steps)
+    for t in starts:
+        steps[t - 1] = replace(steps[t - 1], action=Action(f"start at {t}", "start"))
+        steps[t] = replace(steps[t], displacement=None, covariance=None)
+    return replace(trace, steps=tuple(steps))
+
+
+@settings(max_examples=12)
+@given(st.data())
+def test_the_solver_lists_the_joint_maps_of_the_brute_force(data: st.DataObject) -> None:
+    trace = data.draw(joint_traces(), label="trace")
+    theory = data.draw(theories(trace), label="theory")
+    first_prefix = data.draw(st.sampled_from([1, 3, prefixes.FIRST_PREFIX]), label="first prefix")
+    first_paths = data.draw(st.sampled_from([1, 2, prefixes.FIRST_PATHS]), label="first paths")
+    few_steps = data.draw(st.sampled_from([0, choosing.FEW_STEPS]), label="few steps")
+    with (
+        patch.multiple(prefixes, FIRST_PREFIX=first_prefix, FIRST_PATHS=first_paths),
+        patch.object(choosing, "FEW_STEPS", few_steps),
+    ):
+        agree(trace, theory)
+
+
+@settings(max_examples=5)
+@given(st.data())
+def test_the_cheapest_joint_maps_are_those_of_plain_least_squares(data: st.DataObject) -> None:
+    trace = data.draw(joint_traces().filter(lambda trace: trace.has_displacements), label="trace")
+    theory = data.draw(theories(trace, fixed=("displacement",)), label="theory")
+    prices = data.draw(st.sampled_from(test_weighing.PRICES), label="prices")
+    test_weighing.agree(trace, test_weighing.weighed(theory, prices))
+
+
+@settings(max_examples=8)
+@given(st.data())
+def test_the_checker_rejects_joint_maps_that_the_brute_force_does_not_find(
+    data: st.DataObject,
+) -> None:
+    trace = data.draw(joint_traces(), label="trace")
+    theory = data.draw(theories(trace, fixed=FOREIGN), label="theory of the maps")
+    other = data.draw(theories(trace, fixed=FOREIGN), label="theory to check them by")
+    consistent = {found for found, _ in consistent_maps(trace, other)}
+    for ssh_map in solve(trace, theory, max_maps=50, time_limit=LIMIT).maps:
+        if key(ssh_map) not in consistent:
+            assert check(trace, ssh_map, other)
+
+
+MONDAY = Trace.from_steps("abcd", ["travel", "around", "travel"], name="monday")
+TUESDAY = Trace.from_steps("bcd", ["around", "travel"], name="tuesday")
+
+
+def test_drives_are_joined_and_split() -> None:
+    joint = together([MONDAY, TUESDAY, MONDAY[:1]], names=["monday", "tuesday", "again"])
+    assert [(d.name, d.first, d.stop) for d in drives_of(joint)] == [
+        ("monday", 0, 4),
+        ("tuesday", 4, 7),
+        ("again", 7, 8),
+    ]
+    assert by_drive(joint, joint.views)["tuesday"] == ("b", "c", "d")
+    assert joint[5:].drive == "tuesday"
+    assert [drive.name for drive in drives_of(joint[5:])] == ["tuesday", "again"]
+    assert drives_of(joint.prefix(4)) == drives_of(joint)[:1]
+    assert together([joint.prefix(4), joint[4:7]]).steps == joint.prefix(7).steps
+    assert drives_of(MONDAY)[0].name == "monday"
+
+
+def test_a_joint_trace_is_saved_and_read(tmp_path: Path) -> None:
+    joint = together([MONDAY, TUESDAY])
+    joint.save(tmp_path / "joint.jsonl")
+    read = Trace.load(tmp_path / "joint.jsonl")
+    assert read == joint
+    assert read.digest == joint.digest
+    assert drives_of(read) == drives_of(joint)
+
+
+WITH_STARS = Trace.from_steps("ab", ["travel"], stars=[(1, 0, 0, 0), (0, 0, 1, 0)])
+BEARINGS = Trace.from_steps("ab", ["travel"], stars=[[0], [180]])
+MOVED = Trace.from_steps("ab", ["travel"], displacements=[(1, 0, 0)])
+NOISY = Trace.from_steps("ab", ["travel"], displacements=[(1, 0, 0)], odometry={"scale": 0.5})
+OTHER = Trace.from_steps("ab", [{"name": "travel", "kind": "turn", "turn": "left"}])
+
+
+@pytest.mark.parametrize(
+    ("parts", "names", "said"),
+    [
+        ([], None, "traces: expected at least one trace, got none"),
+        ([MONDAY, "tuesday"], None, r"traces\[1\]: expected a Trace, got 'tuesday'"),
+        ([MONDAY, MONDAY[:2]], None, "a different name for each drive, got 'monday' twice"),
+        ([MONDAY, TUESDAY], ["one"], "names: expected 2, one a drive, got 1"),
+        ([MONDAY, TUESDAY], ["one", 2], r"names\[1\]: expected a text, got 2"),
+        ([MONDAY, WITH_STARS], None, "star: expected the same .* no stars in trace 1 and four"),
+        ([WITH_STARS, BEARINGS], None, "star: .* four openings in trace 1 and bearings in trace 2"),
+        ([MONDAY, MOVED], None, "displacement: .* no displacements in trace 1 and displacements"),
+        ([MOVED, NOISY], None, "odometry: expected the same in all traces"),
+        ([MONDAY, OTHER], None, "action: expected one meaning of 'travel' in all traces, got"),
+        ([MONDAY, TUESDAY], ["travel", "b"], "'travel' in all traces, got 'the name of a drive'"),
+    ],
+)
+def test_traces_that_do_not_fit_are_refused(parts: Any, names: Any, said: str) -> None:
+    with pytest.raises(TraceError, match=said):
+        together(parts, names)
+
+
+def test_a_trace_given_twice_is_noticed() -> None:
+    with pytest.warns(UserWarning, match="traces 1 and 2 have the same steps"):
+        together([MONDAY, MONDAY], names=["monday", "again"])
+
+
+def test_the_first_step_of_a_drive_has_no_displacement_and_a_new_name() -> None:
+    start = Action("tuesday", "start")
+    with pytest.raises(TraceError, match="step 1: displacement: expected none on the first step"):
+        Trace.from_steps("ab", [start], displacements=[(1, 0, 0)])
+    with pytest.raises(TraceError, match="step 1: action: expected a new name for this drive"):
+        Trace.from_steps("aba", [start, start])
+
+
+def test_drives_that_share_a_place_have_one_map() -> None:
+    """Tuesday adds nothing to the map of Monday. Nothing links the end of Monday to Tuesday."""
+    solution = solve([MONDAY, TUESDAY])
+    assert [ssh_map.labels for ssh_map in solution.maps] == [(0, 1, 2, 3, 1, 2, 3)]
+    (ssh_map,) = solution.maps
+    assert len(ssh_map.pieces) == 1
+    assert {action for _, action, _ in ssh_map.links} == {"travel", "around"}
+    assert sentence_of(solution.drives, ssh_map) == "the map joins all 2 drives: monday, tuesday"
+
+
+def test_drives_that_share_nothing_are_pieces(tmp_path: Path) -> None:
+    far = Trace.from_steps("xyx", ["travel", "around"], name="far")
+    solution = solve([MONDAY, far, TUESDAY], Theory.causal())
+    (ssh_map,) = solution.maps
+    assert ssh_map.pieces == ((0, 1, 2, 3), (4, 5, 6))
+    assert "2 pieces that share no place: far alone; monday, tuesday" in sentence_of(
+        solution.drives, ssh_map
+    )
+    solution.save(tmp_path / "maps.json")
+    data = json.loads((tmp_path / "maps.json").read_text())
+    assert data["maps"][0]["pieces"] == [[0, 1, 2, 3], [4, 5, 6]]
+    assert data["drives"][1] == {"name": "far", "first": 4, "stop": 7}
+    read = Solution.load(tmp_path / "maps.json")
+    assert read.drives == solution.drives
+    assert read == solution
+    data["drives"][1]["first"] = 5
+    with pytest.raises(MapError, match="drives: expected drives that follow each other"):
+        Solution.from_dict(data)
+
+
+def test_the_command_line_solves_traces_together(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = [str(tmp_path / f"{trace.name}.jsonl") for trace in (MONDAY, TUESDAY)]
+    for trace, file in zip((MONDAY, TUESDAY), files, strict=True):
+        replace(trace, name=None).save(file)
+    maps = str(tmp_path / "maps.json")
+    assert main(["solve", *files, "--together", "-o", maps]) == 0
+    assert "the map joins all 2 drives: monday, tuesday" in capsys.readouterr().out
+    assert [drive.name for drive in Solution.load(maps).drives] == ["monday", "tuesday"]
+    assert main(["solve", *files, "--together", "--jobs", "2"]) == 1
+    assert "--together: expected one search for all traces" in capsys.readouterr().err
+    assert main(["solve", *files, "-o", maps]) == 1
+    assert "--output: expected one trace, or --together" in capsys.readouterr().err
+    assert main(["solve", *files, "--together", "--front", "2"]) == 1
+    assert "--front: expected one trace" in capsys.readouterr().err
+
+
+def test_a_fault_between_drives_is_refused() -> None:
+    """No action led to the first step of a drive, so none can have slipped there."""
+    theory = Theory.causal().replace(slipped=1.0)
+    solution = solve([MONDAY, TUESDAY], theory)
+    (ssh_map, *_) = solution.maps
+    wrong = replace(ssh_map, faults=(Fault(3, "slipped", "tuesday", cost=1.0),))
+    assert solution.trace is not None
+    assert any("nothing to disbelieve" in v.message for v in check(solution.trace, wrong, theory))
+    linked = replace(ssh_map, links=(*ssh_map.links, (3, "tuesday", 1)))
+    assert any("the trace never does" in v.message for v in check(solution.trace, linked, theory))
+
+
+def test_a_driving_robot_makes_one_drive() -> None:
+    mapper = OnlineMapper("a")
+    with pytest.raises(TraceError, match="got the start of a drive"):
+        mapper.observe(Action("tuesday", "start"), "b")
+
+
+def test_a_localiser_is_lost_where_a_drive_starts() -> None:
+    solution = solve([MONDAY, TUESDAY])
+    assert solution.trace is not None
+    beliefs = list(Localiser(solution.maps[0]).beliefs(solution.trace))
+    assert len(beliefs) == len(solution.trace)
+    assert beliefs[4].probabilities == pytest.approx(
+        next(iter(Localiser(solution.maps[0]).beliefs(TUESDAY))).probabilities
+    )
