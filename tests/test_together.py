@@ -155,7 +155,7 @@ def test_drives_that_share_a_place_have_one_map() -> None:
 
 
 def test_drives_that_share_nothing_are_pieces(tmp_path: Path) -> None:
-    far = Trace.from_steps("xyx", ["travel", "around"], name="far")
+    far = Trace.from_steps("xyz", ["travel", "around"], name="far")
     solution = solve([MONDAY, far, TUESDAY], Theory.causal())
     (ssh_map,) = solution.maps
     assert ssh_map.pieces == ((0, 1, 2, 3), (4, 5, 6))
