@@ -110,6 +110,7 @@ def maze(
     cell: float = CELL,
     scale: float = 0.0,
     bend: float = 0.0,
+    drive: int | None = None,
 ) -> Walk:
     """Make a random walk in a maze of corridors.
 
@@ -132,9 +133,13 @@ def maze(
         cell: Metres from one cell to the next.
         scale: Share by which reported distances are too long.
         bend: Radians a metre by which the reported heading drifts to the left.
+        drive: The number of the walk, for several walks in one maze; None for a single one.
     """
     chance = random.Random(seed)
     doors = doors_of(width, height, chance, loops)
+    if drive is not None:
+        chance = random.Random(f"{seed}, {drive}")
+        seed = chance.randrange(2**32)
 
     def ahead(x: int, y: int, heading: int) -> tuple[int, int]:
         return x + HEADINGS[heading % 4][0], y + HEADINGS[heading % 4][1]

@@ -45,9 +45,10 @@ def test_the_solver_lists_the_joint_maps_of_the_brute_force(data: st.DataObject)
     first_prefix = data.draw(st.sampled_from([1, 3, prefixes.FIRST_PREFIX]), label="first prefix")
     first_paths = data.draw(st.sampled_from([1, 2, prefixes.FIRST_PATHS]), label="first paths")
     few_steps = data.draw(st.sampled_from([0, choosing.FEW_STEPS]), label="few steps")
+    stepwise = data.draw(st.sampled_from([-1.0, choosing.STEPWISE]), label="seconds step by step")
     with (
         patch.multiple(prefixes, FIRST_PREFIX=first_prefix, FIRST_PATHS=first_paths),
-        patch.object(choosing, "FEW_STEPS", few_steps),
+        patch.multiple(choosing, FEW_STEPS=few_steps, STEPWISE=stepwise),
     ):
         agree(trace, theory)
 

@@ -169,7 +169,7 @@ class Judging:
             action = self._trace.steps[t - 1].action
             if (
                 action is None
-                or (here, action.name, there) not in links
+                or (not action.starts and (here, action.name, there) not in links)
                 or self._trace.steps[t].view not in (None, ssh_map.dstates[there].view)
             ):
                 self._fail(

@@ -141,7 +141,7 @@ def _first_moves(trace: Trace, labels: Sequence[int]) -> list[int]:
     first: dict[tuple[int, str, int], int] = {}
     for t, (here, there) in enumerate(pairwise(labels)):
         action = trace.steps[t].action
-        if action is not None and action.kind is not None:
+        if action is not None and action.kind in ("travel", "turn"):
             first.setdefault((here, action.name, there), t)
     return sorted(first.values())
 

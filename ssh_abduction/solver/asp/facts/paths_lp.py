@@ -89,7 +89,7 @@ def paths_frameless_facts(
     facts += [
         f"turn({s},{action.turn},{x})." if action.turn else f"travel({s},{x})."
         for s, action, x in done
-        if action.kind
+        if action.kind and not action.starts
     ]
     return "\n".join([*facts, *preferred(theory)])
 

@@ -1,0 +1,131 @@
+"""Are the joint maps of several drives through one building true?
+
+    python benchmarks/together.py --family aces3 [--seeds 10] [--stars]
+    python benchmarks/together.py --family mazes [--cells 4] [--steps 60] [--seeds 10] [--stars]
+    python benchmarks/together.py --family plans --folder ../shared/data/plans [--steps 100]
+
+The script prints a table in Markdown with a row for each joint trace, and a summary below, as
+benchmarks/truth.py does. ACES3 is one drive, cut into three that overlap by two places. In mazes
+and plans, three robots start at random. Nothing is known of where a drive starts. The noise is that
+of benchmarks/truth.py.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Hashable, Iterator, Sequence
+from itertools import pairwise
+from pathlib import Path
+
+from instances import maze
+from truth import NOISE, ROOT, Known, Noise, aces3, report, told
+
+from simulator.plan_tours import tour
+from simulator.plans import Plan
+from ssh_abduction import Theory
+from ssh_abduction.data import Odometry, together
+
+DRIVES = 3
+
+
+def joined(name: str, drives: Sequence[Known]) -> Known:
+    """Join drives through one building, whose truth has the same names."""
+    names = [f"{name}, drive {i + 1}" for i in range(len(drives))]
+    return Known(
+        name,
+        together([drive.trace for drive in drives], names),
+        tuple(state for drive in drives for state in drive.dstates),
+        tuple(place for drive in drives for place in drive.places),
+    )
+
+
+def cut(known: Known, drives: int = DRIVES, overlap: int = 2) -> Known:
+    """Cut a drive into several. Each shares its last `overlap` places with the next one."""
+    moved = [t for t, (p, q) in enumerate(pairwise(known.places), 1) if p != q]
+    arrivals = [0, *moved, len(known.trace)]
+    visits = len(arrivals) - 1
+    own = (visits - overlap) / drives  # visits of each drive that it does not share with the next
+    parts = []
+    for i in range(drives):
+        first = arrivals[round(i * own)]
+        stop = arrivals[min(round((i + 1) * own) + overlap, visits)]
+        parts.append(
+            Known(
+                "",
+                known.trace[first:stop],
+                known.dstates[first:stop],
+                known.places[first:stop],
+            )
+        )
+    return joined(known.name, parts)
+
+
+def of_mazes(cells: int, steps: int, seeds: Sequence[int], noise: Noise) -> Iterator[Known]:
+    """Yield joint traces of random walks in mazes, one for each seed."""
+    for seed in seeds:
+        walks = [
+            maze(
+                cells,
+                cells,
+                steps=steps,
+                seed=seed,
+                stars=True,
+                follow=True,
+                odometry=noise.odometry,
+                drive=drive,
+            )
+            for drive in range(DRIVES)
+        ]
+        yield joined(
+            f"maze {cells} x {cells}, {seed}",
+            [Known("", walk.trace, walk.truth, tuple(map(_cell, walk.truth))) for walk in walks],
+        )
+
+
+def _cell(state: object) -> Hashable:
+    assert isinstance(state, tuple)
+    return state[:2]
+
+
+def of_plans(folder: Path, steps: int, seeds: Sequence[int], noise: Noise) -> Iterator[Known]:
+    """Yield joint traces of tours of floor plans, one for each plan and seed."""
+    for path in sorted(folder.glob("*.xml"), key=lambda path: path.stem.lower()):
+        plan = Plan.load(path)
+        for seed in seeds:
+            name = f"{plan.name}, {seed}"
+            tours = [tour(plan, steps, DRIVES * seed + i, noise.odometry) for i in range(DRIVES)]
+            yield joined(name, [told("", trace) for trace in tours])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--family", choices=("aces3", "mazes", "plans"), required=True)
+    parser.add_argument("--seeds", type=int, metavar="N", help="seeds (default 10; plans 1)")
+    parser.add_argument("--first", type=int, default=0, metavar="SEED", help="the first seed")
+    parser.add_argument("--cells", type=int, default=4, metavar="N", help="mazes of N x N cells")
+    parser.add_argument(
+        "--steps", type=int, metavar="N", help="actions of a drive (default: mazes 60, plans 100)"
+    )
+    parser.add_argument(
+        "--folder", type=Path, default=ROOT.parent / "shared" / "data" / "plans", metavar="FOLDER"
+    )
+    parser.add_argument("--limit", type=float, default=60, metavar="S", help="seconds for each")
+    parser.add_argument("--stars", action="store_true", help="give the solver stars, too")
+    parser.add_argument(
+        "--displacement", choices=("auto", "none"), default="auto", help="none ignores odometry"
+    )
+    options = parser.parse_args()
+    noise = Noise(Odometry(**NOISE))
+    count = options.seeds or (1 if options.family == "plans" else 10)
+    seeds = range(options.first, options.first + count)
+    families = {
+        "aces3": lambda: map(cut, aces3(seeds, noise)),
+        "mazes": lambda: of_mazes(options.cells, options.steps or 60, seeds, noise),
+        "plans": lambda: of_plans(options.folder, options.steps or 100, seeds, noise),
+    }
+    theory = Theory(displacement=options.displacement, star="auto" if options.stars else "none")
+    print(f"\n{report(families[options.family](), theory, options.limit)}")
+
+
+if __name__ == "__main__":
+    main()
