@@ -20,14 +20,17 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import combinations, permutations, product
 from typing import NamedTuple, TypeAlias
 
+import numpy as np
 from brute_geometry import Geometry
+from scipy.stats import chi2
 
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.star import Gateway, Openings, Star
 from ssh_abduction.data.trace import Action, Step, Trace
 from ssh_abduction.theory.settle import settle
@@ -156,6 +159,8 @@ def consistent_maps(trace: Trace, theory: Theory) -> Iterator[tuple[Key, Counts]
             continue
         if "one_star" in on and not _stars_alike(trace, labels):
             continue
+        if "closure" in on and not _closures_agree(trace, theory, labels, 3):
+            continue
         dstates = max(labels) + 1
         if theory.level == "causal":
             yield (labels, (None,) * dstates, (None,) * dstates), Counts(dstates, 0, 0, 0)
@@ -169,6 +174,9 @@ def consistent_maps(trace: Trace, theory: Theory) -> Iterator[tuple[Key, Counts]
             if "asserted" in on and not _as_asserted(labels, places, theory):
                 continue
             if geometry and not geometry.allows(labels, places):
+                continue
+            where = [places[label] for label in labels]
+            if "closure" in on and not _closures_agree(trace, theory, where, 2):
                 continue
             headings = (
                 list(_headings(labels, places, trace.actions, stars, on))
@@ -818,6 +826,29 @@ def _sides_allowed(
             return False
         # B4: no place on a path lies to its right or left.
         if "path_between_sides" in on and q in on_path[h]:
+            return False
+    return True
+
+
+# --- closures: whether none of them is far off between steps at one dstate, or at one place
+
+
+def _closures_agree(
+    trace: Trace, theory: Theory, labels: Sequence[int | None], freedom: int
+) -> bool:
+    """freedom  3 where the labels are dstates, 2 where they are places"""
+    odometry = trace.odometry or Odometry()
+    most = chi2.isf(theory.reject / max(theory.returns, 1), freedom)
+    for closure in trace.closures:
+        if labels[closure.first] != labels[closure.last]:
+            continue
+        x, y, turned = closure.displacement
+        off = np.array([x, y, math.remainder(turned, 2 * math.pi)])
+        noise = np.array(closure.covariance)
+        for k, spread in enumerate((odometry.offset, odometry.offset, odometry.facing)):
+            noise[k, k] += 2 * spread**2
+        one = slice(0, freedom)
+        if off[one] @ np.linalg.solve(noise[one, one], off[one]) > most:
             return False
     return True
 

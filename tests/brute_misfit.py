@@ -1,5 +1,5 @@
-"""The misfit of a map to the displacements, by plain least squares from several starts: slow, and
-independent of the package.
+"""The misfit of a map to displacements and closures, by plain least squares from several starts:
+slow, and independent of the package.
 
 The unknowns are the position of each place (of each dstate where there are no places), the heading
 of each dstate, the scale and the drift.
@@ -28,6 +28,10 @@ class LeastSquares:
         self.odometry = trace.odometry or Odometry()
         # The robot is off the pose of a dstate when it arrives, and when it leaves.
         ends = 2 * np.diag([self.odometry.offset] * 2 + [self.odometry.facing]) ** 2
+        self.closures = [
+            (closure, np.linalg.inv(np.array(closure.covariance) + ends))
+            for closure in trace.closures
+        ]
         travels = [None, *(action.kind != "turn" for action in trace.actions)]
         self.moved = [
             (
@@ -50,6 +54,7 @@ class LeastSquares:
         where = [at[positions[heading]] for heading in headings]
         size = 2 * len(at) + len(positions) + 2
         roots = [np.linalg.cholesky(weight).T for _, _, weight in self.moved]
+        seen = [np.linalg.cholesky(weight).T for _, weight in self.closures]
 
         def off(unknown: np.ndarray) -> np.ndarray:
             xy, facing = unknown[: 2 * len(at)].reshape(-1, 2), unknown[2 * len(at) : -2]
@@ -64,6 +69,14 @@ class LeastSquares:
                 left = math.cos(angle) * gone[1] - math.sin(angle) * gone[0]
                 turn = math.remainder(end - start + bend * way - turned, math.tau)
                 rows.append(root @ [(1 + scale) * ahead - dx, (1 + scale) * left - dy, turn])
+            for (closure, _), root in zip(self.closures, seen, strict=True):
+                x, y, turned = closure.displacement
+                here, there = headings[closure.first], headings[closure.last]
+                gone = xy[where[closure.last]] - xy[where[closure.first]]
+                cos, sin = math.cos(facing[here]), math.sin(facing[here])
+                ahead, left = cos * gone[0] + sin * gone[1], cos * gone[1] - sin * gone[0]
+                turn = math.remainder(facing[there] - facing[here] - turned, math.tau)
+                rows.append(root @ [ahead - x, left - y, turn])
             return np.concatenate(rows)
 
         random = np.random.default_rng(0)

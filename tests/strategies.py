@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from brute_force import Key
 from hypothesis import strategies as st
 
-from ssh_abduction.data.odometry import Odometry
+from ssh_abduction.data.closure import Closure
+from ssh_abduction.data.odometry import Covariance, Odometry, between
+from ssh_abduction.data.odometry import moved as moved_pose
 from ssh_abduction.data.trace import STANDARD_ACTIONS, Action, Trace
 from ssh_abduction.theory.encodings import axioms
 from ssh_abduction.theory.fields import COUNTS, PRICES, Count
@@ -106,9 +108,9 @@ TOYS = (
 
 
 @st.composite
-def traces(draw: st.DrawFn, max_steps: int = 7) -> Trace:
+def traces(draw: st.DrawFn, max_steps: int = 7, closures: bool = False) -> Trace:
     """One to `max_steps` observations of two or three views, any actions in between, with or
-    without stars."""
+    without stars. With `closures`, some traces with displacements have closures, too."""
     steps = draw(st.integers(1, max_steps) | st.just(max_steps))
     views = draw(st.sampled_from(["ab", "abc"]))
     seen = draw(st.lists(st.sampled_from(views), min_size=steps, max_size=steps))
@@ -135,7 +137,32 @@ def traces(draw: st.DrawFn, max_steps: int = 7) -> Trace:
             for action in actions
         ]
         noise = Odometry(**draw(st.sampled_from(ODOMETRY)))
-    return Trace.from_steps(seen, actions, stars=stars, displacements=moved, odometry=noise)
+    trace = Trace.from_steps(seen, actions, stars=stars, displacements=moved, odometry=noise)
+    if not closures or moved is None or steps < 2 or not draw(st.booleans()):
+        return trace
+    return replace(trace, closures=tuple(draw(_closures(trace))))
+
+
+def _closures(trace: Trace) -> st.SearchStrategy[list[Closure]]:
+    """One to three closures that say nearly what the displacements say.
+
+    Maps with a closure that contradicts the displacements have misfits with several minima.
+    """
+    poses = [(0.0, 0.0, 0.0)]
+    for step in trace.steps[1:]:
+        poses.append(moved_pose(poses[-1], step.displacement or (0.0, 0.0, 0.0)))
+    pairs = st.sampled_from([(i, j) for j in range(len(poses)) for i in range(j)])
+    wrong = st.tuples(*(st.sampled_from([0.0, wrong]) for wrong in (0.4, -0.2, 0.05)))
+    noise = st.sampled_from([0.1, 0.5]).map(
+        lambda s: ((s**2, 0.0, 0.0), (0.0, s**2, 0.001), (0.0, 0.001, 0.02))
+    )
+
+    def closure(pair: tuple[int, int], off: tuple[float, ...], spread: Covariance) -> Closure:
+        x, y, turned = map(sum, zip(between(poses[pair[0]], poses[pair[1]]), off, strict=True))
+        return Closure(*pair, (x, y, turned), spread)
+
+    found = st.builds(closure, pairs, wrong, noise)
+    return st.lists(found, min_size=1, max_size=3, unique_by=lambda c: (c.first, c.last))
 
 
 def _usual(action: Action) -> tuple[float, float, float]:

@@ -58,7 +58,7 @@ def test_gateways_at_any_angles(tmp_path: Path) -> None:
 @settings(max_examples=60, deadline=None)
 @given(data=st.data())
 def test_all_maps_of_a_beam_satisfy_the_axioms(data: st.DataObject) -> None:
-    trace = data.draw(traces().filter(lambda trace: trace.has_displacements))
+    trace = data.draw(traces(closures=True).filter(lambda trace: trace.has_displacements))
     theory = data.draw(theories(trace)).without_faults().replace(displacement="use", weigh="auto")
     for ssh_map in maps_of(trace, theory, data.draw(st.sampled_from([1, 3]))):
         assert check(trace, ssh_map, theory) == ()

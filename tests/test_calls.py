@@ -42,7 +42,7 @@ from ssh_abduction import (
     solve,
     view_page,
 )
-from ssh_abduction.data import Action, Odometry, Step
+from ssh_abduction.data import Action, Closure, Odometry, Step
 from ssh_abduction.evaluation import evaluate_visits
 from ssh_abduction.evaluation.ladder import ladder
 from ssh_abduction.learning.learner import BootstrapLearner
@@ -123,6 +123,7 @@ RIGHT: dict[str, set[str]] = {
     "Camera.shot.walls": {"huge"},
     "Camera.shot.hour": {"3.5"},
     "Certificate.to_dict.trace": {"None"},
+    "Closure.last": {"huge"},
     "Cost.preferred_by.theory": {"None"},
     "Explorer.explore.steps": {"huge"},
     "Odometry.of.value": {"dict"},
@@ -145,6 +146,7 @@ RIGHT: dict[str, set[str]] = {
     **{f"Theory.{price}": {"3.5"} for price in ("misread", "slipped", "jumped")},
     **{f"{written}.save.path": {"nonsense"} for written in ("Page", "Solution", "SSHMap", "Trace")},
     "Trace.at.step": {"huge"},
+    "Trace.closures": {"list"},
     "Trace.from_steps.views": {"[1, 2]"},
     "Trace.prefix.steps": {"huge"},
     "Trace.without_displacements_at.steps": {"array", "[1, 2]", *EMPTY},
@@ -356,6 +358,8 @@ def good(call: str, parameter: inspect.Parameter) -> Any:
         "Search.continuing.after": made["search"],
         "Search.continuing.max_maps": 1,
         "Search.continuing.time_limit": None,
+        "Closure.covariance": np.eye(3),
+        "Closure.of.value": Closure(0, 1, (0.0, 0.0, 0.0), tuple(map(tuple, np.eye(3)))),
         "Search.solution.maps": solution.maps,
         "Solution.from_dict.data": solution.to_dict(),
         "Solution.load.path": "solution.json",
@@ -401,6 +405,7 @@ def good(call: str, parameter: inspect.Parameter) -> Any:
         "goal": 1,
         "hour": 12.0,
         "key": ("wall", 1),
+        "last": 1,
         "kind": "misread",
         "least": 0.1,
         "length": 2,

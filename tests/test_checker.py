@@ -6,11 +6,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import permutations, product
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ssh_abduction.checker.checker import AXIOMS, COHERENCE, Violation, check
+from ssh_abduction.data.closure import Closure
 from ssh_abduction.data.maps import DState, MapPath, SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory import encodings
@@ -177,8 +179,12 @@ SPUN = replace(
         replace(s, displacement=(0, 0, -1.5) if t else None) for t, s in enumerate(seen("a R a"))
     ),
 )
+SHIFTED = replace(
+    seen("a R a"), closures=(Closure(0, 1, (2, 0, 0), tuple(map(tuple, np.eye(3) * 0.01))),)
+)
 BROKEN = {
     "one_pose": case(TOPOLOGICAL, SPUN, "0 0", "0"),
+    "closure": case(TOPOLOGICAL, SHIFTED, "0 0", "0"),
     "one_star": case(
         Theory.causal().replace(star="alike"), seen("a R a", [(0, 90), (0, 120)]), "0 0", "."
     ),

@@ -124,7 +124,7 @@ def test_without_any_one_axiom_the_rectangles_steps_may_be_one() -> None:
 @settings(max_examples=8)
 @given(st.data())
 def test_verdicts_are_those_of_the_brute_force(data: st.DataObject) -> None:
-    trace = data.draw(traces(max_steps=5), label="trace")
+    trace = data.draw(traces(max_steps=5, closures=True), label="trace")
     assume(len(trace) > 1)
     theory = data.draw(theories(trace), label="theory")
     first = data.draw(st.integers(0, len(trace) - 2), label="first")

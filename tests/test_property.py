@@ -44,7 +44,7 @@ def agree(trace: Trace, theory: Theory) -> None:
 @settings(max_examples=20)
 @given(st.data())
 def test_solver_lists_the_maps_of_the_brute_force(data: st.DataObject) -> None:
-    trace = data.draw(traces(), label="trace")
+    trace = data.draw(traces(closures=True), label="trace")
     theory = data.draw(theories(trace), label="theory")
     # The traces are shorter than the solver's first prefix: a shorter one makes it replay and
     # extend.

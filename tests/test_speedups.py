@@ -56,7 +56,7 @@ def machines(draw: st.DrawFn, most_steps: int = 14) -> Trace:
     """A walk in a random machine of few states, or any trace at all: maps that close, and maps that
     do not."""
     if draw(st.booleans()):
-        return draw(traces(max_steps=8))
+        return draw(traces(max_steps=8, closures=True))
     states = draw(st.integers(1, 6))
     views = draw(st.lists(st.sampled_from("ab"), min_size=states, max_size=states))
     follow = draw(

@@ -79,7 +79,9 @@ PRICES = [(8.0, 8.0, 0.0), (1.0, 2.0, 0.5), (3.0, 0.0, 0.0)]
 @settings(max_examples=8)
 @given(st.data())
 def test_the_cheapest_maps_are_those_of_plain_least_squares(data: st.DataObject) -> None:
-    trace = data.draw(traces().filter(lambda trace: trace.has_displacements), label="trace")
+    trace = data.draw(
+        traces(closures=True).filter(lambda trace: trace.has_displacements), label="trace"
+    )
     theory = data.draw(theories(trace, fixed=("displacement",)), label="theory")
     agree(trace, weighed(theory, data.draw(st.sampled_from(PRICES), label="prices")))
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from ssh_abduction.checker.moves import Move, heading_of
 from ssh_abduction.checker.planarity import Edges
 from ssh_abduction.checker.reading import Check, Found, Reading
 from ssh_abduction.checker.stars import stars_of
+from ssh_abduction.data.closure import Closure
+from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.star import Star
 
 
@@ -73,6 +76,47 @@ def one_pose(m: Reading) -> Found:
             f"By the displacements it cannot be that {said}: {refused} (chi-square "
             f"{refused.square:.0f}, and at most {refused.most:.0f} is allowed).",
         )
+
+
+def closure(m: Reading) -> Found:
+    """Check that each closure agrees with one pose per dstate and one position per place."""
+    labels, odometry = m.map.labels, m.trace.odometry or Odometry()
+    for match in m.trace.closures:
+        i, j = match.first, match.last
+        if j >= len(labels):
+            continue
+        here, there = (m.states.get(labels[step]) for step in (i, j))
+        for freedom, kind, is_one in (
+            (3, "dstate", labels[i] == labels[j]),
+            (2, "place", here and there and here.place is not None and here.place == there.place),
+        ):
+            if is_one and _p_value(match, odometry, freedom) < m.theory.reject / max(
+                m.theory.returns, 1
+            ):
+                yield (
+                    [i, j],
+                    f"Steps {i} and {j} are at one {kind}, but {match} and a turn of "
+                    f"{math.degrees(match.displacement[2]):.0f} degrees.",
+                )
+
+
+def _p_value(match: Closure, odometry: Odometry, freedom: int) -> float:
+    """Compute how probable a closure at least so far from zero is, if both poses are one.
+
+    Args:
+        match: The closure.
+        odometry: The noise model, with the errors of poses at visits.
+        freedom: 2 to compare positions, 3 to compare poses.
+    """
+    import numpy as np
+    from scipy.stats import chi2
+
+    spreads = np.array([odometry.offset, odometry.offset, odometry.facing])
+    total = np.array(match.covariance) + np.diag(2 * spreads * spreads)
+    x, y, turned = match.displacement
+    off = np.array([x, y, math.remainder(turned, math.tau)])[:freedom]
+    square = off @ np.linalg.inv(total[:freedom, :freedom]) @ off
+    return float(chi2.sf(square, freedom))
 
 
 def planar(m: Reading) -> Found:
@@ -144,6 +188,7 @@ AXIOMS: dict[str, Check] = {
     for check in (
         one_star,
         asserted,
+        closure,
         one_pose,
         planar,
     )

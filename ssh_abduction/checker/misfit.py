@@ -1,10 +1,11 @@
 """Compute the cost of maps in nats anew, and compare it with what an answer claims.
 
 The solver looks for poses of dstates. This module looks for errors of the displacements instead, so
-the two share nothing. The unknowns z are the errors of all displacements, the scale and the drift,
-each in standard deviations. A map demands that its loops close: c(z) = 0. The misfit is the least
-sum of z², found by Gauss-Newton: z is moved to the smallest solution of J z = J z - c(z), where J
-holds the derivatives of c. This is the update of an iterated Kalman filter for all loops at once.
+the two share nothing. The unknowns z are the errors of all displacements and closures, the scale
+and the drift, each in standard deviations. A map demands that its loops close, and that the poses
+of the two steps of each closure lie as it says: c(z) = 0. The misfit is the least sum of z², found
+by Gauss-Newton: z is moved to the smallest solution of J z = J z - c(z), where J holds the
+derivatives of c. This is the update of an iterated Kalman filter for all loops at once.
 """
 
 from __future__ import annotations
@@ -39,10 +40,10 @@ LONGEST = 400
 
 
 def misfit(trace: Trace, dstates: Sequence[int], places: Sequence[int]) -> float:
-    """The least chi-square of the displacements if each step is at this dstate and this place.
+    """The least chi-square if each step is at this dstate and this place.
 
     Args:
-        trace: A trace with displacements.
+        trace: A trace with displacements, and perhaps closures.
         dstates: The dstate of each step, as a number.
         places: The place of each step, as a number.
     """
@@ -95,7 +96,7 @@ def false_costs(
 
 
 class _Errors:
-    """The errors of the displacements that make the loops of a map close."""
+    """The errors of the displacements and closures that make the loops of a map close."""
 
     def __init__(self, trace: Trace, dstates: Sequence[int], places: Sequence[int]) -> None:
         odometry = trace.odometry or Odometry()
@@ -114,6 +115,14 @@ class _Errors:
             self._root[t] = np.linalg.cholesky(np.array(covariance) + at_ends)
         self._way = np.hypot(self._moved[:, 0], self._moved[:, 1])
         self._sigma = np.array([odometry.scale, odometry.bend])
+        ends = 2 * np.diag([odometry.offset, odometry.offset, odometry.facing]) ** 2
+        # The closures, each with the root of its covariance.
+        self._closures = [
+            (closure, np.linalg.cholesky(np.array(closure.covariance) + ends))
+            for closure in trace.closures
+        ]
+        # The number of unknowns: errors of displacements and closures, scale and drift.
+        self._size = 3 * (size + len(self._closures)) + 2
         # The loops: the last step at the same place, and whether it is at the same dstate.
         self._loops: list[tuple[int, int, bool]] = []
         at_place: dict[int, int] = {}
@@ -127,7 +136,7 @@ class _Errors:
 
     def least(self) -> float:
         """The least sum of squares of the errors, in standard deviations."""
-        z: Array = np.zeros(3 * len(self._moved) + 2)
+        z: Array = np.zeros(self._size)
         for _ in range(ROUNDS):
             look_at_clock()
             closing, jacobian = self._closings(z)
@@ -145,7 +154,7 @@ class _Errors:
         """How far off the loops close with these errors, and the derivatives by the errors."""
         size = len(self._moved)
         scale, bend = self._sigma * z[-2:]
-        noise = np.einsum("tij,tj->ti", self._root, z[:-2].reshape(size, 3))
+        noise = np.einsum("tij,tj->ti", self._root, z[: 3 * size].reshape(size, 3))
         turned = self._moved[:, 2] + noise[:, 2] - bend * self._way
         turned[0] = 0.0
         heading = np.cumsum(turned)
@@ -172,20 +181,42 @@ class _Errors:
         rows: list[Array] = []
         off: list[float] = []
         for first, last, is_dstate in self._loops:
-            along = slice(first + 1, last + 1)
-            rest = pose[last, :2] - pose[along, :2]
-            # An error of the heading turns the rest of the way.
-            carried = own[along].copy()
-            carried[:, 0] -= rest[:, 1, None] * own[along, 2]
-            carried[:, 1] += rest[:, 0, None] * own[along, 2]
-            row = np.zeros((3, 3 * size + 2))
-            row[:, 3 * first + 3 : 3 * last + 3] = (
-                carried[:, :, :3].transpose(1, 0, 2).reshape(3, -1)
-            )
-            row[:, -2:] = carried[:, :, 3:].sum(axis=0)
+            kept = 3 if is_dstate else 2
             gap = pose[last] - pose[first]
             gap[2] = math.remainder(gap[2], math.tau)
-            kept = 3 if is_dstate else 2
-            rows.append(row[:kept])
+            rows.append(self._row(pose, own, first, last)[:kept])
             off += gap[:kept].tolist()
-        return np.array(off), np.concatenate(rows) if rows else np.zeros((0, 3 * size + 2))
+        for k, (closure, root) in enumerate(self._closures):
+            # The pose at the later step in the frame of the earlier one. Errors up to the earlier
+            # step move both poses alike.
+            first, last = closure.first, closure.last
+            cos, sin = math.cos(heading[first]), math.sin(heading[first])
+            back = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
+            mine = slice(3 * (size + k), 3 * (size + k) + 3)
+            row = back @ self._row(pose, own, first, last)
+            row[:, mine] = -root
+            gap = back @ (pose[last] - pose[first]) - closure.displacement - root @ z[mine]
+            gap[2] = math.remainder(gap[2], math.tau)
+            rows.append(row)
+            off += gap.tolist()
+        return np.array(off), np.concatenate(rows) if rows else np.zeros((0, self._size))
+
+    def _row(self, pose: Array, own: Array, first: int, last: int) -> Array:
+        """The derivatives of the pose at `last` minus that at `first`, 3 x the unknowns.
+
+        Args:
+            pose: The poses of all steps, n x 3.
+            own: The derivatives of each movement by its own unknowns, n x 3 x 5.
+            first: The earlier step.
+            last: The later step.
+        """
+        along = slice(first + 1, last + 1)
+        rest = pose[last, :2] - pose[along, :2]
+        # An error of the heading turns the rest of the way.
+        carried = own[along].copy()
+        carried[:, 0] -= rest[:, 1, None] * own[along, 2]
+        carried[:, 1] += rest[:, 0, None] * own[along, 2]
+        row = np.zeros((3, self._size))
+        row[:, 3 * first + 3 : 3 * last + 3] = carried[:, :, :3].transpose(1, 0, 2).reshape(3, -1)
+        row[:, -2:] = carried[:, :, 3:].sum(axis=0)
+        return row

@@ -9,6 +9,7 @@ from ssh_abduction import lazy_names
 TYPE_CHECKING = False
 
 if TYPE_CHECKING:
+    from ssh_abduction.data.closure import Closure
     from ssh_abduction.data.drives import Drive, by_drive, drives_of, together
     from ssh_abduction.data.errors import (
         AbductionError,
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from ssh_abduction.data.trace import Action, Step, Trace
 
 _HOMES = {  # module: the names that this package exports from it
+    "closure": ("Closure",),
     "drives": ("Drive", "by_drive", "drives_of", "together"),
     "errors": (
         "AbductionError",
@@ -54,6 +56,7 @@ _HOMES = {  # module: the names that this package exports from it
 __all__ = [
     "AbductionError",
     "Action",
+    "Closure",
     "DState",
     "Drive",
     "Fault",

@@ -20,7 +20,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import TypeVar
 
@@ -139,6 +139,12 @@ def together(traces: Iterable[Trace], names: Iterable[str] | None = None) -> Tra
         return parts[0]
     _warn_of_repeats(parts)
     steps: list[Step] = []
+    begins = accumulate([0, *map(len, parts[:-1])])
+    closures = [
+        replace(closure, first=begin + closure.first, last=begin + closure.last)
+        for begin, trace in zip(begins, parts, strict=True)
+        for closure in trace.closures
+    ]
     for name, drive in zip(called, drives, strict=True):
         if steps:
             steps[-1] = replace(steps[-1], action=Action(name, "start"))
@@ -149,6 +155,7 @@ def together(traces: Iterable[Trace], names: Iterable[str] | None = None) -> Tra
         images=next((trace.images for trace in parts if trace.images), None),
         odometry=next((trace.odometry for trace in parts if trace.odometry), None),
         drive=called[0],
+        closures=tuple(closures),
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -166,3 +166,29 @@ class Step:
         }
         unknown = {"view": None} if self.view is None and self.image is None else {}
         return {**unknown, **{k: v for k, v in known.items() if v is not None}, **self.extra}
+
+
+def of_actions(values: Iterable[Any] | None, name: str, actions: int) -> list[Any]:
+    """Return a list of one value for each step, from one value for each action.
+
+    The value of an action goes to the step that it led to. The first step gets None.
+
+    Args:
+        values: The values; None to make them all None.
+        name: The name of the values in messages.
+        actions: The number of actions.
+    """
+    found = [None] * actions if values is None else listed(values, name)
+    if len(found) != actions:
+        raise TraceError(
+            f"trace: expected one of {name} for each action, got {len(found)} and {actions} "
+            f"actions; give None where one is not known"
+        )
+    return [None, *found]
+
+
+def listed(values: Any, name: str) -> list[Any]:
+    """Return an iterable as a list. A text becomes a list of its letters, which are views."""
+    if not isinstance(values, Iterable) or isinstance(values, bytes | Mapping):
+        raise TraceError(f"{name}: expected a list, got {brief(values)}; give one value a step")
+    return list(values)

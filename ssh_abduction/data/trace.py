@@ -22,13 +22,14 @@ from typing import Any, overload
 
 from ssh_abduction.data.action import STANDARD_ACTIONS, Action, Kind, TurnDirection
 from ssh_abduction.data.checks import a_list, a_path, a_text, a_whole_number, an_instance, an_object
+from ssh_abduction.data.closure import Closure, checked_closures, closures_among
 from ssh_abduction.data.errors import RangeError, TraceError, brief, checked_index, named
 from ssh_abduction.data.files import json_line, write_file
 from ssh_abduction.data.notebook import in_output
 from ssh_abduction.data.observation import View, checked_probability, view_or_unknown
 from ssh_abduction.data.odometry import Covariance, Odometry
 from ssh_abduction.data.star import Star
-from ssh_abduction.data.step import Step
+from ssh_abduction.data.step import Step, listed, of_actions
 from ssh_abduction.data.trace_file import FORMAT, VERSION, read_trace
 from ssh_abduction.data.words import counted
 
@@ -61,6 +62,8 @@ class Trace:
         extra: Fields of the file's header that this package does not know.
         source: The file that the trace was read from.
         drive: The name of the first drive, in a trace of several drives (`data/drives.py`).
+        closures: How pairs of steps lie relative to each other, from matches of their local maps.
+            They count as displacements.
     """
 
     steps: tuple[Step, ...]
@@ -70,6 +73,7 @@ class Trace:
     extra: Mapping[str, Any] = field(default_factory=dict, hash=False)
     source: str | None = field(default=None, compare=False)
     drive: str | None = None
+    closures: tuple[Closure, ...] = ()
 
     def __post_init__(self) -> None:
         if not isinstance(self.steps, tuple) or not all(
@@ -96,6 +100,9 @@ class Trace:
                 mend="make one with Odometry.of, or leave it out",
             )
         an_object("extra", self.extra, TraceError)
+        object.__setattr__(
+            self, "closures", checked_closures(self.closures, len(self.steps), self.source)
+        )
         self._check_actions()
 
     def _check_actions(self) -> None:
@@ -184,6 +191,7 @@ class Trace:
             steps=(replace(here[0], displacement=None, covariance=None), *here[1:]),
             source=None,
             drive=next((a.name for a in self.actions[start - 1 :: -1] if a.starts), self.drive),
+            closures=closures_among(self.closures, range(start, stop)),
         )
 
     def __repr__(self) -> str:
@@ -198,7 +206,8 @@ class Trace:
         there = {
             "images": any(step.image is not None for step in self),
             "stars": self.has_stars,
-            "displacements": self.has_displacements,
+            "displacements": any(step.displacement is not None for step in self),
+            "closures": bool(self.closures),
         }
         more = "".join(f"; {what}" for what, is_there in there.items() if is_there)
         return f"<Trace{name}: {', '.join(parts)}{more}>"
@@ -236,8 +245,8 @@ class Trace:
 
     @property
     def has_displacements(self) -> bool:
-        """Whether any step has a displacement."""
-        return any(step.displacement is not None for step in self.steps)
+        """Whether any step has a displacement, or there are closures."""
+        return bool(self.closures) or any(step.displacement is not None for step in self.steps)
 
     def covariance(self, step: int) -> Covariance | None:
         """Return the covariance of a step's displacement, 3 x 3; None without a displacement.
@@ -289,22 +298,22 @@ class Trace:
                 f"actions: expected a list, got {brief(actions)}; "
                 f"give the name of one action after another, as in ['travel']"
             )
-        seen = _listed(views, "views")
-        done = [Action.of(a) for a in _listed(actions, "actions")]
+        seen = listed(views, "views")
+        done = [Action.of(a) for a in listed(actions, "actions")]
         if len(seen) != len(done) + 1:
             raise TraceError(
                 f"trace: expected one view more than actions, got {len(seen)} views and "
                 f"{len(done)} actions; each action leads from one view to the next"
             )
         # A step has its star. The displacement of an action belongs to the step after the action.
-        openings = [None] * len(seen) if stars is None else _listed(stars, "stars")
+        openings = [None] * len(seen) if stars is None else listed(stars, "stars")
         if len(openings) != len(seen):
             raise TraceError(
                 f"trace: expected a star a view, got {len(openings)} stars and {len(seen)} views; "
                 f"give None where none was seen"
             )
-        moved = _of_actions(displacements, "displacements", len(done))
-        noise = _of_actions(covariances, "covariances", len(done))
+        moved = of_actions(displacements, "displacements", len(done))
+        noise = of_actions(covariances, "covariances", len(done))
         steps = tuple(
             Step.of(view, star, f"step {i}", action, displacement, covariance)
             for i, (view, star, action, displacement, covariance) in enumerate(
@@ -318,11 +327,12 @@ class Trace:
         return replace(self, steps=tuple(replace(step, star=None) for step in self.steps))
 
     def without_displacements(self) -> Trace:
-        """Return the same trace without displacements and odometry."""
+        """Return the same trace without displacements, closures and odometry."""
         return replace(
             self,
             steps=tuple(replace(step, displacement=None, covariance=None) for step in self.steps),
             odometry=None,
+            closures=(),
         )
 
     def without_displacements_at(self, steps: Collection[int]) -> Trace:
@@ -353,8 +363,8 @@ class Trace:
         Raises:
             TraceError: If a value is wrong, or there is not one for each step.
         """
-        seen = _listed(views, "views")
-        sure = [None] * len(seen) if confidences is None else _listed(confidences, "confidences")
+        seen = listed(views, "views")
+        sure = [None] * len(seen) if confidences is None else listed(confidences, "confidences")
         for name, values in (("views", seen), ("confidences", sure)):
             if len(values) != len(self):
                 raise TraceError(f"{name}: expected {len(self)}, one a step, got {len(values)}")
@@ -378,7 +388,8 @@ class Trace:
         head = self.steps[: a_whole_number("steps", steps, TraceError, 1)]
         if head:
             head = (*head[:-1], replace(head[-1], action=None))
-        return replace(self, steps=head)
+        kept = closures_among(self.closures, range(len(head)))
+        return replace(self, steps=head, closures=kept)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Trace:
@@ -445,10 +456,12 @@ class Trace:
         """Yield the lines of the trace as a file: the header, then one line for each step."""
         named_by = {name: getattr(self, name) for name in ("name", "images", "drive")}
         header = {"format": FORMAT, "version": VERSION, **named_by}
-        odometry = {} if self.odometry is None else {"odometry": self.odometry.to_json()}
-        yield _dump(
-            {**{k: v for k, v in header.items() if v is not None}, **odometry, **self.extra}
-        )
+        more: dict[str, Any] = {}
+        if self.odometry is not None:
+            more["odometry"] = self.odometry.to_json()
+        if self.closures:
+            more["closures"] = [closure.to_json() for closure in self.closures]
+        yield _dump({**{k: v for k, v in header.items() if v is not None}, **more, **self.extra})
         for step in self.steps:
             yield _dump(step.to_json())
 
@@ -469,29 +482,3 @@ def _dump(value: Mapping[str, Any]) -> str:
             f"trace: expected what JSON can hold, got {brief(dict(value))} ({error}); "
             f"mend the field"
         ) from None
-
-
-def _of_actions(values: Iterable[Any] | None, name: str, actions: int) -> list[Any]:
-    """Return a list of one value for each step, from one value for each action.
-
-    The value of an action goes to the step that it led to. The first step gets None.
-
-    Args:
-        values: The values; None to make them all None.
-        name: The name of the values in messages.
-        actions: The number of actions.
-    """
-    listed = [None] * actions if values is None else _listed(values, name)
-    if len(listed) != actions:
-        raise TraceError(
-            f"trace: expected one of {name} for each action, got {len(listed)} and {actions} "
-            f"actions; give None where one is not known"
-        )
-    return [None, *listed]
-
-
-def _listed(values: Any, name: str) -> list[Any]:
-    """Return an iterable as a list. A text becomes a list of its letters, which are views."""
-    if not isinstance(values, Iterable) or isinstance(values, bytes | Mapping):
-        raise TraceError(f"{name}: expected a list, got {brief(values)}; give one value a step")
-    return list(values)

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import Any, BinaryIO
 
 from ssh_abduction.data.action import Action, parse_action
+from ssh_abduction.data.closure import parse_closures
 from ssh_abduction.data.errors import TraceError, brief
 from ssh_abduction.data.files import LINE_OF_A_LOG, HalfCharacter, NotFinite, parse_json
 from ssh_abduction.data.observation import checked_image, checked_view
@@ -40,7 +41,7 @@ _STEP_FIELDS = (
     "truth",
     "confidence",
 )
-_HEADER_FIELDS = ("format", "version", "name", "images", "odometry", "drive")
+_HEADER_FIELDS = ("format", "version", "name", "images", "odometry", "drive", "closures")
 
 
 def read_trace(file: BinaryIO, source: str) -> dict[str, Any]:
@@ -51,7 +52,7 @@ def read_trace(file: BinaryIO, source: str) -> dict[str, Any]:
         source: The name of the file in messages.
 
     Returns:
-        A dict of arguments of Trace: steps, name, images, odometry, drive and extra.
+        A dict of arguments of Trace: steps, name, images, odometry, drive, closures and extra.
 
     Raises:
         TraceError: If the file is malformed. The error names the file, the line and the field.
@@ -93,6 +94,7 @@ def read_trace(file: BinaryIO, source: str) -> dict[str, Any]:
     return {
         "steps": tuple(steps),
         **{name: header.get(name) for name in ("name", "images", "odometry", "drive")},
+        "closures": header["closures"],
         "extra": {k: v for k, v in header.items() if k not in _HEADER_FIELDS},
     }
 
@@ -159,7 +161,7 @@ def _refuse_other_files(raw: bytes, where: str) -> None:
 
 
 def _header(record: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Check the header and return it as a dict. Its odometry becomes an Odometry."""
+    """Check the header and return it as a dict, its odometry and closures as objects."""
     if record.get("format") != FORMAT:
         came = (
             brief(record["format"])
@@ -182,10 +184,13 @@ def _header(record: Mapping[str, Any], where: str) -> dict[str, Any]:
                 f"{where}: {key}: expected a text, got {brief(record[key])}; "
                 f"quote it or leave it out"
             )
-    if record.get("odometry") is None:
-        return dict(record)
+    odometry = record.get("odometry")
     try:
-        return {**record, "odometry": Odometry.of(record["odometry"])}
+        return {
+            **record,
+            "odometry": None if odometry is None else Odometry.of(odometry),
+            "closures": parse_closures(record.get("closures")),
+        }
     except TraceError as error:
         raise TraceError(f"{where}: {error}") from None
 

@@ -161,7 +161,10 @@ class PairQuestion(Question[PairExplanation]):
         if evidence is None:
             return None
         closing = evidence.returns_of(self.trace).closing(self.first, self.second)
-        return f"the loop of {closing.way:.0f} m closes {closing.size:.1f} m off"
+        loop = f"the loop of {closing.way:.0f} m closes {closing.size:.1f} m off"
+        pair = self.first, self.second
+        match = next((c for c in self.trace.closures if (c.first, c.last) == pair), None)
+        return loop if match is None else f"{loop}, and {match}"
 
     def _verdict(self) -> Verdict:
         one, two = self._sides[True], self._sides[False]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from ssh_abduction.data.closure import closures_among
 from ssh_abduction.data.trace import Action, Step, Trace
 from ssh_abduction.theory.fields import ASSERTIONS
 from ssh_abduction.theory.settle import Problem, displacement_of
@@ -67,7 +68,10 @@ class Piece:
         gap = steps[-1] - steps[0] + 1 > len(steps)
         facts_across = _said_across(problem, number) if gap else ""
         return Piece(
-            problem.changed(replace(trace, steps=tuple(kept)), theory.replace(**pairs)),
+            problem.changed(
+                replace(trace, steps=tuple(kept), closures=closures_among(trace.closures, steps)),
+                theory.replace(**pairs),
+            ),
             tuple(steps),
             facts_across,
         )

@@ -148,6 +148,10 @@ class Words:
             return (
                 f"{sentence}, and {', '.join(f'step {steps[k]} sees {seen[k]!r}' for k in named)}"
             )
+        if axiom == "closure":
+            ends = steps[i], steps[j]
+            found = [c for c in self._trace.closures if (c.first, c.last) == ends]
+            return "; ".join([sentence, *map(str, found)])
         if axiom == "one_pose" and (
             apart := why_apart(
                 self._trace,

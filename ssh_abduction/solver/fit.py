@@ -9,10 +9,11 @@
 >>> len(found.poses) == len(ssh_map.dstates)
 True
 
-A displacement is how the robot moved from one step to the next, by its odometry. The unknowns are
-the position of each place (of each dstate, if the map has no places), the heading of each dstate,
-and two errors that all displacements share: their scale, and a steady drift of heading. These two
-have a prior. Each displacement gives three equations, divided by their standard deviations. The
+A displacement is how the robot moved from one step to the next, by its odometry. A closure is how
+two steps lie relative to each other, by a match of local maps. The unknowns are the position of
+each place (of each dstate, if the map has no places), the heading of each dstate, and two errors
+that all displacements share: their scale, and a steady drift of heading. These two have a prior.
+Each displacement and each closure gives three equations (`equations.py`). The
 best poses have the least sum of squares (Lu & Milios 1997, "Globally consistent range scan
 alignment"). If the map is true and the odometry is as good as it claims, this sum is chi-square
 distributed. The sum ranks equally minimal maps, and may cause a warning. It rejects no map.
@@ -33,9 +34,9 @@ from scipy.sparse.linalg import lsqr, splu
 from scipy.special import gammaincc
 
 from ssh_abduction.data.maps import Fit, Pose, SSHMap
-from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
+from ssh_abduction.solver.equations import Equations
 from ssh_abduction.theory.evidence.loops import turned
 
 Array: TypeAlias = NDArray[np.float64]
@@ -63,20 +64,6 @@ def fit(trace: Trace, ssh_map: SSHMap) -> Fit:
     return Poses.of_map(trace, ssh_map).fit()
 
 
-def noises(trace: Trace, steps: Sequence[int]) -> Array:
-    """The covariances of the displacements that lead to some steps: n x 3 x 3.
-
-    A dstate has one pose in a map, but the robot is not at exactly this pose on each visit. That
-    error counts in the displacements to the dstate and from it.
-    """
-    odometry = trace.odometry or Odometry()
-    offset = 2 * np.diag([odometry.offset, odometry.offset, odometry.facing]) ** 2
-    travelled = np.array([trace.actions[t - 1].kind != "turn" for t in steps], dtype=float)
-    noise = np.array([trace.covariance(t) for t in steps], dtype=float).reshape(-1, 3, 3)
-    whole: Array = noise + travelled.reshape(-1, 1, 1) * offset
-    return whole
-
-
 class Poses:
     """Least squares over positions and headings that the steps of a trace share.
 
@@ -94,18 +81,11 @@ class Poses:
             headings: The heading of each step, as a number. The numbers are consecutive, from 0.
             positions: The position of each heading, as a number or another name.
         """
-        odometry = trace.odometry or Odometry()
-        steps = [t for t in range(1, len(trace)) if trace.steps[t].displacement is not None]
-        labels = np.asarray(headings, dtype=int)
-        self._of_step = np.asarray(steps, dtype=int)
-        self._from, self._to = labels[self._of_step - 1], labels[self._of_step]
-        self._moved = np.array([trace.steps[t].displacement for t in steps], dtype=float).reshape(
-            -1, 3
-        )
-        noise = noises(trace, steps)
-        self._whitening = np.linalg.inv(np.linalg.cholesky(noise)) if steps else noise
-        self._way = np.hypot(self._moved[:, 0], self._moved[:, 1])
-        self._sigma = np.array([odometry.scale, odometry.bend])
+        said, labels = Equations.of(trace), np.asarray(headings, dtype=int)
+        self._from, self._to = labels[said.first], labels[said.last]
+        self._moved, self._way, self._sigma = said.moved, said.way, said.sigma
+        self._scaled = said.scaled
+        self._whitening = np.linalg.inv(np.linalg.cholesky(said.noise))
         number = {position: i for i, position in enumerate(dict.fromkeys(positions))}
         self._place = np.array([number[position] for position in positions], dtype=int)
         self._positions, self._headings = len(number), len(positions)
@@ -302,7 +282,8 @@ class Poses:
         cos, sin = np.cos(facing), np.sin(facing)
         ahead, left = cos * gone[:, 0] + sin * gone[:, 1], cos * gone[:, 1] - sin * gone[:, 0]
         rotated = heading[self._to] - heading[self._from] + bend * self._way
-        return np.stack([(1 + scale) * ahead, (1 + scale) * left, rotated], axis=1), cos, sin
+        scale = 1 + scale * self._scaled
+        return np.stack([scale * ahead, scale * left, rotated], axis=1), cos, sin
 
     def _residuals(self, unknown: Array) -> Array:
         look_at_clock()
@@ -313,7 +294,7 @@ class Poses:
 
     def _jacobian(self, unknown: Array) -> csr_array:
         predicted, cos, sin = self._predicted(unknown)
-        scale = 1 + unknown[-2] * self._sigma[0]
+        scale = 1 + unknown[-2] * self._sigma[0] * self._scaled
         m, heading = len(self._moved), 2 * self._positions
         zero, one = np.zeros(m), np.ones(m)
         ahead, left = predicted[:, 0], predicted[:, 1]
@@ -331,7 +312,7 @@ class Poses:
             (heading + self._to, np.stack([zero, zero, one], 1)),
             (
                 np.full(m, self._size - 2),
-                np.stack([ahead, left, zero], 1) * (self._sigma[0] / scale),
+                np.stack([ahead, left, zero], 1) * (self._sigma[0] * self._scaled / scale)[:, None],
             ),
             (
                 np.full(m, self._size - 1),

@@ -248,11 +248,12 @@ SURVIVE_A_CUT = FRAMES | {
     "asserted same",
     "one_star",
     "one_pose",
+    "closure",
     DRIVES,
 }
 # Kinds of evidence about steps only: they say which steps are different dstates or at different
 # places, and which labels contradict each other.
-PAIRS_OF_STEPS = ("asserted", "one_star", "one_pose", "planar")
+PAIRS_OF_STEPS = ("asserted", "one_star", "one_pose", "closure", "planar")
 
 TABLE = (
     Speedup(

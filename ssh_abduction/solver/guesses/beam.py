@@ -5,6 +5,9 @@ distribution of the positions of its places, the headings of its dstates, and th
 displacements share. It costs the prices of its dstates and places, and half of the chi-square of
 its returns, as a map does (`solver/weighing.py`).
 
+A closure says how a step lies relative to an earlier one. It moves the poses of a hypothesis when
+the later step comes, and its misfit adds to the cost.
+
 Each step extends each hypothesis in all ways that cost little: the robot is at a known dstate, at a
 new dstate of a known place, or at a new place. The *beam* is the hypotheses of least cost. The
 checker looks at them every few steps. So a hypothesis that breaks an axiom does not crowd out
@@ -31,13 +34,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssh_abduction.checker.checker import violations
+from ssh_abduction.data.closure import Closure
 from ssh_abduction.data.gateways import rotations
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Step
 from ssh_abduction.runtime.clock import look_at_clock
-from ssh_abduction.solver.fit import noises
+from ssh_abduction.solver.equations import noise_of, noises
 from ssh_abduction.solver.guesses.completing import completed
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import Problem
@@ -134,6 +138,11 @@ class Beam:
         self._sigma = odometry.scale, odometry.bend
         steps = [t for t in range(1, len(trace)) if trace.steps[t].displacement is not None]
         self._noise = dict(zip(steps, noises(trace, steps), strict=True))
+        # The closures of each step, and their covariances.
+        self._closures: dict[int, list[tuple[Closure, Array]]] = {}
+        for closure in trace.closures:
+            told = closure, noise_of(closure, odometry)
+            self._closures.setdefault(closure.last, []).append(told)
         self.nats = math.inf
         self._sights = [self._sight(step) for step in trace.steps]
 
@@ -279,7 +288,41 @@ class Beam:
         covariance[:n, n:] = covariance[n:, :n].T
         covariance[n:, n:] = covariance[n:, :n] @ by.T + rotation @ noise @ rotation.T
         pose = [*(mean[at : at + 2] + gone), mean[heading] + turn - drift]
-        return replace(found, mean=np.concatenate([mean, pose]), covariance=covariance)
+        moved = replace(found, mean=np.concatenate([mean, pose]), covariance=covariance)
+        for closure, spread in self._closures.get(t, ()):
+            moved = self._closed(moved, closure, spread)
+        return moved
+
+    def _closed(self, moved: Hypothesis, closure: Closure, noise: Array) -> Hypothesis:
+        """Update a hypothesis by a closure that leads to the last pose of its means.
+
+        Args:
+            moved: The hypothesis.
+            closure: The closure.
+            noise: The covariance of the closure, 3 x 3, with the errors of both ends.
+        """
+        mean, n = moved.mean, len(moved.mean) - 3
+        there = moved.labels[closure.first]
+        at, heading = moved.position[moved.places[there]], moved.heading[there]
+        cos, sin = math.cos(mean[heading]), math.sin(mean[heading])
+        back = np.array([[cos, sin], [-sin, cos]])
+        gone = back @ (mean[n : n + 2] - mean[at : at + 2])
+        # How the pose, relative to the earlier step, depends on the means.
+        by = np.zeros((3, n + 3))
+        by[:2, n : n + 2], by[:2, at : at + 2] = back, -back
+        by[:2, heading] = gone[1], -gone[0]
+        by[2, n + 2], by[2, heading] = 1.0, -1.0
+        off = np.array([*gone, mean[n + 2] - mean[heading]]) - closure.displacement
+        off[2] = math.remainder(off[2], math.tau)
+        across = moved.covariance @ by.T
+        solved = np.linalg.solve(by @ across + noise, np.column_stack([off, across.T]))
+        covariance = moved.covariance - across @ solved[:, 1:]
+        return replace(
+            moved,
+            mean=mean - across @ solved[:, 0],
+            covariance=(covariance + covariance.T) / 2,
+            nats=moved.nats + float(off @ solved[:, 0]) / 2,
+        )
 
     def _options(self, moved: Hypothesis, t: int, joins: bool) -> list[_Extension]:
         """The ways to extend a hypothesis by step t that cost little."""

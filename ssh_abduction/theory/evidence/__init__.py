@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory.evidence.alike import Alike
 from ssh_abduction.theory.evidence.asserted import Asserted
+from ssh_abduction.theory.evidence.closure import Closure
 from ssh_abduction.theory.evidence.displacement import Displacement
 from ssh_abduction.theory.evidence.planar import Planar
 from ssh_abduction.theory.evidence.protocol import Equality, Evidence
@@ -30,13 +31,14 @@ from ssh_abduction.theory.pairs import NO_PAIRS, Pairs
 if TYPE_CHECKING:
     from ssh_abduction.theory.theory import Theory
 
-KINDS: tuple[type[Evidence], ...] = (Asserted, Alike, Displacement, Planar)
+KINDS: tuple[type[Evidence], ...] = (Asserted, Alike, Displacement, Closure, Planar)
 
 __all__ = [
     "KINDS",
     "NO_PAIRS",
     "Alike",
     "Asserted",
+    "Closure",
     "Displacement",
     "Equality",
     "Evidence",

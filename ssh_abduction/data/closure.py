@@ -1,0 +1,163 @@
+"""Closures: how two steps lie relative to each other, from a match of what was seen there.
+
+>>> from ssh_abduction.data.closure import Closure
+>>> near = Closure(3, 19, (0.05, 0.05, 0.0), ((0.01, 0, 0), (0, 0.01, 0), (0, 0, 0.001)))
+>>> str(near)
+'the local maps of steps 3 and 19 match with an offset of 0.07 m'
+
+A closure does not say that the two steps are at one place. It says how far apart they are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from ssh_abduction.data.checks import a_whole_number, an_instance
+from ssh_abduction.data.errors import TraceError, brief, named
+from ssh_abduction.data.odometry import (
+    Covariance,
+    Displacement,
+    checked_covariance,
+    checked_displacement,
+)
+
+_FIELDS = ("steps", "displacement", "covariance")
+
+
+@dataclass(frozen=True, slots=True)
+class Closure:
+    """The pose at a later step, relative to the pose at an earlier one.
+
+    Attributes:
+        first: The earlier step.
+        last: The later step.
+        displacement: (dx, dy, dtheta) from the pose at the earlier step to the pose at the later
+            one, in metres and radians, in the frame of the robot at the earlier step.
+        covariance: The covariance of the displacement, 3 x 3.
+    """
+
+    first: int
+    last: int
+    displacement: Displacement
+    covariance: Covariance
+
+    def __post_init__(self) -> None:
+        first = a_whole_number("steps[0]", self.first, TraceError, 0)
+        last = a_whole_number("steps[1]", self.last, TraceError, 0)
+        if first >= last:
+            raise TraceError(
+                f"steps: expected an earlier and a later step, got {first} and {last}; "
+                f"swap them, and invert the displacement"
+            )
+        moved = checked_displacement(self.displacement, "displacement")
+        noise = checked_covariance(self.covariance, "covariance")
+        for name, value in (
+            ("first", first),
+            ("last", last),
+            ("displacement", moved),
+            ("covariance", noise),
+        ):
+            object.__setattr__(self, name, value)
+
+    def __str__(self) -> str:
+        offset = math.hypot(*self.displacement[:2])
+        steps = f"the local maps of steps {self.first} and {self.last}"
+        return f"{steps} match with an offset of {offset:.2f} m"
+
+    @classmethod
+    def of(cls, value: Any) -> Closure:
+        """Make a closure of an object with the fields steps, displacement and covariance.
+
+        Raises:
+            TraceError: If a field is missing, unknown or wrong.
+        """
+        if isinstance(value, Closure):
+            return value
+        if not isinstance(value, Mapping) or set(value) != set(_FIELDS):
+            raise TraceError(
+                f"expected an object with {', '.join(_FIELDS)}, got {brief(value)}; "
+                f'write {{"steps": [3, 19], "displacement": [0.1, 0, 0], "covariance": …}}'
+            )
+        steps = value["steps"]
+        if not isinstance(steps, Sequence) or isinstance(steps, str) or len(steps) != 2:
+            raise TraceError(
+                f"steps: expected two steps, got {brief(steps)}; give an earlier and a later one"
+            )
+        return cls(steps[0], steps[1], value["displacement"], value["covariance"])
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the closure as the header of a trace file has it."""
+        return {
+            "steps": [self.first, self.last],
+            "displacement": list(self.displacement),
+            "covariance": [list(row) for row in self.covariance],
+        }
+
+
+def parse_closures(value: Any) -> tuple[Closure, ...]:
+    """Make closures of the list in the header of a trace file; none of None.
+
+    Raises:
+        TraceError: If the list is malformed. The error names the entry and the field.
+    """
+    if value is None:
+        return ()
+    if not isinstance(value, Sequence) or isinstance(value, str | bytes):
+        raise TraceError(f"closures: expected a list, got {brief(value)}; leave it out for none")
+    found = []
+    for i, entry in enumerate(value):
+        try:
+            found.append(Closure.of(entry))
+        except TraceError as error:
+            raise TraceError(f"closures[{i}]: {error}") from None
+    return tuple(found)
+
+
+def checked_closures(value: Any, steps: int, source: str | None) -> tuple[Closure, ...]:
+    """Return closures, each pair of steps once, or raise TraceError.
+
+    Args:
+        value: A sequence of Closure.
+        steps: The number of steps of the trace.
+        source: The file of the trace, for messages; None if there is none.
+    """
+    where = named(source or "trace")
+    if not isinstance(value, Sequence) or isinstance(value, str | bytes):
+        raise TraceError(
+            f"{where}: closures: expected a list of Closure, got {brief(value)}; make them with "
+            f"Closure.of"
+        )
+    known: set[tuple[int, int]] = set()
+    for i, closure in enumerate(value):
+        at = f"{where}: closures[{i}]"
+        an_instance(at, closure, Closure, TraceError, mend="make one with Closure.of")
+        if closure.last >= steps:
+            raise TraceError(
+                f"{at}: steps: expected steps from 0 to {steps - 1}, got {closure.last}; "
+                f"steps are counted from 0"
+            )
+        if (closure.first, closure.last) in known:
+            raise TraceError(
+                f"{at}: steps: expected each pair once, got {closure.first} and "
+                f"{closure.last} twice; leave one out"
+            )
+        known.add((closure.first, closure.last))
+    return tuple(value)
+
+
+def closures_among(closures: Sequence[Closure], steps: Sequence[int]) -> tuple[Closure, ...]:
+    """Return the closures between some steps of a trace, with the steps renumbered from 0.
+
+    Args:
+        closures: The closures of the trace.
+        steps: The steps that are kept, ascending.
+    """
+    number = {step: k for k, step in enumerate(steps)}
+    return tuple(
+        replace(closure, first=number[closure.first], last=number[closure.last])
+        for closure in closures
+        if closure.first in number and closure.last in number
+    )

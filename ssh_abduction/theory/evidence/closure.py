@@ -1,0 +1,90 @@
+"""Closures as evidence: they say how two steps lie relative to each other.
+
+If the local maps of two visits match with an offset that is far from zero, within the covariance of
+the match and of the middles of places, then the visits are not at one place. The axiom `closure`
+demands this for each closure alone. Closures together with displacements count in the misfit
+(`solver/fit.py`).
+
+*How often a true map is rejected.* The probability `reject` is divided among the returns that may
+be true, as for displacements.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+from ssh_abduction.data.closure import Closure as Match
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.odometry import Odometry
+from ssh_abduction.data.trace import Trace
+from ssh_abduction.theory.evidence.protocol import Equality
+from ssh_abduction.theory.pairs import Pairs
+
+if TYPE_CHECKING:
+    from ssh_abduction.theory.theory import Theory
+
+
+@dataclass(frozen=True)
+class Closure:
+    """Evidence from closures, with the fields `reject` and `returns` of a theory.
+
+    Attributes:
+        reject: The largest probability of rejecting the true map.
+        returns: How many returns may be true.
+        has_places: Whether maps have places.
+    """
+
+    name: ClassVar[str] = "closure"
+    axiom: ClassVar[str] = "closure"
+    reject: float
+    returns: int
+    has_places: bool
+
+    @classmethod
+    def of(cls, theory: Theory) -> Closure:
+        return cls(theory.reject, theory.returns, theory.level == "topological")
+
+    def remembering(self, known: Closure) -> Closure:
+        return self
+
+    def pairs(self, trace: Trace) -> Pairs:
+        return Pairs.of(self._refused(trace, False), self._refused(trace, True))
+
+    def facts(self, trace: Trace, start: int, stop: int) -> str:
+        return ""
+
+    def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
+        return None
+
+    def _refused(self, trace: Trace, places: bool) -> Iterator[tuple[int, int]]:
+        """Yield the pairs of steps of the closures that are rejected.
+
+        Args:
+            trace: The trace.
+            places: Whether the steps are compared as places, by their positions alone. Otherwise
+                they are compared as dstates.
+        """
+        if not trace.closures or (places and not self.has_places):
+            return
+        from scipy.special import gammainccinv
+
+        most = 2 * gammainccinv((2 if places else 3) / 2, self.reject / max(self.returns, 1))
+        odometry = trace.odometry or Odometry()
+        for match in trace.closures:
+            if _square(match, odometry, places) > most:
+                yield match.first, match.last
+
+
+def _square(match: Match, odometry: Odometry, places: bool) -> float:
+    """The chi-square if the two steps of a closure have one position, or one pose."""
+    import numpy as np
+
+    kept = 2 if places else 3
+    ends = 2 * np.diag([odometry.offset, odometry.offset, odometry.facing]) ** 2
+    noise = (np.array(match.covariance) + ends)[:kept, :kept]
+    off = np.array(match.displacement)
+    off[2] = math.remainder(off[2], math.tau)
+    return float(off[:kept] @ np.linalg.solve(noise, off[:kept]))

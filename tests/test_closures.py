@@ -1,0 +1,196 @@
+"""Closures: relative poses of steps from matches of local maps, as evidence."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import truth
+from brute_misfit import LeastSquares
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import traces
+
+from ssh_abduction import Theory, Trace, solve
+from ssh_abduction.checker.misfit import misfit
+from ssh_abduction.data import Closure, TraceError, together
+from ssh_abduction.data.odometry import Covariance, Displacement, Odometry, between, moved
+from ssh_abduction.explain import explain_pair
+from ssh_abduction.solver.fit import Poses
+from ssh_abduction.solver.guesses.beam import Beam
+from ssh_abduction.solver.steps.log import Log
+from ssh_abduction.theory.settle import settle
+
+TIGHT: Covariance = ((0.01, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.001))
+# A square of 10 m, driven once and a little farther.
+GO, LEFT = (10.0, 0.0, 0.0), (0.0, 0.0, math.pi / 2)
+# Misfits above this belong to absurd maps, whose least squares have several minima.
+PLAUSIBLE = 300.0
+
+
+def square(views: str = "aaaaaaaaaa") -> Trace:
+    return Trace.from_steps(
+        views, ["travel", "left"] * 4 + ["travel"], displacements=[GO, LEFT] * 4 + [GO]
+    )
+
+
+def closed(first: int, last: int, onward: Displacement, noise: Covariance = TIGHT) -> Trace:
+    return replace(square(), closures=(Closure(first, last, onward, noise),))
+
+
+def test_closures_are_written_and_read(tmp_path: Path) -> None:
+    trace = closed(1, 9, (0.05, 0.0, 0.1))
+    trace.save(tmp_path / "trace.jsonl")
+    read = Trace.load(tmp_path / "trace.jsonl")
+    assert read == trace
+    assert read.digest != square().digest
+    assert "closures" in repr(trace)
+    assert not trace.without_displacements().closures
+
+
+def test_a_part_of_a_trace_keeps_the_closures_between_its_steps() -> None:
+    trace = closed(1, 9, (0.05, 0.0, 0.1))
+    assert not trace.prefix(9).closures
+    assert trace.prefix(10) == trace
+    (kept,) = trace[1:].closures
+    assert (kept.first, kept.last) == (0, 8)
+    assert not trace[2:].closures
+
+
+@pytest.mark.parametrize(
+    ("closures", "said"),
+    [
+        (3, r"closures: expected a list, got 3; "),
+        ([7], r"closures\[0\]: expected an object with steps, displacement, covariance, got 7; "),
+        ([{"steps": [0, 1]}], r"closures\[0\]: expected an object with steps"),
+        ([{"steps": 4}], r"closures\[0\]: steps: expected two steps, got 4; "),
+        ([{"steps": [1, 0]}], r"expected an earlier and a later step, got 1 and 0; swap them"),
+        ([{"steps": [0, 0.5]}], r"closures\[0\]: steps\[1\]: expected a whole number"),
+        ([{"steps": [0, 5]}], r"closures\[0\]: steps: expected steps from 0 to 1, got 5; "),
+        ([{"displacement": [1, 2]}], r"closures\[0\]: displacement: expected \[dx, dy, dtheta\]"),
+        ([{"covariance": [[0] * 3] * 3}], r"covariance: expected a positive definite matrix"),
+        ([{}, {}], r"closures\[1\]: steps: expected each pair once, got 0 and 1 twice; "),
+    ],
+)
+def test_a_malformed_closure_is_named(tmp_path: Path, closures: Any, said: str) -> None:
+    good = {"steps": [0, 1], "displacement": [0, 0, 0], "covariance": TIGHT}
+    if isinstance(closures, list):
+        is_part = closures[0] == {"steps": [0, 1]}
+        closures = [{**good, **c} if isinstance(c, dict) and not is_part else c for c in closures]
+    header = {"format": "ssh-trace", "version": 1, "closures": closures}
+    path = tmp_path / "trace.jsonl"
+    path.write_text(f'{json.dumps(header)}\n{{"view": "a", "action": "travel"}}\n{{"view": "b"}}\n')
+    with pytest.raises(TraceError, match=r"trace\.jsonl.*: " + said):
+        Trace.load(path)
+
+
+@settings(max_examples=40)
+@given(st.data())
+def test_solver_checker_and_plain_least_squares_have_one_misfit(data: st.DataObject) -> None:
+    trace = data.draw(
+        traces(max_steps=5, closures=True).filter(lambda trace: trace.closures), label="trace"
+    )
+    size = len(trace)
+    labels = data.draw(st.lists(st.integers(0, 2), min_size=size, max_size=size), label="labels")
+    labels = [list(dict.fromkeys(labels)).index(label) for label in labels]
+    some = st.lists(st.integers(0, 2), min_size=max(labels) + 1, max_size=max(labels) + 1)
+    places = data.draw(some, label="places")
+    plain = LeastSquares(trace).misfit(tuple(labels), tuple(places))
+    solver = Poses(trace, labels, places).misfit()
+    checker = misfit(trace, labels, [places[label] for label in labels])
+    if min(plain, solver, checker) < PLAUSIBLE:
+        assert solver == pytest.approx(plain, rel=1e-4, abs=1e-4)
+        assert checker == pytest.approx(plain, rel=1e-4, abs=1e-4)
+
+
+@pytest.mark.parametrize(("offset", "costs"), [(0.0, False), (1.0, True)])
+def test_a_closure_says_how_far_apart_two_steps_are(offset: float, costs: bool) -> None:
+    trace, apart = closed(1, 9, (0.0, offset, 0.0)), list(range(10))
+    more = Poses(trace, [*apart[:9], 1], apart[:9]).misfit() - Poses(trace, apart, apart).misfit()
+    assert (more > 30) is costs
+    assert costs or more < 1
+
+
+@pytest.mark.parametrize("offset", [0.0, 3.0])
+def test_a_closure_decides_between_maps_that_odometry_allows(offset: float) -> None:
+    """Odometry with 2 m of noise cannot tell whether the robot is back."""
+    noise = ((4.0, 0.0, 0.0), (0.0, 4.0, 0.0), (0.0, 0.0, 0.01))
+    trace = Trace.from_steps(
+        "abcda", ["left", "travel", "left", "travel"], displacements=[LEFT, GO, (0, 0, -3.1), GO]
+    )
+    steps = [replace(step, covariance=noise) if i else step for i, step in enumerate(trace.steps)]
+    turned = math.pi / 2 + math.pi / 2 - 3.1
+    away = Closure(0, 4, (offset, 0.0, turned - math.pi / 2), TIGHT)
+    trace = replace(trace, steps=tuple(steps), closures=(away,))
+    solution = solve(trace, Theory.topological().replace(boundary="none"))
+    assert solution.weighed is not None
+    ssh_map = solution.maps[0]
+    first, last = (ssh_map.dstates[ssh_map.labels[step]].place for step in (0, 4))
+    assert (first == last) is (offset == 0.0)
+    if offset:
+        pinned = solve(trace, Theory.topological().replace(boundary="none", without=("closure",)))
+        assert pinned.theory.without == ("closure",)
+
+
+def test_a_sentence_names_the_offset() -> None:
+    trace = closed(1, 9, (0.05, 0.05, 0.0))
+    theory = Theory.topological().replace(star="none", boundary="none")
+    sentences = " ".join(explain_pair(trace, 1, 9, theory).sentences)
+    assert "the local maps of steps 1 and 9 match with an offset of 0.07 m" in sentences
+
+
+def test_distances_of_poses_are_those_of_an_exact_closure() -> None:
+    exact = tuple(tuple(row) for row in (np.eye(3) * 1e-4).tolist())
+    trace = closed(1, 9, (0.0, 2.0, 0.0), exact)  # type: ignore[arg-type]
+    labels = list(range(10))
+    poses = Poses(trace, labels, labels).fit().poses
+    assert math.dist((poses[1].x, poses[1].y), (poses[9].x, poses[9].y)) == pytest.approx(
+        2.0, abs=0.1
+    )
+
+
+def test_an_argument_cites_the_match() -> None:
+    explained = explain_pair(closed(0, 8, (0.0, 3.0, 0.0)), 0, 8, Theory.causal())
+    assert explained.verdict.value == "different"
+    assert "the local maps of steps 0 and 8 match with an offset of 3.00 m" in str(explained)
+
+
+def test_the_beam_counts_closures_as_a_map_does() -> None:
+    """The equations of a hypothesis are linear. So its cost is nearly that of its map."""
+    (known,) = truth.mazes(4, 24, [701], truth.Noise(Odometry(**truth.NOISE)))
+    pairs = [(i, j) for i, j in combinations(range(len(known.trace)), 2) if j - i > 6]
+    random = np.random.default_rng(0)
+    poses = [(0.0, 0.0, 0.0)]
+    for step in known.trace.steps[1:]:
+        poses.append(moved(poses[-1], step.displacement or (0.0, 0.0, 0.0)))
+    noise: Covariance = ((0.04, 0.0, 0.0), (0.0, 0.04, 0.0), (0.0, 0.0, 0.01))
+    closures = []
+    for i, j in pairs[::20]:
+        x, y, turned = between(poses[i], poses[j])
+        dx, dy = random.normal(0, 0.2, 2)
+        closures.append(Closure(i, j, (x + dx, y + dy, turned), noise))
+    assert len(closures) > 3
+    trace = replace(known.trace, closures=tuple(closures))
+    beams = [_beam(known.trace), _beam(trace)]
+    maps = [next(beam.maps()) for beam in beams]
+    assert maps[0] == maps[1]
+    without, square = (Poses.of_map(drive, maps[0]).misfit() for drive in (known.trace, trace))
+    assert square > without + 10
+    assert beams[1].nats - beams[0].nats == pytest.approx((square - without) / 2, rel=0.02)
+
+
+def _beam(trace: Trace) -> Beam:
+    problem = settle(trace, Theory())
+    return Beam(problem, Log(trace, problem.theory, problem.pairs), 16)
+
+
+def test_a_joint_trace_has_the_closures_of_its_drives() -> None:
+    drives = [replace(closed(1, 9, (x, 0.0, 0.0)), name=f"drive {x}") for x in (0.0, 0.1)]
+    drives[1] = drives[1].with_views("b" * 10)
+    assert [(c.first, c.last) for c in together(drives).closures] == [(1, 9), (11, 19)]
