@@ -1,11 +1,25 @@
-"""A laser that sees less, so that tests of drives take less time."""
+"""A drive through a hallway, simulated once, and a laser that sees less: tests of drives take less
+time."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import cache
 
 from perception.readers.scans import Scan
+from simulator.tours import record
+from simulator.world import World
+from ssh_abduction.cli.simulate import scans_of
+
+
+@cache
+def hall() -> tuple[Scan, ...]:
+    """A tour through the hallway of Taylor Hall, with a scan each metre.
+
+    The first 80 scans lead into a side hallway and out of it.
+    """
+    return tuple(scans_of(record(World.named("taylor-hall"), every=1.0)))
 
 
 def every_second_beam(scans: Iterable[Scan]) -> tuple[Scan, ...]:

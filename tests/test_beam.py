@@ -55,7 +55,7 @@ def test_gateways_at_any_angles(tmp_path: Path) -> None:
     assert truth.is_true(maps_of(known.trace, Theory.topological(), 4)[0], known)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30)
 @given(data=st.data())
 def test_all_maps_of_a_beam_satisfy_the_axioms(data: st.DataObject) -> None:
     trace = data.draw(traces(closures=True).filter(lambda trace: trace.has_displacements))

@@ -7,6 +7,7 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
 
+import aces
 import pytest
 from worlds import rectangle
 
@@ -32,7 +33,7 @@ def rows(tree: ET.Element) -> list[list[str]]:
 
 
 def test_a_solution_shows_the_first_map_and_what_all_share() -> None:
-    solution = solve(ACES)
+    solution = aces.solution()
     tree, text = shown(solution)
     assert "optimal: 19 dstates, 10 places, 4 paths; 4 minimal maps" in text
     assert solution.summary in text
@@ -105,7 +106,7 @@ def test_an_unknown_answer_shows_the_best_map_of_the_first_steps() -> None:
 
 
 def test_to_show_a_solution_takes_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    solution = solve(ACES, max_maps=2)
+    solution = aces.solution(max_maps=2)
     monkeypatch.setattr(
         "ssh_abduction.solver.backbone.prove_backbone", lambda *_: pytest.fail("it searched")
     )

@@ -637,7 +637,7 @@ def mutants(draw: st.DrawFn) -> tuple[Case, SSHMap]:
     return original, m
 
 
-@settings(max_examples=150)
+@settings(max_examples=75)
 @given(mutants(), THEORIES | st.none())
 def test_a_mutated_map_never_raises(mutant: tuple[Case, SSHMap], theory: Theory | None) -> None:
     original, m = mutant

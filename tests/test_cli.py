@@ -73,7 +73,7 @@ def test_json_is_the_contract(solved: Path) -> None:
     assert [SSHMap.from_dict(m).to_dict() for m in data["maps"]] == data["maps"]
 
 
-def test_all_maps_and_a_few(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_few_of_many_maps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     route = saved(drive(*TOURS["comb"]), tmp_path)
     flags = [
         "--set",
@@ -84,10 +84,9 @@ def test_all_maps_and_a_few(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
         "prefer=paths,places,dstates",
         "--json",
     ]
-    for n, count, complete in (("5", 5, False), ("308", 308, True)):
-        assert main(["solve", route, "-n", n, *flags]) == 0
-        data = json.loads(capsys.readouterr().out)
-        assert (data["count"], len(data["maps"]), data["complete"]) == (count, count, complete)
+    assert main(["solve", route, "-n", "5", *flags]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert (data["count"], len(data["maps"]), data["complete"]) == (5, 5, False)
 
 
 def test_every_field_of_a_theory_is_a_flag(

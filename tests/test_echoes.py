@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from coarse import every_second_beam
+from coarse import every_second_beam, hall
 
 from perception.errors import LogError
 from perception.places.agreement import disagreement
@@ -19,10 +19,7 @@ from perception.readers.echoes import MEANINGS, Array, Told, interpret_log, inte
 from perception.readers.logs import read_log
 from perception.readers.scans import RobotLog, Scan
 from perception.readers.writers import write_bag, write_carmen
-from simulator.tours import record
-from simulator.world import World
 from ssh_abduction.cli import main
-from ssh_abduction.cli.simulate import scans_of
 
 # Metres beyond which the lasers of these tests see nothing.
 SEES = 5.0
@@ -31,7 +28,7 @@ SEES = 5.0
 @pytest.fixture(scope="module")
 def drive() -> tuple[Scan, ...]:
     """A drive around a corner of a hall, with a scan each metre and true ranges."""
-    return tuple(scans_of(record(World.named("taylor-hall"), every=1.0)))[:80]
+    return hall()[:80]
 
 
 @pytest.fixture(scope="module")

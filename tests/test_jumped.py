@@ -127,10 +127,8 @@ def test_the_checker_believes_what_the_map_believes() -> None:
     assert check(trace, best, solution.theory.without_faults())
 
 
-@pytest.mark.parametrize(("seed", "jumps"), [(11, 1), (12, 2)])
-def test_a_maze_with_wrong_displacements_has_a_map_that_costs_no_more_than_the_truth(
-    seed: int, jumps: int
-) -> None:
+def test_a_maze_with_wrong_displacements_has_a_map_that_costs_no_more_than_the_truth() -> None:
+    seed, jumps = 12, 2
     chance = random.Random(seed)
     walk = maze(3, 3, steps=60, seed=seed, stars=True, follow=True, odometry=NOISE)
     wrong = sorted(chance.sample(range(20, 45), jumps))

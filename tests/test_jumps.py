@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from coarse import every_second_beam
+from coarse import every_second_beam, hall
 
 from perception.errors import LogError
 from perception.places import importing
@@ -18,10 +18,7 @@ from perception.places.importing import import_log, tracked
 from perception.places.jumps import Unknown, unknown_steps
 from perception.places.track import Track
 from perception.readers.scans import Pose, RobotLog, Scan
-from simulator.tours import record
-from simulator.world import World
 from ssh_abduction.checker.checker import check
-from ssh_abduction.cli.simulate import scans_of
 from ssh_abduction.data.odometry import between, moved
 from ssh_abduction.solver import solve
 
@@ -32,7 +29,7 @@ COUNT = 110
 @pytest.fixture(scope="module")
 def scans() -> tuple[Scan, ...]:
     """A drive through half of a hall, a scan of 90 beams each metre."""
-    return every_second_beam(scans_of(record(World.named("taylor-hall"), every=1.0)))[:COUNT]
+    return every_second_beam(hall()[:COUNT])
 
 
 def by(scans: Sequence[Scan], poses: Sequence[Pose]) -> tuple[Scan, ...]:

@@ -91,10 +91,9 @@ def test_a_map_of_a_beginning_explains_all_visits_or_misses_some(seed: int) -> N
             assert {visit: found.states[visit] for visit in at} == at
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_a_long_trace_is_solved_from_few_of_its_visits(seed: int) -> None:
+def test_a_long_trace_is_solved_from_few_of_its_visits() -> None:
     """It has the same minimal maps as when clingo is given all visits."""
-    trace = maze(3, 3, steps=800, seed=seed, stars=True).trace
+    trace = maze(3, 3, steps=800, seed=1, stars=True).trace
     search = Search(trace, max_maps=None)
     with patch.object(same, "FIRST_PAIRS", 500):
         maps = tuple(search)

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from coarse import every_second_beam
+from coarse import hall as drive_through_hall
 from test_plans import DOORS, MIDDLES, plan_of, xml
 from visited import Truth
 
@@ -20,6 +21,7 @@ from perception.places.importing import Imported, import_log
 from perception.places.track import Track, follow
 from perception.readers.logs import read_log
 from perception.readers.scans import Laser, RobotLog, Scan
+from perception.readers.writers import write_carmen
 from simulator.rounds import record_plan
 from ssh_abduction import AbductionError, Theory
 from ssh_abduction.cli import main
@@ -34,7 +36,7 @@ from ssh_abduction.robot_logs.log_maps import SPEED, map_log, seconds_driven, se
 from ssh_abduction.solver import Solution
 from ssh_abduction.solver.asp import workers
 
-LINES = 390  # Three for each scan.
+SCANS = 110
 REAL = Path(__file__).parents[2] / "shared" / "data" / "logs"
 
 
@@ -42,25 +44,7 @@ REAL = Path(__file__).parents[2] / "shared" / "data" / "logs"
 def hall(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Most of a tour through the hallway, as a CARMEN log: into and out of both side hallways."""
     path = tmp_path_factory.mktemp("logs") / "hall.log"
-    assert (
-        main(
-            [
-                "simulate",
-                "taylor-hall",
-                "--format",
-                "carmen",
-                "--set",
-                "every=0.8",
-                "--seed",
-                "1",
-                "-q",
-                "-o",
-                str(path),
-            ]
-        )
-        == 0
-    )
-    path.write_text("".join(path.read_text().splitlines(keepends=True)[:LINES]))
+    write_carmen(path, drive_through_hall()[:SCANS])
     return path
 
 

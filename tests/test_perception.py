@@ -10,14 +10,13 @@ import functools
 import math
 import os
 import pickle
-import subprocess
-import sys
 import tracemalloc
 import warnings
 import zipfile
 from pathlib import Path
 from typing import Any
 
+import images as benchmark
 import numpy as np
 import pytest
 import skops.io
@@ -823,15 +822,9 @@ def test_what_could_not_be_read_is_not_written(tmp_path: Path) -> None:
 # the benchmark and the docstrings
 
 
-def test_the_benchmark_runs() -> None:
-    script = Path(__file__).parent.parent / "benchmarks" / "images.py"
-    done = subprocess.run(
-        [sys.executable, script, "search", "dstates", "60"],
-        check=True,
-        capture_output=True,
-        text=True,
-    )
-    assert "60 images" in done.stdout
+def test_the_benchmark_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    benchmark.search("dstates", 60)
+    assert "60 images" in capsys.readouterr().out
 
 
 def test_docstrings_run() -> None:

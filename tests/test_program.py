@@ -15,8 +15,10 @@ from unittest.mock import patch
 
 import pytest
 from aces import ACES
+from coarse import hall
 from in_processes import from_here, from_there
 
+from perception.readers.writers import write_carmen
 from ssh_abduction import AbductionError, Solution, Theory, Trace
 from ssh_abduction.cli import main
 from ssh_abduction.evaluation.ladder import UnderWay
@@ -173,22 +175,7 @@ def test_map_that_is_interrupted_says_so_and_is_done_again(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     log, runs = tmp_path / "drive.log", tmp_path / "runs"
-    assert (
-        main(
-            [
-                "simulate",
-                "taylor-hall",
-                "--format",
-                "carmen",
-                "--set",
-                "every=0.8",
-                "-q",
-                "-o",
-                str(log),
-            ]
-        )
-        == 0
-    )
+    write_carmen(log, hall()[:80])
     solve = LogMapping.solve
 
     def solve_until_a_signal(mapping: LogMapping, *trace: Any, **limits: Any) -> Solution:

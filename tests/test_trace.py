@@ -364,7 +364,7 @@ def test_a_prefix_ends_without_an_action() -> None:
     assert trace.prefix(3) == trace
 
 
-@settings(max_examples=150)
+@settings(max_examples=75)
 @given(
     st.binary(max_size=200) | st.text(max_size=200).map(lambda text: f"{HEADER}\n{text}".encode())
 )

@@ -12,6 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import aces
 import pytest
 from worlds import TOURS, drive, rectangle
 
@@ -38,7 +39,7 @@ from ssh_abduction.theory import Speedups
 ROOT = Path(__file__).parent.parent
 ACES = Trace.load(ROOT / "examples" / "aces3-route.jsonl")
 RECTANGLE = Trace.load(ROOT / "examples" / "notched-rectangle.jsonl")
-SOLUTION = solve(ACES)
+SOLUTION = aces.solution()
 IMPOSSIBLE = Trace.from_steps("abcd", ["travel", "around", "around"])
 LONG = 120  # characters of a repr, at most
 
@@ -75,7 +76,7 @@ def noisy() -> Trace:
 SOLVED: dict[str, Callable[[], tuple[Trace, Solution]]] = {
     "several maps": lambda: (ACES, SOLUTION),
     "one map": lambda: (RECTANGLE, solve(RECTANGLE)),
-    "cut off": lambda: (ACES, solve(ACES, max_maps=2)),
+    "cut off": lambda: (ACES, aces.solution(max_maps=2)),
     "levels": lambda: (
         ACES,
         solve(ACES, Theory(prefer=("dstates", "places", "paths")), within=3, max_maps=None),
