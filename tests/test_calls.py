@@ -174,6 +174,7 @@ RIGHT: dict[str, set[str]] = {
 # The package makes these values: nobody needs their constructors, which take what they are given.
 # Their methods are swept.
 MADE_BY_THE_PACKAGE = {
+    "DrivePair",
     "Drive",
     "Fault",
     "MapPath",

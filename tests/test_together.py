@@ -21,6 +21,7 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main
 from ssh_abduction.data import Action, Fault, MapError, TraceError, by_drive, drives_of, together
 from ssh_abduction.data.drives import sentence_of
+from ssh_abduction.rivals import Listing, joins_of_drives
 from ssh_abduction.solver import choosing, prefixes
 
 
@@ -219,3 +220,52 @@ def test_a_localiser_is_lost_where_a_drive_starts() -> None:
     assert beliefs[4].probabilities == pytest.approx(
         next(iter(Localiser(solution.maps[0]).beliefs(TUESDAY))).probabilities
     )
+
+
+def test_joins_of_drives_are_forced_possible_or_excluded(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By views alone, the b that Tuesday sees may be Monday's first b or the second one."""
+    monday = Trace.from_steps("abcbd", ["travel"] * 4, name="monday")
+    tuesday = Trace.from_steps("db", ["around"], name="tuesday")
+    far = Trace.from_steps("xy", ["travel"], name="far")
+    solution = solve([monday, tuesday, far], Theory.causal().replace(different=[(1, 3)]))
+    of_tuesday, of_far, _ = joins_of_drives(Listing.of(solution))
+    assert [(join.first, join.second) for join in of_tuesday.forced] == [(4, 0)]
+    assert [(join.first, join.second, join.share) for join in of_tuesday.possible] == [
+        (1, 1, 0.5),
+        (3, 1, 0.5),
+    ]
+    assert of_tuesday.excluded == 5 * 2 - 3
+    assert (of_far.forced, of_far.possible, of_far.excluded) == ((), (), 10)
+    assert "nothing in common in any of the maps" in str(of_far)
+    maps = str(tmp_path / "maps.json")
+    solution.save(maps)
+    assert main(["compare", maps]) == 0
+    said = "monday and tuesday: 1 dstate in common in all maps (monday:4 = tuesday:0); 2 dstates"
+    assert said in capsys.readouterr().out
+    assert main(["compare", maps, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["drives"][0]["excluded"] == 7
+
+
+def test_steps_are_named_by_their_drives(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for trace in (MONDAY, TUESDAY):
+        trace.save(tmp_path / f"{trace.name}.jsonl")
+    files = [str(tmp_path / f"{name}.jsonl") for name in ("monday", "tuesday")]
+    joint = str(tmp_path / "joint.jsonl")
+    options = ["--together", "--joint-trace", joint, "--json", "--different", "monday:1,tuesday:0"]
+    assert main(["solve", *files, *options]) == 0
+    assert json.loads(capsys.readouterr().out)["theory"]["different"] == [[1, 4]]
+    assert main(["explain", joint, "monday:1", "tuesday:0", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["steps"] == [1, 4]
+    for name, said in (
+        ("sunday:0", "expected a drive out of monday, tuesday, got 'sunday'"),
+        ("tuesday:3", "expected a number from 0 to 2"),
+        ("tuesday:x", "expected a number from 0 to 2"),
+    ):
+        assert main(["explain", joint, "0", name]) == 1
+        assert said in capsys.readouterr().err
+    assert main(["solve", files[0], "--joint-trace", joint]) == 1
+    assert "--joint-trace: expected --together" in capsys.readouterr().err

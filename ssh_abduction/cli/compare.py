@@ -59,6 +59,7 @@ def add_parser(verbs: Verbs) -> None:
 def run(options: argparse.Namespace) -> int:
     from ssh_abduction.rivals.comparison import compare  # loads numpy
     from ssh_abduction.rivals.differences import difference
+    from ssh_abduction.rivals.drive_joins import joins_of_drives
     from ssh_abduction.rivals.listing import Listing
 
     maps, others = (
@@ -90,10 +91,13 @@ def run(options: argparse.Namespace) -> int:
         told["confidence"] = listing.weighed.confidence
     elif listing.by_minimality:
         told["by_minimality"] = [join.to_dict() for join in listing.by_minimality]
+    drives = joins_of_drives(listing)
+    if drives:
+        told["drives"] = [pair.to_dict() for pair in drives]
     if options.json:
         print(json_line({**told, **found.to_dict()}))
         return 0
-    print("\n".join(_lines(found)))
+    print("\n".join([*_lines(found), *map(str, drives)]))
     if listing.sureness:
         print(listing.sureness)
     return 0

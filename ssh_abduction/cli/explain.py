@@ -9,8 +9,9 @@ import argparse
 from typing import Any
 
 from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.options import Verbs, add_theory, theory_of
+from ssh_abduction.cli.options import Verbs, add_theory, number_steps, theory_of
 from ssh_abduction.cli.outcome import dump, on_ctrl_c
+from ssh_abduction.data.drives import step_named
 from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.mend import TraceExplanation, TraceQuestion
@@ -38,10 +39,12 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_argument(
         "steps",
         nargs="*",
-        type=int,
         default=(),
         metavar="step",
-        help="the numbers of two steps, from 0; leave them out to learn why there is no map",
+        help=(
+            "the numbers of two steps, from 0, or DRIVE:STEP in a joint trace; leave them out to "
+            "learn why there is no map"
+        ),
     )
     parser.add_argument(
         "-n",
@@ -80,6 +83,7 @@ def run(options: argparse.Namespace) -> int:
             "to be explained"
         )
     trace = Trace.load(options.trace)
+    number_steps(options, trace)
     theory = theory_of(options)
     limits: dict[str, Any] = {
         "time_limit": options.time_limit,
@@ -87,7 +91,7 @@ def run(options: argparse.Namespace) -> int:
     }
     question: PairQuestion | TraceQuestion
     if options.steps:
-        first, second = options.steps
+        first, second = (step_named(trace, step) for step in options.steps)
         question = PairQuestion(
             trace, first, second, theory, max_maps=options.maps or None, **limits
         )

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ssh_abduction.cli.parsing import Parser, true_or_false
+from ssh_abduction.data.drives import step_named
 from ssh_abduction.data.errors import AbductionError, MapError, TheoryError, brief, named
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.trace import Trace
@@ -65,7 +66,10 @@ def add_theory(parser: Parser, default: str = "topological") -> None:
             f"--{name}",
             action="append",
             metavar="I,J",
-            help=f"assume that steps I and J {text}; may be given again",
+            help=(
+                f"assume that steps I and J {text}; a step of a joint trace may be named as "
+                "DRIVE:STEP; may be given again"
+            ),
         )
     for field in fields(Theory):
         if field.name in FLAGS or field.name in SETTLED:
@@ -247,6 +251,19 @@ def theory_of(options: argparse.Namespace, found: Theory | None = None) -> Theor
             "take what solve --json printed"
         )
     return Theory.from_dict(data["theory"]).replace(**chosen)
+
+
+def number_steps(options: argparse.Namespace, trace: Trace) -> None:
+    """Replace the steps in --same and the like that name a drive, such as tuesday:14.
+
+    Raises:
+        TraceError: The trace has no such drive or step.
+    """
+    for name in ASSERTIONS:
+        pairs = getattr(options, name) or []
+        for i, pair in enumerate(pairs):
+            if ":" in pair:
+                pairs[i] = ",".join(str(step_named(trace, step)) for step in pair.split(","))
 
 
 def choices_of(options: argparse.Namespace) -> dict[str, Any]:

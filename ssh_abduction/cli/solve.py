@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any
 
 from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.options import Verbs, add_theory, theory_of
+from ssh_abduction.cli.options import Verbs, add_theory, number_steps, theory_of
 from ssh_abduction.cli.outcome import (
     Given,
     all_given,
@@ -91,6 +91,11 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_argument(
         "-o", "--output", metavar="FILE", help="also write the solution to this file, as JSON"
     )
+    parser.add_argument(
+        "--joint-trace",
+        metavar="TRACE",
+        help="with --together: also write the joint trace to this file",
+    )
     front = (
         "report the fewest dstates of a map with at most 0, 1, … K faults (steps treated as "
         "wrong), by the causal theory; with --misread or --slipped, only faults of these kinds. "
@@ -159,7 +164,14 @@ def run(options: argparse.Namespace) -> int:
         from ssh_abduction.cli import batch
 
         return batch.run(options)
+    if options.joint_trace is not None and not options.together:
+        raise AbductionError(
+            "--joint-trace: expected --together, got one trace; add it, or leave it out"
+        )
     trace = _joint(options.traces) if options.together else Trace.load(options.traces[0])
+    if options.joint_trace is not None:
+        trace.save(options.joint_trace)
+    number_steps(options, trace)
     theory = theory_of(options)
     theory.check_steps(trace)
     with contextlib.ExitStack() as until_printed:

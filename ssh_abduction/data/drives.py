@@ -87,6 +87,32 @@ def by_drive(trace: Trace, values: Sequence[T]) -> dict[str, tuple[T, ...]]:
     return {drive.name: tuple(listed[drive.first : drive.stop]) for drive in drives_of(trace)}
 
 
+def step_named(trace: Trace, name: str) -> int:
+    """Return the number of a step, such as "14", or "tuesday:14" for step 14 of a drive.
+
+    Args:
+        trace: The trace.
+        name: The number of the step; or the name of a drive, a colon, and the number of the step in
+            this drive, from 0.
+
+    Raises:
+        TraceError: There is no such step.
+    """
+    a_text("name", name, TraceError)
+    drive_name, colon, number = name.rpartition(":")
+    drives = {drive.name: drive for drive in drives_of(trace)}
+    drive = drives.get(drive_name) if colon else Drive("", 0, len(trace))
+    if drive is None:
+        raise TraceError(
+            f"step {brief(name)}: expected a drive out of {', '.join(drives)}, got "
+            f"{brief(drive_name)}"
+        )
+    steps = drive.stop - drive.first
+    if not (number.isascii() and number.isdecimal()) or int(number) >= steps:
+        raise TraceError(f"step {brief(name)}: expected a number from 0 to {steps - 1}")
+    return drive.first + int(number)
+
+
 def joined_drives(drives: Sequence[Drive], ssh_map: SSHMap) -> tuple[tuple[str, ...], ...]:
     """Group the names of drives that a map joins: their steps are in one piece of the map."""
     piece_of = {s: i for i, piece in enumerate(ssh_map.pieces) for s in piece}

@@ -7,6 +7,7 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from ssh_abduction.rivals.comparison import Comparison, compare
     from ssh_abduction.rivals.differences import Difference, difference
+    from ssh_abduction.rivals.drive_joins import DrivePair, joins_of_drives
     from ssh_abduction.rivals.experiment import Experiment
     from ssh_abduction.rivals.explore import next_experiment
     from ssh_abduction.rivals.listing import Listing
@@ -20,6 +21,7 @@ _HOMES = {
         "Difference",
         "difference",
     ),
+    "drive_joins": ("DrivePair", "joins_of_drives"),
     "experiment": ("Experiment",),
     "explore": ("next_experiment",),
     "listing": ("Listing",),
@@ -27,10 +29,12 @@ _HOMES = {
 __all__ = [
     "Comparison",
     "Difference",
+    "DrivePair",
     "Experiment",
     "Listing",
     "compare",
     "difference",
+    "joins_of_drives",
     "next_experiment",
 ]
 

@@ -18,12 +18,13 @@ from typing import Any, TypeAlias
 
 from ssh_abduction.checker.joins import Join, sentence_of
 from ssh_abduction.data.checks import a_flag, a_text, an_instance
+from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.errors import MapError, brief, is_whole, named
 from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.maps import ID_LENGTH, SSHMap, maps_of
 from ssh_abduction.data.trace import View
-from ssh_abduction.solver import Backbone, Solution, Status, Weighed, joins_in, theory_in
+from ssh_abduction.solver import Backbone, Solution, Status, Weighed, drives_in, joins_in, theory_in
 from ssh_abduction.theory.theory import Theory
 
 
@@ -42,6 +43,7 @@ class Listing:
         source: The name of the list, for messages.
         weighed: The costs of the maps in nats, if they were compared by cost; else None.
         by_minimality: The joins of the first map that rest on minimality alone, if known.
+        drives: The drives of a joint trace; empty if there is one drive.
     """
 
     maps: tuple[SSHMap, ...]
@@ -52,6 +54,7 @@ class Listing:
     source: str = "maps"
     weighed: Weighed | None = None
     by_minimality: tuple[Join, ...] = ()
+    drives: tuple[Drive, ...] = ()
 
     @property
     def steps(self) -> int:
@@ -92,6 +95,7 @@ class Listing:
                 backbone,
                 weighed=source.weighed,
                 by_minimality=source.by_minimality,
+                drives=source.drives,
             )
             return listing.checked(one_view=_has_one_view(source.theory))
         if isinstance(source, SSHMap):
@@ -203,6 +207,7 @@ class Listing:
             where,
             weighed,
             joins_in(read, told if maps else {}, steps),
+            drives_in(read, told if maps else {}, steps),
         )
         return listing.checked(one_view=theory is None or _has_one_view(theory))
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.guesses.tree import Sketch
     from ssh_abduction.solver.judging import InternalError, Judging
     from ssh_abduction.solver.ranking import Ranking
-    from ssh_abduction.solver.recorded import joins_in, theory_in
+    from ssh_abduction.solver.recorded import drives_in, joins_in, theory_in
     from ssh_abduction.solver.result import Solution
     from ssh_abduction.solver.search import Search
     from ssh_abduction.solver.sharing import SORTS, Backbone, Shared, Sharing, Sort, stretches
@@ -89,6 +89,8 @@ _HOMES = {  # module: the names that this package exports from it
     ),
     "ranking": ("Ranking",),
     "recorded": (
+        "drives_in",
+        "drives_in",
         "joins_in",
         "theory_in",
     ),
@@ -173,6 +175,7 @@ __all__ = [
     "check_limit",
     "check_rules",
     "cost_as_counted",
+    "drives_in",
     "end_all",
     "ending",
     "facts",

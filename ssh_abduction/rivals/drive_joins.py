@@ -1,0 +1,161 @@
+"""Which places two drives of a joint trace have in common: in all maps, in some, or in none.
+
+>>> from ssh_abduction import Theory, Trace, solve
+>>> from ssh_abduction.rivals.listing import Listing
+>>> monday = Trace.from_steps("abc", ["travel", "travel"], name="monday")
+>>> tuesday = Trace.from_steps("cd", ["travel"], name="tuesday")
+>>> solution = solve([monday, tuesday], Theory.causal())
+>>> print(*joins_of_drives(Listing.of(solution)), sep="; ")
+monday and tuesday: 1 dstate in common in all maps (monday:2 = tuesday:0)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from itertools import combinations
+from typing import Any, TypeAlias
+
+from ssh_abduction.data.checks import an_instance
+from ssh_abduction.data.drives import Drive
+from ssh_abduction.data.errors import MapError
+from ssh_abduction.data.words import counted
+from ssh_abduction.rivals.listing import Listing
+
+SHOWN = 6  # a sentence names at most this many joins of a kind
+
+_Placing: TypeAlias = Sequence[int]  # the place of each step by one map; without places, the dstate
+
+
+@dataclass(frozen=True, slots=True)
+class DriveJoin:
+    """A step of one drive and a step of another that some map has at one place.
+
+    Attributes:
+        first: The number of the step in its own drive.
+        second: The number of the other step in its own drive.
+        share: The share of the maps that have both at one place. If maps were weighed, this is the
+            probability that they are.
+    """
+
+    first: int
+    second: int
+    share: float
+
+
+@dataclass(frozen=True, slots=True)
+class DrivePair:
+    """What two drives have in common. A visit to a place counts once for each drive.
+
+    Attributes:
+        first: The name of the earlier drive.
+        second: The name of the later drive.
+        of: "place"; or "dstate", if maps have no places.
+        forced: The joins that all maps have.
+        possible: The joins that some maps have.
+        excluded: The number of pairs of places that no map joins.
+        proven: Whether all maps are known. If not, other maps may differ.
+    """
+
+    first: str
+    second: str
+    of: str
+    forced: tuple[DriveJoin, ...]
+    possible: tuple[DriveJoin, ...]
+    excluded: int
+    proven: bool
+
+    def __str__(self) -> str:
+        maps = "maps" if self.proven else "maps that were found"
+        parts = []
+        for joins, where in ((self.forced, f"all {maps}"), (self.possible, f"some {maps}")):
+            if joins:
+                number = counted(len(joins), f"{self.of}s")
+                parts.append(f"{number} in common in {where} ({self._named(joins)})")
+        told = "; ".join(parts) or f"nothing in common in any of the {maps}"
+        return f"{self.first} and {self.second}: {told}"
+
+    def _named(self, joins: Sequence[DriveJoin]) -> str:
+        shown = [
+            f"{self.first}:{join.first} = {self.second}:{join.second}"
+            + ("" if join.share == 1 else f", {join.share:.0%}")
+            for join in joins[:SHOWN]
+        ]
+        more = len(joins) - SHOWN
+        return "; ".join([*shown, *([f"and {more} more"] if more > 0 else [])])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the pair as plain data, as `compare --json` prints it."""
+        return asdict(self)
+
+
+def joins_of_drives(listing: Listing) -> tuple[DrivePair, ...]:
+    """Find what each pair of drives has in common in the maps of a joint trace.
+
+    Args:
+        listing: The maps. If they were weighed, all their rivals count.
+
+    Returns:
+        A value for each pair of drives, in order; empty for the maps of a single drive.
+    """
+    an_instance("listing", listing, Listing, MapError, mend="make one with Listing.of")
+    placings, weights, proven = _placings(listing)
+    of = "place" if listing.maps[0].places else "dstate"
+    return tuple(
+        _pair(one, other, placings, weights, of, proven)
+        for one, other in combinations(listing.drives, 2)
+    )
+
+
+def _placings(listing: Listing) -> tuple[list[_Placing], list[float], bool]:
+    """Find where each map has the steps, the weight of each map, and whether these are all maps."""
+    weighed = listing.weighed
+    if weighed is not None:
+        rivals = weighed.rivals
+        return [r.places or r.dstates for r in rivals], [*weighed.weights], weighed.within > 0
+    minimal = listing.maps[: listing.minimal]
+    placings: list[_Placing] = []
+    for ssh_map in minimal:
+        places = [ssh_map.dstates[label].place for label in ssh_map.labels]
+        placings.append(
+            [
+                label if place is None else place
+                for label, place in zip(ssh_map.labels, places, strict=True)
+            ]
+        )
+    return placings, [1 / len(minimal)] * len(minimal), listing.complete is True
+
+
+def _pair(
+    one: Drive,
+    other: Drive,
+    placings: Sequence[_Placing],
+    weights: Sequence[float],
+    of: str,
+    proven: bool,
+) -> DrivePair:
+    """Compare two drives."""
+    forced: list[DriveJoin] = []
+    possible: list[DriveJoin] = []
+    excluded = 0
+    for i in _stations(one, placings):
+        for j in _stations(other, placings):
+            have = [at[i] == at[j] for at in placings]
+            share = sum(weight for weight, has in zip(weights, have, strict=True) if has)
+            join = DriveJoin(i - one.first, j - other.first, 1.0 if all(have) else share)
+            if all(have):
+                forced.append(join)
+            elif any(have):
+                possible.append(join)
+            else:
+                excluded += 1
+    possible.sort(key=lambda join: -join.share)
+    return DrivePair(one.name, other.name, of, tuple(forced), tuple(possible), excluded, proven)
+
+
+def _stations(drive: Drive, placings: Sequence[_Placing]) -> list[int]:
+    """The first step of a drive at each of its places. Places differ if some map tells them so."""
+    first: dict[tuple[int, ...], int] = {}
+    for t in range(drive.first, drive.stop):
+        first.setdefault(tuple(at[t] for at in placings), t)
+    return list(first.values())
