@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.guesses.beam import Beam
 from ssh_abduction.solver.guesses.completing import completed
 from ssh_abduction.solver.steps.log import Log
+from ssh_abduction.theory.fields import EXCUSED
 from ssh_abduction.theory.settle import settle
 
 DRIFTING = truth.Noise(Odometry(**{**truth.NOISE, "scale": 0.05, "bend": 0.0035}))
@@ -55,11 +57,37 @@ def test_gateways_at_any_angles(tmp_path: Path) -> None:
     assert truth.is_true(maps_of(known.trace, Theory.topological(), 4)[0], known)
 
 
+@pytest.mark.parametrize(("kind", "seed"), [("misread", 702), ("jumped", 701), ("slipped", 701)])
+def test_a_beam_finds_faults(kind: str, seed: int) -> None:
+    (known,) = truth.mazes(5, 120, [seed], DRIFTING)
+    steps, wrong = list(known.trace.steps), [41, 55, 77]
+    for t in wrong:
+        step, other = steps[t], steps[t + 1]
+        x, y, turned = step.displacement or (0.0, 0.0, 0.0)
+        faulty = {
+            "misread": {"view": other.view},
+            "jumped": {"displacement": (x + 2, y - 3, turned)},
+            "slipped": {"action": other.action},
+        }
+        steps[t] = replace(step, **faulty[kind])
+    wrong = [t for t in wrong if steps[t] != known.trace.steps[t]]
+    trace = replace(known.trace, steps=tuple(steps))
+    theory = Theory(**{kind: 3.0})
+    best = maps_of(trace, theory, 4)[0]
+    assert truth.is_true(best, replace(known, trace=trace))
+    assert [(fault.kind, fault.step) for fault in best.faults] == [(kind, t) for t in wrong]
+    assert check(trace, best, theory) == ()
+
+
 @settings(max_examples=30)
 @given(data=st.data())
 def test_all_maps_of_a_beam_satisfy_the_axioms(data: st.DataObject) -> None:
     trace = data.draw(traces(closures=True).filter(lambda trace: trace.has_displacements))
-    theory = data.draw(theories(trace)).without_faults().replace(displacement="use", weigh="auto")
+    faults = st.sampled_from([0.0, 1.0]) if data.draw(st.booleans()) else st.just(0.0)
+    theory = data.draw(theories(trace, fixed=("misread", "slipped", "jumped")))
+    theory = theory.replace(displacement="use", weigh="auto")
+    if theory.boundary != "defeasible" and not theory.planar and theory.prefer[:1] == ("dstates",):
+        theory = theory.replace(**{kind: data.draw(faults) for kind in EXCUSED})
     for ssh_map in maps_of(trace, theory, data.draw(st.sampled_from([1, 3]))):
         assert check(trace, ssh_map, theory) == ()
 

@@ -35,7 +35,6 @@ from ssh_abduction.explain.axioms import Interrupted
 from ssh_abduction.explain.no_map import explain
 from ssh_abduction.learning.learner import BootstrapLearner
 from ssh_abduction.solver import Progress, Search, Status, fallback, map_list, prefixes
-from ssh_abduction.solver.asp.facts.answer_maps import links_of
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.engines import base as engine_module
 from ssh_abduction.solver.engines import stepwise
@@ -43,6 +42,7 @@ from ssh_abduction.solver.engines.base import Found, Task
 from ssh_abduction.solver.engines.causal import CausalEngine
 from ssh_abduction.solver.engines.framed import FramedEngine
 from ssh_abduction.solver.engines.stepwise import StepEngine
+from ssh_abduction.solver.steps.faults import links_of
 from ssh_abduction.solver.steps.log import Log, Outcome
 from ssh_abduction.theory import Speedups
 from ssh_abduction.theory.settle import Problem, settle

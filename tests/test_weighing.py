@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
+from itertools import combinations, pairwise, product
 from pathlib import Path
 from unittest.mock import patch
 
@@ -25,6 +25,7 @@ from ssh_abduction.solver.misfit import Misfit
 from ssh_abduction.theory.settle import settle
 
 EQUAL = 1e-6
+Told = tuple[Key, frozenset[tuple[int, str]]]  # a map, and the step and kind of each fault
 
 
 def cheapest(trace: Trace, theory: Theory) -> tuple[float, set[Key]]:
@@ -71,6 +72,86 @@ def weighed(theory: Theory, prices: tuple[float, float, float]) -> Theory:
     """A theory that compares maps by cost. Excuses have no price in nats."""
     boundary = "strict" if theory.boundary == "defeasible" else theory.boundary
     return theory.replace(weigh="cost", prices=prices, prefer=("auto",), boundary=boundary)
+
+
+def cheapest_with_faults(trace: Trace, theory: Theory) -> tuple[float, set[Told]]:
+    """The least cost, and the maps that have it, by trying all views and all sets of wrong
+    displacements. The corrected traces are mapped without faults."""
+    settled = settle(trace, theory).theory
+    moved = [t for t, step in enumerate(trace.steps) if step.displacement is not None]
+    views = sorted({str(view) for view in trace.views}) if theory.misread else []
+    found: dict[object, tuple[float, int, set[Told]]] = {}
+    for seen in product(views, repeat=len(trace)) if views else [trace.views]:
+        for wrong in subsets(moved) if theory.jumped else [()]:
+            faults = frozenset(
+                {(t, "jumped") for t in wrong}
+                | {(t, "misread") for t, view in enumerate(seen) if view != trace.views[t]}
+            )
+            tenths = sum(settled.fault_tenths(kind, trace.steps[t]) for t, kind in faults)
+            corrected = trace.with_views(list(seen)).without_displacements_at(wrong)
+            bare = settled.without_faults()
+            if not corrected.has_displacements:
+                bare = bare.replace(displacement="none")
+            squares = LeastSquares(corrected)
+            for one, counts in consistent_maps(corrected, bare):
+                labels, places, _ = one
+                if not all(
+                    any(x == s and seen[t] == trace.views[t] for t, x in enumerate(labels))
+                    for s in labels
+                ):
+                    continue  # no step shows the view of the dstate
+                positions = tuple(-1 - i if p is None else p for i, p in enumerate(places))
+                prices = zip(
+                    theory.prices, (counts.dstates, counts.places, counts.paths), strict=True
+                )
+                nats = sum(price * count for price, count in prices)
+                nats += theory.prices[0] * tenths / 10 + squares.misfit(labels, positions) / 2
+                course = labels, places, wrong
+                known = found.get(course)
+                if known is None or (nats, counts.paths) < (known[0] - EQUAL, known[1]):
+                    known = found[course] = nats, counts.paths, set()
+                if counts.paths == known[1] and nats < known[0] + EQUAL:
+                    known[2].add((one, faults))
+    least = min((nats for nats, _, _ in found.values()), default=math.inf)
+    return least, {one for nats, _, maps in found.values() if nats <= least + EQUAL for one in maps}
+
+
+def subsets(steps: list[int]) -> list[tuple[int, ...]]:
+    return [some for size in range(len(steps) + 1) for some in combinations(steps, size)]
+
+
+@settings(max_examples=6)
+@given(st.data())
+def test_faults_are_weighed_beside_misfit(data: st.DataObject) -> None:
+    trace = data.draw(
+        traces(max_steps=3).filter(lambda trace: trace.has_displacements), label="trace"
+    )
+    kinds = data.draw(st.sampled_from([("misread",), ("jumped",), ("misread", "jumped")]))
+    faults = {kind: data.draw(st.sampled_from([0.4, 1.0, 3.0]), label=kind) for kind in kinds}
+    level = data.draw(st.sampled_from(["causal", "topological"]), label="level")
+    theory = Theory(
+        level=level,
+        boundary="none",
+        star="none",
+        reject=1e-300,
+        weigh="cost",
+        prices=data.draw(st.sampled_from(PRICES), label="prices"),
+        **faults,
+    )
+    nats, expected = cheapest_with_faults(trace, theory)
+    solution = solve(trace, theory, max_maps=None, time_limit=100)
+    if not expected:
+        assert solution.status is Status.UNSATISFIABLE
+        return
+    assert solution.status is Status.OPTIMAL
+    assert solution.weighed is not None
+    assert solution.weighed.nats == pytest.approx(nats, abs=EQUAL)
+    found = {(key(m), frozenset((f.step, f.kind) for f in m.faults)) for m in solution.maps}
+    assert found == expected
+    assert solution.complete
+    assert all(check(trace, ssh_map, theory) == () for ssh_map in solution.maps)
+    answer = solution.to_dict()
+    assert list(false_costs(trace, answer, solution.maps, solution.theory)) == []
 
 
 PRICES = [(8.0, 8.0, 0.0), (1.0, 2.0, 0.5), (3.0, 0.0, 0.0)]

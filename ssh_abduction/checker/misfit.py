@@ -25,6 +25,7 @@ from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.theory.theory import Theory
 
 Array: TypeAlias = NDArray[np.float64]
+Faults: TypeAlias = Sequence[tuple[str, int]]
 
 ROUNDS = 50
 # Stop when no unknown moves by more than this many standard deviations.
@@ -39,15 +40,19 @@ RIVALS = 5
 LONGEST = 400
 
 
-def misfit(trace: Trace, dstates: Sequence[int], places: Sequence[int]) -> float:
+def misfit(
+    trace: Trace, dstates: Sequence[int], places: Sequence[int], faults: Faults = ()
+) -> float:
     """The least chi-square if each step is at this dstate and this place.
 
     Args:
         trace: A trace with displacements, and perhaps closures.
         dstates: The dstate of each step, as a number.
         places: The place of each step, as a number.
+        faults: The kind and the step of each fault. A displacement that jumped is ignored.
     """
-    return _Errors(trace, dstates, places).least()
+    wrong = [step for kind, step in faults if kind == "jumped"]
+    return _Errors(trace.without_displacements_at(wrong), dstates, places).least()
 
 
 def false_costs(
@@ -80,15 +85,20 @@ def false_costs(
         return
     places = [maps[0].dstates[label].place for label in maps[0].labels]
     here = [p if p is not None else s for p, s in zip(places, maps[0].labels, strict=True)]
-    courses = [("weighed.nats", nats, maps[0].labels, here, len(maps[0].places))]
+    of_map: Faults = [(fault.kind, fault.step) for fault in maps[0].faults]
+    courses = [("weighed.nats", nats, maps[0].labels, here, len(maps[0].places), of_map)]
     for i, rival in enumerate(rivals[:RIVALS] if isinstance(rivals, list) else ()):
         at = rival.get("places") or rival.get("dstates")
         there = len(set(at)) if rival.get("places") else 0
-        courses.append((f"weighed.rivals[{i}]", rival.get("nats"), rival["dstates"], at, there))
+        of_rival = rival.get("faults", [])
+        name = f"weighed.rivals[{i}]"
+        courses.append((name, rival.get("nats"), rival["dstates"], at, there, of_rival))
     paths = theory.prices[2] * len(maps[0].paths)
-    for name, claimed, dstates, at, count in courses:
-        square = misfit(trace, dstates, at)
+    for name, claimed, dstates, at, count, faults in courses:
+        square = misfit(trace, dstates, at, faults)
         true = theory.prices[0] * len(set(dstates)) + theory.prices[1] * count + square / 2
+        tenths = [theory.fault_tenths(kind, trace.steps[step]) for kind, step in faults]
+        true += theory.prices[0] * sum(tenths) / 10
         # The paths of a rival are not listed.
         true += paths if name == "weighed.nats" or not theory.prices[2] else math.nan
         if abs(true - claimed) > EXACT + SHARE * square:

@@ -28,14 +28,14 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.trace import Action, Step, Trace, View
-from ssh_abduction.solver.asp.facts import answer_maps
+from ssh_abduction.data.trace import Action, Step, Trace
 from ssh_abduction.solver.engines.base import Found, Task
 from ssh_abduction.solver.engines.faulty import FaultyEngine
 from ssh_abduction.solver.engines.framed import FramedEngine
 from ssh_abduction.solver.guesses.outliers import wrong_displacements
 from ssh_abduction.solver.guesses.voting import Merging
 from ssh_abduction.solver.judging import Judging
+from ssh_abduction.solver.steps.faults import with_faults
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import row
 from ssh_abduction.theory.theory import Theory
@@ -62,7 +62,7 @@ class Mending:
 
     def __init__(self, task: Task, solver: Solver) -> None:
         self._task, self._solver = task, solver
-        self._without_faults = task.theory.without_faults()
+        self._without_faults = task.theory.without_faults().replace(weigh="count")
         # The best map of each mended trace, and whether it is proven minimal. If not, the trace is
         # solved again when there is more time.
         self._solved: dict[Trace, tuple[Found | None, bool]] = {}
@@ -346,40 +346,3 @@ def _places(ssh_map: SSHMap) -> list[tuple[int, int] | None]:
         for s in ssh_map.dstates
     ]
     return [at[label] for label in ssh_map.labels]
-
-
-def with_faults(ssh_map: SSHMap, trace: Trace, mended: Trace, theory: Theory) -> SSHMap:
-    """Turn a map of a mended trace into a map of the trace itself.
-
-    Each dstate gets the view that most of its steps have, weighted by the cost of a wrong view.
-    The steps at which the map differs from the trace become its faults.
-
-    Args:
-        ssh_map: The map of the mended trace.
-        trace: The trace itself.
-        mended: The mended trace.
-        theory: The theory, with the costs of faults.
-    """
-    votes: dict[int, Counter[View]] = {}
-    for label, step in zip(ssh_map.labels, trace.steps, strict=True):
-        assert step.view is not None
-        votes.setdefault(label, Counter())[step.view] += theory.fault_tenths("misread", step) or 1
-    shows = {label: max(counts, key=lambda view: counts[view]) for label, counts in votes.items()}
-    faults: list[tuple[int, str]] = []
-    for t, (step, other) in enumerate(zip(trace.steps, mended.steps, strict=True)):
-        if step.view != shows[ssh_map.labels[t]]:
-            faults.append((t, "misread"))
-        if theory.star in ("pattern", "frame") and step.openings != other.openings:
-            faults.append((t, "misseen"))
-        if step.action != other.action:
-            faults.append((t, "slipped"))
-        if step.displacement != other.displacement:
-            faults.append((t, "jumped"))
-    told = answer_maps.faults_of(faults, dict(enumerate(ssh_map.labels)), shows, trace, theory)
-    dstates = tuple(replace(s, view=shows[s.id]) for s in ssh_map.dstates)
-    return replace(
-        ssh_map,
-        dstates=dstates,
-        links=answer_maps.links_of(ssh_map.labels, trace, faults),
-        faults=told,
-    )

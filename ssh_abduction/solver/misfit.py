@@ -7,21 +7,24 @@ never less than that of a part of it, and a part of the returns of a map bounds 
 map that has them.
 
 A visit to a place holds several steps, as turns stay at their place. So these steps have one
-position in each topological map, also without a return.
+position in each topological map, also without a return. If displacements may be wrong, one of a
+turn may be, too. Then each step is a visit of its own, and its turn is a return.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import TypeAlias
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.fit import Poses
 from ssh_abduction.theory.evidence import Equality
+from ssh_abduction.theory.evidence.displacement import jumped
 from ssh_abduction.theory.settle import Problem
 
-# The heading and the position of each step, as numbers. Steps with equal numbers share them.
-_Groups: TypeAlias = tuple[tuple[int, ...], tuple[int, ...]]
+# The heading and the position of each step, as numbers. Steps with equal numbers share them. Last,
+# the steps whose displacements are ignored.
+_Groups: TypeAlias = tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]
 
 
 class Misfit:
@@ -39,37 +42,46 @@ class Misfit:
             problem: The trace, and its theory with all defaults filled in.
         """
         self.trace = problem.trace
-        stays = problem.theory.level == "topological" and "turn_stays" in problem.theory.hard
+        theory = problem.theory
+        stays = theory.level == "topological" and "turn_stays" in theory.hard and not theory.jumped
         self.visit = [0]
         for t, action in enumerate(self.trace.actions, 1):
             self.visit.append(self.visit[-1] if stays and action.kind == "turn" else t)
         self._known: dict[_Groups, float] = {}
 
-    def of_returns(self, returns: Iterable[Equality]) -> float:
-        """The chi-square of a set of returns."""
+    def of_returns(self, returns: Iterable[Equality], wrong: Collection[int] = ()) -> float:
+        """The chi-square of a set of returns.
+
+        Args:
+            returns: The returns.
+            wrong: The steps whose displacements are ignored.
+        """
         headings, positions = list(range(len(self.visit))), list(self.visit)
         for found in returns:
             if found.of == "dstate":
                 _join(headings, found.first, found.second)
             _join(positions, found.first, found.second)
-        return self._of_groups(_roots(headings), _roots(positions))
+        return self._of_groups((_roots(headings), _roots(positions), tuple(sorted(wrong))))
 
-    def of_course(self, dstates: Sequence[int], places: Sequence[int]) -> float:
+    def of_course(
+        self, dstates: Sequence[int], places: Sequence[int], wrong: Collection[int] = ()
+    ) -> float:
         """The chi-square if each step is at this dstate and this place.
 
         Args:
             dstates: The dstate of each step, as a number.
             places: The place of each step, as a number. Steps at one dstate are at one place.
+            wrong: The steps whose displacements are ignored.
         """
         first_at: dict[int, int] = {}
         first_in: dict[int, int] = {}
         headings = [first_at.setdefault(name, t) for t, name in enumerate(dstates)]
         positions = [first_in.setdefault(name, t) for t, name in enumerate(places)]
-        return self._of_groups(tuple(headings), tuple(positions))
+        return self._of_groups((tuple(headings), tuple(positions), tuple(sorted(wrong))))
 
     def of_map(self, ssh_map: SSHMap) -> float:
         """The chi-square of all returns of a map of the whole trace."""
-        return self.of_returns(self.returns_of(ssh_map))
+        return self.of_returns(self.returns_of(ssh_map), jumped(ssh_map))
 
     def returns_of(self, ssh_map: SSHMap) -> list[Equality]:
         """The returns of a map to the last step at the same dstate or place, by their later step.
@@ -90,12 +102,15 @@ class Misfit:
                 at_place[place] = t
         return found
 
-    def core(self, returns: Sequence[Equality], least: float) -> list[Equality]:
+    def core(
+        self, returns: Sequence[Equality], least: float, wrong: Collection[int] = ()
+    ) -> list[Equality]:
         """A minimal subset of returns whose misfit is at least `least`.
 
         Args:
             returns: The returns.
             least: A chi-square.
+            wrong: The steps whose displacements are ignored.
 
         Returns:
             The subset. All returns if even their misfit is less; none if no return is needed.
@@ -104,23 +119,24 @@ class Misfit:
             Junker 2004, "QuickXplain: preferred explanations and relaxations for over-constrained
             problems".
         """
-        if self.of_returns(returns) < least:
+        if self.of_returns(returns, wrong) < least:
             return list(returns)
 
         def suffices(some: Sequence[Equality]) -> bool:
-            return self.of_returns(some) >= least
+            return self.of_returns(some, wrong) >= least
 
         return [] if suffices([]) else _minimal(suffices, list(returns))
 
-    def _of_groups(self, headings: tuple[int, ...], positions: tuple[int, ...]) -> float:
-        key = headings, positions
-        if key not in self._known:
+    def _of_groups(self, groups: _Groups) -> float:
+        if groups not in self._known:
+            headings, positions, wrong = groups
+            trace = self.trace.without_displacements_at(wrong)
             number = {heading: i for i, heading in enumerate(dict.fromkeys(headings))}
             position = dict(zip(headings, positions, strict=True))
-            self._known[key] = Poses(
-                self.trace, [number[heading] for heading in headings], [position[h] for h in number]
+            self._known[groups] = Poses(
+                trace, [number[heading] for heading in headings], [position[h] for h in number]
             ).misfit()
-        return self._known[key]
+        return self._known[groups]
 
 
 def _minimal(

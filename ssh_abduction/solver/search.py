@@ -297,7 +297,7 @@ class Search:
         watch.end_stage_after(math.inf)
         if self._parts.known.status is not Status.UNSATISFIABLE:
             most = self.limits.most
-            weighing.search(lambda theory, s: self._solve_mended(self.trace, theory, most, s))
+            weighing.search(lambda trace, theory, s: self._solve_mended(trace, theory, most, s))
 
     def _solve_mended(
         self, mended: Trace, theory: Theory, most: int, seconds: float

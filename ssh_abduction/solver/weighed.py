@@ -14,6 +14,7 @@ from functools import cached_property
 from typing import Any
 
 from ssh_abduction.data.fields import FieldReader
+from ssh_abduction.data.map_parts import FAULTS
 
 EQUAL = 1e-6  # costs in nats that differ by less are equal
 # The price of breaking axioms, in nats. A map that breaks them is said if it costs SAID less.
@@ -31,17 +32,20 @@ class Rival:
         places: The place of each step, numbered by first visit; empty for a causal map.
         estimated: Whether the map was made from the best one by taking a visit out of its place. It
             fits the displacements, but may break an axiom.
+        faults: The kind and the step of each fault, such as ("jumped", 7).
     """
 
     nats: float
     dstates: tuple[int, ...]
     places: tuple[int, ...] = ()
     estimated: bool = False
+    faults: tuple[tuple[str, int], ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """The rival as plain data."""
         written: dict[str, Any] = {"nats": round(self.nats, 6), "dstates": list(self.dstates)}
         written |= {"places": list(self.places)} if self.places else {}
+        written |= {"faults": [list(fault) for fault in self.faults]} if self.faults else {}
         return written | ({"estimated": True} if self.estimated else {})
 
 
@@ -198,7 +202,16 @@ def _rival(read: FieldReader, value: Any, name: str, steps: int) -> Rival:
     if len(dstates) != steps or len(places) not in (0, steps):
         raise read.wrong(name, f"the dstates and places of {steps} steps", value)
     nats = _number(read, record, "nats", name)
-    return Rival(nats, dstates, places, bool(record.get("estimated", False)))
+    faults = _faults(read, record.get("faults", []), f"{name}.faults")
+    return Rival(nats, dstates, places, bool(record.get("estimated", False)), faults)
+
+
+def _faults(read: FieldReader, value: Any, name: str) -> tuple[tuple[str, int], ...]:
+    if not isinstance(value, list) or not all(
+        isinstance(fault, list) and len(fault) == 2 and fault[0] in FAULTS for fault in value
+    ):
+        raise read.wrong(name, 'a list of faults such as ["jumped", 7]', value)
+    return tuple((kind, read.integer(step, name)) for kind, step in value)
 
 
 def _names(read: FieldReader, value: Any, name: str) -> tuple[int, ...]:

@@ -1,14 +1,15 @@
 """Find the maps of least cost, and prove it: the prices of what a map has, and its misfit.
 
-The cost of a map is the sum of the prices of its dstates, places and paths, and half of the
-chi-square of its misfit to the displacements (`misfit.py`).
+The cost of a map is the sum of the prices of its dstates, places, paths and faults, and half of the
+chi-square of its misfit to the displacements (`misfit.py`). A fault costs as much as some dstates.
 
 *The search* is a logic-based Benders decomposition (Hooker & Ottosson 2003). clingo finds the map
 with the fewest dstates, and among these the fewest places and paths. It knows nothing of the
 misfit. If the map has returns whose misfit alone makes every map with them too expensive, clingo is
 told so: no map has all of these returns. Then it finds the next map. Its number of dstates never
 falls, so the prices of the last map bound the cost of all maps that are left. The search ends when
-this bound reaches the cost of the best map.
+this bound reaches the cost of the best map. If displacements may be wrong, a misfit excludes only
+maps that believe the displacements that cause it.
 
 *Rivals.* A map is too expensive if it costs at least `WITHIN` nats more than the best one. So all
 maps that cost less are found, and each weighs exp(-cost) beside the others.
@@ -20,7 +21,6 @@ different places by the evidence.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -29,13 +29,15 @@ from typing import TypeAlias
 
 from scipy.special import gammaincc
 
-from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.maps import Fault, SSHMap
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.runtime.logs import log_of
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError
 from ssh_abduction.solver.choosing import FEW_STEPS, new_engine, takes_all
 from ssh_abduction.solver.engines.base import Engine, Found, Task
 from ssh_abduction.solver.engines.stepwise import StepEngine
+from ssh_abduction.solver.estimating import CostOf, Course, estimated
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
 from ssh_abduction.solver.map_list import Priced
@@ -46,13 +48,12 @@ from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.solver.values import Cost, Status
 from ssh_abduction.solver.weighed import EQUAL, Rival, Weighed
 from ssh_abduction.theory.evidence import Equality
-from ssh_abduction.theory.settle import Problem
+from ssh_abduction.theory.evidence.displacement import jumped
+from ssh_abduction.theory.settle import Problem, displacement_of
 from ssh_abduction.theory.theory import Theory
 
 _log = log_of(__name__)
 
-# What has a price, in the order of `Theory.prices`.
-NAMES = ("dstates", "places", "paths")
 # Maps that cost less than this many nats more than the best one are found: 100 times less probable.
 WITHIN = math.log(100)
 # At most this many maps are kept. If there are more, fewer nats count.
@@ -67,13 +68,11 @@ PATIENCE, MORE = 10.0, 5.0
 WIDTHS = {1: 0.8, 4: 0.6, 16: 0.4}
 # A beam of this width or more ends with the map of least cost, nearly always.
 BROAD = 4
-# Estimating rivals may take this many seconds. A rival that costs CERTAIN nats more than the best
-# map does not count: a million of them make 0.005 of a doubt.
-ESTIMATING, CERTAIN = 0.5, 19.0
 
 
-# Lists the minimal maps of a theory within some seconds, and says whether they are proven.
-OfLabels: TypeAlias = Callable[[Theory, float], tuple[tuple[SSHMap, ...], bool]]
+# Lists the minimal maps of a trace and a theory within some seconds, and says whether they are
+# proven.
+OfLabels: TypeAlias = Callable[[Trace, Theory, float], tuple[tuple[SSHMap, ...], bool]]
 
 
 @dataclass(frozen=True)
@@ -101,7 +100,7 @@ class Weighing:
         """
         self._parts = parts
         self._misfit = Misfit(parts.task.problem)
-        self._prices = parts.task.theory.prices
+        self._prices = _prices_of(parts.task.theory)
         self._least: dict[str, int] = {}
         self._base = 0.0
         self._within = max(WITHIN, parts.limits.within)
@@ -164,7 +163,8 @@ class Weighing:
         if parts.known.best is not None:
             self.add(parts.known.best)
         self._least = {"places": _least_places(parts.task.problem)}
-        self._base = self._misfit.of_returns([]) / 2  # of every map
+        may_be_wrong = range(1, len(parts.task.trace)) if parts.task.theory.jumped else ()
+        self._base = self._misfit.of_returns([], may_be_wrong) / 2  # of every map
         task = replace(parts.task, speedups=replace(parts.task.speedups, prefixes=False))
         judging = _Judging(task.problem, self)
         engine = _engine(task, parts)
@@ -191,7 +191,8 @@ class Weighing:
         if known.best is not None:
             self.add(known.best)
         if not self.proven:
-            least = {**dict.fromkeys(NAMES, 0), **self._least, "dstates": known.bound.dstates or 0}
+            first = next(iter(self._prices))
+            least = {**self._least, first: getattr(known.bound, first) or 0}
             self.bound = max(self.bound, self._price(least) + self._base)
         if self.candidates:
             best = self.candidates[0].map
@@ -217,14 +218,20 @@ class Weighing:
     def _with_other_paths(self, ssh_map: SSHMap) -> tuple[tuple[SSHMap, ...], bool]:
         """All maps with the dstates and places of a map, and as few paths; and whether it is all.
 
-        They cost the same, as displacements say nothing about paths.
+        They cost the same, as displacements say nothing about paths. They have the same wrong
+        displacements, and may have other faults.
         """
-        theory, watch = self._parts.task.theory, self._parts.watch
-        if theory.level == "causal" or self._of_labels is None:
+        task, wrong = self._parts.task, jumped(ssh_map)
+        theory = task.theory
+        if (theory.level == "causal" and not theory.has_faults) or self._of_labels is None:
             return (ssh_map,), True
-        pinned = _pinned(theory, ssh_map)
-        found, proven = self._of_labels(pinned, watch.left())
-        alike = [other for other in found if _course(other) == _course(ssh_map)]
+        trace = task.trace.without_displacements_at(wrong)
+        pinned = _pinned(theory, ssh_map).replace(
+            jumped=0.0, displacement="use" if trace.has_displacements else "none"
+        )
+        found, proven = self._of_labels(trace, pinned, self._parts.watch.left())
+        jumps = tuple(fault for fault in ssh_map.faults if fault.kind == "jumped")
+        alike = [_with(jumps, other) for other in found if _course(other) == _course(ssh_map)]
         return tuple(alike) or (ssh_map,), proven and bool(alike)
 
     def add(self, ssh_map: SSHMap) -> float:
@@ -234,7 +241,7 @@ class Weighing:
             The cost in nats.
         """
         counts = Cost.of(ssh_map)
-        prices = self._price({name: getattr(counts, name) for name in NAMES})
+        prices = self._price({name: getattr(counts, name) for name in self._prices})
         nats = prices + self._misfit.of_map(ssh_map) / 2
         if self.candidates and nats < self.candidates[0].nats - EQUAL:
             self._improved = self._parts.watch.elapsed()
@@ -262,12 +269,16 @@ class Weighing:
             return None
         nats = self.add(ssh_map)
         _log.debug("a map of %.1f nats, and all others cost at least %.1f", nats, least)
-        returns = self._misfit.returns_of(ssh_map)
-        if nats < self._most:
-            return frozenset(returns) or None
-        # The misfit of no returns is in `least` already.
-        enough = 2 * (self._most - least + self._base)
-        return frozenset(self._misfit.core(returns[::-1], enough)) or None
+        task, returns, wrong = self._parts.task, self._misfit.returns_of(ssh_map), jumped(ssh_map)
+        if nats >= self._most:
+            # The misfit of no returns is in `least` already.
+            enough = 2 * (self._most - least + self._base)
+            returns = self._misfit.core(returns[::-1], enough, wrong)
+        elif task.theory.has_faults:
+            returns = _course_of(ssh_map)
+        displacement = displacement_of(task.problem)
+        believed = displacement.believed(task.trace, returns, wrong) if displacement else ()
+        return frozenset((*returns, *believed)) or None
 
     def _check_patience(self) -> None:
         """Without a time limit, raise LimitError if no better map was found for long."""
@@ -287,7 +298,7 @@ class Weighing:
         some count, and greater there.
         """
         counts, priorities = Cost.of(ssh_map), self._parts.task.theory.priorities
-        least = {name: self._least.get(name, 0) for name in NAMES}
+        least = {name: self._least.get(name, 0) for name in self._prices}
         found = []
         for name in priorities:
             if name in least:
@@ -298,13 +309,13 @@ class Weighing:
 
     def _price(self, counts: Mapping[str, int]) -> float:
         """The price of this many dstates, places and paths, in nats."""
-        return sum(price * counts[name] for name, price in zip(NAMES, self._prices, strict=True))
+        return sum(price * counts.get(name, 0) for name, price in self._prices.items())
 
     def weighed(self) -> Weighed | None:
         """What is known of the costs; None if no map is known."""
         if not self.candidates:
             return None
-        rivals: dict[tuple[tuple[int, ...], ...], Rival] = {}
+        rivals: dict[Course, Rival] = {}
         for candidate in self.candidates:
             rival = _rival_of(candidate)
             rivals.setdefault((rival.dstates, rival.places), rival)
@@ -324,74 +335,72 @@ class Weighing:
             return False
         best = self.candidates[0].map
         returns = self._misfit.returns_of(best)
-        square = self._misfit.of_returns(returns) - self._misfit.of_returns([])
+        square = self._misfit.of_map(best) - self._misfit.of_returns([], jumped(best))
         freedom = sum(3 if found.of == "dstate" else 2 for found in returns)
         return freedom == 0 or float(gammaincc(freedom / 2, max(square, 0.0) / 2)) >= IMPROBABLE
 
-    def _estimated(
-        self, best: Rival, known: Collection[tuple[tuple[int, ...], ...]]
-    ) -> Iterator[Rival]:
-        """Rivals in which some visits to a place of the best map are visits to a new place.
-
-        These are each single visit, and all visits from one on. The axioms may not allow them. If
-        all maps within some nats are known, a rival that costs less breaks an axiom.
-        """
-        counts = Cost.of(self.candidates[0].map)
-        paths = self._prices[2] * counts.paths
+    def _estimated(self, best: Rival, known: Collection[Course]) -> Iterator[Rival]:
+        """Rivals that were not found. If all within some nats are, one below them breaks axioms."""
         least = best.nats + self._within if self.proven else -math.inf
-        at = best.places or best.dstates
-        visits: dict[int, list[int]] = {}  # the first steps of the visits to each place
-        for step, begin in enumerate(_begins(at, self._misfit.visit)):
-            if begin == step:
-                visits.setdefault(at[step], []).append(step)
-        ends = time.perf_counter() + ESTIMATING
-        tried = set(known)
-        for name, begins in visits.items():
-            singly = [{begin} for begin in begins[1:]]
-            from_then_on = [set(begins[i:]) for i in range(1, len(begins) - 1)]
-            for moved in (*singly, *from_then_on) if len(begins) > 1 else ():
-                if time.perf_counter() > ends:
-                    return
-                dstates, places = _moved(best, self._misfit.visit, name, moved)
-                if (dstates, places) in tried:
-                    continue
-                tried.add((dstates, places))
-                nats = paths + self._misfit.of_course(dstates, places or dstates) / 2
-                nats += self._prices[0] * len(set(dstates)) + self._prices[1] * len(set(places))
-                if least <= nats < best.nats + CERTAIN:
-                    yield Rival(nats, dstates, places, estimated=True)
+        for rival in estimated(best, self._misfit.visit, self._cost_like(best)):
+            if rival.nats >= least and (rival.dstates, rival.places) not in known:
+                yield rival
+
+    def _cost_like(self, best: Rival) -> CostOf:
+        """Compute the cost of maps with the paths and faults of the best map."""
+        prices, counts = self._prices, Cost.of(self.candidates[0].map)
+        first, price = next(iter(prices.items()))
+        units = _units_of(first)
+        kept = prices["paths"] * counts.paths
+        kept += price * (getattr(counts, first) - counts.dstates * units)
+        wrong = [step for kind, step in best.faults if kind == "jumped"]
+
+        def cost_of(dstates: Sequence[int], places: Sequence[int]) -> float:
+            nats: float = kept + self._misfit.of_course(dstates, places or dstates, wrong) / 2
+            nats += price * units * len(set(dstates)) + prices["places"] * len(set(places))
+            return nats
+
+        return cost_of
 
 
-def _moved(
-    best: Rival, visit: Sequence[int], place: int, moved: Collection[int]
-) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """The dstates and places of a map, if some visits to a place are visits to a new one.
+def _prices_of(theory: Theory) -> dict[str, float]:
+    """The price of one of each count, in nats; the price of what is minimised first comes first.
 
-    Args:
-        best: The map.
-        visit: The first step of the visit of each step.
-        place: The place; without places, the dstate.
-        moved: The first steps of the visits.
+    If faults are allowed, tenths of dstates are minimised: of dstates and faults together.
     """
-    at = best.places or best.dstates
-    begins = _begins(at, visit)
-    new = [name == place and begin in moved for name, begin in zip(at, begins, strict=True)]
-    more = len(at)
-    dstates = [name + more * is_new for name, is_new in zip(best.dstates, new, strict=True)]
-    places = [name + more * is_new for name, is_new in zip(best.places, new, strict=False)]
-    return tuple(numbered(dstates)), tuple(numbered(places))
+    dstate, place, path = theory.prices
+    first = "tenths" if theory.has_faults else "dstates"
+    return {first: dstate / _units_of(first), "places": place, "paths": path}
 
 
-def _begins(at: Sequence[int], visit: Sequence[int]) -> list[int]:
-    """The first step of the visit of each step to its place, or without places to its dstate."""
-    begins: list[int] = []
-    for step, name in enumerate(at):
-        is_first = not step or at[step - 1] != name or visit[step] == step
-        begins.append(step if is_first else begins[-1])
-    return begins
+def _units_of(first: str) -> int:
+    """How many of what is minimised first a dstate costs."""
+    return 10 if first == "tenths" else 1
 
 
-def _course(ssh_map: SSHMap) -> tuple[tuple[int, ...], tuple[int, ...]]:
+def _course_of(ssh_map: SSHMap) -> list[Equality]:
+    """For each two steps, whether they are one dstate, and whether they are at one place.
+
+    Maps with faults may have other faults, and less of them, if more steps are one dstate. So only
+    the maps with the same dstates and places are excluded.
+    """
+    dstates, places = _course(ssh_map)
+    found = []
+    for of, names in (("dstate", dstates), ("place", places if ssh_map.places else ())):
+        pairs = combinations(range(len(names)), 2)
+        found += [Equality(i, j, of, names[i] == names[j]) for i, j in pairs]
+    return found
+
+
+def _with(faults: Sequence[Fault], ssh_map: SSHMap) -> SSHMap:
+    """A map with some more faults."""
+    if not faults:
+        return ssh_map
+    both = sorted((*ssh_map.faults, *faults), key=lambda fault: (fault.step, fault.kind))
+    return replace(ssh_map, faults=tuple(both))
+
+
+def _course(ssh_map: SSHMap) -> Course:
     """The dstate and the place of each step, numbered by first visit."""
     places = [ssh_map.dstates[label].place for label in ssh_map.labels]
     return tuple(numbered(ssh_map.labels)), tuple(numbered(places))
@@ -417,7 +426,8 @@ def _pinned(theory: Theory, ssh_map: SSHMap) -> Theory:
 
 def _rival_of(candidate: Candidate) -> Rival:
     dstates, places = _course(candidate.map)
-    return Rival(candidate.nats, dstates, places if candidate.map.places else ())
+    faults = tuple((fault.kind, fault.step) for fault in candidate.map.faults)
+    return Rival(candidate.nats, dstates, places if candidate.map.places else (), faults=faults)
 
 
 class _Judging(Judging):

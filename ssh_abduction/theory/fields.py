@@ -126,22 +126,17 @@ def _check_weigh(theory: Theory) -> None:
             f"{', '.join(theory.prefer) or 'nothing'}; leave it out, or take "
             f"{choice('weigh', 'count')}"
         )
-    for reason, is_given in (("faults", theory.has_faults), ("excuses", _has_excuses(theory))):
-        if is_given:
-            raise TheoryError(
-                f"weigh: expected count where {reason} are allowed, as their price in nats is not "
-                f"known, got cost; take {choice('weigh', 'count')}"
-            )
-
-
-def _has_excuses(theory: Theory) -> bool:
-    return theory.boundary == "defeasible"
+    if theory.boundary == "defeasible":
+        raise TheoryError(
+            "weigh: expected count where excuses are allowed, as their price in nats is not "
+            f"known, got cost; take {choice('weigh', 'count')}"
+        )
 
 
 def can_weigh(theory: Theory) -> bool:
     """Whether the maps of a theory can be compared by their cost in nats."""
     dstates_first = theory.prefer == AUTO or theory.prefer[:1] == ("dstates",)
-    return dstates_first and not theory.has_faults and not _has_excuses(theory)
+    return dstates_first and theory.boundary != "defeasible"
 
 
 def _check_faults(theory: Theory) -> None:

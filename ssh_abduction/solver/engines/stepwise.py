@@ -180,9 +180,7 @@ class StepEngine:
         self.asker.control.add(
             part,
             [],
-            questions.forbidden_equalities(
-                self._forbidden[number], excusable=self._task.theory.jumped > 0
-            ),
+            questions.forbidden_equalities(self._forbidden[number]),
         )
         self.asker.control.ground([(part, [])])
 

@@ -9,15 +9,14 @@ A closure says how a step lies relative to an earlier one. It moves the poses of
 the later step comes, and its misfit adds to the cost.
 
 Each step extends each hypothesis in all ways that cost little: the robot is at a known dstate, at a
-new dstate of a known place, or at a new place. The *beam* is the hypotheses of least cost. The
-checker looks at them every few steps. So a hypothesis that breaks an axiom does not crowd out
-others for long.
+new dstate of a known place, or at a new place. If faults are allowed, the action may have slipped,
+the displacement may be wrong, and the view may be misread, each at its price. The *beam* is the
+hypotheses of least cost. The checker looks at them every few steps. So a hypothesis that breaks an
+axiom does not crowd out others for long.
 
-The equations are linear in the neighbourhood of the means. So the cost of a hypothesis is close to
-the cost of its map, and not equal to it.
+The cost of a hypothesis is close to the cost of its map, and not equal to it (`reckoning.py`).
 
-References:
-    Smith, Self & Cheeseman 1990, "Estimating uncertain spatial relationships in robotics".
+Reference:
     Reid 1979, "An algorithm for tracking multiple targets" (hypotheses in a beam).
 """
 
@@ -28,25 +27,27 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import islice, product
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ssh_abduction.checker.checker import violations
-from ssh_abduction.data.closure import Closure
+from ssh_abduction.data.action import Action
 from ssh_abduction.data.gateways import rotations
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.star import Star
-from ssh_abduction.data.trace import Step
+from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.runtime.clock import look_at_clock
-from ssh_abduction.solver.equations import noise_of, noises
 from ssh_abduction.solver.guesses.completing import completed
+from ssh_abduction.solver.guesses.reckoning import (
+    Hypothesis,
+    Reckoning,
+    conditioned,
+    first_pose,
+    squares_of,
+)
+from ssh_abduction.solver.steps.faults import with_faults
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import Problem
-
-Array: TypeAlias = NDArray[np.float64]
 
 # The checker looks at the beam after this many steps.
 CHECKED_EVERY = 8
@@ -56,41 +57,6 @@ WIDER = 2
 SPARE = 2
 # An extension that costs this many nats more than the best one of its hypothesis is not made.
 DEAREST = 20.0
-# Added to variances, in square metres and square radians, so that no matrix is singular.
-BLUR = 1e-6
-# The standard deviations, in metres and radians, of a move without a displacement.
-UNKNOWN = (1e3, 1e3, 3.0)
-# The first entries of the means: how wrong the scale and the drift are, in standard deviations.
-SCALE, BEND = 0, 1
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Hypothesis:
-    """What a robot may have visited.
-
-    Attributes:
-        labels: The dstate of each step so far.
-        places: The place of each dstate.
-        shows: For each dstate, a number for what is seen there.
-        links: For each dstate and action, the dstate that it leads to.
-        sights: For each place, what its first step shows of it.
-        position: For each place, the index of its x in the means; y is the next one.
-        heading: For each dstate, the index of its heading in the means.
-        mean: The means in metres, radians and standard deviations.
-        covariance: Their covariance.
-        nats: The cost.
-    """
-
-    labels: list[int]
-    places: list[int]
-    shows: list[int]
-    links: dict[tuple[int, int], int]
-    sights: list[Star | tuple[bool, ...] | None]
-    position: list[int]
-    heading: list[int]
-    mean: Array
-    covariance: Array
-    nats: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +87,7 @@ class Beam:
         """Search nothing yet.
 
         Args:
-            problem: A trace and a theory. The maps have no faults, also if the theory allows them.
+            problem: A trace and a theory.
             log: The trace as integers.
             width: How many hypotheses are kept.
         """
@@ -134,17 +100,15 @@ class Beam:
         self._price, self._price_of_place = theory.prices[:2]
         if not self._has_places:
             self._price_of_place = 0.0
-        odometry = trace.odometry or Odometry()
-        self._sigma = odometry.scale, odometry.bend
-        steps = [t for t in range(1, len(trace)) if trace.steps[t].displacement is not None]
-        self._noise = dict(zip(steps, noises(trace, steps), strict=True))
-        # The closures of each step, and their covariances.
-        self._closures: dict[int, list[tuple[Closure, Array]]] = {}
-        for closure in trace.closures:
-            told = closure, noise_of(closure, odometry)
-            self._closures.setdefault(closure.last, []).append(told)
+        self._reckoning = Reckoning(trace)
         self.nats = math.inf
         self._sights = [self._sight(step) for step in trace.steps]
+        # For each kind of fault, what it costs at each step in nats.
+        self._fault = {
+            kind: [self._price * theory.fault_tenths(kind, step) / 10 for step in trace.steps]
+            for kind in ("misread", "slipped", "jumped")
+            if getattr(theory, kind)
+        }
 
     def maps(self) -> Iterator[SSHMap]:
         """The maps of the hypotheses of the whole trace that agree with the axioms, by their cost.
@@ -217,18 +181,15 @@ class Beam:
         return beam
 
     def _first(self) -> Hypothesis:
-        mean, covariance = np.zeros(5), np.zeros((5, 5))
-        covariance[[SCALE, BEND], [SCALE, BEND]] = 1.0
         return Hypothesis(
             [0],
             [0],
-            [self._log.seen[0]],
+            [{self._log.seen[0]: self._doubt(0)}],
             {},
             self._sights[:1],
             [2],
             [4],
-            mean,
-            covariance,
+            *first_pose(),
             self._price,
         )
 
@@ -241,114 +202,103 @@ class Beam:
         """
         look_at_clock()
         steps = len(found.labels)
-        trace, theory = self._trace.prefix(steps), self._bare.of_steps(0, steps)
+        trace, theory = self._mended(found), self._bare.of_steps(0, steps)
         facing: list[float] = found.mean[found.heading].tolist()
         ssh_map = completed(trace, theory, found.labels, found.places, facing)
         if (
             ssh_map is None
             or next(violations(trace, ssh_map, theory), None) is not None
-            or any(e.refuse(self._trace, ssh_map, since) for e in self._problem.evidence)
+            or any(e.refuse(trace, ssh_map, since) for e in self._problem.evidence)
         ):
             return None
-        return ssh_map
+        if not self._fault:
+            return ssh_map
+        whole, theory = self._trace.prefix(steps), self._problem.theory.of_steps(0, steps)
+        ssh_map = with_faults(ssh_map, whole, trace, theory)
+        return None if next(violations(whole, ssh_map, theory), None) else ssh_map
+
+    def _mended(self, found: Hypothesis) -> Trace:
+        """The steps of a hypothesis, with its faults corrected."""
+        trace = self._trace.prefix(len(found.labels))
+        if not self._fault:
+            return trace
+        steps = list(trace.steps)
+        first = {number: t for t, number in reversed([*enumerate(self._log.seen)])}
+        for t, label in enumerate(found.labels):
+            right = self._trace.steps[first[_shown(found.seen[label])]]
+            if right.view != steps[t].view or right.openings != steps[t].openings:
+                steps[t] = replace(steps[t], view=right.view, star=right.star)
+        for t, kind in found.faults:
+            if kind == "slipped":
+                steps[t] = replace(steps[t], action=Action.that_slipped(t))
+            else:
+                steps[t] = replace(steps[t], displacement=None, covariance=None)
+        return replace(trace, steps=tuple(steps))
+
+    def _doubt(self, t: int) -> float:
+        """What it costs to treat the observation of a step as misread, in nats."""
+        return self._fault["misread"][t] if "misread" in self._fault else math.inf
+
+    def _misread(self, found: Hypothesis, dstate: int, t: int) -> float:
+        """What faults of views cost more, in nats, if the last step is at a dstate."""
+        seen, number, doubt = found.seen[dstate], self._log.seen[t], self._doubt(t)
+        if math.isinf(doubt):
+            return 0.0 if number in seen else math.inf
+        before = sum(seen.values()) - max(seen.values())
+        after = {**seen, number: seen.get(number, 0.0) + doubt}
+        return sum(after.values()) - max(after.values()) - before
 
     def _options_of(self, beam: Sequence[Hypothesis], t: int, joins: bool) -> list[_Extension]:
         """The ways to extend the hypotheses of a beam by step t, by their cost."""
         look_at_clock()
         options = [
-            option for found in beam for option in self._options(self._moved(found, t), t, joins)
+            option
+            for found in beam
+            for moved in self._moves(found, t)
+            for option in self._options(moved, t, joins)
         ]
         return sorted(options, key=lambda option: option.nats)
 
-    def _moved(self, found: Hypothesis, t: int) -> Hypothesis:
-        """Append the pose after the move to step t to the means of a hypothesis."""
-        here = found.labels[-1]
-        at, heading = found.position[found.places[here]], found.heading[here]
-        mean, n = found.mean, len(found.mean)
-        displacement = self._trace.steps[t].displacement
-        dx, dy, turn = displacement or (0.0, 0.0, 0.0)
-        way = math.hypot(dx, dy)
-        scale = 1 + mean[SCALE] * self._sigma[SCALE]
-        drift = mean[BEND] * self._sigma[BEND] * way
-        facing = mean[heading] - drift / 2
-        cos, sin = math.cos(facing), math.sin(facing)
-        gone = np.array([cos * dx - sin * dy, sin * dx + cos * dy]) / scale
-        aside = np.array([-gone[1], gone[0]])
-        by = np.zeros((3, n))
-        by[0, at] = by[1, at + 1] = by[2, heading] = 1.0
-        by[:2, heading] = aside
-        by[:2, SCALE] = -gone * self._sigma[SCALE] / scale
-        by[:2, BEND] = aside * (-way / 2 * self._sigma[BEND])
-        by[2, BEND] = -way * self._sigma[BEND]
-        rotation = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, scale]]) / scale
-        noise = self._noise[t] if t in self._noise else np.diag(UNKNOWN) ** 2
-        covariance = np.empty((n + 3, n + 3))
-        covariance[:n, :n] = found.covariance
-        covariance[n:, :n] = by @ found.covariance
-        covariance[:n, n:] = covariance[n:, :n].T
-        covariance[n:, n:] = covariance[n:, :n] @ by.T + rotation @ noise @ rotation.T
-        pose = [*(mean[at : at + 2] + gone), mean[heading] + turn - drift]
-        moved = replace(found, mean=np.concatenate([mean, pose]), covariance=covariance)
-        for closure, spread in self._closures.get(t, ()):
-            moved = self._closed(moved, closure, spread)
-        return moved
-
-    def _closed(self, moved: Hypothesis, closure: Closure, noise: Array) -> Hypothesis:
-        """Update a hypothesis by a closure that leads to the last pose of its means.
-
-        Args:
-            moved: The hypothesis.
-            closure: The closure.
-            noise: The covariance of the closure, 3 x 3, with the errors of both ends.
-        """
-        mean, n = moved.mean, len(moved.mean) - 3
-        there = moved.labels[closure.first]
-        at, heading = moved.position[moved.places[there]], moved.heading[there]
-        cos, sin = math.cos(mean[heading]), math.sin(mean[heading])
-        back = np.array([[cos, sin], [-sin, cos]])
-        gone = back @ (mean[n : n + 2] - mean[at : at + 2])
-        # How the pose, relative to the earlier step, depends on the means.
-        by = np.zeros((3, n + 3))
-        by[:2, n : n + 2], by[:2, at : at + 2] = back, -back
-        by[:2, heading] = gone[1], -gone[0]
-        by[2, n + 2], by[2, heading] = 1.0, -1.0
-        off = np.array([*gone, mean[n + 2] - mean[heading]]) - closure.displacement
-        off[2] = math.remainder(off[2], math.tau)
-        across = moved.covariance @ by.T
-        solved = np.linalg.solve(by @ across + noise, np.column_stack([off, across.T]))
-        covariance = moved.covariance - across @ solved[:, 1:]
-        return replace(
-            moved,
-            mean=mean - across @ solved[:, 0],
-            covariance=(covariance + covariance.T) / 2,
-            nats=moved.nats + float(off @ solved[:, 0]) / 2,
-        )
+    def _moves(self, found: Hypothesis, t: int) -> Iterator[Hypothesis]:
+        """A hypothesis after the move to step t, with and without a fault of the move."""
+        moved = self._reckoning.moved(found, t)
+        yield moved
+        if "slipped" in self._fault:
+            faults, price = (*found.faults, (t - 1, "slipped")), self._fault["slipped"][t - 1]
+            yield replace(moved, faults=faults, nats=moved.nats + price)
+        if "jumped" in self._fault and self._trace.steps[t].displacement is not None:
+            faults, price = (*found.faults, (t, "jumped")), self._fault["jumped"][t]
+            moved = self._reckoning.moved(found, t, believes=False)
+            yield replace(moved, faults=faults, nats=moved.nats + price)
 
     def _options(self, moved: Hypothesis, t: int, joins: bool) -> list[_Extension]:
         """The ways to extend a hypothesis by step t that cost little."""
-        here, action, seen = moved.labels[-1], self._log.actions[t - 1], self._log.seen[t]
-        known = moved.links.get((here, action))
+        here, action = moved.labels[-1], self._log.actions[t - 1]
+        slips = moved.faults[-1:] == ((t - 1, "slipped"),)
+        known = None if slips else moved.links.get((here, action))
         if known is not None:
-            if moved.shows[known] != seen:
-                return []
-            nats = moved.nats + self._squares(moved, [moved.places[known]], known)[0] / 2
-            return [_Extension(nats, moved.places[known], known, moved)]
-        stays = self._stays and self._trace.actions[t - 1].kind == "turn"
-        there = moved.places[here]
+            place = moved.places[known]
+            nats = moved.nats + self._misread(moved, known, t)
+            nats += float(squares_of(moved, [place], known)[0]) / 2
+            option = _Extension(nats, place, known, moved)
+            return [option] if nats < math.inf and self._is_allowed(option, t) else []
+        stays = self._stays and self._trace.actions[t - 1].kind == "turn" and not slips
+        there, leaves = moved.places[here], self._leaves and not slips
+        misreads = "misread" in self._fault
         if stays:
             places = [there]
         else:
             places = [
                 place
                 for place, sight in enumerate(moved.sights)
-                if (place != there or not self._leaves) and _agree(sight, self._sights[t])
+                if (place != there or not leaves) and (misreads or _agree(sight, self._sights[t]))
             ]
         dstate, new_place = (self._price, self._price_of_place) if joins else (0.0, 0.0)
         options = []
         if not stays:
             nats = moved.nats + dstate + new_place
             options.append(_Extension(nats, None, None, moved))
-        squares = self._squares(moved, places) if places else np.zeros(0)
+        squares = squares_of(moved, places) if places else np.zeros(0)
         for place, square in zip(places, squares.tolist(), strict=True):
             if square / 2 > DEAREST and not stays:
                 continue
@@ -356,8 +306,8 @@ class Beam:
                 nats = moved.nats + dstate + square / 2
                 options.append(_Extension(nats, place, None, moved))
             for s, p in enumerate(moved.places):
-                if p == place and moved.shows[s] == seen:
-                    nats = moved.nats + float(self._squares(moved, [place], s)[0]) / 2
+                if p == place and (misread := self._misread(moved, s, t)) < math.inf:
+                    nats = moved.nats + misread + float(squares_of(moved, [place], s)[0]) / 2
                     options.append(_Extension(nats, place, s, moved))
         least = min(option.nats for option in options)
         return [
@@ -374,43 +324,17 @@ class Beam:
         place = len(option.of.position) if option.place is None else option.place
         return self._log.pairs.allow(t, [*labels, len(places)], [*places, place])
 
-    def _squares(
-        self, moved: Hypothesis, places: Sequence[int], dstate: int | None = None
-    ) -> Array:
-        """The chi-square if the last pose is at each of some places, or at a dstate of one."""
-        n = len(moved.mean) - 3
-        at = np.array([moved.position[p] for p in places])
-        rows = np.stack([at, at + 1], 1)
-        last = np.array([n, n + 1])
-        if dstate is not None:
-            rows = np.concatenate([rows, [[moved.heading[dstate]]]], 1)
-            last = np.array([n, n + 1, n + 2])
-        off = moved.mean[last] - moved.mean[rows]
-        if dstate is not None:
-            off[:, 2] -= math.tau * np.round(off[:, 2] / math.tau)
-        c = moved.covariance
-        crossed = c[rows[:, :, None], last[None, None, :]]
-        spread = (
-            c[np.ix_(last, last)][None]
-            + c[rows[:, :, None], rows[:, None, :]]
-            - crossed
-            - crossed.transpose(0, 2, 1)
-            + BLUR * np.identity(len(last))
-        )
-        squares: Array = np.einsum("ni,ni->n", off, np.linalg.solve(spread, off[..., None])[..., 0])
-        return squares
-
     def _child(self, option: _Extension, t: int) -> Hypothesis:
         """Make an extended hypothesis."""
         moved = option.of
         n = len(moved.mean) - 3
         mean, covariance = moved.mean, moved.covariance
-        position, heading, places, shows = moved.position, moved.heading, moved.places, moved.shows
+        position, heading, places, seen = moved.position, moved.heading, moved.places, moved.seen
         last, keep, sights = [n, n + 1, n + 2], [*range(n)], moved.sights
         if option.place is not None:
             rows = [position[option.place], position[option.place] + 1]
             rows += [] if option.dstate is None else [heading[option.dstate]]
-            mean, covariance = _conditioned(mean, covariance, last[: len(rows)], rows)
+            mean, covariance = conditioned(mean, covariance, last[: len(rows)], rows)
             keep += last[len(rows) :]
         else:
             keep += last
@@ -419,20 +343,33 @@ class Beam:
         there = option.dstate
         if there is None:
             there = len(places)
-            places, shows = [*places, place], [*shows, self._log.seen[t]]
+            places, seen = [*places, place], [*seen, {}]
             heading = [*heading, len(keep) - 1]
+        number, (dstate, action) = self._log.seen[t], (moved.labels[-1], self._log.actions[t - 1])
+        links = moved.links
+        if (t - 1, "slipped") not in moved.faults[-1:]:
+            links = {**links, (dstate, action): there}
+        if number not in seen[there] or "misread" in self._fault:
+            doubt = self._doubt(t) + seen[there].get(number, 0.0)
+            seen = [*seen[:there], {**seen[there], number: doubt}, *seen[there + 1 :]]
         return Hypothesis(
             [*moved.labels, there],
             places,
-            shows,
-            {**moved.links, (moved.labels[-1], self._log.actions[t - 1]): there},
+            seen,
+            links,
             sights,
             position,
             heading,
             mean[keep],
             covariance[np.ix_(keep, keep)],
             option.nats,
+            moved.faults,
         )
+
+
+def _shown(seen: dict[int, float]) -> int:
+    """The observation that a dstate shows: the one that is dearest to treat as misread."""
+    return max(seen, key=lambda number: seen[number])
 
 
 def _agree(first: Star | tuple[bool, ...] | None, second: Star | tuple[bool, ...] | None) -> bool:
@@ -450,16 +387,3 @@ def _may_fit(first: Star, second: Star) -> bool:
         for frame, other in product(first.frames, second.frames)
         for shift in range(max(frame.slots, 1))
     )
-
-
-def _conditioned(
-    mean: Array, covariance: Array, first: Sequence[int], second: Sequence[int]
-) -> tuple[Array, Array]:
-    """Condition a Gaussian on equalities of entries. The third entry is an angle."""
-    off = mean[first] - mean[second]
-    off[2:] -= math.tau * np.round(off[2:] / math.tau)
-    across = covariance[:, first] - covariance[:, second]
-    spread = across[first] - across[second] + BLUR * np.identity(len(off))
-    gain = np.linalg.solve(spread, across.T).T
-    conditioned = covariance - gain @ across.T
-    return mean - gain @ off, (conditioned + conditioned.T) / 2

@@ -21,6 +21,7 @@ to a power of two, so that it seldom changes while a robot drives.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from operator import is_
@@ -50,6 +51,7 @@ class Displacement:
         has_places: Whether maps have places.
         turns_stay: Whether a test of two visits says something about all steps of these visits.
         has_one_view: Whether a dstate has only one view.
+        may_be_wrong: Whether a map may treat displacements as wrong.
         known: The returns of the last traces.
     """
 
@@ -61,6 +63,7 @@ class Displacement:
     has_places: bool
     turns_stay: bool
     has_one_view: bool
+    may_be_wrong: bool
     known: list[Returns] = field(default_factory=list, compare=False, repr=False)
 
     @classmethod
@@ -76,6 +79,7 @@ class Displacement:
             topological,
             turns_stay,
             "functional_view" in hard and not theory.unknown_views,
+            theory.jumped > 0,
         )
 
     def pairs(self, trace: Trace) -> Pairs:
@@ -87,9 +91,29 @@ class Displacement:
     def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
         if self.joint <= 1:
             return None
-        return self.returns_of(trace.without_displacements_at(jumped(ssh_map))).refused_together(
+        wrong = jumped(ssh_map)
+        refused = self.returns_of(trace.without_displacements_at(wrong)).refused_together(
             ssh_map, since
         )
+        return frozenset(refused | self.believed(trace, refused, wrong)) if refused else None
+
+    def believed(
+        self, trace: Trace, returns: Collection[Equality], wrong: Collection[int]
+    ) -> frozenset[Equality]:
+        """The displacements in the loops of returns that a map believes, if some may be wrong.
+
+        Closures make further loops. So with closures, all displacements are in loops.
+
+        Args:
+            trace: The trace.
+            returns: The returns.
+            wrong: The steps whose displacements the map treats as wrong.
+        """
+        if not self.may_be_wrong:
+            return frozenset()
+        loops = [range(found.first + 1, found.second + 1) for found in returns]
+        inside = {*range(1, len(trace))} if trace.closures else set[int]().union(*loops)
+        return frozenset(Equality(t - 1, t, "displacement") for t in inside - set(wrong))
 
     def remembering(self, known: Displacement) -> Displacement:
         return replace(self, known=known.known)

@@ -17,10 +17,12 @@ if TYPE_CHECKING:
 class Equality:
     """The statement that two steps are one dstate or at one place, or that they are not.
 
+    It may also say that the displacement from one step to the next is right.
+
     Attributes:
         first: One step.
         second: The other step.
-        of: "dstate" or "place".
+        of: "dstate", "place" or "displacement".
         holds: False for the statement that they are not one.
     """
 

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import pairwise
 
 from clingo import Model
 
-from ssh_abduction.data.maps import FAULTS, DState, Fault, MapPath, SSHMap
-from ssh_abduction.data.odometry import in_words
+from ssh_abduction.data.maps import FAULTS, DState, MapPath, SSHMap
 from ssh_abduction.data.trace import Trace, View
 from ssh_abduction.solver.asp.facts.atoms import read_atom
 from ssh_abduction.solver.steps import frames
+from ssh_abduction.solver.steps.faults import faults_of, links_of, view_at
 from ssh_abduction.theory.theory import Theory
 
 
@@ -153,40 +152,6 @@ def views_of(
     return views
 
 
-def faults_of(
-    faults: Iterable[tuple[int, str]],
-    labels: Mapping[int, int],
-    views: Mapping[int, View | None],
-    trace: Trace,
-    theory: Theory,
-) -> tuple[Fault, ...]:
-    """Make the faults of a map.
-
-    Args:
-        faults: Steps and kinds of faults.
-        labels: The dstate of each step.
-        views: The view of each dstate.
-        trace: The trace.
-        theory: The theory, for the costs of faults.
-    """
-    found = []
-    for t, kind in sorted(faults):
-        cost = theory.fault_tenths(kind, trace.steps[t]) / 10
-        if kind == "misread":
-            found.append(Fault(t, "misread", view_at(trace, t), views[labels[t]], cost))
-        elif kind == "slipped":
-            found.append(Fault(t, "slipped", trace.actions[t].name, cost=cost))
-        elif kind == "jumped":
-            found.append(
-                Fault(
-                    t, "jumped", in_words(trace.steps[t].displacement or (0.0, 0.0, 0.0)), cost=cost
-                )
-            )
-        else:
-            found.append(Fault(t, "misseen", cost=cost))
-    return tuple(found)
-
-
 def causal_map(labels: Sequence[int], trace: Trace) -> SSHMap:
     """Make a causal map (without places) from labels. Dstates are numbered by first visit.
 
@@ -229,29 +194,6 @@ def faulty_map(
         links_of(found, trace, faults),
         faults=faults_of(faults, is_at, views, trace, theory),
     )
-
-
-def links_of(
-    labels: Sequence[int], trace: Trace, faults: Iterable[tuple[int, str]] = ()
-) -> tuple[tuple[int, str, int], ...]:
-    """The distinct links (dstate, action, dstate) of labels, sorted.
-
-    Args:
-        labels: The dstate of each step.
-        trace: The trace.
-        faults: Steps and kinds of faults. An action that slipped makes no link, nor does the start
-            of a drive.
-    """
-    none = {t for t, kind in faults if kind == "slipped"}
-    none |= {t for t, action in enumerate(trace.actions) if action.starts}
-    links = enumerate(zip(pairwise(labels), trace.actions, strict=False))
-    return tuple(sorted({(s, action.name, x) for t, ((s, x), action) in links if t not in none}))
-
-
-def view_at(trace: Trace, step: int) -> str | int:
-    view = trace.steps[step].view
-    assert view is not None
-    return view
 
 
 def _paths(

@@ -16,9 +16,10 @@ from clingo import Control, Function, Model
 
 from ssh_abduction.data.maps import DState, MapPath, SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.solver.asp.facts.answer_maps import in_order, links_of, view_at
+from ssh_abduction.solver.asp.facts.answer_maps import in_order
 from ssh_abduction.solver.asp.facts.atoms import numbers, read_atom
 from ssh_abduction.solver.steps.chart import Chart
+from ssh_abduction.solver.steps.faults import links_of, view_at
 from ssh_abduction.theory.theory import Theory
 
 # A path and two of its places, the earlier one first.

@@ -22,21 +22,18 @@ def are_one(first: int, second: int) -> Symbol:
     return Function("same", numbers(first, second))
 
 
-def forbidden_equalities(
-    equalities: Iterable[Equality], where: Symbol | None = None, excusable: bool = False
-) -> str:
+def forbidden_equalities(equalities: Iterable[Equality], where: Symbol | None = None) -> str:
     """The rule that some equalities of steps do not all hold.
 
     Args:
         equalities: The equalities.
         where: The rule applies only if this atom is true. None if it always applies.
-        excusable: Whether a wrong displacement excuses: then the rule does not apply if, for one of
-            the equalities, a displacement between its two steps is treated as wrong.
     """
     atoms = [str(where)] if where else []
-    if excusable:
-        atoms += [f"not jumped_since({e.first},{e.second})" for e in equalities]
     for e in equalities:
+        if e.of == "displacement":
+            atoms.append(f"not jumped({e.second})")
+            continue
         sign, of = "" if e.holds else "not ", "same" if e.of == "dstate" else "same_place"
         atoms.append(f"{sign}{of}({min(e.first, e.second)},{max(e.first, e.second)})")
     return f":- {', '.join(atoms)}."

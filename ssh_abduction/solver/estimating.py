@@ -1,0 +1,82 @@
+"""Estimate rivals of the best map: some visits to a place may be visits to a new place.
+
+The search for maps of least cost (`weighing.py`) finds few rivals of a long trace. So these are
+added. They fit the displacements, and may break axioms.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Collection, Iterator, Sequence
+from typing import TypeAlias
+
+from ssh_abduction.solver.steps.chart import numbered
+from ssh_abduction.solver.weighed import Rival
+
+# The dstate and the place of each step, numbered by first visit.
+Course: TypeAlias = tuple[tuple[int, ...], tuple[int, ...]]
+# Computes the cost in nats of a map with these dstates and places.
+CostOf: TypeAlias = Callable[[Sequence[int], Sequence[int]], float]
+# Estimating rivals may take this many seconds. A rival that costs CERTAIN nats more than the best
+# map does not count: a million of them make 0.005 of a doubt.
+ESTIMATING, CERTAIN = 0.5, 19.0
+
+
+def estimated(best: Rival, visit: Sequence[int], cost_of: CostOf) -> Iterator[Rival]:
+    """Yield rivals that cost little more than the best map, each once.
+
+    In each, some visits to a place of the best map are visits to a new place: a single visit, or
+    all visits from one on.
+
+    Args:
+        best: The best map.
+        visit: The first step of the visit of each step.
+        cost_of: Computes the cost of a map.
+    """
+    at = best.places or best.dstates
+    visits: dict[int, list[int]] = {}  # the first steps of the visits to each place
+    for step, begin in enumerate(_begins(at, visit)):
+        if begin == step:
+            visits.setdefault(at[step], []).append(step)
+    ends = time.perf_counter() + ESTIMATING
+    tried: set[Course] = {(best.dstates, best.places)}
+    for name, begins in visits.items():
+        singly = [{begin} for begin in begins[1:]]
+        from_then_on = [set(begins[i:]) for i in range(1, len(begins) - 1)]
+        for moved in (*singly, *from_then_on) if len(begins) > 1 else ():
+            if time.perf_counter() > ends:
+                return
+            dstates, places = course = _moved(best, visit, name, moved)
+            if course in tried:
+                continue
+            tried.add(course)
+            nats = cost_of(dstates, places)
+            if nats < best.nats + CERTAIN:
+                yield Rival(nats, dstates, places, True, best.faults)
+
+
+def _moved(best: Rival, visit: Sequence[int], place: int, moved: Collection[int]) -> Course:
+    """The dstates and places of a map, if some visits to a place are visits to a new one.
+
+    Args:
+        best: The map.
+        visit: The first step of the visit of each step.
+        place: The place; without places, the dstate.
+        moved: The first steps of the visits.
+    """
+    at = best.places or best.dstates
+    begins = _begins(at, visit)
+    new = [name == place and begin in moved for name, begin in zip(at, begins, strict=True)]
+    more = len(at)
+    dstates = [name + more * is_new for name, is_new in zip(best.dstates, new, strict=True)]
+    places = [name + more * is_new for name, is_new in zip(best.places, new, strict=False)]
+    return tuple(numbered(dstates)), tuple(numbered(places))
+
+
+def _begins(at: Sequence[int], visit: Sequence[int]) -> list[int]:
+    """The first step of the visit of each step to its place, or without places to its dstate."""
+    begins: list[int] = []
+    for step, name in enumerate(at):
+        is_first = not step or at[step - 1] != name or visit[step] == step
+        begins.append(step if is_first else begins[-1])
+    return begins

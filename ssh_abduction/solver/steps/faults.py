@@ -1,0 +1,107 @@
+"""The faults and links of a map, from the dstate of each step and from a mended trace."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+from ssh_abduction.data.maps import Fault, SSHMap
+from ssh_abduction.data.odometry import in_words
+from ssh_abduction.data.trace import Trace, View
+from ssh_abduction.theory.theory import Theory
+
+
+def faults_of(
+    faults: Iterable[tuple[int, str]],
+    labels: Mapping[int, int],
+    views: Mapping[int, View | None],
+    trace: Trace,
+    theory: Theory,
+) -> tuple[Fault, ...]:
+    """Make the faults of a map.
+
+    Args:
+        faults: Steps and kinds of faults.
+        labels: The dstate of each step.
+        views: The view of each dstate.
+        trace: The trace.
+        theory: The theory, for the costs of faults.
+    """
+    found = []
+    for t, kind in sorted(faults):
+        cost = theory.fault_tenths(kind, trace.steps[t]) / 10
+        if kind == "misread":
+            found.append(Fault(t, "misread", view_at(trace, t), views[labels[t]], cost))
+        elif kind == "slipped":
+            found.append(Fault(t, "slipped", trace.actions[t].name, cost=cost))
+        elif kind == "jumped":
+            found.append(
+                Fault(
+                    t, "jumped", in_words(trace.steps[t].displacement or (0.0, 0.0, 0.0)), cost=cost
+                )
+            )
+        else:
+            found.append(Fault(t, "misseen", cost=cost))
+    return tuple(found)
+
+
+def links_of(
+    labels: Sequence[int], trace: Trace, faults: Iterable[tuple[int, str]] = ()
+) -> tuple[tuple[int, str, int], ...]:
+    """The distinct links (dstate, action, dstate) of labels, sorted.
+
+    Args:
+        labels: The dstate of each step.
+        trace: The trace.
+        faults: Steps and kinds of faults. An action that slipped makes no link, nor does the start
+            of a drive.
+    """
+    none = {t for t, kind in faults if kind == "slipped"}
+    none |= {t for t, action in enumerate(trace.actions) if action.starts}
+    links = enumerate(zip(pairwise(labels), trace.actions, strict=False))
+    return tuple(sorted({(s, action.name, x) for t, ((s, x), action) in links if t not in none}))
+
+
+def view_at(trace: Trace, step: int) -> str | int:
+    view = trace.steps[step].view
+    assert view is not None
+    return view
+
+
+def with_faults(ssh_map: SSHMap, trace: Trace, mended: Trace, theory: Theory) -> SSHMap:
+    """Turn a map of a mended trace into a map of the trace itself.
+
+    Each dstate gets the view that most of its steps have, weighted by the cost of a wrong view.
+    The steps at which the map differs from the trace become its faults.
+
+    Args:
+        ssh_map: The map of the mended trace.
+        trace: The trace itself.
+        mended: The mended trace.
+        theory: The theory, with the costs of faults.
+    """
+    votes: dict[int, Counter[View]] = {}
+    for label, step in zip(ssh_map.labels, trace.steps, strict=True):
+        assert step.view is not None
+        votes.setdefault(label, Counter())[step.view] += theory.fault_tenths("misread", step) or 1
+    shows = {label: max(counts, key=lambda view: counts[view]) for label, counts in votes.items()}
+    faults: list[tuple[int, str]] = []
+    for t, (step, other) in enumerate(zip(trace.steps, mended.steps, strict=True)):
+        if step.view != shows[ssh_map.labels[t]]:
+            faults.append((t, "misread"))
+        if theory.star in ("pattern", "frame") and step.openings != other.openings:
+            faults.append((t, "misseen"))
+        if step.action != other.action:
+            faults.append((t, "slipped"))
+        if step.displacement != other.displacement:
+            faults.append((t, "jumped"))
+    told = faults_of(faults, dict(enumerate(ssh_map.labels)), shows, trace, theory)
+    dstates = tuple(replace(s, view=shows[s.id]) for s in ssh_map.dstates)
+    return replace(
+        ssh_map,
+        dstates=dstates,
+        links=links_of(ssh_map.labels, trace, faults),
+        faults=told,
+    )
