@@ -24,7 +24,7 @@ from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from ssh_abduction import SSHMap, Trace
+from ssh_abduction import Solution, SSHMap, Trace
 from ssh_abduction.evaluation import told_poses
 
 Array = NDArray[np.float64]
@@ -74,6 +74,27 @@ def counts_of(trace: Trace, ssh_map: SSHMap | None, poses: Array) -> dict[str, A
         "travel_pairs": _travel_pairs(courses, edges),
         "partings": _noticed(partings(poses[:, :2]), middles),
     }
+
+
+def joins_of(trace: Trace, solution: Solution) -> list[tuple[float, bool]]:
+    """The probability of each join of the best map, and whether it is right.
+
+    A join is a visit to a place, and the visit before it to the same place. It is right if the
+    middles of the two visits are within 2 m.
+
+    Args:
+        trace: The trace of a log, with poses as its truth.
+        solution: Its maps, with probabilities; without them there are no joins.
+    """
+    told = told_poses(trace)
+    visit = [0]
+    for t, action in enumerate(trace.actions, 1):
+        visit.append(visit[-1] if action.kind == "turn" else t)
+    return [
+        (probability, math.dist(told[first][:2], told[second][:2]) <= ONE)  # type: ignore[index]
+        for first, second, probability in (solution.weighed.joins if solution.weighed else ())
+        if visit[first] != visit[second]
+    ]
 
 
 def _place(ssh_map: SSHMap | None, step: int) -> int | None:

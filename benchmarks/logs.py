@@ -30,13 +30,14 @@ from time import process_time
 from typing import Any
 
 import numpy as np
-from courses import counts_of
+from courses import counts_of, joins_of
 from pages import print_rows, seeds_from
 from skeleton import lay, poses_of, skeleton_of
+from truth import diagram, reliability
 from visited import Events, Truth, judged, truth_of
 
 from perception.readers.logs import read_log
-from ssh_abduction import SSHMap, Trace
+from ssh_abduction import Solution, SSHMap, Trace
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.maps import maps_of
 
@@ -196,7 +197,11 @@ def pairs_row(log: Path, truth: Truth | None, runs: Path) -> dict[str, Any]:
     run = read_json(runs / name_of(log) / "run.json")
     row |= {"visits": run["visits"], "seconds": sum(run["seconds"].values())}
     row |= {"status": run["status"], "places": None if ssh_map is None else len(ssh_map.places)}
-    return row if truth is None else row | counts_of(trace, ssh_map, truth.poses)
+    if truth is None:
+        return row
+    solution = Solution.load(runs / name_of(log) / "maps.json", trace)
+    row |= {"confidence": solution.confidence, "joins": joins_of(trace, solution)}
+    return row | counts_of(trace, ssh_map, truth.poses)
 
 
 def row_of(log: Path, method: str, truth: Truth, runs: Path) -> dict[str, Any]:
@@ -446,6 +451,14 @@ def main() -> None:
             options.page,
             r"\| log \| visits",
         )
+        joins = [(p, right) for row in pairs for p, right in row.get("joins", ())]
+        if joins:
+            error, brier = reliability(joins)
+            print(
+                f"{len(joins)} joins, {sum(not right for _, right in joins)} of them false: "
+                f"expected calibration error {error:.3f}, Brier score {brier:.3f} "
+                f"({diagram(joins)})"
+            )
     if not rows:
         return
     real = sorted(

@@ -226,8 +226,9 @@ class Beam:
         first = {number: t for t, number in reversed([*enumerate(self._log.seen)])}
         for t, label in enumerate(found.labels):
             right = self._trace.steps[first[_shown(found.seen[label])]]
-            if right.view != steps[t].view or right.openings != steps[t].openings:
-                steps[t] = replace(steps[t], view=right.view, star=right.star)
+            steps[t] = replace(steps[t], view=right.view)
+            if self._bare.star in ("pattern", "frame"):
+                steps[t] = replace(steps[t], star=right.star)
         for t, kind in found.faults:
             if kind == "slipped":
                 steps[t] = replace(steps[t], action=Action.that_slipped(t))
