@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 THICK = 0.05
 # Smallest length of a wall in metres; anything shorter is clutter, or the end of a wall.
 LONG = 0.4
+# The direction of each beam as a vector, (180, 2).
+AHEAD_AND_LEFT = np.stack([np.cos(BEARINGS), np.sin(BEARINGS)], axis=1)
 
 
 @dataclass(frozen=True)
@@ -95,16 +97,12 @@ def sight(image: Array, reach: float, farthest: float) -> Sight:
         farthest: Range in metres that means that nothing was seen.
     """
     seen = image < farthest - 0.02
-    bearings, ranges = BEARINGS[seen], image[seen]
-    points = np.stack([ranges * np.cos(bearings), ranges * np.sin(bearings)], axis=1)
-    if len(points) < 20:
+    met = image[seen, None] * AHEAD_AND_LEFT[seen]
+    if len(met) < 20:
         return Sight(0.0, None, None, None, None, None)
-    axis = _axis(points)
-    points = _turned(points, -axis)
-    axis += _finer(points, reach)
-    points = _turned(
-        np.stack([ranges * np.cos(bearings), ranges * np.sin(bearings)], axis=1), -axis
-    )
+    axis = _axis(met)
+    axis += _finer(_turned(met, -axis), reach)
+    points = _turned(met, -axis)
     x, y = points[:, 0], points[:, 1]
     across, along = _spacing(y), _spacing(x)
     # If the axis is turned to the left of the robot, the robot is turned to the right of the axis.
@@ -140,7 +138,7 @@ def _axis(points: Array) -> float:
         off = np.angle(np.exp(4j * (directions - axis))) / 4
         close = np.abs(off) < tolerance
         if close.sum() > 5:
-            axis += float(np.average(off[close], weights=weights[close]))
+            axis += _mean(off[close], weights[close])
     return axis
 
 
@@ -151,27 +149,33 @@ def _finer(points: Array, reach: float) -> float:
     """
     slopes, weights = [], []
     for u, v in ((0, 1), (1, 0)):
-        inside = np.abs(points[:, v]) < 3 * reach
+        values, spacing = points[:, v], _spacing(points[:, u])
+        inside = np.abs(values) < 3 * reach
         for side in (1, -1):
-            chosen = inside & (side * points[:, v] > 0.05)
-            line = _line(points[:, v], _spacing(points[:, u]), chosen)
+            chosen = inside & (side * values > 0.05)
+            line = _line(values, spacing, chosen)
             if line is None:
                 continue
             # Fit a slope to the points on the line. The sign must mean the same rotation for both
             # axes.
-            on = chosen & (np.abs(points[:, v] - line) < THICK)
-            a, b = points[on, u], points[on, v]
-            spread = float(((a - a.mean()) ** 2).sum())
-            if on.sum() > 8 and spread > 0.2:
-                slope = float(((a - a.mean()) * (b - b.mean())).sum()) / spread
+            on = chosen & (np.abs(values - line) < THICK)
+            a, b = points[on, u], values[on]
+            off = a - a.mean()
+            spread = float((off**2).sum())
+            if len(off) > 8 and spread > 0.2:
+                slope = float((off * (b - b.mean())).sum()) / spread
                 slopes.append(slope if v == 1 else -slope)
                 weights.append(spread)
-    return float(np.average(slopes, weights=weights)) if slopes else 0.0
+    return _mean(np.array(slopes), np.array(weights)) if slopes else 0.0
 
 
 def _spacing(values: Array) -> Array:
     """How many metres of wall along this axis each point represents, (n,)."""
-    return np.minimum(np.abs(np.gradient(values)), 0.3)
+    # This is np.gradient, which takes three times as long.
+    slopes = np.empty_like(values)
+    slopes[1:-1] = (values[2:] - values[:-2]) / 2
+    slopes[[0, -1]] = values[1] - values[0], values[-1] - values[-2]
+    return np.minimum(np.abs(slopes), 0.3)
 
 
 def _line(values: Array, weights: Array, chosen: NDArray[np.bool_]) -> float | None:
@@ -193,6 +197,9 @@ def _line(values: Array, weights: Array, chosen: NDArray[np.bool_]) -> float | N
     first = int(support.argmax())
     if support[first] < LONG or ends[first] - first < 5:
         return None
-    return float(
-        np.average(picked[first : ends[first]], weights=length[first : ends[first]] + 1e-6)
-    )
+    return _mean(picked[first : ends[first]], length[first : ends[first]] + 1e-6)
+
+
+def _mean(values: Array, weights: Array) -> float:
+    """The weighted mean. `np.average` gives the same, and takes ten times as long to check."""
+    return float((values * weights).sum() / weights.sum())

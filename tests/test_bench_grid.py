@@ -58,7 +58,7 @@ def test_the_ranges_of_a_grid_are_those_of_the_world() -> None:
 def test_the_histogram_is_brute_force_bayes() -> None:
     """A tiny grid, whose belief is computed once more by a sum over all pairs of poses, with one
     Gaussian of the displacement for each."""
-    tiny = Grid.of(WORLD, 0.4)
+    tiny = Grid.of(WORLD, 0.5)
     model, slipped = BeamModel(beams=30), 0.05
     belief = Histogram(tiny, model, slipped)
     poses = [(x, y, heading) for heading in tiny.angles for x, y in tiny.centres]

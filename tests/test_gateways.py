@@ -383,7 +383,7 @@ def test_general_stars_switch_off_what_knows_frames_of_four_slots() -> None:
 
 WORLDS: dict[str, tuple[nx.Graph, int, set[object]]] = {
     "corners of 60 degrees": (planar.triangle(), 13, set()),
-    "bends of 120 degrees": (planar.hexagon(), 25, {0}),
+    "bends of 120 degrees": (planar.hexagon(), 19, {0}),
     "three gateways, and a hub": (planar.wheel(3), 30, {0}),
     "three gateways, and dead ends": (planar.junction(0, 120, 240), 16, set()),
     "five gateways": (planar.junction(0, 72, 144, 216, 288), 30, set()),
@@ -439,7 +439,7 @@ def test_streets_at_any_angles_are_mapped_right(noise: float, unseen: bool) -> N
     assert solution.cost.places == tour.places
 
 
-@pytest.mark.parametrize(("spokes", "noise", "unseen"), [(5, 0, False), (6, 9, True)])
+@pytest.mark.parametrize(("spokes", "noise", "unseen"), [(5, 0, False), (5, 9, True)])
 def test_no_axiom_forbids_the_true_map(spokes: int, noise: float, unseen: bool) -> None:
     """Hubs with a ring road: bearings may be off by less than their spread, and gateways behind the
     robot need not be observed."""

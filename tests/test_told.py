@@ -288,7 +288,7 @@ def test_the_bootstrap_loop_tells_its_stages(caplog: pytest.LogCaptureFixture) -
     from simulator.world import World
     from ssh_abduction.learning.learner import BootstrapLearner
 
-    run = simulate(World.named("notched-rectangle"), tours=4, seed=1)
+    run = simulate(World.named("notched-rectangle"), tours=3, seed=1)
     with caplog.at_level(logging.INFO, "ssh_abduction"):
         learner = BootstrapLearner().fit(run)
     told = [
