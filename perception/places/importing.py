@@ -10,14 +10,14 @@ from __future__ import annotations
 import math
 import time
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from perception.errors import ImageWarning, LogError
-from perception.places import jumps
+from perception.places import jumps, log_checks
 from perception.places.agreement import disagreement
 from perception.places.distinctive import WIDTH, find_visits
 from perception.places.tracing import to_trace
@@ -39,7 +39,8 @@ SEEN = 12
 MOST_BREAKS = 0.1
 # UNITS: units of odometry, and how many make a metre. STRETCH: number of scans over which odometry
 # is compared with scan matching. UNLIKE: largest relative difference of the two.
-UNITS, STRETCH, UNLIKE = {"millimetres": 1000.0, "centimetres": 100.0}, 80, 0.25
+UNITS = {"metres": 1.0, "millimetres": 1000.0, "centimetres": 100.0}
+STRETCH, UNLIKE = 80, 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +65,12 @@ class Imported:
     notes: tuple[str, ...] = ()
 
 
-def import_log(log: RobotLog, width: float = WIDTH, name: str | None = None) -> Imported:
+def import_log(
+    log: RobotLog,
+    width: float = WIDTH,
+    name: str | None = None,
+    tell: Callable[[str], None] = lambda note: None,
+) -> Imported:
     """Import a log as a trace.
 
     Corrected poses become the truth for evaluation; nothing else reads them.
@@ -73,6 +79,7 @@ def import_log(log: RobotLog, width: float = WIDTH, name: str | None = None) -> 
         log: The log of one drive.
         width: Width of the robot in metres. Narrower parts of the free space are no ways.
         name: Name of the trace.
+        tell: Takes each note on suspicious odometry as soon as it is known.
 
     Returns:
         The trace, and the trajectory, visits and notes that it was made from.
@@ -88,12 +95,17 @@ def import_log(log: RobotLog, width: float = WIDTH, name: str | None = None) -> 
         )
     # Each stage is timed. Errors repeat the notes about the track, which are the likely causes.
     with _timed(seconds, "track"):
-        log, track, notes = tracked(log)
+        log, track, notes = tracked(log, tell)
     if len(track.breaks) > MOST_BREAKS * len(log):
         raise LogError(
             f"{named(log.source)}: expected a log of one drive, got {len(log)} scans of which "
             f"{len(track.breaks)} show nothing that the previous scan shows; sort it by "
             f"time, or cut it into drives{_besides(notes)}"
+        )
+    if (failing := log_checks.share_failing(track)) > log_checks.HOPELESS:
+        raise LogError(
+            f"{named(log.source)}: expected scans that show what the scans before them showed, got "
+            f"{len(log)} of which {100 * failing:.0f} % do not{_besides(notes)}"
         )
     if track.way[-1] < 1.0:
         raise LogError(
@@ -114,21 +126,42 @@ def import_log(log: RobotLog, width: float = WIDTH, name: str | None = None) -> 
     return Imported(trace, track, width, visits, seconds, notes)
 
 
-def tracked(log: RobotLog) -> tuple[RobotLog, Track, tuple[str, ...]]:
+def tracked(
+    log: RobotLog, tell: Callable[[str], None] = lambda note: None
+) -> tuple[RobotLog, Track, tuple[str, ...]]:
     """Compute the trajectory of a robot from its log.
 
+    Args:
+        log: The log of one drive.
+        tell: Takes each note as soon as it is known.
+
     Returns:
-        The log with the odometry of a single source, in metres; its track; and notes on suspicious
-        odometry.
+        The log with the odometry of a single source, in metres and radians; its track; and notes on
+        suspicious odometry.
+
+    Raises:
+        LogError: The scans are in random order.
     """
+    notes: list[str] = []
+
+    def say(more: Sequence[str]) -> None:
+        notes.extend(more)
+        for note in more:
+            _log.warning("%s: %s", named(log.source), note)
+            tell(note)
+
+    log_checks.refuse_shuffled(log)
     log, alternating = jumps.keep_one_source(log)
     log, counted = in_metres(log)
+    log, turned = log_checks.in_radians(log)
+    whole = log_checks.describe_drive(log)
+    say([*alternating, *counted, *turned, *whole])
     track = follow(log)
-    notes = alternating + counted + jumps.describe_cuts(log, track, turned_wrongly(log, track))
+    say(jumps.describe_cuts(log, track, turned_wrongly(log, track)))
     # If the odometry is wrong throughout, that explains all differences between the trajectories.
-    notes += jumps.describe_whole(log) or [doubt for doubt in [disagreement(log, track)] if doubt]
-    for note in notes:
-        _log.warning("%s: %s", named(log.source), note)
+    doubt = None if whole else disagreement(log, track)
+    say([doubt] if doubt else [])
+    say(log_checks.describe_track(log, track, explained=bool(whole or doubt)))
     return log, track, tuple(notes)
 
 
@@ -142,7 +175,7 @@ def in_metres(log: RobotLog) -> tuple[RobotLog, list[str]]:
         The log, and a list of notes: one if the log was converted, otherwise none.
     """
     usual = jumps.usual_step(log)
-    if usual <= jumps.LONG:
+    if usual <= log_checks.SPARSE:
         return log, []
     far = np.array([scan.odometry[:2] for scan in log.scans])
     begin = int(np.argmax(np.hypot(*np.diff(far, axis=0).T) > usual / 2))
@@ -159,8 +192,10 @@ def in_metres(log: RobotLog) -> tuple[RobotLog, list[str]]:
             else math.inf
         )
 
-    found = min(UNITS, key=off)
-    if off(found) > UNLIKE:
+    # Matching cannot correct metres that are too large to be true.
+    possible = [unit for unit in UNITS if unit != "metres" or usual <= log_checks.FAR_OFF]
+    found = min(possible, key=off)
+    if found == "metres" or off(found) > UNLIKE:
         return log, []
     count = UNITS[found]
     return jumps.in_unit(log, count), [

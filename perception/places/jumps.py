@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,8 +24,6 @@ FAR, UNUSUAL = 1.5, 3.5
 # After a pause of PAUSE times the usual interval, the robot may have driven on at up to FASTER
 # times its usual speed.
 PAUSE, FASTER = 3.0, 2.0
-# A usual step longer than this many metres means that the odometry has another unit.
-LONG = 5.0
 # Odometry stands still if it changes by less than STILL metres and radians. A beam changed if its
 # range differs by more than CHANGED metres plus CHANGED_SHARE of the range. The robot moved if more
 # than the share MOVED of the beams changed.
@@ -34,11 +33,9 @@ STILL, MOVED, CHANGED, CHANGED_SHARE = 1e-3, 0.35, 0.2, 0.03
 MOVED_UNSEEN = 0.15
 # Odometry that stands still in more than this share of the steps is missing.
 MISSING = 0.5
-# The trajectory over every second scan is about as long as the whole one. If it is shorter than
-# this share, poses go back and forth.
-TO_AND_FRO = 0.8
-# A log is out of order if the times of more than this share of its scans run backwards.
-SHUFFLED = 0.05
+# A clock starts anew if it goes back by more than ANEW_CLOCK seconds or on by more than a DAY, at
+# most SEAMS times in a log.
+ANEW_CLOCK, DAY, SEAMS = 60.0, 86400.0, 3
 # Limit of ranges in metres, for comparing scans.
 NO_RANGE = 25.0
 # A step to within this many metres of the origin means that the odometer restarted.
@@ -65,6 +62,38 @@ def keep_one_source(log: RobotLog) -> tuple[RobotLog, list[str]]:
         "Stop the other source, and record again, if it is the better one."
     )
     return replace(log, scans=_of_source(log.scans, sources[0])), [said]
+
+
+def seams_of(log: RobotLog) -> list[tuple[int, str]]:
+    """Find where a second drive seems to begin: the laser changes for good, or the clock is reset.
+
+    Returns:
+        The first scan of each further drive, and what changes there.
+    """
+    lasers = [(scan.laser.first, scan.laser.step, scan.laser.mount) for scan in log.scans]
+    other = [i for i in range(1, len(log)) if lasers[i] != lasers[i - 1]]
+    seams = {i: "The laser changes" for i in other if len(other) == 1}
+    times = [scan.time for scan in log.scans]
+    steps = [0.0 if last is None or time is None else time - last for last, time in pairwise(times)]
+    # A single wrong time is followed by a step back to the clock.
+    resets = [i for i, step in enumerate(steps, 1) if not -ANEW_CLOCK <= step <= DAY]
+    if len(resets) <= SEAMS and all(later - first > 1 for first, later in pairwise(resets)):
+        seams |= {i: "The clock starts anew" for i in resets if i not in seams}
+    return sorted(seams.items())
+
+
+def is_missing(log: RobotLog) -> bool:
+    """Whether the odometry stands still in most steps."""
+    return bool(len(log) > 1 and stands_still(log).mean() > MISSING)
+
+
+def goes_back_and_forth(log: RobotLog) -> float:
+    """Compare the trajectory by odometry over every second scan with that over all scans.
+
+    Returns:
+        The ratio of their lengths: about 1 for a drive, 0 for poses of two sources.
+    """
+    return float(_far(log, 2).sum() / max(2 * _far(log, 1).sum(), 1e-9))
 
 
 def usual_step(log: RobotLog) -> float:
@@ -176,46 +205,6 @@ def describe_cuts(log: RobotLog, track: Track, turned: list[tuple[int, float]]) 
     return notes
 
 
-def describe_whole(log: RobotLog) -> list[str]:
-    """Describe odometry that is wrong in the whole log, or a log that is out of order.
-
-    Returns:
-        Notes for the user; none if nothing is wrong.
-    """
-    notes = []
-    far_apart, to_and_fro = (
-        usual_step(log),
-        float(_far(log, 2).sum() / max(2 * _far(log, 1).sum(), 1e-9)),
-    )
-    # A wrong unit explains poses that go back and forth, so it is reported alone.
-    if far_apart > LONG:
-        notes.append(
-            f"The usual step between two scans is {far_apart:.0f} m by the odometry: it does "
-            "not count metres, or the log is not in order."
-        )
-    elif to_and_fro < TO_AND_FRO and far_apart > 0:
-        notes.append(
-            "The odometry goes back and forth: over every second scan it is "
-            f"{100 * to_and_fro:.0f} % as long as over all scans. Two programs may publish it, "
-            "or the log is not in order."
-        )
-    missing = stands_still(log) if len(log) > 1 else np.zeros(1, bool)
-    if missing.mean() > MISSING:
-        notes.append(
-            f"The odometry stands still in {missing.sum()} of {len(missing)} steps. If the "
-            "robot did not, its odometry is missing there, and the map rests on the scans "
-            "alone."
-        )
-    times = np.array([scan.time for scan in log.scans if scan.time is not None])
-    back = int((np.diff(times) < 0).sum())
-    if back > SHUFFLED * len(log):
-        notes.append(
-            f"The times of the scans run back {back} times in {len(log)} scans. If the log is "
-            "not in the order of time, sort it."
-        )
-    return notes
-
-
 def _times(count: int) -> str:
     return "once" if count == 1 else f"{count} times"
 
@@ -259,9 +248,12 @@ def unknown_steps(log: RobotLog) -> Unknown:
         np.zeros(len(log) - 1, bool) if seconds is None else seconds > PAUSE * np.median(seconds)
     )
     jumped, doubtful = _impossible(log, seconds, paused)
+    seams = frozenset(scan for scan, _ in seams_of(log))
     carried, still = _moved_while_still(log, paused)
     moved = frozenset(k for first, last in still for k in range(first, last + 1))
-    return Unknown(_targets(jumped) | moved | carried, carried, _targets(doubtful & ~jumped), still)
+    return Unknown(
+        _targets(jumped) | moved | carried | seams, carried, _targets(doubtful & ~jumped), still
+    )
 
 
 def _targets(steps: NDArray[np.bool_]) -> frozenset[int]:
@@ -319,7 +311,7 @@ def _moved_while_still(
         there is no odometry.
     """
     still = stands_still(log)
-    if still.mean() > MISSING:
+    if is_missing(log):
         return frozenset(), ()
     carried, found = set[int](), list[tuple[int, int]]()
     # Each stretch of standing still begins and ends at an edge of the mask.

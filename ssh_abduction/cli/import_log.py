@@ -169,8 +169,9 @@ def run(options: argparse.Namespace) -> int:
         )
     log = read(options.log, options)
     warn(log.warnings)
-    done = import_log(log, options.width or WIDTH, named_after(options.log))
-    warn(done.notes)
+    done = import_log(
+        log, options.width or WIDTH, named_after(options.log), lambda note: warn([note])
+    )
     said = (
         f"{counted(len(log), 'scans')}, {done.track.way[-1]:.0f} m: "
         f"{counted(len(done.visits), 'visits')} to distinctive places; "

@@ -112,6 +112,7 @@ class MapQuestion:
         content: bytes | None = None,
         given_up: Callable[[], bool] = lambda: False,
         answer_last: Callable[[MapAnswer], None] = workers.reply,
+        tell: Callable[[str], None] = lambda note: None,
     ) -> MapAnswer:
         """Map one log. If that fails, the answer says why.
 
@@ -121,19 +122,20 @@ class MapQuestion:
             content: The content of the log if it was sent along; None to read it here.
             given_up: Returns whether the answer is not needed any more.
             answer_last: Takes the answer if the process has to end because clingo does not stop.
+            tell: Takes each warning about the log as soon as it is known.
         """
         try:
             if given_up():
                 return self._given_up(number, path)
             if content is None:
-                return self._mapped(number, path, path, digest(path), given_up, answer_last)
+                return self._mapped(number, path, path, digest(path), given_up, answer_last, tell)
             sent = hashlib.sha256(content).hexdigest()
             if Path(path).exists() and digest(path) == sent:
-                return self._mapped(number, path, path, sent, given_up, answer_last)
+                return self._mapped(number, path, path, sent, given_up, answer_last, tell)
             with tempfile.TemporaryDirectory() as folder:
                 here = Path(folder) / Path(path).name[-KEPT:]
                 here.write_bytes(content)
-                return self._mapped(number, path, str(here), sent, given_up, answer_last)
+                return self._mapped(number, path, str(here), sent, given_up, answer_last, tell)
         except Exception as error:  # one bad log must not stop the others
             return self.failed(number, path, error)
 
@@ -145,6 +147,7 @@ class MapQuestion:
         content: str | None,
         given_up: Callable[[], bool],
         answer_last: Callable[[MapAnswer], None],
+        tell: Callable[[str], None],
     ) -> MapAnswer:
         """Map one log.
 
@@ -156,6 +159,7 @@ class MapQuestion:
                 changes later, the next call sees another digest and maps the log again.
             given_up: Returns whether the answer is not needed any more.
             answer_last: Takes the answer if the process has to end because clingo does not stop.
+            tell: Takes each warning about the log as soon as it is known.
         """
         begun: list[tuple[RobotLog, LogMapping]] = []  # one entry, once the log is read
 
@@ -186,6 +190,8 @@ class MapQuestion:
 
                 log = read_log(here, **self.reading)
                 begun.append((log, LogMapping()))
+                for warning in log.warnings:
+                    tell(warning)
                 done = map_log(
                     log,
                     self.theory,
@@ -196,6 +202,7 @@ class MapQuestion:
                     max_maps=self.maps or None,
                     with_ladder=self.ladder,
                     mapping=begun[0][1],
+                    tell=tell,
                 )
             return self._told(number, path, log, done, content)
 
@@ -333,6 +340,12 @@ def _alone(question: MapQuestion, left: list[str], folders: dict[str, Path]) -> 
         folders: The folder of each log.
     """
 
+    told: set[str] = set()  # warnings that were printed while the log was mapped
+
+    def tell(warning: str) -> None:
+        told.add(warning)
+        warn([warning])
+
     def keep(answer: MapAnswer) -> None:
         if answer.code == EXIT_ERROR:
             raise AbductionError(answer.line)
@@ -341,12 +354,12 @@ def _alone(question: MapQuestion, left: list[str], folders: dict[str, Path]) -> 
         except OSError as error:
             raise AbductionError(unwritten(error, folders[left[0]])) from None
         _say(answer, folders[left[0]])
-        warn(answer.warnings)
+        warn([warning for warning in answer.warnings if warning not in told])
 
     codes = [0]
     for path in left:
         check_folder(folders[path])
-        answer = question.answer(0, path, answer_last=keep)
+        answer = question.answer(0, path, answer_last=keep, tell=tell)
         keep(answer)
         codes.append(answer.code)
     return max(codes)

@@ -193,6 +193,7 @@ def map_log(
     max_maps: int | None = MAPS,
     with_ladder: bool = True,
     mapping: LogMapping | None = None,
+    tell: Callable[[str], None] = lambda note: None,
 ) -> LogMap:
     """Find the minimal maps of a building from a robot's log.
 
@@ -211,6 +212,7 @@ def map_log(
         with_ladder: Whether to solve the trace with fewer kinds of evidence, too, to show what each
             kind contributes.
         mapping: An object through which another thread can interrupt the mapping; None for none.
+        tell: Takes each note on suspicious odometry as soon as it is known.
 
     Raises:
         LogError: The log cannot be imported.
@@ -219,7 +221,7 @@ def map_log(
     mapping = mapping or LogMapping()
 
     # 1. Trace: import the log.
-    imported = import_log(log, width, name)
+    imported = import_log(log, width, name, tell)
     trace, seconds, notes = imported.trace, dict(imported.seconds), imported.notes
     _log.info("%d visits, %d steps", len(imported.visits), len(trace))
 

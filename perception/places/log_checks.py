@@ -1,0 +1,324 @@
+"""Checks whether a log is one drive in order, with odometry in metres and radians that fits it.
+
+The thresholds were measured on ten recorded logs and ten simulated drives. No good log reaches any
+of them (docs/measurements/robustness.md). Each check says what is wrong and what to do.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from perception.errors import LogError
+from perception.places import jumps
+from perception.places.track import POOR, Array, Track, Trust, wrapped
+from perception.readers.scans import Pose, RobotLog, Scan
+from ssh_abduction.data.errors import named
+from ssh_abduction.data.odometry import between, moved
+
+# In a shuffled log, scans some steps apart are about as far apart as neighbours: the quartiles of
+# their distances differ by at most this factor. In a drive, they grow with the number of steps. If
+# two sources of odometry alternate, the lower quartile is that of one source.
+LAGS, ALIKE = (2, 4, 8), 1.3
+# Share of the way that the robot drives straight ahead by the headings of its odometry: good logs
+# have 0.95 or more, reversed logs -0.99, headings in degrees at most 0.1.
+AHEAD, SIDEWAYS, LEAST_WAY = 0.9, 0.5, 10.0
+# Good logs have matches that fail in at most 1.5 % of the scans, and matches that contradict the
+# odometer (chi-square above CONTRADICTS, three degrees of freedom) in at most 2 % of the steps.
+FAILING, OVERRIDING, CONTRADICTS = 0.05, 0.08, 25.0
+# A log is refused if more than this share of its scans fails to match.
+HOPELESS = 0.5
+# Scans that are farther apart than SPARSE metres overlap too little, and those farther apart than
+# FAR_OFF hardly overlap. Good logs have up to 1 m.
+SPARSE, FAR_OFF = 1.5, 5.0
+# The odometry over every second scan is at least 0.98 times as long in good logs.
+TO_AND_FRO = 0.8
+# A log is out of order if the times of more than this share of its scans run backwards.
+RUNS_BACK = 0.05
+# A robot returns if it comes within NEAR metres, plus DRIFT of the way between, of a point where it
+# was at least AWAY metres of way before.
+NEAR, DRIFT, AWAY = 3.0, 0.02, 15.0
+# A scan contradicts the scans before it if more than the share INTRUDING of the points of either
+# lie in the free space of the other, by MARGIN metres, and less than the share POORLY matches. In
+# good logs, no scan with such a match has more than 0.27.
+INTRUDING, MARGIN, POORLY, BESIDE = 0.3, 0.4, 0.6, 3
+
+
+def refuse_shuffled(log: RobotLog) -> None:
+    """Raise a LogError if the scans of a log are in random order.
+
+    Args:
+        log: The log.
+
+    Raises:
+        LogError: The scans are in random order.
+    """
+    if len(log) < 4 * max(LAGS):
+        return
+    places = np.array([scan.odometry[:2] for scan in log.scans])
+    next_to, *apart = (
+        float(np.percentile(np.hypot(*(places[lag:] - places[:-lag]).T), 25)) for lag in (1, *LAGS)
+    )
+    if next_to == 0 or not all(next_to / ALIKE < far < next_to * ALIKE for far in apart):
+        return
+    times = np.array([scan.time for scan in log.scans if scan.time is not None])
+    back = int((np.diff(times) < 0).sum())
+    clock = f", and their times run back {back} times" if back else ""
+    raise LogError(
+        f"{named(log.source)}: expected scans in the order of the drive, got {len(log)} in random "
+        f"order: by the odometry, a scan is as far from the next one as from the eighth after it"
+        f"{clock}; sort the log by time, or record it again"
+    )
+
+
+def in_radians(log: RobotLog) -> tuple[RobotLog, list[str]]:
+    """Convert the headings of the odometry to radians if they count degrees.
+
+    The robot drives ahead by headings in the right unit only.
+
+    Returns:
+        The log, and a list of notes: one if the log was converted, otherwise none.
+    """
+    if _way(log) < LEAST_WAY or abs(ahead(log)) > SIDEWAYS:
+        return log, []
+    turned = replace(log, scans=tuple(_with_heading_of_degrees(scan) for scan in log.scans))
+    if ahead(turned) < AHEAD:
+        return log, []
+    return turned, [
+        "The headings of the odometry are read as degrees: by radians, the robot would drive "
+        "sideways. Write them in radians to be sure."
+    ]
+
+
+def ahead(log: RobotLog) -> float:
+    """Compute the share of the way that the robot drives in the direction of its heading.
+
+    Returns:
+        1 for a robot that drives ahead all the way, -1 for one that drives backwards; 1 for a robot
+        that stands.
+    """
+    poses = np.array([scan.odometry for scan in log.scans])
+    steps = np.diff(poses[:, :2], axis=0)
+    length = np.hypot(*steps.T)
+    if not length.any():
+        return 1.0
+    turns = (np.diff(poses[:, 2]) + math.pi) % math.tau - math.pi
+    off = np.arctan2(steps[:, 1], steps[:, 0]) - poses[:-1, 2] - turns / 2
+    return float((length * np.cos(off)).sum() / length.sum())
+
+
+def describe_drive(log: RobotLog) -> list[str]:
+    """Describe a log that is reversed, has several drives, or has scans far apart.
+
+    Only the odometry, the clock and the laser are looked at, so that this can be said at once.
+
+    Returns:
+        Notes for the user; none if nothing is wrong.
+    """
+    return [
+        *_about_order(log),
+        *_about_odometry(log),
+        *(
+            f"{what} before scan {scan} (line or message {log.scans[scan].line}), so the file "
+            "seems to hold two drives. If they were in two buildings, cut the file there and map "
+            "each part."
+            for scan, what in jumps.seams_of(log)
+        ),
+    ]
+
+
+def _about_order(log: RobotLog) -> list[str]:
+    """Describe scans that are in reverse order, out of order, or too far apart."""
+    notes = []
+    if _way(log) >= LEAST_WAY and ahead(log) < -SIDEWAYS:
+        notes.append(
+            "The robot drives backwards all the way by its odometry, so the scans are probably in "
+            "reverse order. Reverse the log, or turn the headings by half a circle."
+        )
+    times = np.array([scan.time for scan in log.scans if scan.time is not None])
+    back = int((np.diff(times) < 0).sum())
+    if back > RUNS_BACK * len(log):
+        notes.append(
+            f"The times of the scans run back {back} times in {len(log)} scans. If the log is "
+            "not in the order of time, sort it."
+        )
+    if (usual := jumps.usual_step(log)) > FAR_OFF:
+        notes.append(
+            f"The usual step between two scans is {usual:.0f} m by the odometry, so that they "
+            "hardly overlap. Take all scans of the drive, at least one a metre. If they are not so "
+            "far apart, the odometry does not count metres, or the log is not in order."
+        )
+    return notes
+
+
+def _about_odometry(log: RobotLog) -> list[str]:
+    """Describe odometry that is missing, of two sources, or at odds with its own headings."""
+    straight, usual = ahead(log), jumps.usual_step(log)
+    back_and_forth = jumps.goes_back_and_forth(log)
+    if jumps.is_missing(log):
+        missing = jumps.stands_still(log)
+        return [
+            f"The odometry stands still in {missing.sum()} of {len(missing)} steps. If the "
+            "robot did not, its odometry is missing there, and the map rests on the scans "
+            "alone. Record the odometry, or name its topic (--set odom_topic)."
+        ]
+    if back_and_forth < TO_AND_FRO and 0 < usual <= FAR_OFF:
+        return [
+            "The odometry goes back and forth: over every second scan it is "
+            f"{100 * back_and_forth:.0f} % as long as over all scans. Two programs may publish it, "
+            "or the log is not in order. Stop one of them, or sort the log."
+        ]
+    if _way(log) >= LEAST_WAY and abs(straight) <= SIDEWAYS and usual <= SPARSE:
+        return [
+            f"The robot drives ahead for {100 * straight:.0f} % of its way by the odometry. Unless "
+            "it can drive sideways, its headings are wrong: write them in radians, "
+            "counterclockwise."
+        ]
+    return []
+
+
+def describe_track(log: RobotLog, track: Track, explained: bool) -> list[str]:
+    """Describe a track that rests on poor matches, contradicts itself, or never returns.
+
+    Args:
+        log: The scans with odometry.
+        track: Poses by scan matching.
+        explained: Whether another note says what is wrong, so that this one need not guess.
+
+    Returns:
+        Notes for the user; none if nothing is wrong.
+    """
+    failing, overriding = share_failing(track), _overriding(log, track)
+    notes = []
+    if failing > FAILING or overriding > OVERRIDING:
+        notes.append(
+            f"The track is unreliable: scan matching fails in {100 * failing:.0f} % of the scans, "
+            f"and contradicts the odometry in {100 * overriding:.0f} % of the steps, where good "
+            "logs have 2 % at most. It is "
+            f"{track.way[-1]:.0f} m long. The map may be wrong."
+            f"{'' if explained else f' Do this: {_causes(log)}.'}"
+        )
+    elif contradictions := _contradictions(log, track):
+        notes.append(
+            f"The scans before and after scan {contradictions[0]} (line or message "
+            f"{log.scans[contradictions[0]].line}) contradict each other"
+            f"{f', and so at {len(contradictions) - 1} more' if contradictions[1:] else ''}. The "
+            "robot may have been carried there, or the file may hold two drives: cut it there, and "
+            "map each part."
+        )
+    if track.way[-1] > 2 * AWAY and not _returns(track):
+        notes.append(
+            f"In {track.way[-1]:.0f} m the robot never comes back to where it was, so nothing "
+            "confirms the map, and no loop is closed. Drive each corridor twice, or end where the "
+            "drive began."
+        )
+    return notes
+
+
+def share_failing(track: Track) -> float:
+    """Compute the share of the scans that hardly match what was seen before."""
+    return float((track.shares < POOR).mean())
+
+
+def _causes(log: RobotLog) -> str:
+    """Say what to do about a log whose scans match badly."""
+    usual = jumps.usual_step(log)
+    if jumps.is_missing(log):
+        return (
+            "record the odometry, or name its topic (--set odom_topic); matching alone needs "
+            "scans that are a few centimetres apart"
+        )
+    if usual > SPARSE:
+        return (
+            f"take all scans of the drive, at least one a metre; these are {usual:.1f} m apart by "
+            "the odometry. If they are not, the odometry does not count metres"
+        )
+    return (
+        "put the scans into the order of the drive, and check the unit of the odometry and the "
+        "direction of the beams (--fov, --set mount)"
+    )
+
+
+def _way(log: RobotLog) -> float:
+    """The length of the drive by odometry, in metres."""
+    places = np.array([scan.odometry[:2] for scan in log.scans])
+    return float(np.hypot(*np.diff(places, axis=0).T).sum())
+
+
+def _with_heading_of_degrees(scan: Scan) -> Scan:
+    x, y, heading = scan.odometry
+    return replace(scan, odometry=(x, y, wrapped(math.radians(heading))))
+
+
+def _overriding(log: RobotLog, track: Track) -> float:
+    """The share of the steps in which matching contradicts the odometry."""
+    trust, count = Trust(), 0
+    for i in range(1, len(log)):
+        told = between(log.scans[i - 1].odometry, log.scans[i].odometry)
+        seen = between(_pose(track, i - 1), _pose(track, i))
+        off = np.array([*np.subtract(seen[:2], told[:2]), wrapped(seen[2] - told[2])])
+        spread = np.diag(trust.covariance(told))
+        count += i not in track.cuts and float((off**2 / spread).sum()) > CONTRADICTS
+    return count / max(len(log) - 1, 1)
+
+
+def _returns(track: Track) -> bool:
+    """Whether the robot comes back to where it was before."""
+    some = np.unique(np.searchsorted(track.way, np.arange(0.0, track.way[-1], 1.0)))
+    places, way = track.poses[some, :2], track.way[some]
+    for i in range(len(some)):
+        gap = way[i] - way[:i]
+        far = np.hypot(*(places[:i] - places[i]).T)
+        if ((gap >= AWAY) & (far <= NEAR + DRIFT * gap)).any():
+            return True
+    return False
+
+
+def _contradictions(log: RobotLog, track: Track) -> list[int]:
+    """Find the scans that match badly and lie in the free space of the scans before them."""
+    found: list[int] = []
+    for i in np.flatnonzero(track.shares < POORLY).tolist():
+        pairs = [
+            pair
+            for k in range(max(0, i - BESIDE), i)
+            for n in range(i, min(len(log), i + BESIDE))
+            for pair in ((k, n), (n, k))
+        ]
+        if not pairs or track.cuts_between(i - BESIDE, i):
+            continue
+        inside, seen = np.sum([_intruding(log, track, *pair) for pair in pairs], axis=0)
+        if inside > INTRUDING * seen:
+            found.append(i)
+    return found
+
+
+def _intruding(log: RobotLog, track: Track, one: int, other: int) -> tuple[int, int]:
+    """Count the points of one scan in the free space of another one, and those in its sight."""
+    pose = moved(_pose(track, one), log.scans[one].laser.mount)
+    scan, laser = log.scans[other], log.scans[other].laser
+    x, y, heading = between(moved(_pose(track, other), laser.mount), pose)
+    met = np.isfinite(log.scans[one].ranges) & (log.scans[one].ranges > 0)
+    angles = log.scans[one].laser.bearings[met] + heading
+    points = log.scans[one].ranges[met] * np.exp(1j * angles) + complex(x, y)
+    onward = math.copysign(1.0, laser.step)
+    beam = np.rint(onward * (np.angle(points) - laser.first) % math.tau / abs(laser.step))
+    beam = beam.astype(int)
+    in_view = (beam >= 1) & (beam < len(scan.ranges) - 1)
+    beam, far = beam[in_view], np.abs(points[in_view])
+    free = _neighbours(np.nan_to_num(scan.ranges, nan=0.0, posinf=laser.reach), beam, np.min)
+    wall = _neighbours(np.nan_to_num(scan.ranges, nan=0.0, posinf=laser.reach), beam, np.max)
+    margin = MARGIN + MARGIN / 8 * far
+    return int((far < free - margin).sum()), int((far < wall + MARGIN).sum())
+
+
+def _neighbours(ranges: Array, beam: Array, best: Callable[..., Array]) -> Array:
+    """The least or the greatest range of each beam and its two neighbours."""
+    return best([ranges[beam - 1], ranges[beam], ranges[beam + 1]], axis=0)
+
+
+def _pose(track: Track, scan: int) -> Pose:
+    x, y, heading = track.poses[scan]
+    return float(x), float(y), float(heading)

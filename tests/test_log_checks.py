@@ -1,0 +1,128 @@
+"""Logs that are shuffled, reversed, of two drives, in other units, or too sparse: each is said."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+from coarse import every_second_beam
+
+from perception.errors import LogError
+from perception.places import log_checks
+from perception.places.importing import import_log, tracked
+from perception.readers.scans import RobotLog, Scan
+from simulator.tours import record
+from simulator.world import World
+from ssh_abduction.cli.simulate import scans_of
+from ssh_abduction.data.odometry import between, moved
+
+Scans = Sequence[Scan]
+
+
+@pytest.fixture(scope="module")
+def scans() -> tuple[Scan, ...]:
+    """A drive of two tours through a hall, a scan of 90 beams every half metre."""
+    return every_second_beam(scans_of(record(World.named("taylor-hall"), every=0.5)))[:300]
+
+
+def notes_of(scans: Scans) -> str:
+    """All notes on a log; those that a user reads first come first."""
+    said: list[str] = []
+    _, _, notes = tracked(RobotLog(tuple(scans), source="drive"), said.append)
+    assert tuple(said) == notes
+    return "\n".join(notes)
+
+
+def with_poses(scans: Scans, change: Callable[[float, float, float], tuple[float, ...]]) -> Scans:
+    return [replace(scan, odometry=change(*scan.odometry)) for scan in scans]
+
+
+def backwards(scans: Scans) -> Scans:
+    return [replace(scan, time=None) for scan in scans[::-1]]
+
+
+def in_degrees(scans: Scans) -> Scans:
+    return with_poses(scans, lambda x, y, heading: (x, y, math.degrees(heading)))
+
+
+def sideways(scans: Scans) -> Scans:
+    return with_poses(scans, lambda x, y, heading: (x, y, heading + math.pi / 2))
+
+
+def kidnapped(scans: Scans) -> Scans:
+    """The robot is carried while neither the odometer nor the clock goes on."""
+    first, last = scans[:100], scans[170:]
+    poses = [first[-1].odometry]
+    for one, other in pairwise(last):
+        poses.append(moved(poses[-1], between(one.odometry, other.odometry)))
+    after = zip(last, poses, strict=True)
+    return [
+        replace(scan, time=None)
+        for scan in [*first, *(replace(scan, odometry=pose) for scan, pose in after)]
+    ]
+
+
+def of_two_lasers(scans: Scans) -> Scans:
+    other = [replace(s, laser=replace(s.laser, mount=(0.1, 0.0, 0.0))) for s in scans[150:]]
+    return [*scans[:150], *other]
+
+
+def of_two_clocks(scans: Scans) -> Scans:
+    return [*scans[:150], *(replace(s, time=(s.time or 0.0) - 1e4) for s in scans[150:])]
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (backwards, "drives backwards all the way"),
+        (in_degrees, "headings of the odometry are read as degrees"),
+        (sideways, "headings are wrong: write them in radians"),
+        (kidnapped, "before and after scan 100 (line or message 171) contradict each other"),
+        (of_two_lasers, "The laser changes before scan 150"),
+        (of_two_clocks, "The clock starts anew before scan 150"),
+        (lambda scans: with_poses(scans, lambda x, y, h: (0.0, 0.0, 0.0)), "Record the odometry"),
+        (lambda scans: scans[::20], "Take all scans of the drive"),
+        (lambda scans: scans[::8], "take all scans of the drive, at least one a metre"),
+        (lambda scans: scans[:80], "never comes back to where it was"),
+    ],
+)
+def test_what_is_wrong_with_a_log_is_said(
+    scans: tuple[Scan, ...], change: Callable[[Scans], Scans], told: str
+) -> None:
+    assert told in notes_of(change(scans))
+
+
+def test_a_good_drive_is_not_doubted(scans: tuple[Scan, ...]) -> None:
+    assert notes_of(scans) == ""
+
+
+def test_headings_in_degrees_are_read_as_such(scans: tuple[Scan, ...]) -> None:
+    good, other = (
+        tracked(RobotLog(tuple(some), source="drive"))[1] for some in (scans, in_degrees(scans))
+    )
+    assert other.poses == pytest.approx(good.poses, abs=0.01)
+
+
+def test_a_shuffled_log_is_refused_before_it_is_matched(
+    scans: tuple[Scan, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("perception.places.importing.follow", None)
+    shuffled = random.Random(1).sample(scans, len(scans))
+    with pytest.raises(LogError, match="expected scans in the order of the drive"):
+        tracked(RobotLog(tuple(shuffled), source="drive"))
+
+
+def test_a_log_whose_scans_do_not_match_is_refused(
+    scans: tuple[Scan, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = RobotLog(scans[::20], source="drive")
+    with pytest.raises(LogError, match=r"% do not\. The usual step between two scans is"):
+        import_log(log)
+    # The laser of a robot whose beams are mirrored sees what the odometry contradicts.
+    monkeypatch.setattr(log_checks, "SPARSE", 1e9)
+    mirrored = [replace(scan, ranges=scan.ranges[::-1].copy()) for scan in scans]
+    assert "contradicts the odometry in" in notes_of(mirrored)
