@@ -8,6 +8,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,8 +33,15 @@ from ssh_abduction.data.odometry import between
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.evaluation import evaluate_visits
 from ssh_abduction.robot_logs import log_maps
-from ssh_abduction.robot_logs.log_maps import SPEED, map_log, seconds_driven, seconds_left
-from ssh_abduction.solver import Solution
+from ssh_abduction.robot_logs.log_maps import (
+    SPEED,
+    LogMapping,
+    how_it_ended,
+    map_log,
+    seconds_driven,
+    seconds_left,
+)
+from ssh_abduction.solver import Solution, Status, solve
 from ssh_abduction.solver.asp import workers
 
 SCANS = 110
@@ -247,6 +255,44 @@ def test_a_log_has_a_twentieth_of_its_drive_to_be_mapped_in_less_what_the_import
     assert seconds_left(RobotLog(untimed, source="untimed.log"), imported) == pytest.approx(
         5.0 / SPEED / 20 - 1.5
     )
+
+
+@pytest.mark.parametrize(("limit", "searches"), [(None, 3), (5.0, 1)])
+def test_without_a_limit_the_search_goes_on_until_it_has_a_map(
+    hall: Path, monkeypatch: pytest.MonkeyPatch, limit: float | None, searches: int
+) -> None:
+    asked: list[float] = []
+    solve = LogMapping.solve
+
+    def late(self: LogMapping, trace: Trace, theory: Theory, **given: Any) -> Solution:
+        asked.append(given["time_limit"])
+        found = solve(self, trace, theory, **{**given, "time_limit": 1000.0})
+        if len(asked) == 3:
+            return found
+        return replace(found, status=Status.UNKNOWN, maps=(), cost=None, stopped="time limit")
+
+    monkeypatch.setattr(LogMapping, "solve", late)
+    told: list[str] = []
+    done = map_log(read_log(hall), time_limit=limit, with_ladder=False, tell=told.append)
+    assert asked == [asked[0] * 4**k for k in range(searches)]
+    if limit is None:
+        assert done.solution.maps
+        assert (done.limit, done.notes) == (asked[-1], ())
+        assert told[-1] == f"No map was found yet. The search goes on for up to {asked[-1]:.0f} s."
+    else:
+        assert done.notes[-1] == (
+            "The search ended after 5 s without a map. To search longer, give a limit: "
+            "--time-limit 20."
+        )
+
+
+def test_a_search_says_why_it_has_no_map_or_no_proof() -> None:
+    solution = solve(Trace.from_steps([0, 1], ["travel"]))
+    assert how_it_ended(solution, 5.0) is None
+    stopped = replace(solution, status=Status.FEASIBLE, stopped="time limit")
+    assert "without a proof" in str(how_it_ended(stopped, 5.0))
+    nothing = replace(solution, status=Status.UNSATISFIABLE, maps=())
+    assert "No map satisfies the axioms" in str(how_it_ended(nothing, 5.0))
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ from ssh_abduction.page.html import view_page
 from ssh_abduction.robot_logs.log_report import report
 from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.runtime.logs import log_of
-from ssh_abduction.solver import Solution, find_backbone
+from ssh_abduction.solver import Solution, Status, find_backbone
 from ssh_abduction.theory.theory import Theory
 
 _log = log_of(__name__)
@@ -37,6 +37,8 @@ _log = log_of(__name__)
 SHARE, LADDER = 1 / 20, 1 / 4
 # Least numbers of seconds: for the search for minimal maps, and for each rung of the ladder.
 LEAST, LEAST_RUNG = 5.0, 1.0
+# Without a map, the search is given LONGER times its time, at most PATIENCE times.
+LONGER, PATIENCE = 4.0, 3
 # Largest number of seconds for a rung, because the ladder is only information for the reader.
 RUNG = 10.0
 # Speed of the robot in metres a second, assumed if the log has no clock. Robots whose logs have a
@@ -165,6 +167,30 @@ def seconds_left(log: RobotLog, imported: Imported) -> float:
     return SHARE * drove - math.fsum(imported.seconds.values())
 
 
+def how_it_ended(solution: Solution, allowed: float) -> str | None:
+    """Say why a search yielded no map, or no proof that no map costs less.
+
+    Args:
+        solution: What the search found.
+        allowed: Seconds that it had.
+
+    Returns:
+        A note with what to do; None if the map is proven.
+    """
+    if solution.status is Status.UNSATISFIABLE:
+        return (
+            "No map satisfies the axioms. Let some steps be wrong (--misread 4), or ask why: "
+            "ssh-abduction explain trace.jsonl."
+        )
+    if solution.stopped != "time limit":
+        return None
+    missing = "a proof" if solution.maps else "a map"
+    return (
+        f"The search ended after {allowed:.0f} s without {missing}. To search longer, give a limit:"
+        f" --time-limit {math.ceil(LONGER * allowed / 10) * 10}."
+    )
+
+
 class LogMapping(UnderWay):
     """The mapping of a log while it runs. Another thread or a signal handler may interrupt it."""
 
@@ -207,12 +233,13 @@ def map_log(
         width: The width of the robot in metres. Narrower parts of the free space are no ways.
         name: The name of the trace; None for no name.
         time_limit: Seconds for the search for minimal maps. None takes what the import leaves of a
-            twentieth of the time that the robot drove, but at least 5.
+            twentieth of the time that the robot drove, but at least 5. If that yields no map, the
+            search is given up to 64 times as long.
         max_maps: List at most this many minimal maps; None lists all.
         with_ladder: Whether to solve the trace with fewer kinds of evidence, too, to show what each
             kind contributes.
         mapping: An object through which another thread can interrupt the mapping; None for none.
-        tell: Takes each note on suspicious odometry as soon as it is known.
+        tell: Takes each note on the log and on the search as soon as it is known.
 
     Raises:
         LogError: The log cannot be imported.
@@ -228,13 +255,13 @@ def map_log(
     # 2. Theory, and time as it suits the log.
     chosen = (theory or BARE).replace(**choices or {})
     left = seconds_left(log, imported)
-    allowed = time_limit
-    if allowed is None:
-        allowed = max(left * (1 - LADDER if with_ladder else 1), LEAST)
+    by_drive = max(left * (1 - LADDER if with_ladder else 1), LEAST)
+    allowed = by_drive if time_limit is None else time_limit
     climbed: list[Rung] = []
 
     def outcome(solution: Solution, interrupted: bool = True) -> LogMap:
-        said = (*notes, INTERRUPTED) if interrupted else notes
+        ended = INTERRUPTED if interrupted else how_it_ended(solution, allowed)
+        said = (*notes, ended) if ended else notes
         return LogMap(
             log, imported, solution, tuple(climbed), dict(seconds), allowed, said, interrupted
         )
@@ -243,6 +270,11 @@ def map_log(
     mapping.tell = lambda: outcome(mapping.snapshot())
     begin = time.process_time()
     solution = mapping.solve(trace, chosen, time_limit=allowed, max_maps=max_maps)
+    tries = 0 if time_limit is not None else PATIENCE
+    while solution.status is Status.UNKNOWN and tries and not mapping.interrupted:
+        allowed, tries = allowed * LONGER, tries - 1
+        tell(f"No map was found yet. The search goes on for up to {allowed:.0f} s.")
+        solution = mapping.solve(trace, chosen, time_limit=allowed, max_maps=max_maps)
     mapping.tell = lambda: outcome(solution)
     seconds["maps"] = round(time.process_time() - begin, 3)
 
