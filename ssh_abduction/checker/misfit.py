@@ -17,6 +17,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from ssh_abduction.checker.gaps import likely_moves
 from ssh_abduction.data.errors import brief
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import Odometry
@@ -124,6 +125,10 @@ class _Errors:
             self._moved[t] = displacement
             self._root[t] = np.linalg.cholesky(np.array(covariance) + at_ends)
         self._way = np.hypot(self._moved[:, 0], self._moved[:, 1])
+        # A wrong heading after a gap may be too far off for Gauss-Newton: begin near the least.
+        missing = [t for t in range(1, size) if trace.steps[t].displacement is None]
+        for t, likely in likely_moves(self._moved, missing, dstates, places):
+            self._moved[t] = likely
         self._sigma = np.array([odometry.scale, odometry.bend])
         ends = 2 * np.diag([odometry.offset, odometry.offset, odometry.facing]) ** 2
         # The closures, each with the root of its covariance.

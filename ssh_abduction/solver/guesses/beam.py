@@ -5,6 +5,9 @@ distribution of the positions of its places, the headings of its dstates, and th
 displacements share. It costs the prices of its dstates and places, and half of the chi-square of
 its returns, as a map does (`solver/weighing.py`).
 
+With several drives, each begins a piece with a frame of its own (`pieces.py`). It may join others
+at any step.
+
 A closure says how a step lies relative to an earlier one. It moves the poses of a hypothesis when
 the later step comes, and its misfit adds to the cost.
 
@@ -23,21 +26,24 @@ Reference:
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import islice, product
+from itertools import product
 
 import numpy as np
 
 from ssh_abduction.checker.checker import violations
 from ssh_abduction.data.action import Action
+from ssh_abduction.data.drives import starts_of
 from ssh_abduction.data.gateways import rotations
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.guesses.completing import completed
+from ssh_abduction.solver.guesses.pieces import fitted
 from ssh_abduction.solver.guesses.reckoning import (
     Hypothesis,
     Reckoning,
@@ -53,6 +59,8 @@ from ssh_abduction.theory.settle import Problem
 CHECKED_EVERY = 8
 # If no hypothesis is left, look for this many times as many.
 WIDER = 2
+# With several drives, keep this many hypotheses: it is open where drives start.
+LOST = 32
 # Of the beams at earlier looks, this many hypotheses are kept.
 SPARE = 2
 # An extension that costs this many nats more than the best one of its hypothesis is not made.
@@ -100,7 +108,7 @@ class Beam:
         self._price, self._price_of_place = theory.prices[:2]
         if not self._has_places:
             self._price_of_place = 0.0
-        self._reckoning = Reckoning(trace)
+        self._reckoning, self._starts = Reckoning(trace), starts_of(trace)
         self.nats = math.inf
         self._sights = [self._sight(step) for step in trace.steps]
         # For each kind of fault, what it costs at each step in nats.
@@ -149,8 +157,24 @@ class Beam:
         """Extend a beam to a number of steps. Nothing is checked."""
         for t in range(len(beam[0].labels), end):
             options = self._options_of(beam, t, joins=True)
-            beam = list(islice((self._child(option, t) for option in options), self._width))
+            beam = list(self._best((self._child(option, t) for option in options), self._width))
         return beam
+
+    def _best(self, found: Iterator[Hypothesis], width: int) -> Iterator[Hypothesis]:
+        """The first `width` hypotheses; so many for each choice of how drives are joined.
+
+        With several drives these are at most LOST hypotheses, or twice as many in a broad beam.
+        Those that leave a drive loose come on top. They cost more until they join it to others.
+        """
+        most = max(width, LOST * min(width, 2) if self._starts else 0)
+        count: Counter[tuple[object, ...]] = Counter()
+        for hypothesis in found:
+            pieces, enough = hypothesis.pieces, count.total() >= most
+            if enough and not self._starts:
+                return
+            if count[pieces.joins] < width and (pieces.is_loose or not enough):
+                count[pieces.joins] += 1
+                yield hypothesis
 
     def _sight(self, step: Step) -> Star | tuple[bool, ...] | None:
         """What a step shows of its place, in any direction: its star, or nothing."""
@@ -177,7 +201,7 @@ class Beam:
         for t in range(len(beam[0].labels) if beam else end, end):
             children = (self._child(option, t) for option in self._options_of(beam, t, joins))
             valid = (child for child in children if self._map(child, t) is not None)
-            beam = list(islice(valid, WIDER * self._width))
+            beam = list(self._best(valid, WIDER * self._width))
         return beam
 
     def _first(self) -> Hypothesis:
@@ -264,7 +288,7 @@ class Beam:
         """A hypothesis after the move to step t, with and without a fault of the move."""
         moved = self._reckoning.moved(found, t)
         yield moved
-        if "slipped" in self._fault:
+        if "slipped" in self._fault and t not in self._starts:
             faults, price = (*found.faults, (t - 1, "slipped")), self._fault["slipped"][t - 1]
             yield replace(moved, faults=faults, nats=moved.nats + price)
         if "jumped" in self._fault and self._trace.steps[t].displacement is not None:
@@ -279,12 +303,14 @@ class Beam:
         known = None if slips else moved.links.get((here, action))
         if known is not None:
             place = moved.places[known]
+            moved = fitted(moved, place, known)
             nats = moved.nats + self._misread(moved, known, t)
             nats += float(squares_of(moved, [place], known)[0]) / 2
             option = _Extension(nats, place, known, moved)
             return [option] if nats < math.inf and self._is_allowed(option, t) else []
         stays = self._stays and self._trace.actions[t - 1].kind == "turn" and not slips
-        there, leaves = moved.places[here], self._leaves and not slips
+        there = moved.places[here]
+        leaves = self._leaves and not slips and t not in self._starts
         misreads = "misread" in self._fault
         if stays:
             places = [there]
@@ -299,17 +325,16 @@ class Beam:
         if not stays:
             nats = moved.nats + dstate + new_place
             options.append(_Extension(nats, None, None, moved))
-        squares = squares_of(moved, places) if places else np.zeros(0)
-        for place, square in zip(places, squares.tolist(), strict=True):
+        for place, square, near in _near(moved, places):
             if square / 2 > DEAREST and not stays:
                 continue
             if self._has_places:
-                nats = moved.nats + dstate + square / 2
-                options.append(_Extension(nats, place, None, moved))
+                options.append(_Extension(moved.nats + dstate + square / 2, place, None, near))
             for s, p in enumerate(moved.places):
                 if p == place and (misread := self._misread(moved, s, t)) < math.inf:
-                    nats = moved.nats + misread + float(squares_of(moved, [place], s)[0]) / 2
-                    options.append(_Extension(nats, place, s, moved))
+                    facing = fitted(moved, place, s)
+                    nats = moved.nats + misread + float(squares_of(facing, [place], s)[0]) / 2
+                    options.append(_Extension(nats, place, s, facing))
         least = min(option.nats for option in options)
         return [
             option
@@ -365,7 +390,23 @@ class Beam:
             covariance[np.ix_(keep, keep)],
             option.nats,
             moved.faults,
+            moved.pieces.grown(place=option.place is None, dstate=option.dstate is None),
         )
+
+
+def _near(moved: Hypothesis, places: Sequence[int]) -> Iterator[tuple[int, float, Hypothesis]]:
+    """The chi-square if the last pose is at each of some places.
+
+    Yields:
+        The place, the chi-square, and the hypothesis, turned to fit the place.
+    """
+    own = [place for place in places if moved.pieces.of_place[place] == moved.pieces.here]
+    squares = squares_of(moved, own).tolist() if own else []
+    yield from ((place, square, moved) for place, square in zip(own, squares, strict=True))
+    for place in places:
+        if moved.pieces.of_place[place] != moved.pieces.here:
+            turned = fitted(moved, place)
+            yield place, float(squares_of(turned, [place])[0]), turned
 
 
 def _shown(seen: dict[int, float]) -> int:

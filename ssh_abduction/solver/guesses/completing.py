@@ -56,7 +56,7 @@ def completed(
     """
     links: dict[tuple[int, str], int] = {}
     for here, action, there in zip(labels, trace.actions, labels[1:], strict=False):
-        if links.setdefault((here, action.name), there) != there:
+        if not action.starts and links.setdefault((here, action.name), there) != there:
             return None
     views = {label: step.view for label, step in zip(labels, trace.steps, strict=False)}
     listed = tuple((s, action, x) for (s, action), x in links.items())

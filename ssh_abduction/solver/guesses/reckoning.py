@@ -11,17 +11,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ssh_abduction.data.closure import Closure
+from ssh_abduction.data.drives import starts_of
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.equations import noise_of, noises
+from ssh_abduction.solver.guesses.pieces import Pieces
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -49,6 +51,7 @@ class Hypothesis:
         covariance: Their covariance.
         nats: The cost.
         faults: The steps at which an action slipped or a displacement is wrong, and which.
+        pieces: Which poses are in one frame.
     """
 
     labels: list[int]
@@ -62,13 +65,14 @@ class Hypothesis:
     covariance: Array
     nats: float
     faults: tuple[tuple[int, str], ...] = ()
+    pieces: Pieces = field(default_factory=Pieces)
 
 
 class Reckoning:
     """The moves of a trace, and how they change the poses of a hypothesis."""
 
     def __init__(self, trace: Trace) -> None:
-        self._trace = trace
+        self._trace, self._starts = trace, starts_of(trace)
         odometry = trace.odometry or Odometry()
         self._sigma = odometry.scale, odometry.bend
         steps = [t for t in range(1, len(trace)) if trace.steps[t].displacement is not None]
@@ -113,7 +117,13 @@ class Reckoning:
         covariance[:n, n:] = covariance[n:, :n].T
         covariance[n:, n:] = covariance[n:, :n] @ by.T + rotation @ noise @ rotation.T
         pose = [*(mean[at : at + 2] + gone), mean[heading] + turn - drift]
-        moved = replace(found, mean=np.concatenate([mean, pose]), covariance=covariance)
+        piece = t if t in self._starts else found.pieces.of_heading[here]
+        moved = replace(
+            found,
+            mean=np.concatenate([mean, pose]),
+            covariance=covariance,
+            pieces=replace(found.pieces, here=piece),
+        )
         for closure, spread in self._closures.get(t, ()):
             moved = self._closed(moved, closure, spread)
         return moved

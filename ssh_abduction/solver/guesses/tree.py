@@ -176,7 +176,9 @@ class Sketch:
         there = self._links.get((here, action.name))
         try:
             if there is None:
-                there = self._links[here, action.name] = self._untried(here, action, step)
+                there = self._untried(here, action, step)
+                if not action.starts:
+                    self._links[here, action.name] = there
                 self._map = None
             self._must_show(there, step)
         except _Contradiction:

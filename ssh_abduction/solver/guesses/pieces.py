@@ -1,0 +1,123 @@
+"""The pieces of a hypothesis about several drives, and how they are turned when they are joined.
+
+A *piece* is a part of a hypothesis whose poses are in one frame. Each drive begins a new piece. If
+it comes to a dstate of another piece, the heading there fixes the two frames to each other. If the
+two pieces have only a place in common, this place is a *hinge*: the drive may have any heading. The
+next place that the two pieces have in common decides.
+
+The equations of a hypothesis are linear in the neighbourhood of the means (`reckoning.py`). So
+before two pieces are joined, the means of one are turned until they agree with the other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ssh_abduction.solver.guesses.reckoning import Hypothesis
+
+# Two positions that are less than this many metres apart have no direction.
+NEAR = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Pieces:
+    """Which poses of a hypothesis are in one frame. Pieces are named by first steps of drives.
+
+    Attributes:
+        here: The piece that the robot is in.
+        of_place: The piece of each place.
+        of_heading: The piece of the heading of each dstate.
+        hinges: For a piece that has only a place in common with others: the index of the x of this
+            place in the means.
+        joins: How pieces were joined: a piece, and the place and perhaps the dstate of another
+            piece that it came to.
+    """
+
+    here: int = 0
+    of_place: tuple[int, ...] = (0,)
+    of_heading: tuple[int, ...] = (0,)
+    hinges: Mapping[int, int] = field(default_factory=dict)
+    joins: tuple[tuple[int, int, int | None], ...] = ()
+
+    @property
+    def is_loose(self) -> bool:
+        """Whether the piece of the robot has nothing in common with others yet."""
+        return self.here > 0 and all(piece != self.here for piece, _, _ in self.joins)
+
+    def grown(self, place: bool, dstate: bool) -> Pieces:
+        """Add a new place, or a new dstate, or both, to the piece of the robot."""
+        return replace(
+            self,
+            of_place=self.of_place + (self.here,) * place,
+            of_heading=self.of_heading + (self.here,) * dstate,
+        )
+
+    def merged(self, other: int) -> Pieces:
+        """Make the piece of the robot a part of another piece."""
+        return replace(
+            self,
+            here=other,
+            of_place=tuple(other if piece == self.here else piece for piece in self.of_place),
+            of_heading=tuple(other if piece == self.here else piece for piece in self.of_heading),
+            hinges={piece: at for piece, at in self.hinges.items() if piece != self.here},
+        )
+
+
+def fitted(found: Hypothesis, place: int, dstate: int | None = None) -> Hypothesis:
+    """Turn the piece of the robot, so that its last pose fits a place or dstate of another piece.
+
+    The last three entries of the means are the pose. If the place is in the piece of the robot,
+    nothing changes.
+
+    Args:
+        found: The hypothesis.
+        place: The place.
+        dstate: A dstate of this place; None to fit the position only.
+    """
+    pieces = found.pieces
+    other = pieces.of_place[place] if dstate is None else pieces.of_heading[dstate]
+    if other == pieces.here:
+        return found
+    joined = replace(pieces, joins=(*pieces.joins, (pieces.here, place, dstate)))
+    mean, n = found.mean, len(found.mean) - 3
+    hinge, at = pieces.hinges.get(pieces.here), found.position[place]
+    if dstate is not None:
+        angle = mean[found.heading[dstate]] - mean[n + 2]
+    elif hinge is None:
+        return replace(found, pieces=replace(joined, hinges={**pieces.hinges, pieces.here: at}))
+    else:
+        ways = [mean[[x, x + 1]] - mean[[hinge, hinge + 1]] for x in (n, at)]
+        if min(math.hypot(*way) for way in ways) < NEAR:
+            return found
+        angle = math.atan2(*ways[1][::-1]) - math.atan2(*ways[0][::-1])
+    turned = _turned(found, float(angle), n if hinge is None else hinge)
+    return replace(turned, pieces=joined.merged(other))
+
+
+def _turned(found: Hypothesis, angle: float, centre: int) -> Hypothesis:
+    """Turn the poses of the piece of the robot.
+
+    Args:
+        found: The hypothesis.
+        angle: The angle in radians.
+        centre: The index of the x of the centre in the means.
+    """
+    n, pieces = len(found.mean) - 3, found.pieces
+    places = zip(found.position, pieces.of_place, strict=True)
+    headings = zip(found.heading, pieces.of_heading, strict=True)
+    x = [n, *(at for at, piece in places if piece == pieces.here)]
+    y = [at + 1 for at in x]
+    facing = [n + 2, *(at for at, piece in headings if piece == pieces.here)]
+    cos, sin = math.cos(angle), math.sin(angle)
+    mean, covariance = found.mean.copy(), found.covariance.copy()
+    dx, dy = mean[x] - mean[centre], mean[y] - mean[centre + 1]
+    mean[x] += cos * dx - sin * dy - dx
+    mean[y] += sin * dx + cos * dy - dy
+    mean[facing] += angle
+    for half in (covariance, covariance.T):  # the rows, and then the columns
+        half[x], half[y] = cos * half[x] - sin * half[y], sin * half[x] + cos * half[y]
+    return replace(found, mean=mean, covariance=covariance)
