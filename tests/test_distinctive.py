@@ -76,6 +76,56 @@ def test_junctions_are_where_ways_part(patch: Patch, bearings: list[float]) -> N
             assert min(apart(way, bearing) for way in ways) < math.radians(20)
 
 
+HALL = (-6.0, -6.0, 6.0, 6.0)
+DOOR = (-4.5, 5.0, -3.5, 8.0)  # in the upper wall of the hall, at x = -4
+OPPOSITE = (3.5, -8.0, 4.5, -5.0)
+MOUTH, MOUTH_OPPOSITE = (-4.0, 4.5), (4.0, -4.5)
+
+
+@pytest.mark.parametrize(
+    ("patch", "mouths"),
+    [
+        pytest.param(patch_of(HALL), [], id="hall without a door"),
+        pytest.param(patch_of(HALL, DOOR), [MOUTH], id="hall with a door"),
+        pytest.param(patch_of(HALL, DOOR, OPPOSITE), [MOUTH, MOUTH_OPPOSITE], id="two doors"),
+        pytest.param(
+            patch_of(HALL, DOOR, OPPOSITE, solid=((-1.0, -1.0, 0.0, 0.0),)),
+            [MOUTH, MOUTH_OPPOSITE],
+            id="a pillar in the middle",
+        ),
+        pytest.param(
+            patch_of((-8, -8, 8, 6), DOOR), [MOUTH], id="hall that is larger than the local map"
+        ),
+        pytest.param(
+            patch_of((-8, -2, 8, 2), (-0.5, 0, 0.5, 8)), [(0.0, 0.0)], id="corridor, not open"
+        ),
+        pytest.param(
+            patch_of((-8, -3, 8, 3), (-0.5, 0, 0.5, 8)),
+            [(0.0, 1.5), (0.0, 0.0)],
+            id="corridor as wide as a hall",
+        ),
+    ],
+)
+def test_an_open_space_has_a_junction_in_front_of_each_door(
+    patch: Patch, mouths: list[tuple[float, float]]
+) -> None:
+    found = [junction.middle for junction in junctions(patch, ROOM)]
+    assert len(found) == len(mouths)
+    for mouth in mouths:
+        assert min(math.dist(middle, mouth) for middle in found) < 0.4
+
+
+def test_junctions_amid_an_open_space_have_a_disc_as_wide_as_a_shore() -> None:
+    """Ways from four sides also meet in the middle of a hall."""
+    hall = patch_of((-4, -4, 4, 4), (-8, -1, 8, 1), (-1, -8, 1, 8))
+    found = sorted(junctions(hall, ROOM), key=lambda junction: math.hypot(*junction.middle))
+    assert len(found) == 5
+    assert math.hypot(*found[0].middle) < 0.3
+    assert found[0].radius == pytest.approx(1.5)
+    for mouth in found[1:]:
+        assert 2 < math.hypot(*mouth.middle) < 3.5
+
+
 def log_of(walls: Segments, way: list[tuple[float, float]]) -> tuple[RobotLog, Track]:
     """The log of a robot with an exact odometer that drives along a way between walls."""
     laser = Laser(float(BEARINGS[0]), math.radians(2), len(BEARINGS), 20.0)

@@ -5,9 +5,15 @@ has a junction where ways part. A junction has a disc, which reaches to the near
 branch for each way. A way into a niche has a branch, too. So a branch that ends soon after it
 leaves the disc is removed. Junctions whose discs hold each other's middle are one.
 
+In a hall, ways part in front of its doors, and not only in its middle. So the skeleton is also
+extended: around an open space it follows the walls at a fixed distance. Each way into the open
+space has a junction with this shore.
+
 References:
     Thrun 1998, "Learning metric-topological maps for indoor mobile robot navigation".
     Shaked & Bruckstein 1998, "Pruning medial axes".
+    Beeson, Jong & Kuipers 2005, "Towards autonomous topological place detection using the extended
+    Voronoi graph".
     Beeson, Modayil & Kuipers 2010, "Factoring the mapping problem".
 """
 
@@ -15,13 +21,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
 
 from perception.places.local_map import CELL, Bools, Patch
-from perception.places.thinning import Edge, Graph, Node, thinned
+from perception.places.thinning import Edge, Graph, Node, graph_of, thinned
 from perception.places.track import Array
 
 # Obstacles that stand free and cover less than this many square metres are furniture.
@@ -32,6 +38,10 @@ OUT, SHARE = 0.75, 0.5
 # Junctions are one up to ONE metres from each other, even if their discs are smaller. The free
 # space between them is nowhere narrower than a share of NARROW of the smaller disc.
 ONE, NARROW = 0.6, 0.75
+# A shore is so many widths of the robot away from obstacles. Shores at both sides of a space are
+# two ways if they are farther apart than that. So a space is open if its middle is at least WIDE
+# times as far from obstacles as the shore.
+SHORE, WIDE = 3.0, 1.5
 
 _EIGHT = np.ones((3, 3), bool)
 
@@ -61,14 +71,63 @@ def junctions(patch: Patch, room: float) -> list[Junction]:
     mask = passable(patch, room)
     # The middle of the robot is `room` away from obstacles, so the disc of a cell is larger.
     distance = _distances(mask) + room / CELL
-    graph = pruned(thinned(mask, distance))
+    lines, far = thinned(mask), SHORE * 2 * room
+    inner = open_space(distance, far / CELL)
+    found = _junctions_of(patch, lines, distance)
+    if not inner.any():
+        return found
+    mouths = _junctions_of(patch, with_shores(lines, inner), distance)
+    # The disc of a junction amid an open space is as large as those of the mouths around it.
+    amid = [
+        replace(junction, radius=far)
+        for junction in found
+        if junction.radius > far
+        and all(math.dist(junction.middle, mouth.middle) > far for mouth in mouths)
+    ]
+    return mouths + amid
+
+
+def open_space(distance: Array, far: float) -> Bools:
+    """Find the cells inside the shores of open spaces.
+
+    Args:
+        distance: (rows, columns) distance of each cell to the nearest obstacle, in cells.
+        far: Distance of a shore from obstacles, in cells.
+    """
+    parts, count = ndimage.label(distance > far, _EIGHT)
+    widest = ndimage.maximum(distance, parts, np.arange(count + 1))
+    is_open = np.asarray(widest) >= WIDE * far
+    is_open[0] = False
+    return np.asarray(is_open[parts])
+
+
+def with_shores(lines: Bools, inner: Bools) -> Bools:
+    """Replace the lines of a skeleton in open spaces by the shores of these.
+
+    Args:
+        lines: (rows, columns) lines of the skeleton.
+        inner: (rows, columns) cells inside the shores.
+    """
+    # A space that leads on beyond the border of the map has no shore there.
+    shore = inner & ~ndimage.binary_erosion(inner, border_value=1)
+    return thinned((lines & ~inner) | shore)
+
+
+def _junctions_of(patch: Patch, lines: Bools, distance: Array) -> list[Junction]:
+    """The junctions of the lines of a skeleton, in the frame of the track.
+
+    Args:
+        patch: The local map.
+        lines: (rows, columns) lines one cell wide.
+        distance: (rows, columns) distance of each cell to the nearest obstacle, in cells.
+    """
     return [
         Junction(
             patch.position(node.at),
             node.radius * CELL,
             tuple(patch.position(branch) for branch in branches),
         )
-        for node, branches in merged(graph, distance)
+        for node, branches in merged(pruned(graph_of(lines, distance)), distance)
     ]
 
 

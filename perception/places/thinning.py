@@ -107,18 +107,22 @@ class Graph:
         return replace(self, edges=[edge for edge in self.edges if edge not in here] + [both])
 
 
-def thinned(mask: Bools, distance: Array) -> Graph:
-    """Thin a mask to its skeleton, and make a graph of it.
-
-    Args:
-        mask: (rows, columns) cells.
-        distance: (rows, columns) distance of each cell to the nearest one outside of the mask, in
-            cells.
-    """
+def thinned(mask: Bools) -> Bools:
+    """Thin a mask of cells, (rows, columns), to lines one cell wide."""
     # The import takes a while, and only logs need it.
     from skimage.morphology import skeletonize
 
-    lines = np.asarray(skeletonize(mask), dtype=np.bool_)
+    return np.asarray(skeletonize(mask), dtype=np.bool_)
+
+
+def graph_of(lines: Bools, distance: Array) -> Graph:
+    """Read lines as a graph.
+
+    Args:
+        lines: (rows, columns) lines one cell wide.
+        distance: (rows, columns) distance of each cell to the nearest one outside of the mask that
+            was thinned, in cells.
+    """
     neighbours = ndimage.convolve(lines.astype(int), _EIGHT.astype(int), mode="constant") - 1
     forks, count = ndimage.label(lines & (neighbours > 2), _EIGHT)
     nodes = {k: _junction(np.argwhere(forks == k), distance) for k in range(1, count + 1)}
