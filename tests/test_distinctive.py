@@ -126,6 +126,31 @@ def test_junctions_amid_an_open_space_have_a_disc_as_wide_as_a_shore() -> None:
         assert 2 < math.hypot(*mouth.middle) < 3.5
 
 
+def bent(degrees: float) -> Patch:
+    """A corridor from the west, 2 m wide, that turns left at (0, 0) by some degrees."""
+    straight = patch_of((-8, -1, 0, 1))
+    at = np.arange(-80, 81) * CELL
+    x, y = np.meshgrid(at, at, indexing="ij")
+    turn = math.radians(degrees)
+    along, across = x * math.cos(turn) + y * math.sin(turn), y * math.cos(turn) - x * math.sin(turn)
+    free = straight.free | ((along >= 0) & (np.abs(across) <= 1)) | (np.hypot(x, y) <= 1)
+    return replace(straight, free=free, occupied=~free)
+
+
+@pytest.mark.parametrize(("degrees", "ways"), [(0, None), (20, None), (60, 60), (90, 90)])
+def test_a_corner_of_a_corridor_is_a_junction_of_two_ways(degrees: int, ways: int | None) -> None:
+    found = junctions(bent(degrees), ROOM)
+    assert len(found) == (ways is not None)
+    for corner in found:
+        assert math.hypot(*corner.middle) < 0.6
+        back, ahead = sorted(
+            (np.arctan2(*(branch[-1] - corner.middle)[::-1]) for branch in corner.branches),
+            key=lambda way: -abs(way),
+        )
+        assert apart(back, math.pi) < math.radians(15)
+        assert apart(ahead, math.radians(degrees)) < math.radians(15)
+
+
 def log_of(walls: Segments, way: list[tuple[float, float]]) -> tuple[RobotLog, Track]:
     """The log of a robot with an exact odometer that drives along a way between walls."""
     laser = Laser(float(BEARINGS[0]), math.radians(2), len(BEARINGS), 20.0)

@@ -7,7 +7,7 @@ leaves the disc is removed. Junctions whose discs hold each other's middle are o
 
 In a hall, ways part in front of its doors, and not only in its middle. So the skeleton is also
 extended: around an open space it follows the walls at a fixed distance. Each way into the open
-space has a junction with this shore.
+space has a junction with this shore. A bend of a line counts as a junction of two ways.
 
 References:
     Thrun 1998, "Learning metric-topological maps for indoor mobile robot navigation".
@@ -26,6 +26,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import ndimage
 
+from perception.places.bends import bends
 from perception.places.local_map import CELL, Bools, Patch
 from perception.places.thinning import Edge, Graph, Node, graph_of, thinned
 from perception.places.track import Array
@@ -41,14 +42,18 @@ ONE, NARROW = 0.6, 0.75
 # A shore is so many widths of the robot away from obstacles. Shores at both sides of a space are
 # two ways if they are farther apart than that. So a space is open if its middle is at least WIDE
 # times as far from obstacles as the shore.
+# The directions of a bend are those of points as far out of its disc.
 SHORE, WIDE = 3.0, 1.5
+
+# A node of a skeleton with its branches: (n, 2) rows and columns each.
+Fork = tuple[Node, list[Array]]
 
 _EIGHT = np.ones((3, 3), bool)
 
 
 @dataclass(frozen=True, eq=False)
 class Junction:
-    """A point of a local map where ways part.
+    """A point of a local map where ways part, or where the only way bends.
 
     Attributes:
         middle: (x, y) in metres, in the frame of the track.
@@ -62,7 +67,7 @@ class Junction:
 
 
 def junctions(patch: Patch, room: float) -> list[Junction]:
-    """Find the junctions of the skeleton of a local map.
+    """Find the junctions and the bends of the skeleton of a local map.
 
     Args:
         patch: The local map.
@@ -71,20 +76,48 @@ def junctions(patch: Patch, room: float) -> list[Junction]:
     mask = passable(patch, room)
     # The middle of the robot is `room` away from obstacles, so the disc of a cell is larger.
     distance = _distances(mask) + room / CELL
-    lines, far = thinned(mask), SHORE * 2 * room
-    inner = open_space(distance, far / CELL)
-    found = _junctions_of(patch, lines, distance)
-    if not inner.any():
-        return found
-    mouths = _junctions_of(patch, with_shores(lines, inner), distance)
+    far = SHORE * 2 * room / CELL
+    lines, inner = thinned(mask), open_space(distance, far)
+    graph = pruned(graph_of(lines, distance))
+    found = merged(graph, distance)
+    if inner.any():
+        shores = pruned(graph_of(with_shores(lines, inner), distance))
+        found = _with_mouths(found, merged(shores, distance), far)
+    corners = [
+        (node, branches)
+        for node, branches in bends(graph, distance, far)
+        if not inner[node.cell] and not any(_overlap(node, other) for other, _ in found)
+    ]
+    return [
+        Junction(
+            patch.position(node.at),
+            node.radius * CELL,
+            tuple(patch.position(branch) for branch in branches),
+        )
+        for node, branches in found + corners
+    ]
+
+
+def _with_mouths(found: list[Fork], mouths: list[Fork], far: float) -> list[Fork]:
+    """Replace the junctions in front of ways into an open space by the mouths of these ways.
+
+    Args:
+        found: The junctions of the skeleton.
+        mouths: The junctions of the skeleton with shores.
+        far: Distance of a shore from obstacles, in cells.
+    """
     # The disc of a junction amid an open space is as large as those of the mouths around it.
     amid = [
-        replace(junction, radius=far)
-        for junction in found
-        if junction.radius > far
-        and all(math.dist(junction.middle, mouth.middle) > far for mouth in mouths)
+        (replace(node, radius=far), branches)
+        for node, branches in found
+        if node.radius > far and all(math.dist(node.at, mouth.at) > far for mouth, _ in mouths)
     ]
     return mouths + amid
+
+
+def _overlap(first: Node, second: Node) -> bool:
+    """Check whether one of two nodes is in the disc of the other one."""
+    return math.dist(first.at, second.at) <= max(first.radius, second.radius)
 
 
 def open_space(distance: Array, far: float) -> Bools:
@@ -111,24 +144,6 @@ def with_shores(lines: Bools, inner: Bools) -> Bools:
     # A space that leads on beyond the border of the map has no shore there.
     shore = inner & ~ndimage.binary_erosion(inner, border_value=1)
     return thinned((lines & ~inner) | shore)
-
-
-def _junctions_of(patch: Patch, lines: Bools, distance: Array) -> list[Junction]:
-    """The junctions of the lines of a skeleton, in the frame of the track.
-
-    Args:
-        patch: The local map.
-        lines: (rows, columns) lines one cell wide.
-        distance: (rows, columns) distance of each cell to the nearest obstacle, in cells.
-    """
-    return [
-        Junction(
-            patch.position(node.at),
-            node.radius * CELL,
-            tuple(patch.position(branch) for branch in branches),
-        )
-        for node, branches in merged(pruned(graph_of(lines, distance)), distance)
-    ]
 
 
 def passable(patch: Patch, room: float) -> Bools:
@@ -189,7 +204,7 @@ def _out(edge: Edge, nodes: Mapping[int, Node], degrees: Mapping[int, int]) -> f
     return out if out < max(OUT, SHARE * junction.radius * CELL) else None
 
 
-def merged(graph: Graph, distance: Array) -> list[tuple[Node, list[Array]]]:
+def merged(graph: Graph, distance: Array) -> list[Fork]:
     """Merge junctions in one open space.
 
     Args:

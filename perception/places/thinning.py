@@ -44,6 +44,12 @@ class Node:
     radius: float
     cut: bool = False
 
+    @property
+    def cell(self) -> Cell:
+        """The cell at or nearest to the node."""
+        row, column = np.rint(self.at).astype(int)
+        return int(row), int(column)
+
 
 @dataclass(frozen=True, eq=False)
 class Edge:
