@@ -289,6 +289,7 @@ def test_without_a_limit_the_search_goes_on_until_it_has_a_map(
 def test_a_search_says_why_it_has_no_map_or_no_proof() -> None:
     solution = solve(Trace.from_steps([0, 1], ["travel"]))
     assert how_it_ended(solution, 5.0) is None
+    assert how_it_ended(replace(solution, stopped="time limit"), 5.0) is None  # of the listing
     stopped = replace(solution, status=Status.FEASIBLE, stopped="time limit")
     assert "without a proof" in str(how_it_ended(stopped, 5.0))
     nothing = replace(solution, status=Status.UNSATISFIABLE, maps=())

@@ -182,7 +182,7 @@ def how_it_ended(solution: Solution, allowed: float) -> str | None:
             "No map satisfies the axioms. Let some steps be wrong (--misread 4), or ask why: "
             "ssh-abduction explain trace.jsonl."
         )
-    if solution.stopped != "time limit":
+    if solution.stopped != "time limit" or solution.status is Status.OPTIMAL:
         return None
     missing = "a proof" if solution.maps else "a map"
     return (

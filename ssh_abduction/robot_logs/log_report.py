@@ -8,32 +8,23 @@ the log has them. The map itself was made without corrected poses.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import pairwise
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from perception.places.importing import Imported
-from perception.readers.scans import Pose, RobotLog
+from perception.readers.scans import RobotLog
 from ssh_abduction.checker.joins import sentence_of
-from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.odometry import between, moved
 from ssh_abduction.data.words import counted
 from ssh_abduction.evaluation.ladder import Rung
-from ssh_abduction.output.drawing import COLOURS, escaped, page, text
+from ssh_abduction.output.drawing import escaped
+from ssh_abduction.robot_logs.log_picture import (
+    SURE,
+    doubtful_joins,
+    figure,
+    paths_mean_something,
+    place_of_steps,
+)
 from ssh_abduction.solver import Solution, Status
-
-Array = NDArray[np.float64]
-Point = tuple[float, float]
-
-# The picture has at most one point of a wall in each square with sides of this many metres.
-GRAIN = 0.2
-# A metre has this many units of the page, or fewer, so that the picture is at most LARGEST wide.
-METRE, LARGEST = 14.0, 1500.0
-# Beams longer than this many metres are not drawn: their ends are too far apart to show a wall.
-DRAWN = 12.0
 
 STYLE = """
 :root { color-scheme: light dark; --ink: #1c1c1c; --paper: #ffffff; --line: #c8c8c8 }
@@ -69,8 +60,9 @@ def report(
     parts = [
         f"<h1>{escaped(name)}</h1>",
         *map(_paragraph, [_summary(solution, run), *run["notes"]]),
-        _figure(log, imported, solution),
+        figure(log, imported, solution),
         "<h2>What each kind of evidence is worth</h2>" + _ladder(rungs) if rungs else "",
+        "<h2>Doubtful joins</h2>" + _doubts(solution) if solution.weighed else "",
         "<h2>Rival maps</h2>" + _paragraph(solution.summary or "There is no other minimal map.")
         if solution.maps
         else "",
@@ -110,129 +102,9 @@ def _summary(solution: Solution, run: Mapping[str, Any]) -> str:
         proven += f"; {solution.weighed.sentence}"
     elif told := sentence_of(solution.by_minimality, solution.count):
         proven += f"; {told}"
-    size = f"{cost.places} places, {cost.paths} paths, {cost.dstates} distinctive states"
+    paths = f", {cost.paths} paths" if paths_mean_something(solution) else ""
+    size = f"{cost.places} places{paths}, {cost.dstates} distinctive states"
     return f"{seen} {size}: {proven}."
-
-
-def _figure(log: RobotLog, imported: Imported, solution: Solution) -> str:
-    """Draw the first map over the scans, with a caption."""
-    corrected = all(scan.corrected is not None for scan in log.scans)
-    poses: list[Pose] = (
-        [scan.corrected or (0.0, 0.0, 0.0) for scan in log.scans]
-        if corrected
-        else [_pose(row) for row in imported.track.poses]
-    )
-    walls = _walls(log, poses)
-    # The middle of each visit, relative to the pose at which its scan is drawn.
-    spots = {
-        number: moved(
-            poses[visit.scan],
-            between(_pose(imported.track.poses[visit.scan]), (*_xy(visit.middle), 0.0)),
-        )[:2]
-        for number, visit in enumerate(imported.visits)
-    }
-    extent = 1.0
-    if len(walls):
-        extent = float(np.ptp(np.concatenate([walls, [p[:2] for p in poses]]), axis=0).max())
-    unit = min(METRE, LARGEST / max(extent, 1.0))
-
-    def on_page(point: Sequence[float]) -> Point:
-        return point[0] * unit, -point[1] * unit
-
-    dots = "".join(f"M{x * unit:.0f} {-y * unit:.0f}h0" for x, y in walls)
-    way = " ".join(f"{x:.1f},{y:.1f}" for x, y in (on_page(pose[:2]) for pose in poses))
-    width = max(GRAIN * unit * 0.7, 1)
-    best = solution.maps[0] if solution.maps else None
-    marks = [
-        f'<path d="{dots}" stroke="#9a9a9a" stroke-width="{width:.1f}" stroke-linecap="round" '
-        'fill="none"/>',
-        f'<polyline points="{way}" fill="none" stroke="#b9c7d6" stroke-width="1"/>',
-        *_streets(imported, best, {n: on_page(p) for n, p in spots.items()}),
-    ]
-    points = [on_page(p) for p in walls] + [on_page(p[:2]) for p in poses]
-    picture = page(marks, points or [(0.0, 0.0)], margin=20)
-    poses_said = (
-        "corrected poses of the log, which were not read for the map"
-        if corrected
-        else "the poses of the track, which drifts"
-    )
-    caption = (
-        f"The {'first map' if solution.maps else 'visits'} over the scans, at {poses_said}. "
-        "Numbers are places; small dots are visits."
-    )
-    return f"<figure>{picture}<figcaption>{caption}</figcaption></figure>"
-
-
-def _streets(
-    imported: Imported, ssh_map: SSHMap | None, spots: Mapping[int, Point]
-) -> Iterator[str]:
-    """Draw the streets and the places of a map, or only the visits without a map.
-
-    Args:
-        imported: The trace, and how it was made.
-        ssh_map: The map; None if there is none.
-        spots: The point of each visit on the page.
-    """
-    trace = imported.trace
-    if ssh_map is None:
-        yield from (
-            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="#d55e00"/>' for x, y in spots.values()
-        )
-        return
-    of_label = {state.id: state for state in ssh_map.dstates}
-    visit_of = [int(step.extra["visit"]) for step in trace.steps]
-    place_of = {
-        visit: of_label[label].place for visit, label in zip(visit_of, ssh_map.labels, strict=True)
-    }
-    # A place is drawn at the mean of its visits.
-    visited: dict[int | None, list[Point]] = {}
-    for visit, place in place_of.items():
-        visited.setdefault(place, []).append(spots[visit])
-    middle = {
-        place: (float(np.mean([x for x, _ in at])), float(np.mean([y for _, y in at])))
-        for place, at in visited.items()
-    }
-    for (t, before), (_, after) in pairwise(enumerate(ssh_map.labels)):
-        if trace.actions[t].kind == "travel":
-            a, b = (middle[of_label[label].place] for label in (before, after))
-            colour = COLOURS[(of_label[before].path or 0) % len(COLOURS)]
-            yield (
-                f'<path d="M{a[0]:.1f} {a[1]:.1f}L{b[0]:.1f} {b[1]:.1f}" stroke="{colour}" '
-                'stroke-width="5" stroke-opacity=".75" fill="none"/>'
-            )
-    yield from (f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" fill="#444"/>' for x, y in spots.values())
-    for place, (x, y) in middle.items():
-        if place is not None:
-            yield (
-                f'<circle cx="{x:.1f}" cy="{y:.1f}" r="11" fill="white" stroke="#222" '
-                'stroke-width="2"/>' + text(x, y, str(place), "#222", 12, "bold")
-            )
-
-
-def _walls(log: RobotLog, poses: Sequence[Pose]) -> Array:
-    """Find the walls: one point, in metres, for each square in which a laser beam ended, (n, 2).
-
-    The squares have sides of GRAIN metres. In a log of more than 100 scans, at least two beams must
-    have ended in a square, so that few stray beams are drawn.
-
-    Args:
-        log: The robot's log.
-        poses: The pose of each scan.
-    """
-    found = []
-    for scan, pose in zip(log.scans, poses, strict=True):
-        x, y, heading = moved(pose, scan.laser.mount)
-        near = np.isfinite(scan.ranges) & (scan.ranges < min(DRAWN, scan.laser.reach))
-        angles = heading + scan.laser.bearings[near]
-        found.append(
-            np.stack(
-                [x + scan.ranges[near] * np.cos(angles), y + scan.ranges[near] * np.sin(angles)],
-                axis=1,
-            )
-        )
-    cells = np.rint(np.concatenate(found) / GRAIN).astype(int)
-    kept, counts = np.unique(cells, axis=0, return_counts=True)
-    return np.asarray(kept[counts > (1 if len(log) > 100 else 0)] * GRAIN)
 
 
 def _ladder(rungs: Sequence[Rung]) -> str:
@@ -245,6 +117,22 @@ def _ladder(rungs: Sequence[Rung]) -> str:
             (rung.name, rung.solution.status.value, *counts, f"{rung.solution.seconds.total:.1f} s")
         )
     return _table(("evidence", "status", "dstates", "places", "paths", "time"), rows)
+
+
+def _doubts(solution: Solution) -> str:
+    """Make the table of the visits that the first map joins though they may be two places."""
+    doubts = doubtful_joins(solution)
+    if not doubts:
+        return _paragraph(
+            f"Each join of the first map has a probability of at least {SURE:g}, or the map joins "
+            "nothing."
+        )
+    places = place_of_steps(solution.maps[0])
+    rows = [
+        (first, second, places[second], f"{probability:.2f}")
+        for first, second, probability in doubts
+    ]
+    return _table(("step", "and step", "place", "probability"), rows)
 
 
 def _faults(solution: Solution) -> str:
@@ -343,13 +231,3 @@ def _table(head: Iterable[object], rows: Iterable[Iterable[object]]) -> str:
 
 def _paragraph(told: str) -> str:
     return f"<p>{escaped(told)}</p>"
-
-
-def _pose(row: Array) -> Pose:
-    x, y, heading = row
-    return float(x), float(y), float(heading)
-
-
-def _xy(middle: Array) -> Point:
-    x, y = middle
-    return float(x), float(y)

@@ -1,0 +1,339 @@
+"""Draw the first map of a log over the walls that the laser saw.
+
+Edges follow the course of the robot. Travels between the same two places whose courses lie close
+together are one edge. Places show their disc and their gateways. Places at which nothing was ever
+decided are drawn as dots.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from perception.places.importing import Imported
+from perception.readers.scans import Pose, RobotLog
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.odometry import between, moved
+from ssh_abduction.output.drawing import ALARM, COLOURS, page, text, titled
+from ssh_abduction.solver import Solution
+
+Array = NDArray[np.float64]
+Point = tuple[float, float]
+
+# The picture has at most one point of a wall in each square with sides of this many metres.
+GRAIN = 0.1
+# A metre has this many units of the page, or fewer, so that the picture is at most LARGEST wide.
+METRE, LARGEST = 24.0, 1500.0
+# Beams longer than this many metres are not drawn: their ends are too far apart to show a wall.
+DRAWN = 12.0
+# Courses are one edge if none of their points is farther than this many metres from the other.
+BESIDE = 1.5
+# Nearer than this many metres to the middle of a place, an edge leads straight to it.
+MIDDLE = 1.0
+# A join with a smaller probability is doubtful.
+SURE = 0.95
+# The colour of edges that belong to no meaningful path, of walls, and of the robot's way.
+EDGE, WALL, WAY = "#0072b2", "#8a8a8a", "#c9d4df"
+
+
+def figure(log: RobotLog, imported: Imported, solution: Solution) -> str:
+    """Draw the first map over the scans, with a caption.
+
+    Args:
+        log: The robot's log.
+        imported: The trace of the log, and how it was made.
+        solution: The maps; without a map, the visits are drawn.
+
+    Returns:
+        A figure in HTML, with the picture as SVG.
+    """
+    sheet = _Sheet.of(log, imported)
+    marks = [*sheet.walls_and_way()]
+    if solution.maps:
+        marks += _map_marks(sheet, imported, solution)
+    else:
+        marks += [_dot(sheet.on_page(p), 4, "#d55e00") for p in sheet.spots]
+    picture = page(marks, sheet.points or [(0.0, 0.0)], margin=20)
+    poses = (
+        "corrected poses of the log, which were not read for the map"
+        if sheet.is_corrected
+        else "the poses of the track, which drifts"
+    )
+    if not solution.maps:
+        caption = f"The visits over the scans, at {poses}."
+    else:
+        colours = "Colours are paths. " if paths_mean_something(solution) else ""
+        caption = (
+            f"The first map over the scans, at {poses}. Numbers are places, ticks their gateways, "
+            f"and lines the edges along the robot's course. {colours}Dots are places at which the "
+            "robot only passed through. Red shows the probability of a doubtful join."
+        )
+    return f"<figure>{picture}<figcaption>{caption}</figcaption></figure>"
+
+
+def paths_mean_something(solution: Solution) -> bool:
+    """Whether stars, sides or planarity say which edges are one path."""
+    theory = solution.theory
+    return theory.star != "none" or theory.boundary != "none" or bool(theory.planar)
+
+
+def place_of_steps(ssh_map: SSHMap) -> list[int | None]:
+    """Return the place of each step of a map."""
+    place = {state.id: state.place for state in ssh_map.dstates}
+    return [place[label] for label in ssh_map.labels]
+
+
+def doubtful_joins(solution: Solution) -> list[tuple[int, int, float]]:
+    """List the joins of the first map whose probability is less than SURE, least first.
+
+    Returns:
+        The two steps of each join, and its probability.
+    """
+    joins = solution.weighed.joins if solution.weighed else ()
+    return sorted((join for join in joins if join[2] < SURE), key=lambda join: join[2])
+
+
+def undecided_places(ssh_map: SSHMap) -> frozenset[int]:
+    """Find the places at which nothing was ever decided.
+
+    The robot came from one of two neighbours and went on to the other, at every visit. It neither
+    turned around there, nor began or ended a drive.
+    """
+    stays: list[int] = []
+    for place in place_of_steps(ssh_map):
+        if place is not None and stays[-1:] != [place]:
+            stays.append(place)
+    through = defaultdict[int, set[frozenset[int]]](set)
+    for before, place, after in zip(stays, stays[1:], stays[2:], strict=False):
+        through[place].add(frozenset((before, after)))
+    ends = {*stays[:1], *stays[-1:]}
+    return frozenset(
+        place
+        for place, pairs in through.items()
+        if place not in ends and len(pairs) == 1 and len(next(iter(pairs))) == 2
+    )
+
+
+@dataclass(frozen=True)
+class _Sheet:
+    """What is drawn under the map, in metres.
+
+    Attributes:
+        poses: The pose of each scan.
+        turns: For each visit, the angle in radians from the frame of the track to that of `poses`.
+        spots: The middle of the place of each visit, by its own pose.
+        walls: (n, 2) points of walls.
+        unit: Units of the page in a metre.
+        is_corrected: Whether the poses are corrected ones.
+    """
+
+    poses: Sequence[Pose]
+    turns: Sequence[float]
+    spots: Sequence[Point]
+    walls: Array
+    unit: float
+    is_corrected: bool
+
+    @classmethod
+    def of(cls, log: RobotLog, imported: Imported) -> _Sheet:
+        track: list[Pose] = [_pose(row) for row in imported.track.poses]
+        corrected = [scan.corrected for scan in log.scans if scan.corrected is not None]
+        is_corrected = len(corrected) == len(log)
+        poses = corrected if is_corrected else track
+        walls = _walls(log, poses)
+        spots, turns = [], []
+        for visit in imported.visits:
+            x, y = visit.middle
+            middle = between(track[visit.scan], (float(x), float(y), 0.0))
+            spots.append(moved(poses[visit.scan], middle)[:2])
+            turns.append(poses[visit.scan][2] - track[visit.scan][2])
+        extent = np.ptp(np.concatenate([walls, [pose[:2] for pose in poses]]), axis=0).max()
+        unit = min(METRE, LARGEST / max(float(extent), 1.0))
+        return cls(poses, turns, spots, walls, unit, is_corrected)
+
+    def on_page(self, point: Sequence[float]) -> Point:
+        return point[0] * self.unit, -point[1] * self.unit
+
+    @property
+    def points(self) -> list[Point]:
+        """All points on the page, for its size."""
+        return [self.on_page(p) for p in (*self.walls.tolist(), *self.poses)]
+
+    def walls_and_way(self) -> Iterator[str]:
+        dots = "".join(f"M{x:.0f} {y:.0f}h0" for x, y in map(self.on_page, self.walls))
+        width = max(GRAIN * self.unit, 1.0)
+        yield (
+            f'<path d="{dots}" stroke="{WALL}" stroke-width="{width:.1f}" stroke-linecap="square" '
+            'fill="none"/>'
+        )
+        yield f'<path d="{_line(map(self.on_page, self.poses))}" stroke="{WAY}" fill="none"/>'
+
+
+def _map_marks(sheet: _Sheet, imported: Imported, solution: Solution) -> Iterator[str]:
+    """Draw the edges and places of the first map."""
+    ssh_map = solution.maps[0]
+    places = place_of_steps(ssh_map)
+    visit_of = [int(step.extra["visit"]) for step in imported.trace.steps]
+    visits: dict[int, list[int]] = defaultdict(list)
+    for place, visit in zip(places, visit_of, strict=True):
+        if place is not None and visit not in visits[place]:
+            visits[place].append(visit)
+    # A place is drawn at the mean of its visits.
+    middles = {p: np.mean([sheet.spots[v] for v in seen], axis=0) for p, seen in visits.items()}
+    doubts: dict[int | None, float] = {}
+    for _, second, probability in doubtful_joins(solution):
+        doubts.setdefault(places[second], probability)
+    hidden = undecided_places(ssh_map) - doubts.keys()
+    shown = {place: middle for place, middle in middles.items() if place not in hidden}
+    path_of = {state.id: state.path for state in ssh_map.dstates}
+    colourful = paths_mean_something(solution)
+    for step, course in _edges(sheet, imported, places, visit_of, shown):
+        path = path_of[ssh_map.labels[step]] or 0
+        colour = COLOURS[path % len(COLOURS)] if colourful else EDGE
+        yield (
+            f'<path d="{_line(map(sheet.on_page, course))}" stroke="{colour}" stroke-width="4" '
+            'stroke-opacity=".8" stroke-linejoin="round" fill="none"/>'
+        )
+    for place, seen in visits.items():
+        at = sheet.on_page(middles[place])
+        if place in hidden:
+            yield _dot(at, 4, EDGE, f"place {place}")
+        else:
+            yield from _place(sheet, imported, at, seen)
+            yield from _number(at, str(place), doubts.get(place))
+
+
+def _edges(
+    sheet: _Sheet,
+    imported: Imported,
+    places: Sequence[int | None],
+    visit_of: Sequence[int],
+    middles: Mapping[int, Array],
+) -> Iterator[tuple[int, Array]]:
+    """Yield the edges: the step at which the robot first set out, and the course, (n, 2) metres.
+
+    Args:
+        sheet: The poses.
+        imported: The trace, and how it was made.
+        places: The place of each step.
+        visit_of: The visit of each step.
+        middles: (2,) the point of each place to which edges lead. At other places, edges follow
+            the course of the robot through the place.
+    """
+    known: dict[frozenset[int], list[Array]] = defaultdict(list)
+    for t, action in enumerate(imported.trace.actions):
+        first, last = places[t], places[t + 1]
+        if action.kind != "travel" or first is None or last is None:
+            continue
+        begin, end = (imported.visits[visit_of[k]] for k in (t, t + 1))
+        way = np.array([pose[:2] for pose in sheet.poses[begin.scan : end.scan + 1]])
+        way = way.reshape(-1, 2)
+        # Near the places, the course leads straight to their middles.
+        shown = [middles[place] for place in (first, last) if place in middles]
+        for middle in shown:
+            way = way[np.hypot(*(way - middle).T) >= MIDDLE]
+        course = np.array(
+            [
+                *(shown[:1] if first in middles else []),
+                *way,
+                *(shown[-1:] if last in middles else []),
+            ]
+        )
+        if len(course) < 2:
+            continue
+        if not any(_is_beside(course, other) for other in known[frozenset((first, last))]):
+            known[frozenset((first, last))].append(course)
+            yield t, course
+
+
+def _is_beside(one: Array, other: Array) -> bool:
+    """Whether two courses lie close together, so that they are one edge."""
+    one, other = _dense(one), _dense(other)
+    return all(cKDTree(a).query(b)[0].max() <= BESIDE for a, b in ((one, other), (other, one)))
+
+
+def _dense(course: Array) -> Array:
+    """Add points to a course, so that neighbours are at most about half a metre apart."""
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(course, axis=0).T))])
+    at = np.linspace(0.0, way[-1], int(way[-1] / 0.5) + 2)
+    return np.stack([np.interp(at, way, course[:, k]) for k in (0, 1)], axis=1)
+
+
+def _place(sheet: _Sheet, imported: Imported, at: Point, visits: Sequence[int]) -> Iterator[str]:
+    """Draw the disc of a place, and a tick for each gateway that was sure at its last visit."""
+    visit = imported.visits[visits[-1]]
+    radius = max(visit.radius * sheet.unit, 11.0)
+    x, y = at
+    yield (
+        f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:.1f}" fill="{EDGE}" fill-opacity=".12" '
+        f'stroke="{EDGE}" stroke-opacity=".5"/>'
+    )
+    for way in visit.ways:
+        if way.sure:
+            angle = way.bearing + sheet.turns[visits[-1]]
+            cos, sin = math.cos(angle), -math.sin(angle)
+            ends = [(x + r * cos, y + r * sin) for r in (radius - 3, radius + 4)]
+            yield f'<path d="{_line(ends)}" stroke="#222" stroke-width="2.5" fill="none"/>'
+
+
+def _number(at: Point, name: str, doubt: float | None) -> Iterator[str]:
+    """Draw the number of a place, and the probability of its most doubtful join."""
+    x, y = at
+    yield (
+        f'<circle cx="{x:.1f}" cy="{y:.1f}" r="8" fill="white" stroke="#222"/>'
+        + text(x, y, name, "#222", 10, "bold")
+    )
+    if doubt is not None:
+        yield titled(
+            f"a join at place {name} has probability {doubt:.2f}",
+            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="13" fill="none" stroke="{ALARM}" '
+            'stroke-width="2" stroke-dasharray="4 3"/>',
+            text(x + 26, y - 12, f"{doubt:.2f}", ALARM, 11, "bold"),
+        )
+
+
+def _dot(at: Point, radius: float, colour: str, title: str = "visit") -> str:
+    x, y = at
+    return titled(title, f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}" fill="{colour}"/>')
+
+
+def _line(points: Sequence[Point] | map[Point]) -> str:
+    """Write a polyline as the data of an SVG path."""
+    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points)
+
+
+def _walls(log: RobotLog, poses: Sequence[Pose]) -> Array:
+    """Find the walls: one point, in metres, for each square in which a laser beam ended, (n, 2).
+
+    The squares have sides of GRAIN metres. In a log of more than 100 scans, at least two beams must
+    have ended in a square, so that few stray beams are drawn.
+
+    Args:
+        log: The robot's log.
+        poses: The pose of each scan.
+    """
+    found = []
+    for scan, pose in zip(log.scans, poses, strict=True):
+        x, y, heading = moved(pose, scan.laser.mount)
+        near = np.isfinite(scan.ranges) & (scan.ranges < min(DRAWN, scan.laser.reach))
+        angles = heading + scan.laser.bearings[near]
+        found.append(
+            np.stack(
+                [x + scan.ranges[near] * np.cos(angles), y + scan.ranges[near] * np.sin(angles)],
+                axis=1,
+            )
+        )
+    cells = np.rint(np.concatenate(found) / GRAIN).astype(int)
+    kept, counts = np.unique(cells, axis=0, return_counts=True)
+    return np.asarray(kept[counts > (1 if len(log) > 100 else 0)] * GRAIN)
+
+
+def _pose(row: Array) -> Pose:
+    x, y, heading = row
+    return float(x), float(y), float(heading)

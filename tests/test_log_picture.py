@@ -1,0 +1,106 @@
+"""The picture of the map of a log: edges along their courses, hidden places, doubtful joins."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from coarse import every_second_beam
+
+from perception.readers.scans import RobotLog
+from simulator.tours import record
+from simulator.world import World
+from ssh_abduction.cli.simulate import scans_of
+from ssh_abduction.data.maps import DState, SSHMap
+from ssh_abduction.output.drawing import ALARM
+from ssh_abduction.robot_logs import log_picture
+from ssh_abduction.robot_logs.log_maps import LogMap, map_log
+from ssh_abduction.robot_logs.log_picture import EDGE, figure, place_of_steps, undecided_places
+from ssh_abduction.robot_logs.log_report import report
+
+
+@pytest.fixture(scope="module")
+def house() -> LogMap:
+    """The map of a drive through a house of six rooms and a hall."""
+    scans = every_second_beam(scans_of(record(World.named("doors"), every=0.5)))
+    return map_log(RobotLog(scans, source="house"), time_limit=20, with_ladder=False)
+
+
+def along(*places: int) -> SSHMap:
+    """A map of a robot that comes past these places, with a dstate at each step."""
+    states = tuple(DState(i, 0, place, 0, 1) for i, place in enumerate(places))
+    links = tuple((i, "travel", i + 1) for i in range(len(places) - 1))
+    return SSHMap(tuple(range(len(places))), states, links)
+
+
+@pytest.mark.parametrize(
+    ("places", "undecided"),
+    [
+        ((0, 1, 2), {1}),
+        ((0, 1, 2, 2, 1, 0), {1}),  # the robot turned around at 2
+        ((0, 1, 2, 1, 0), {1}),
+        ((0, 1, 0, 1, 2), set()),  # it turned around at 1, and at 0
+        ((0, 1, 2, 3, 1, 4), {2, 3}),
+        ((0,), set()),
+    ],
+)
+def test_places_without_a_decision_are_those_with_one_pair_of_neighbours(
+    places: tuple[int, ...], undecided: set[int]
+) -> None:
+    assert undecided_places(along(*places)) == undecided
+
+
+def test_places_without_a_decision_are_dots_and_the_others_have_numbers(house: LogMap) -> None:
+    ssh_map = house.solution.maps[0]
+    hidden = undecided_places(ssh_map)
+    picture = figure(house.log, house.imported, house.solution)
+    assert 0 < len(hidden) < len(ssh_map.places)
+    for place in ssh_map.places:
+        assert (f">{place}</text>" in picture) == (place not in hidden)
+        assert (f"<title>place {place}</title>" in picture) == (place in hidden)
+
+
+def test_edges_follow_the_robot_and_each_is_drawn_once(house: LogMap) -> None:
+    picture = figure(house.log, house.imported, house.solution)
+    courses = [mark for mark in picture.split("<path ") if 'stroke-width="4"' in mark]
+    places = place_of_steps(house.solution.maps[0])
+    travels = [
+        frozenset(places[t : t + 2])
+        for t, action in enumerate(house.imported.trace.actions)
+        if action.kind == "travel"
+    ]
+    assert len(set(travels)) <= len(courses) < len(travels)
+    assert max(mark.count("L") for mark in courses) > 5
+
+
+def test_courses_side_by_side_are_one_edge() -> None:
+    way = np.array([[0.0, 0.0], [10.0, 0.0]])
+    assert log_picture._is_beside(way, way[::-1] + np.array([0.0, 1.0]))
+    assert not log_picture._is_beside(way, way + np.array([0.0, 2.0]))
+    assert not log_picture._is_beside(way, np.array([[0.0, 0.0], [5.0, 5.0], [10.0, 0.0]]))
+
+
+def test_paths_are_shown_only_if_the_theory_says_something_of_them(house: LogMap) -> None:
+    solution = house.solution
+    planar = replace(solution, theory=solution.theory.replace(planar=True))
+    for one, shows in ((solution, False), (planar, True)):
+        page = report(house.log, house.imported, one, (), house.to_dict())
+        assert ("Colours are paths" in page) == shows
+        assert (f"places, {solution.cost.paths} paths, " in page) == shows
+    assert figure(house.log, house.imported, planar).count(f'stroke="{EDGE}"') < figure(
+        house.log, house.imported, solution
+    ).count(f'stroke="{EDGE}"')
+
+
+def test_doubtful_joins_show_their_probability(
+    house: LogMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert ALARM not in figure(house.log, house.imported, house.solution)
+    monkeypatch.setattr(log_picture, "SURE", 2.0)  # all joins are doubtful
+    places = place_of_steps(house.solution.maps[0])
+    joined = {places[second] for _, second, _ in house.solution.weighed.joins}
+    picture = figure(house.log, house.imported, house.solution)
+    assert picture.count("<title>a join at place") == len(joined) > 0
+    page = report(house.log, house.imported, house.solution, (), house.to_dict())
+    assert "<h2>Doubtful joins</h2><table>" in page
