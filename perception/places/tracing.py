@@ -14,11 +14,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from perception.places.closures import NOISE, Closing, find_closures, relative, uncertainty
 from perception.places.distinctive import HALF, WINDOW
 from perception.places.local_map import CELL, LocalMaps, Patch
 from perception.places.track import Array, Track, wrapped
 from perception.places.visits import Visit, apart
 from perception.readers.scans import Pose, RobotLog
+from ssh_abduction.data.closure import Closure
 from ssh_abduction.data.odometry import Covariance, Odometry, between, moved
 from ssh_abduction.data.star import Gateway
 from ssh_abduction.data.trace import Action, Step, Trace
@@ -33,7 +35,7 @@ AHEAD = math.radians(15)
 FLOOR = (0.02, 0.02, 0.002)
 # Systematic errors of a track of matched scans: relative error of the scale, and drift of the
 # heading in radians a metre.
-SCALE, DRIFT = 0.01, 0.0003
+SCALE, DRIFT = 0.01, 0.001
 # Standard deviation of the bearing of a gateway, in degrees.
 SPREAD = 16.0
 # Bearings of an image: a beam in each degree, from the right (-90) to the left (90).
@@ -58,9 +60,14 @@ def to_trace(
     maps = LocalMaps(log.scans, track, WINDOW)
     steps: list[Step] = []
     last: tuple[Visit, Pose] | None = None
+    patches: list[Patch] = []
+    arrivals: list[tuple[int, float]] = []  # the first step of each visit, and its heading
     for number, visit in enumerate(visits):
         patch = maps.around(visit.scan, visit.middle, HALF)
-        for heading in _headings(visit, track):
+        headings = _headings(visit, track)
+        patches.append(patch)
+        arrivals.append((len(steps), headings[0]))
+        for heading in headings:
             pose = (float(visit.middle[0]), float(visit.middle[1]), heading)
             steps.append(_step(log, track, visit, pose, patch, last, number))
             last = (visit, pose)
@@ -75,6 +82,27 @@ def to_trace(
         name=name,
         odometry=Odometry(scale=SCALE, bend=DRIFT, offset=MIDDLE, facing=DIRECTION),
         extra={"beams": {"first": -90, "step": 1}},
+        closures=tuple(
+            _closure(found, arrivals) for found in find_closures(track, visits, patches, 2 * WINDOW)
+        ),
+    )
+
+
+def _closure(found: Closing, arrivals: Sequence[tuple[int, float]]) -> Closure:
+    """Make a closure between the first steps of two visits.
+
+    Args:
+        found: How the visits lie relative to each other.
+        arrivals: The first step of each visit, and its heading in radians.
+    """
+    (first, heading), (last, other) = arrivals[found.first], arrivals[found.last]
+    x, y, turn = relative(found, heading, other)
+    spread = [float(value**2) for value in NOISE]
+    return Closure(
+        first,
+        last,
+        (round(x, 4), round(y, 4), round(turn, 5)),
+        ((spread[0], 0.0, 0.0), (0.0, spread[1], 0.0), (0.0, 0.0, spread[2])),
     )
 
 
@@ -184,23 +212,7 @@ def _covariance(track: Track, begin: int, end: int, first: Pose, last: Pose) -> 
         first: Pose of the first step.
         last: Pose of the last step.
     """
-    if begin > end:
-        begin, end = end, begin
-    total = np.zeros((3, 3))
-    x, y = last[0], last[1]
-    for i in range(begin + 1, end + 1):
-        pose = track.poses[i - 1]
-        cos, sin = math.cos(pose[2]), math.sin(pose[2])
-        # An error of this increment rotates and shifts all later poses. The last step moves as the
-        # end of an arm that begins here.
-        arm = np.array(
-            [
-                [cos, -sin, -(y - track.poses[i, 1])],
-                [sin, cos, x - track.poses[i, 0]],
-                [0.0, 0.0, 1.0],
-            ]
-        )
-        total += arm @ track.covariances[i] @ arm.T
+    total = uncertainty(track, begin, end, np.array(last[:2]))
     turned = np.eye(3)
     cos, sin = math.cos(first[2]), math.sin(first[2])
     turned[:2, :2] = [[cos, sin], [-sin, cos]]

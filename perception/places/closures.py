@@ -1,0 +1,224 @@
+"""Finds closures: pairs of visits whose local maps match, and how they lie relative to each other.
+
+Two places may look alike. So a match counts only if the track allows it: its pose has to agree with
+the track within ten times the covariance of the track, for some steady drift of the heading. A
+match that counts says how far apart two visits are. It does not say that they are to one place.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from perception.places.local_map import Patch
+from perception.places.matching import MOST, Match, Scene, match
+from perception.places.track import Array, Track, wrapped
+from perception.places.visits import Visit
+
+# A match is reliable with at least this score and share of area that both maps observed, and with
+# less than this spread in metres.
+SCORE, MUTUAL, SPREAD = 0.7, 0.5, 0.6
+# Standard deviations of a reliable match, in metres and radians (docs/measurements/logs.md).
+NOISE = (0.1, 0.1, math.radians(1))
+# The covariance of the track is multiplied by INFLATED. The drifts are multiples of BEND up to
+# BENDS times it, in radians a metre. A match may be off by a chi-square of GATE (3 degrees of
+# freedom).
+INFLATED, BEND, BENDS, GATE = 10.0, 2e-4, 10, 20.0
+# Rotations are tried in steps of TURN radians, from the least to the largest that the track allows
+# within SIGMAS standard deviations.
+TURN, SIGMAS = math.radians(3), 3.0
+# Each visit has at most this many closures with earlier ones: those with the best scores.
+KEPT = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Closing:
+    """A reliable match of two visits.
+
+    Attributes:
+        first: Index of the earlier visit.
+        last: Index of the later visit.
+        match: How the later middle lies relative to the earlier one.
+    """
+
+    first: int
+    last: int
+    match: Match
+
+
+def find_closures(
+    track: Track, visits: Sequence[Visit], patches: Sequence[Patch], apart: float
+) -> list[Closing]:
+    """Find the closures between the visits of a log.
+
+    Args:
+        track: Trajectory of the robot.
+        visits: The visits, in order.
+        patches: The local map around the middle of each visit.
+        apart: Two visits are matched if there are at least this many metres of way between them, so
+            that their local maps share no scans.
+    """
+    scenes = [Scene.of(patch, visit.middle) for visit, patch in zip(visits, patches, strict=True)]
+    found: list[Closing] = []
+    for last, gates in enumerate(_gates(track, visits)):
+        way = track.way[visits[last].scan] - apart
+        here = [
+            Closing(first, last, matched)
+            for first, gate in gates
+            if track.way[visits[first].scan] < way
+            and (matched := match(scenes[first], scenes[last], gate.turns)) is not None
+            and _is_reliable(matched)
+            and gate.allows(matched)
+        ]
+        scenes[last].forget()
+        found += sorted(here, key=lambda closing: -closing.match.score)[:KEPT]
+    return found
+
+
+def _is_reliable(found: Match) -> bool:
+    return found.score >= SCORE and found.mutual >= MUTUAL and found.spread < SPREAD
+
+
+@dataclass(frozen=True, eq=False)
+class _Gate:
+    """What the track says about how one visit lies relative to an earlier one.
+
+    Attributes:
+        poses: (d, 3) x, y and rotation of the later visit, by the axes of the earlier one, for each
+            drift of the heading.
+        covariance: (3, 3), inflated.
+    """
+
+    poses: Array
+    covariance: Array
+
+    @property
+    def turns(self) -> list[float]:
+        """Rotations to try in radians: those that the track allows, in steps of TURN."""
+        margin = SIGMAS * math.sqrt(self.covariance[2, 2])
+        least, most = self.poses[:, 2].min() - margin, self.poses[:, 2].max() + margin
+        first, last = math.floor(least / TURN), math.ceil(most / TURN)
+        if last - first >= math.tau / TURN:
+            first, last = 0, round(math.tau / TURN) - 1
+        return [k * TURN for k in range(first, last + 1)]
+
+    def is_near(self) -> bool:
+        """Whether any shift that a match can have is allowed."""
+        far = np.hypot(*self.poses[:, :2].T).min() - MOST
+        spread = math.sqrt(float(np.linalg.eigvalsh(self.covariance[:2, :2])[-1]))
+        return bool(far <= SIGMAS * spread)
+
+    def allows(self, found: Match) -> bool:
+        """Whether a match agrees with the track for some drift."""
+        off = self.poses - (*found.shift, found.turn)
+        off[:, 2] = (off[:, 2] + math.pi) % math.tau - math.pi
+        inverse = np.linalg.inv(self.covariance + np.diag(NOISE) ** 2)
+        return bool(np.einsum("di,ij,dj->d", off, inverse, off).min() < GATE)
+
+
+def _gates(track: Track, visits: Sequence[Visit]) -> Iterator[list[tuple[int, _Gate]]]:
+    """For each visit, the earlier visits that may be near, each with what the track says.
+
+    No gate leads across a cut of the track, where the motion is unknown.
+    """
+    drifts = BEND * np.arange(-BENDS, BENDS + 1)
+    way = track.way[[visit.scan for visit in visits]]
+    middles = np.array([visit.middle for visit in visits])
+    poses = np.array([_drifted(middles, way, drift) for drift in drifts])
+    covariances, begin = np.zeros((0, 3, 3)), 0  # of the visits since the last cut
+    for last, visit in enumerate(visits):
+        if last and track.cuts_between(visits[last - 1].scan, visit.scan):
+            covariances, begin = covariances[:0], last
+        elif last:
+            covariances = _carried(covariances, track, visits[last - 1], visit)
+        gates = []
+        for k in range(begin, last):
+            turn = poses[:, k, 2]
+            cos, sin = np.cos(turn), np.sin(turn)
+            x, y = (poses[:, last, :2] - poses[:, k, :2]).T
+            there = np.stack([cos * x + sin * y, cos * y - sin * x, poses[:, last, 2] - turn], 1)
+            gate = _Gate(there, INFLATED * covariances[k - begin])
+            if gate.is_near():
+                gates.append((k, gate))
+        yield gates
+
+
+def _drifted(middles: Array, way: Array, drift: float) -> Array:
+    """The middles of visits, if the heading of the track drifts steadily.
+
+    Args:
+        middles: (n, 2) middles in metres, by the track.
+        way: (n,) metres driven at each visit.
+        drift: The drift to remove, in radians a metre.
+
+    Returns:
+        (n, 3) x, y and rotation of the axes.
+    """
+    turn = -drift * (way - way[0])
+    halfway = (turn[1:] + turn[:-1]) / 2
+    x, y = np.diff(middles, axis=0).T
+    cos, sin = np.cos(halfway), np.sin(halfway)
+    steps = np.stack([cos * x - sin * y, sin * x + cos * y], axis=1)
+    places = np.concatenate([middles[:1], middles[0] + np.cumsum(steps, axis=0)])
+    return np.column_stack([places, turn])
+
+
+def _carried(covariances: Array, track: Track, before: Visit, visit: Visit) -> Array:
+    """The covariances of the next visit relative to each earlier one, by the axes of the track.
+
+    Args:
+        covariances: (n, 3, 3) those of the visit before.
+        track: Trajectory of the robot.
+        before: The visit before.
+        visit: The next visit.
+
+    Returns:
+        (n + 1, 3, 3); the last one is relative to the visit before.
+    """
+    onward = visit.middle - before.middle
+    arm = np.array([[1.0, 0.0, -onward[1]], [0.0, 1.0, onward[0]], [0.0, 0.0, 1.0]])
+    new = uncertainty(track, before.scan, visit.scan, visit.middle)
+    carried = arm @ np.concatenate([covariances, np.zeros((1, 3, 3))]) @ arm.T + new
+    return np.asarray(carried)
+
+
+def uncertainty(track: Track, first: int, last: int, end: Array) -> Array:
+    """Compute the covariance of a point near a later scan relative to an earlier scan.
+
+    Args:
+        track: Trajectory of the robot.
+        first: Index of the earlier scan.
+        last: Index of the later scan.
+        end: (x, y) of the point in metres, in the frame of the track.
+
+    Returns:
+        (3, 3) in metres and radians, by the axes of the track.
+    """
+    total = np.zeros((3, 3))
+    for i in range(min(first, last) + 1, max(first, last) + 1):
+        cos, sin = math.cos(track.poses[i - 1, 2]), math.sin(track.poses[i - 1, 2])
+        # An error of this increment rotates and shifts all later poses. The point moves as the end
+        # of an arm that begins here.
+        x, y = end - track.poses[i, :2]
+        arm = np.array([[cos, -sin, -y], [sin, cos, x], [0.0, 0.0, 1.0]])
+        total += arm @ track.covariances[i] @ arm.T
+    return total
+
+
+def relative(closing: Closing, first: float, last: float) -> tuple[float, float, float]:
+    """Compute the pose at a later step relative to an earlier one from a closure.
+
+    Args:
+        closing: The closure of the visits.
+        first: Heading of the earlier step in radians, in the frame of the track.
+        last: Heading of the later step.
+
+    Returns:
+        Metres ahead and to the left, and radians counterclockwise.
+    """
+    x, y = closing.match.shift
+    cos, sin = math.cos(first), math.sin(first)
+    return cos * x + sin * y, cos * y - sin * x, wrapped(last + closing.match.turn - first)

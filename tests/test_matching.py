@@ -1,0 +1,148 @@
+"""Matches of local maps, and closures between visits that the track allows."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_distinctive import log_of
+
+from perception.places.closures import Closing, find_closures, relative
+from perception.places.distinctive import HALF, WINDOW, find_visits
+from perception.places.local_map import CELL, LocalMaps, Patch
+from perception.places.matching import Match, Scene, match
+from perception.places.tracing import to_trace
+from perception.places.track import Track, points_turned
+from perception.places.visits import Visit
+from perception.readers.scans import RobotLog
+from ssh_abduction.data.odometry import between
+
+# Corners of a room that looks different from all sides, in metres, counterclockwise.
+ROOM = [(-3, -2), (4, -2), (4, 0.5), (2, 0.5), (2, 3), (-1, 3), (-1, 1.5), (-3, 1.5)]
+ALL_TURNS = np.arange(-60, 60) * math.radians(3)
+
+
+def patch_of(turn: float = 0.0, x: float = 0.0, y: float = 0.0, corners: object = ROOM) -> Patch:
+    """The local map of a room that is turned by radians and then shifted by metres."""
+    points = points_turned(turn, np.array(corners, float)) + np.array([x, y])
+    at = np.arange(-80, 81) * CELL
+    here = np.stack(np.meshgrid(at, at, indexing="ij"), axis=2)
+    inside = np.zeros(here.shape[:2], bool)
+    for (ax, ay), (bx, by) in zip(points, np.roll(points, -1, axis=0), strict=True):
+        if ay != by:
+            crosses = (ay > here[..., 1]) != (by > here[..., 1])
+            inside ^= crosses & (here[..., 0] < ax + (here[..., 1] - ay) / (by - ay) * (bx - ax))
+    walls = np.zeros_like(inside)
+    for axis in (0, 1):
+        walls |= inside != np.roll(inside, 1, axis=axis)
+    return Patch(inside & ~walls, walls, np.zeros_like(inside), np.array([-8.0, -8.0]))
+
+
+def scene(patch: Patch) -> Scene:
+    return Scene.of(patch, np.zeros(2))
+
+
+@pytest.mark.parametrize(
+    ("turn", "x", "y"), [(0.0, 0.0, 0.0), (0.3, 0.62, -0.4), (-2.0, -1.0, 0.5), (3.1, 0.0, 2.0)]
+)
+def test_a_match_finds_how_a_room_is_turned_and_shifted(turn: float, x: float, y: float) -> None:
+    found = match(scene(patch_of(turn, x, y)), scene(patch_of()), ALL_TURNS.tolist())
+    assert found is not None
+    assert found.score > 0.75
+    assert found.mutual > 0.9
+    assert found.spread < 0.3
+    assert math.dist(found.shift, (x, y)) < 0.12
+    assert abs(math.remainder(found.turn - turn, math.tau)) < math.radians(1.5)
+
+
+def test_another_room_matches_badly() -> None:
+    other = [(-5, -1), (5, -1), (5, 1), (-5, 1)]
+    found = match(scene(patch_of()), scene(patch_of(corners=other)), ALL_TURNS.tolist())
+    assert found is None or found.score < 0.6 or found.mutual < 0.2
+
+
+def test_a_wall_in_free_space_lowers_the_score() -> None:
+    room = patch_of()
+    split = room.occupied.copy()
+    split[80, 70:95] = True
+    halved = replace(room, occupied=split, free=room.free & ~split)
+    whole, parted = (match(scene(room), scene(other), [0.0]) for other in (room, halved))
+    assert whole is not None
+    assert parted is not None
+    assert whole.score > parted.score + 0.05
+
+
+def rounds() -> tuple[RobotLog, Track, tuple[Visit, ...], list[Patch]]:
+    """A robot drives twice to the end of a side corridor and back."""
+    walls = [(-9, -1, 2, -1), (3, -1, 7, -1), (8.5, -1, 19, -1), (-9, 1, 4, 1), (6, 1, 19, 1)]
+    walls += [(2, -2.5, 3, -2.5), (2, -2.5, 2, -1), (3, -2.5, 3, -1)]  # two niches
+    walls += [(7, -1.8, 8.5, -1.8), (7, -1.8, 7, -1), (8.5, -1.8, 8.5, -1)]
+    walls += [(4, 1, 4, 9), (6, 1, 6, 9), (4, 9, 6, 9), (-9, -1, -9, 1), (19, -1, 19, 1)]
+    log, track = log_of(walls, [(-7, 0), (5, 0), (5, 7), (5, 0), (17, 0), (5, 0), (5, 7)])
+    visits = find_visits(log, track)
+    maps = LocalMaps(log.scans, track, WINDOW)
+    return log, track, visits, [maps.around(visit.scan, visit.middle, HALF) for visit in visits]
+
+
+def test_visits_to_one_fork_have_a_closure() -> None:
+    _, track, visits, patches = rounds()
+    found = find_closures(track, visits, patches, 2 * WINDOW)
+    assert found
+    for closing in found:
+        first, last = visits[closing.first], visits[closing.last]
+        assert track.way[last.scan] - track.way[first.scan] > 2 * WINDOW
+        assert math.dist(closing.match.shift, last.middle - first.middle) < 0.1
+        assert abs(closing.match.turn) < math.radians(1)
+
+
+def test_a_closure_that_the_track_refuses_does_not_count() -> None:
+    """The later visits are 4 m aside by a track that is sure of itself."""
+    _, track, visits, patches = rounds()
+    late = find_closures(track, visits, patches, 2 * WINDOW)[0].last
+    aside = np.array([0.0, 4.0])
+    moved = [
+        replace(visit, middle=visit.middle + aside) if k >= late else visit
+        for k, visit in enumerate(visits)
+    ]
+    shifted = [
+        replace(patch, corner=patch.corner + aside) if k >= late else patch
+        for k, patch in enumerate(patches)
+    ]
+    sure = replace(track, covariances=track.covariances / 100)
+    found = find_closures(sure, moved, shifted, 2 * WINDOW)
+    assert all(not closing.first < late <= closing.last for closing in found)
+
+
+def test_no_closure_leads_across_a_cut() -> None:
+    _, track, visits, patches = rounds()
+    (closing, *_) = find_closures(track, visits, patches, 2 * WINDOW)
+    cut = replace(track, cuts=(visits[closing.last].scan,))
+    found = find_closures(cut, visits, patches, 2 * WINDOW)
+    assert all(not c.first < closing.last <= c.last for c in found)
+
+
+def test_a_trace_has_the_closures_of_its_visits() -> None:
+    log, track, visits, patches = rounds()
+    trace = to_trace(log, track, visits)
+    expected = find_closures(track, visits, patches, 2 * WINDOW)
+    assert len(trace.closures) == len(expected) > 0
+    for closure, closing in zip(trace.closures, expected, strict=True):
+        steps = [trace.steps[step] for step in (closure.first, closure.last)]
+        assert [step.extra["visit"] for step in steps] == [closing.first, closing.last]
+        # The truth is unknown here, but the odometer is exact.
+        poses = []
+        for step in steps:
+            scan = track.poses[step.extra["scan"]]
+            x, y, turn = step.extra["seen"]
+            ahead, left = points_turned(scan[2], np.array([[x, y]]))[0]
+            poses.append((scan[0] + ahead, scan[1] + left, scan[2] + turn))
+        assert closure.displacement == pytest.approx(between(*poses), abs=0.1)
+
+
+def test_a_pose_is_relative_to_the_heading_of_the_earlier_step() -> None:
+    shift = Match(1.0, 0.1, np.array([1.0, 0.0]), 1.0, 0.1)
+    x, y, turn = relative(Closing(0, 1, shift), math.pi / 2, math.pi)
+    assert (x, y) == pytest.approx((0.0, -1.0))
+    assert turn == pytest.approx(math.pi / 2 + 0.1)
