@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +15,8 @@ from perception.places.distinctive import HALF, WINDOW, find_visits
 from perception.places.local_map import CELL, LocalMaps, Patch
 from perception.places.matching import Match, Scene, match
 from perception.places.tracing import to_trace
-from perception.places.track import Track, points_turned
+from perception.places.track import Track, _matched, points_turned
+from perception.places.trust import Trust
 from perception.places.visits import Visit
 from perception.readers.scans import RobotLog
 from ssh_abduction.data.odometry import between
@@ -146,3 +148,23 @@ def test_a_pose_is_relative_to_the_heading_of_the_earlier_step() -> None:
     x, y, turn = relative(Closing(0, 1, shift), math.pi / 2, math.pi)
     assert (x, y) == pytest.approx((0.0, -1.0))
     assert turn == pytest.approx(math.pi / 2 + 0.1)
+
+
+@pytest.mark.parametrize(("share", "is_wide"), [(1.0, False), (0.7, True)])
+def test_a_doubtful_match_against_the_odometer_is_uncertain(share: float, is_wide: bool) -> None:
+    """The odometer turned by 0.5 radians, and the walls say that the robot did not turn."""
+    along = np.linspace(-3, 3, 61)
+    sides = [(along, np.full(61, 2.0)), (along, np.full(61, -2.0)), (np.full(61, 3.5), along)]
+    walls = np.concatenate([np.stack(side, axis=1) for side in sides])
+    normals = np.repeat([[0.0, 1.0], [0.0, -1.0], [1.0, 0.0]], 61, axis=0)
+    seen = walls.copy()
+    astray = np.arange(len(walls)) % 100 >= 100 * share
+    seen[astray] *= 0.4  # people in the room
+    prior = Trust().covariance((0.0, 0.0, 0.0))
+    recent = deque([(walls, normals)])
+    pose, covariance, found = _matched(
+        seen, normals, recent, (0.0, 0.0, 0.0), (0.0, 0.0, 0.5), prior
+    )
+    assert abs(pose[2]) < 0.05
+    assert found == pytest.approx(share, abs=0.1)
+    assert bool(covariance[2, 2] > 0.4**2) is is_wide

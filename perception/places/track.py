@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from perception.places.jumps import Unknown, unknown_steps
+from perception.places.trust import Trust
 from perception.readers.scans import Pose, RobotLog, Scan
 from ssh_abduction.data.odometry import between, moved
 
@@ -61,42 +62,13 @@ TURNED = math.radians(60)
 CARRIED = 1.0
 # Share of points on walls that a match needs without odometry.
 SURE = 0.7
+# A match contradicts the odometer from this chi-square on (3 degrees of freedom). If less than the
+# share CLEAR of the points lies on walls then, either may be right. So the covariance is widened by
+# the difference of the two.
+CONTRARY, CLEAR = 25.0, 0.8
 # In a bare corridor, moving on and standing still match equally well. If their shares of points on
 # walls differ by at most this, the robot is taken to have moved on.
 ALIKE = 0.03
-
-
-@dataclass(frozen=True)
-class Trust:
-    """Standard deviations of the errors of an odometer from one scan to the next.
-
-    Attributes:
-        way: Error along the motion, as a share of its length; half of that across.
-        offset: Additional error of the position, in metres.
-        turning: Error of the heading, as a share of the turn.
-        drift: Error of the heading for each metre, in radians.
-        angle: Additional error of the heading, in radians.
-    """
-
-    way: float = 0.1
-    offset: float = 0.03
-    turning: float = 0.1
-    drift: float = 0.02
-    angle: float = 0.02
-
-    def covariance(self, onward: Pose) -> Array:
-        """Compute the covariance of a motion by odometry.
-
-        Args:
-            onward: Motion ahead and to the left in metres, and turn in radians.
-
-        Returns:
-            (3, 3), in the frame of the robot before the motion.
-        """
-        way = math.hypot(onward[0], onward[1])
-        along, across = self.offset + self.way * way, self.offset + self.way * way / 2
-        heading = self.angle + self.turning * abs(onward[2]) + self.drift * way
-        return np.diag([along**2, across**2, heading**2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -408,6 +380,10 @@ def _matched(
             if best[0] > 1.5 * share:
                 share, pose, information = best
     covariance = np.asarray(turn.T @ _accumulating(information, weight) @ turn)
+    astray = turn.T @ (pose - guess)
+    astray[2] = wrapped(float(astray[2]))
+    if share < CLEAR and astray @ np.linalg.solve(prior, astray) > CONTRARY:
+        covariance += np.diag(astray**2)
     return (float(pose[0]), float(pose[1]), wrapped(float(pose[2]))), covariance, share
 
 
