@@ -114,6 +114,7 @@ def main() -> None:
     parser.add_argument(
         "--displacement", choices=("auto", "none"), default="auto", help="none ignores odometry"
     )
+    parser.add_argument("--boundary", default="strict", help="the theory's field boundary")
     options = parser.parse_args()
     noise = Noise(Odometry(**NOISE))
     count = options.seeds or (1 if options.family == "plans" else 10)
@@ -123,7 +124,11 @@ def main() -> None:
         "mazes": lambda: of_mazes(options.cells, options.steps or 60, seeds, noise),
         "plans": lambda: of_plans(options.folder, options.steps or 100, seeds, noise),
     }
-    theory = Theory(displacement=options.displacement, star="auto" if options.stars else "none")
+    theory = Theory(
+        displacement=options.displacement,
+        star="auto" if options.stars else "none",
+        boundary=options.boundary,
+    )
     print(f"\n{report(families[options.family](), theory, options.limit)}")
 
 

@@ -132,6 +132,8 @@ class Weighing:
             parts.candidates.sketch(0.0)  # only the surest sketch has time
             self.keep_best()
         for width, share in WIDTHS.items():
+            if width > BROAD and parts.task.theory.several_drives:
+                break  # a beam keeps no more hypotheses then
             watch.end_stage_after(begun + share * left)
             if (beam := parts.candidates.beam(width)) is None:
                 break

@@ -59,8 +59,9 @@ from ssh_abduction.theory.settle import Problem
 CHECKED_EVERY = 8
 # If no hypothesis is left, look for this many times as many.
 WIDER = 2
-# With several drives, keep this many hypotheses: it is open where drives start.
-LOST = 32
+# With several drives, it is open how they are joined. So keep LOST times as many hypotheses, but at
+# most ALIKE that join them alike.
+LOST, ALIKE = 32, 4
 # Of the beams at earlier looks, this many hypotheses are kept.
 SPARE = 2
 # An extension that costs this many nats more than the best one of its hypothesis is not made.
@@ -141,7 +142,7 @@ class Beam:
             kept[-1] = kept[-1][:SPARE]  # saves memory
             kept.append(beam)
         self.nats = float(kept[-1][0].nats)
-        for found in kept[-1]:
+        for found in kept[-1][: ALIKE * self._width]:
             if (ssh_map := self._map(found, len(self._trace))) is not None:
                 yield ssh_map
 
@@ -161,12 +162,16 @@ class Beam:
         return beam
 
     def _best(self, found: Iterator[Hypothesis], width: int) -> Iterator[Hypothesis]:
-        """The first `width` hypotheses; so many for each choice of how drives are joined.
+        """The first `width` hypotheses.
 
-        With several drives these are at most LOST hypotheses, or twice as many in a broad beam.
-        Those that leave a drive loose come on top. They cost more until they join it to others.
+        With several drives, the first hypotheses for each choice of how drives are joined: at most
+        ALIKE, and LOST times as many in all. Those that leave a drive loose come on top. They cost
+        more until they join it to others.
         """
-        most = max(width, LOST * min(width, 2) if self._starts else 0)
+        most = width
+        if self._starts:
+            width = min(width, ALIKE)
+            most = LOST * width
         count: Counter[tuple[object, ...]] = Counter()
         for hypothesis in found:
             pieces, enough = hypothesis.pieces, count.total() >= most
