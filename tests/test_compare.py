@@ -85,7 +85,7 @@ products = st.lists(
 )
 
 
-@settings(max_examples=40)
+@settings(max_examples=75)
 @given(relations | products)
 def test_choices_are_the_finest_division_that_brute_force_finds(rows: list[list[bool]]) -> None:
     table = np.array(rows, dtype=bool)
@@ -103,7 +103,7 @@ def test_choices_are_the_finest_division_that_brute_force_finds(rows: list[list[
     }
 
 
-@settings(max_examples=25)
+@settings(max_examples=50)
 @given(relations)
 def test_deciding_questions_tell_all_apart_and_none_is_superfluous(rows: list[list[bool]]) -> None:
     table = np.array(rows, dtype=bool)

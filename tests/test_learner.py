@@ -878,8 +878,9 @@ def test_bad_images_are_disbelieved_where_views_may_be_misread(
             replace(s, image=tuple(i.tolist())) for s, i in zip(trace.steps, images, strict=True)
         ),
     )
+    theory = Theory.topological().replace(misread=1.5, weigh="count")
     with pytest.warns(ImageWarning, match="2 of 40 images fit no view"):
-        learner = BootstrapLearner(Theory.topological().replace(misread=1.5)).fit(spoilt)
+        learner = BootstrapLearner(theory).fit(spoilt)
     assert one_to_one(np.array(learner.map_.labels), true_dstates(trace))
     assert np.flatnonzero(learner.labels_ < 0).tolist() == bad
     assert {fault.step for fault in learner.map_.faults} <= set(bad)

@@ -366,7 +366,9 @@ def test_a_prefix_ends_without_an_action() -> None:
 
 @settings(max_examples=75)
 @given(
-    st.binary(max_size=200) | st.text(max_size=200).map(lambda text: f"{HEADER}\n{text}".encode())
+    st.binary(max_size=200)
+    | st.binary(max_size=50).map(lambda line: f"{HEADER}\n".encode() + line)
+    | st.text(max_size=200).map(lambda text: f"{HEADER}\n{text}".encode())
 )
 def test_any_file_is_a_trace_or_a_clear_error(data: bytes) -> None:
     import tempfile
