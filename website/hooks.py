@@ -73,6 +73,7 @@ THEMES: dict[str, tuple[str, ...]] = {
         "rivals.Difference",
         "rivals.Listing",
         "rivals.Experiment",
+        "rivals.joins_of_drives",
         "evaluation.Evaluation",
         "evaluation.MapEvaluation",
         "evaluation.evaluate_visits",
