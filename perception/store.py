@@ -118,11 +118,34 @@ def save(model: Any, path: str | os.PathLike[str]) -> None:
     Raises:
         PerceptionError: `load` would reject the model, or the file cannot be written.
     """
+    data = written(model, str(path))
+    try:
+        write_file(path, data)
+    except OSError as error:
+        raise PerceptionError(
+            f"{path}: cannot write the recogniser: {error.strerror or error}; check the folder"
+        ) from None
+    except ValueError as error:
+        raise PerceptionError(
+            f"{brief(str(path))}: cannot write the recogniser: {error}; name a file"
+        ) from None
+
+
+def written(model: Any, name: str = "recogniser") -> bytes:
+    """Make the content of the file of a fitted estimator or pipeline.
+
+    Args:
+        model: The estimator or pipeline, of types of this package or of scikit-learn.
+        name: The name of the file, for errors.
+
+    Raises:
+        PerceptionError: `load` would reject the model.
+    """
     classes = np.asarray(getattr(model, "classes_", ())).tolist()
     versions = {
         name: version(name) for name in ("numpy", "scikit-learn", "skops", "ssh-abduction")
     } | {"python": platform.python_version()}
-    data = skops.io.dumps(
+    data: bytes = skops.io.dumps(
         {
             "format": FORMAT,
             "version": VERSION,
@@ -134,18 +157,9 @@ def save(model: Any, path: str | os.PathLike[str]) -> None:
     # Reject now what `load` would reject later.
     if foreign := _foreign(data=data):
         raise PerceptionError(
-            f"{path}: expected a model of types that can be read back, got {', '.join(foreign)}"
+            f"{name}: expected a model of types that can be read back, got {', '.join(foreign)}"
         )
-    try:
-        write_file(path, data)
-    except OSError as error:
-        raise PerceptionError(
-            f"{path}: cannot write the recogniser: {error.strerror or error}; check the folder"
-        ) from None
-    except ValueError as error:
-        raise PerceptionError(
-            f"{brief(str(path))}: cannot write the recogniser: {error}; name a file"
-        ) from None
+    return data
 
 
 def load(path: str | os.PathLike[str]) -> Stored:

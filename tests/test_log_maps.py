@@ -23,6 +23,7 @@ from perception.places.track import Track, follow
 from perception.readers.logs import read_log
 from perception.readers.scans import Laser, RobotLog, Scan
 from perception.readers.writers import write_carmen
+from perception.store import load
 from simulator.rounds import record_plan
 from ssh_abduction import AbductionError, Theory
 from ssh_abduction.cli import main
@@ -119,6 +120,7 @@ def test_the_map_of_a_drive_joins_what_is_one_place(runs: Path) -> None:
         "trace.jsonl",
         "maps.json",
         "page.html",
+        "recogniser.skops",
         "report.html",
         "run.json",
     }
@@ -129,6 +131,27 @@ def test_the_map_of_a_drive_joins_what_is_one_place(runs: Path) -> None:
     run = json.loads((folder / "run.json").read_text())
     assert set(run["seconds"]) >= {"track", "places", "trace", "views", "maps"}
     assert "<script" not in (folder / "report.html").read_text()
+
+
+def test_the_recogniser_of_a_run_finds_the_robot_on_another_drive(
+    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trace = Trace.load(runs / "hall" / "trace.jsonl")
+    labels = Solution.load(runs / "hall" / "maps.json").maps[0].labels
+    stored = load(runs / "hall" / "recogniser.skops")
+    assert stored.labels([step.image for step in trace]) == list(labels)
+    # On another drive the laser has other noise, and the first steps are missing.
+    noise = np.random.default_rng(1)
+    steps = [
+        replace(step, image=tuple(np.abs(step.image + noise.normal(0, 0.02, len(step.image)))))
+        for step in trace.steps[3:]
+    ]
+    assert np.mean(np.array(stored.labels([s.image for s in steps])) == labels[3:]) > 0.8
+    other = replace(trace, steps=tuple(steps))
+    other.save(tmp_path / "other.jsonl")
+    call = ["localise", str(runs / "hall" / "maps.json"), str(tmp_path / "other.jsonl")]
+    assert main([*call, "--recogniser", str(runs / "hall" / "recogniser.skops")]) == 0
+    assert "located at steps" in capsys.readouterr().out
 
 
 def test_corrected_poses_are_not_read(hall: Path) -> None:

@@ -21,6 +21,8 @@ from typing import Any
 from perception.places.distinctive import WIDTH
 from perception.places.importing import Imported, import_log
 from perception.readers.scans import RobotLog
+from perception.recognition import recogniser as new_recogniser
+from perception.store import written
 from ssh_abduction.data.files import json_line
 from ssh_abduction.evaluation.ladder import Rung, UnderWay, ladder, rungs
 from ssh_abduction.page.html import view_page
@@ -39,6 +41,8 @@ SHARE, LADDER = 1 / 20, 1 / 4
 LEAST, LEAST_RUNG = 5.0, 1.0
 # Without a map, the search is given LONGER times its time, at most PATIENCE times.
 LONGER, PATIENCE = 4.0, 3
+# Shorter ranges than this, in metres, look alike to the recogniser, as they do to the views.
+FLOOR = 0.3
 # Largest number of seconds for a rung, because the ladder is only information for the reader.
 RUNG = 10.0
 # Speed of the robot in metres a second, assumed if the log has no clock. Robots whose logs have a
@@ -139,8 +143,23 @@ class LogMap:
         if solution.maps:
             found["page.html"] = view_page(solution, trace).html
         found["report.html"] = report(self.log, self.imported, solution, self.rungs, self.to_dict())
-        found["run.json"] = f"{json.dumps(self.to_dict(), indent=2, ensure_ascii=False)}\n"
-        return {name: text.encode() for name, text in found.items()}
+        files = {name: text.encode() for name, text in found.items()}
+        if solution.maps:
+            files["recogniser.skops"] = written(self.recogniser())
+        run = f"{json.dumps(self.to_dict(), indent=2, ensure_ascii=False)}\n"
+        return {**files, "run.json": run.encode()}
+
+    def recogniser(self) -> Any:
+        """Train a recogniser on the images of the trace, labelled with the dstates of the best map.
+
+        This is the last step of the bootstrap loop (Kuipers & Beeson 2002): it recognises dstates
+        in the images of another drive.
+
+        Returns:
+            A fitted pipeline of scikit-learn, as `perception.recognition.recogniser` makes it.
+        """
+        images = [step.image for step in self.imported.trace.steps]
+        return new_recogniser(FLOOR).fit(images, self.solution.maps[0].labels)
 
 
 def seconds_driven(log: RobotLog) -> float | None:
