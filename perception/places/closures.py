@@ -105,12 +105,6 @@ class _Gate:
             first, last = 0, round(math.tau / TURN) - 1
         return [k * TURN for k in range(first, last + 1)]
 
-    def is_near(self) -> bool:
-        """Whether any shift that a match can have is allowed."""
-        far = np.hypot(*self.poses[:, :2].T).min() - MOST
-        spread = math.sqrt(float(np.linalg.eigvalsh(self.covariance[:2, :2])[-1]))
-        return bool(far <= SIGMAS * spread)
-
     def allows(self, found: Match) -> bool:
         """Whether a match agrees with the track for some drift."""
         off = self.poses - (*found.shift, found.turn)
@@ -134,16 +128,17 @@ def _gates(track: Track, visits: Sequence[Visit]) -> Iterator[list[tuple[int, _G
             covariances, begin = covariances[:0], last
         elif last:
             covariances = _carried(covariances, track, visits[last - 1], visit)
-        gates = []
-        for k in range(begin, last):
-            turn = poses[:, k, 2]
-            cos, sin = np.cos(turn), np.sin(turn)
-            x, y = (poses[:, last, :2] - poses[:, k, :2]).T
-            there = np.stack([cos * x + sin * y, cos * y - sin * x, poses[:, last, 2] - turn], 1)
-            gate = _Gate(there, INFLATED * covariances[k - begin])
-            if gate.is_near():
-                gates.append((k, gate))
-        yield gates
+        # The pose by the axes of each earlier visit, for each drift: (drifts, visits, 3).
+        turn = poses[:, begin:last, 2]
+        cos, sin = np.cos(turn), np.sin(turn)
+        x, y = np.moveaxis(poses[:, last, None, :2] - poses[:, begin:last, :2], 2, 0)
+        turned = poses[:, last, None, 2] - turn
+        there = np.stack([cos * x + sin * y, cos * y - sin * x, turned], axis=2)
+        spreads = INFLATED * covariances
+        # Any shift that a match can have is allowed for the visits that are near.
+        far = np.hypot(there[..., 0], there[..., 1]).min(axis=0) - MOST
+        near = far <= SIGMAS * np.sqrt(np.linalg.eigvalsh(spreads[:, :2, :2])[:, 1])
+        yield [(begin + k, _Gate(there[:, k], spreads[k])) for k in np.flatnonzero(near).tolist()]
 
 
 def _drifted(middles: Array, way: Array, drift: float) -> Array:
