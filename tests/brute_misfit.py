@@ -2,7 +2,7 @@
 slow, and independent of the package.
 
 The unknowns are the position of each place (of each dstate where there are no places), the heading
-of each dstate, the scale and the drift.
+of each dstate, how far the robot is off at each step, the scale and the drift.
 """
 
 from __future__ import annotations
@@ -26,18 +26,28 @@ class LeastSquares:
     def __init__(self, trace: Trace) -> None:
         self.trace = trace
         self.odometry = trace.odometry or Odometry()
-        # The robot is off the pose of a dstate when it arrives, and when it leaves.
-        ends = 2 * np.diag([self.odometry.offset] * 2 + [self.odometry.facing]) ** 2
         self.closures = [
-            (closure, np.linalg.inv(np.array(closure.covariance) + ends))
-            for closure in trace.closures
+            (closure, np.linalg.inv(np.array(closure.covariance))) for closure in trace.closures
         ]
-        travels = [None, *(action.kind != "turn" for action in trace.actions)]
+        # How far the robot may be off the pose of its dstate at each step. The steps of one visit,
+        # between which it only turns, are off together: so each weighs less.
+        self.off = np.zeros((len(trace), 3))
+        if self.odometry.offset or self.odometry.facing:
+            visits: list[list[int]] = [[0]]
+            for t, action in enumerate(trace.actions, 1):
+                if action.kind == "turn":
+                    visits[-1].append(t)
+                else:
+                    visits.append([t])
+            for visit in visits:
+                for t in visit:
+                    wide = max(self.odometry.offset, 1e-3) * math.sqrt(len(visit))
+                    self.off[t] = wide, wide, max(self.odometry.facing, 1e-3)
         self.moved = [
             (
                 t,
                 step.displacement,
-                np.linalg.inv(np.array(trace.covariance(t)) + (ends if travels[t] else 0)),
+                np.linalg.inv(np.array(trace.covariance(t))),
             )
             for t, step in enumerate(trace.steps)
             if t and step.displacement is not None
@@ -52,18 +62,22 @@ class LeastSquares:
         """
         at = {position: i for i, position in enumerate(dict.fromkeys(positions))}
         where = [at[positions[heading]] for heading in headings]
-        size = 2 * len(at) + len(positions) + 2
+        fixed = 2 * len(at) + len(positions)
+        size = fixed + (self.off.size if self.off.any() else 0) + 2
         roots = [np.linalg.cholesky(weight).T for _, _, weight in self.moved]
         seen = [np.linalg.cholesky(weight).T for _, weight in self.closures]
 
         def off(unknown: np.ndarray) -> np.ndarray:
-            xy, facing = unknown[: 2 * len(at)].reshape(-1, 2), unknown[2 * len(at) : -2]
+            xy, facing = unknown[: 2 * len(at)].reshape(-1, 2), unknown[2 * len(at) : fixed]
             scale, bend = unknown[-2] * self.odometry.scale, unknown[-1] * self.odometry.bend
-            rows = [unknown[-2:]]
+            robot = np.column_stack([xy[where], facing[list(headings)]])
+            if self.off.any():
+                robot = robot + self.off * unknown[fixed:-2].reshape(-1, 3)
+            rows = [unknown[fixed:]]
             for (t, (dx, dy, turned), _), root in zip(self.moved, roots, strict=True):
                 way = math.hypot(dx, dy)
-                start, end = facing[headings[t - 1]], facing[headings[t]]
-                gone = xy[where[t]] - xy[where[t - 1]]
+                start, end = robot[t - 1, 2], robot[t, 2]
+                gone = robot[t, :2] - robot[t - 1, :2]
                 angle = start - bend * way / 2
                 ahead = math.cos(angle) * gone[0] + math.sin(angle) * gone[1]
                 left = math.cos(angle) * gone[1] - math.sin(angle) * gone[0]
@@ -71,11 +85,11 @@ class LeastSquares:
                 rows.append(root @ [(1 + scale) * ahead - dx, (1 + scale) * left - dy, turn])
             for (closure, _), root in zip(self.closures, seen, strict=True):
                 x, y, turned = closure.displacement
-                here, there = headings[closure.first], headings[closure.last]
-                gone = xy[where[closure.last]] - xy[where[closure.first]]
-                cos, sin = math.cos(facing[here]), math.sin(facing[here])
+                here, there = robot[closure.first], robot[closure.last]
+                gone = there[:2] - here[:2]
+                cos, sin = math.cos(here[2]), math.sin(here[2])
                 ahead, left = cos * gone[0] + sin * gone[1], cos * gone[1] - sin * gone[0]
-                turn = math.remainder(facing[there] - facing[here] - turned, math.tau)
+                turn = math.remainder(there[2] - here[2] - turned, math.tau)
                 rows.append(root @ [ahead - x, left - y, turn])
             return np.concatenate(rows)
 

@@ -556,4 +556,4 @@ def test_import_takes_several_topics(tmp_path: Path, capsys: pytest.CaptureFixtu
         )
         == 1
     )
-    assert "expected a robot that drives, got a drive of 0.7 m" in capsys.readouterr().err
+    assert "put the scans into the order of the drive" in capsys.readouterr().err

@@ -410,6 +410,7 @@ def good(call: str, parameter: inspect.Parameter) -> Any:
         "kind": "misread",
         "least": 0.1,
         "length": 2,
+        "listing": made["listing"],
         "light": Light.at(12.0),
         "name": "name",
         "path": "written",

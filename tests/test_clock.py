@@ -147,6 +147,7 @@ def test_no_sketch_takes_all_the_time() -> None:
     with (
         patch.multiple(fallback, OVERTIME=100.0),
         patch.object(candidates.Candidates, "_go_on_to_end", deaf),
+        patch.object(candidates.Candidates, "beam", lambda *_: None),
     ):
         assert solve(trace, time_limit=1e-6).status is Status.UNKNOWN
     assert len(tried) == len(Sketch.all_of(trace.steps[0], settle(trace).theory))

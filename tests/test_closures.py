@@ -164,14 +164,15 @@ def test_an_argument_cites_the_match() -> None:
 def test_the_beam_counts_closures_as_a_map_does() -> None:
     """The equations of a hypothesis are linear. So its cost is nearly that of its map."""
     (known,) = truth.mazes(4, 24, [701], truth.Noise(Odometry(**truth.NOISE)))
-    pairs = [(i, j) for i, j in combinations(range(len(known.trace)), 2) if j - i > 6]
+    steps = range(len(known.trace))
+    pairs = [(i, j) for i, j in combinations(steps, 2) if 6 < j - i < 10]
     random = np.random.default_rng(0)
     poses = [(0.0, 0.0, 0.0)]
     for step in known.trace.steps[1:]:
         poses.append(moved(poses[-1], step.displacement or (0.0, 0.0, 0.0)))
     noise: Covariance = ((0.04, 0.0, 0.0), (0.0, 0.04, 0.0), (0.0, 0.0, 0.01))
     closures = []
-    for i, j in pairs[::20]:
+    for i, j in pairs[::10]:
         x, y, turned = between(poses[i], poses[j])
         dx, dy = random.normal(0, 0.2, 2)
         closures.append(Closure(i, j, (x + dx, y + dy, turned), noise))

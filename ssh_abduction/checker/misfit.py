@@ -35,6 +35,8 @@ STILL = 1e-9
 MISSING = 1e4
 # Claimed costs may be off by this many nats, and by this share of the misfit.
 EXACT, SHARE = 1e-3, 1e-3
+# A robot that is off its dstates is so by this standard deviation at least, in metres and radians.
+SMALLEST = 1e-3
 # The rivals whose costs are checked.
 RIVALS = 5
 # Traces with more steps are not weighed anew: the derivatives are a dense matrix.
@@ -119,25 +121,24 @@ class _Errors:
             if displacement is None or covariance is None:
                 self._root[t] = MISSING * np.identity(3)
                 continue
-            off = odometry.offset if trace.actions[t - 1].kind != "turn" else 0.0
-            facing = odometry.facing if off or trace.actions[t - 1].kind != "turn" else 0.0
-            at_ends = 2 * np.diag([off, off, facing]) ** 2
             self._moved[t] = displacement
-            self._root[t] = np.linalg.cholesky(np.array(covariance) + at_ends)
+            self._root[t] = np.linalg.cholesky(np.array(covariance))
         self._way = np.hypot(self._moved[:, 0], self._moved[:, 1])
         # A wrong heading after a gap may be too far off for Gauss-Newton: begin near the least.
         missing = [t for t in range(1, size) if trace.steps[t].displacement is None]
         for t, likely in likely_moves(self._moved, missing, dstates, places):
             self._moved[t] = likely
         self._sigma = np.array([odometry.scale, odometry.bend])
-        ends = 2 * np.diag([odometry.offset, odometry.offset, odometry.facing]) ** 2
         # The closures, each with the root of its covariance.
         self._closures = [
-            (closure, np.linalg.cholesky(np.array(closure.covariance) + ends))
+            (closure, np.linalg.cholesky(np.array(closure.covariance)))
             for closure in trace.closures
         ]
-        # The number of unknowns: errors of displacements and closures, scale and drift.
-        self._size = 3 * (size + len(self._closures)) + 2
+        self._off = _off_dstates(trace)
+        # The number of unknowns: errors of displacements and closures, then how far the robot is
+        # off its dstate at each step, scale and drift.
+        self._begin = 3 * (size + len(self._closures))
+        self._size = self._begin + self._off.size + 2
         # The loops: the last step at the same place, and whether it is at the same dstate.
         self._loops: list[tuple[int, int, bool]] = []
         at_place: dict[int, int] = {}
@@ -198,8 +199,13 @@ class _Errors:
         for first, last, is_dstate in self._loops:
             kept = 3 if is_dstate else 2
             gap = pose[last] - pose[first]
+            row = self._row(pose, own, first, last)
+            for t, sign in ((last, -1.0), (first, 1.0)) if len(self._off) else ():
+                mine = slice(self._begin + 3 * t, self._begin + 3 * t + 3)
+                gap += sign * self._off[t] * z[mine]
+                row[range(3), range(mine.start, mine.stop)] += sign * self._off[t]
             gap[2] = math.remainder(gap[2], math.tau)
-            rows.append(self._row(pose, own, first, last)[:kept])
+            rows.append(row[:kept])
             off += gap[:kept].tolist()
         for k, (closure, root) in enumerate(self._closures):
             # The pose at the later step in the frame of the earlier one. Errors up to the earlier
@@ -235,3 +241,24 @@ class _Errors:
         row[:, 3 * first + 3 : 3 * last + 3] = carried[:, :, :3].transpose(1, 0, 2).reshape(3, -1)
         row[:, -2:] = carried[:, :, 3:].sum(axis=0)
         return row
+
+
+def _off_dstates(trace: Trace) -> Array:
+    """How far the robot may be off the pose of its dstate at each step: n x 3 standard deviations.
+
+    In metres and radians; empty if the odometry says that it never is. A visit goes on while the
+    robot turns. Its steps share one error of position. So in a visit of k steps each has k times
+    the variance.
+    """
+    odometry = trace.odometry or Odometry()
+    if not odometry.offset and not odometry.facing:
+        return np.zeros((0, 3))
+    found: list[list[float]] = []
+    steps = 0
+    for t in range(len(trace)):
+        steps += 1
+        if t + 1 == len(trace) or trace.actions[t].kind != "turn":
+            far = max(odometry.offset, SMALLEST) * math.sqrt(steps)
+            found += [[far, far, max(odometry.facing, SMALLEST)]] * steps
+            steps = 0
+    return np.array(found)

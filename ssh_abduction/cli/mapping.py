@@ -34,6 +34,7 @@ from ssh_abduction.theory.theory import Theory
 if TYPE_CHECKING:
     from perception.readers.scans import RobotLog
     from ssh_abduction.robot_logs.log_maps import LogMap, LogMapping
+from ssh_abduction.robot_logs.log_picture import paths_mean_something
 
 KILLED = (
     "process: expected an answer, got killed, as happens when memory runs out; map fewer logs at "
@@ -215,13 +216,13 @@ class MapQuestion:
         run["log"]["source"], run["settings"], run["digest"] = path, self.settings, content
         files["run.json"] = (json.dumps(run, indent=2, ensure_ascii=False) + "\n").encode()
         cost, solution = done.solution.cost, done.solution
+        paths = (
+            f"{counted(cost.paths, 'paths')}, " if cost and paths_mean_something(solution) else ""
+        )
         found = (
             "no map"
             if cost is None
-            else (
-                f"{counted(cost.places, 'places')}, {counted(cost.paths, 'paths')}, "
-                f"{counted(cost.dstates, 'dstates')}"
-            )
+            else (f"{counted(cost.places, 'places')}, {paths}{counted(cost.dstates, 'dstates')}")
         )
         how = (
             f"{solution.status.value}, {solution.weighed.sentence}"

@@ -38,7 +38,7 @@ _log = log_of(__name__)
 # the part that the import leaves, the ladder (which compares kinds of evidence) gets LADDER.
 SHARE, LADDER = 1 / 20, 1 / 4
 # Least numbers of seconds: for the search for minimal maps, and for each rung of the ladder.
-LEAST, LEAST_RUNG = 5.0, 1.0
+LEAST, LEAST_RUNG = 30.0, 1.0
 # Without a map, the search is given LONGER times its time, at most PATIENCE times.
 LONGER, PATIENCE = 4.0, 3
 # Shorter ranges than this, in metres, look alike to the recogniser, as they do to the views.
@@ -63,9 +63,21 @@ BACK = 0.01
 
 # The theory for logs. Stars and sides are unreliable there. So are views: a robot that faces one
 # way at one place may see two views. So a place may have two dstates in one direction of a path.
-BARE = Theory.topological().replace(
-    star="none", boundary="none", without=("one_dstate_per_course",)
+# Nothing tells which travels go straight on, so the maps have edges and no paths.
+PATHS = (
+    "one_dstate_per_course",
+    "travel_follows_path",
+    "one_course",
+    "turn_around_reverses",
+    "turn_changes_path",
+    "on_path",
+    "travel_orders",
+    "order_asymmetric",
+    "order_transitive",
+    "path_order_total",
+    "course_needs_travel",
 )
+BARE = Theory.topological().replace(star="none", boundary="none", without=PATHS)
 
 
 @dataclass(frozen=True, eq=False)

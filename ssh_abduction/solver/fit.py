@@ -27,8 +27,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 from scipy.sparse.linalg import lsqr, splu
 from scipy.special import gammaincc
@@ -46,9 +45,11 @@ EXACT = 2e-3
 # SWEEPS is the number of iterations of the power method. HELD is the weight that keeps a rotation
 # at its old value. It is small: a metre weighs some hundreds.
 SWEEPS, HELD = 20, 1e-2
-# The number of unknowns that move and turn the whole map. If the matrix of derivatives has at most
-# DENSE entries, it is a dense array.
-GAUGE, DENSE = 3, 4_000_000
+# Levenberg-Marquardt: the least and the highest damping, and the most rounds. It ends if a round
+# gains less than STILL of the sum of squares; NEARLY is enough for a hypothesis. HELD_STILL keeps
+# poses that nothing is known of.
+LEAST_DAMPING, MOST_DAMPING, ROUNDS, STILL, NEARLY = 1e-9, 1e8, 100, 1e-13, 1e-4
+HELD_STILL = 1e-9
 
 
 def fit(trace: Trace, ssh_map: SSHMap) -> Fit:
@@ -68,7 +69,8 @@ class Poses:
     """Least squares over positions and headings that the steps of a trace share.
 
     The vector of unknowns has x and y of each position in metres, then the heading of each dstate
-    in radians, then the scale and the drift as multiples of their standard deviations.
+    in radians, then the scale and the drift as multiples of their standard deviations. If the robot
+    is off the poses of dstates, its pose at each step has a position and a heading of its own.
     """
 
     def __init__(
@@ -81,8 +83,12 @@ class Poses:
             headings: The heading of each step, as a number. The numbers are consecutive, from 0.
             positions: The position of each heading, as a number or another name.
         """
-        said, labels = Equations.of(trace), np.asarray(headings, dtype=int)
-        self._from, self._to = labels[said.first], labels[said.last]
+        self._dstates = len(positions)
+        labels = np.asarray(headings, dtype=int)
+        said = Equations.of(trace).beside(labels, self._dstates)
+        if said.spreads.any():
+            positions = [*positions, *((t, "robot") for t in range(len(trace)))]
+        self._from, self._to = said.first, said.last
         self._moved, self._way, self._sigma = said.moved, said.way, said.sigma
         self._scaled = said.scaled
         self._whitening = np.linalg.inv(np.linalg.cholesky(said.noise))
@@ -105,37 +111,53 @@ class Poses:
         """The least chi-square of the displacements."""
         return float((self._residuals(self._best()) ** 2).sum())
 
-    def _best(self) -> Array:
-        """The unknowns with the least sum of squares."""
-        unknown = self._begun()
+    def settled(
+        self, start: Array, fixed: Sequence[int], wanted: Sequence[int]
+    ) -> tuple[float, Array, Array]:
+        """The least chi-square, and the unknowns that have it.
+
+        Args:
+            start: Unknowns to begin with.
+            fixed: The indices of unknowns whose values are known.
+            wanted: The indices of the unknowns whose covariance is wanted.
+
+        Returns:
+            The chi-square, the unknowns, and the covariance of the wanted ones.
+        """
+        unknown = self._best(start, NEARLY)
+        squares = float((self._residuals(unknown) ** 2).sum())
+        return squares, unknown, self._covariance(unknown, fixed, wanted)
+
+    def _best(self, start: Array | None = None, still: float = STILL) -> Array:
+        """The unknowns with the least sum of squares.
+
+        Args:
+            start: Unknowns to begin with; None to find some.
+            still: End if a round gains less than this share.
+        """
+        unknown = self._begun() if start is None else start
         if not len(self._moved):
             return unknown
-        equations = 3 * len(self._moved) + 2
-        if self._size <= equations + GAUGE and self._size * equations <= DENSE:
-            # The equations leave open where the first pose is: fix it.
-            gauge = np.zeros((GAUGE, self._size))
-            gauge[range(GAUGE), [0, 1, 2 * self._positions]] = 1.0
-
-            def residuals(at: Array) -> Array:
-                off: Array = np.concatenate([self._residuals(at), gauge @ (at - unknown)])
-                return off
-
-            def jacobian(at: Array) -> Array:
-                return np.concatenate([self._jacobian(at).toarray(), gauge])
-
-            found = least_squares(residuals, unknown, jacobian, method="lm", x_scale="jac")
-        else:
-            found = least_squares(
-                self._residuals,
-                unknown,
-                self._jacobian,
-                method="trf",
-                tr_solver="lsmr",
-                x_scale="jac",
-                max_nfev=50,
-            )
-        best: Array = found.x
-        return best
+        off = self._residuals(unknown)
+        damping = LEAST_DAMPING
+        for _ in range(ROUNDS):
+            jacobian = self._jacobian(unknown)
+            normal, gradient = (jacobian.T @ jacobian).tocsc(), jacobian.T @ off
+            scale = normal.diagonal() + HELD_STILL
+            while True:
+                damped = (normal + diags_array(damping * scale)).tocsc()
+                step = splu(damped).solve(-gradient)
+                better = self._residuals(unknown + step)
+                gain = float(off @ off - better @ better)
+                if gain >= 0 or damping > MOST_DAMPING:
+                    break
+                damping *= 10
+            if gain < 0:
+                break
+            unknown, off, damping = unknown + step, better, max(damping / 10, LEAST_DAMPING)
+            if gain <= still * (1 + float(off @ off)):
+                break
+        return unknown
 
     def fit(self) -> Fit:
         """The best poses, and how well they agree with the displacements."""
@@ -229,9 +251,11 @@ class Poses:
         ).tocsr()
         moves = csr_array(self._moves().multiply(weights[:, None]))
         mixed = (moves.T @ turns).toarray()
-        solved = splu(
-            ((moves.T @ moves) + 1e-9 * _identity(self._positions)).tocsc().astype(complex)
-        ).solve(mixed)
+        square = moves.T @ moves
+        held = 1e-9 * max(float(square.diagonal().max()), 1.0)
+        solved = splu((square + held * _identity(self._positions)).tocsc().astype(complex)).solve(
+            mixed
+        )
         form: NDArray[np.complex128] = (turns.conj().T @ turns).toarray() - mixed.conj().T @ solved
         return form
 
@@ -402,7 +426,7 @@ class Poses:
         first = {int(part[self._place[s]]): s for s in range(self._headings - 1, -1, -1)}
         poses: list[Pose] = []
         spreads = self._spreads(unknown, list(first.values()))
-        for s in range(self._headings):
+        for s in range(self._dstates):
             origin = first[int(part[self._place[s]])]
             dx, dy = at[self._place[s]] - at[self._place[origin]]
             cos, sin = math.cos(heading[origin]), math.sin(heading[origin])
@@ -424,28 +448,34 @@ class Poses:
 
         The poses of the dstates `origins` count as known.
         """
-        jacobian = self._jacobian(unknown)
         fixed = [
-            k
+            int(k)
             for s in origins
             for k in (2 * self._place[s], 2 * self._place[s] + 1, 2 * self._positions + s)
         ]
+        places = np.unique(self._place[: self._dstates])
+        wanted = np.stack([2 * places, 2 * places + 1], 1).ravel().tolist()
+        whole = self._covariance(unknown, fixed, wanted)
+        row = 2 * np.searchsorted(places, self._place[: self._dstates])
+        both = np.stack([row, row + 1], 1)
+        spreads: Array = whole[both[:, :, None], both[:, None, :]]
+        return spreads
+
+    def _covariance(self, unknown: Array, fixed: Sequence[int], wanted: Sequence[int]) -> Array:
+        """The covariance of the wanted unknowns, if the fixed ones are known."""
+        look_at_clock()
+        jacobian = self._jacobian(unknown)
         free = np.setdiff1d(np.arange(self._size), fixed)
         information: Any = (jacobian.T @ jacobian)[free][:, free]
-        information = (information + 1e-12 * _identity(len(free))).tocsc()
-        solver = splu(information)
-        number = {int(k): i for i, k in enumerate(free)}
-        covariance = np.zeros((self._positions, 2, 2))
-        for place in range(self._positions):
-            look_at_clock()
-            if 2 * place not in number:
-                continue
-            columns = np.zeros((len(free), 2))
-            rows = [number[2 * place], number[2 * place + 1]]
-            columns[rows, [0, 1]] = 1.0
-            covariance[place] = solver.solve(columns)[rows]
-        spreads: Array = covariance[self._place]
-        return spreads
+        held = 1e-12 * max(float(information.diagonal().max()), 1.0) if len(free) else 0.0
+        information = (information + held * _identity(len(free))).tocsc()
+        is_free = ~np.isin(wanted, fixed)
+        rows = np.searchsorted(free, np.asarray(wanted)[is_free])
+        columns = np.zeros((len(free), len(rows)))
+        columns[rows, np.arange(len(rows))] = 1.0
+        covariance: Array = np.zeros((len(wanted), len(wanted)))
+        covariance[np.ix_(is_free, is_free)] = splu(information).solve(columns)[rows]
+        return covariance
 
 
 def _identity(size: int) -> csr_array:

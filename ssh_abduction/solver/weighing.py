@@ -34,7 +34,7 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.runtime.logs import log_of
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError
-from ssh_abduction.solver.choosing import FEW_STEPS, new_engine, takes_all
+from ssh_abduction.solver.choosing import FEW_STEPS, READABLE, new_engine, takes_all
 from ssh_abduction.solver.engines.base import Engine, Found, Task
 from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.estimating import CostOf, Course, estimated
@@ -65,7 +65,9 @@ IMPROBABLE = 0.01
 PATIENCE, MORE = 10.0, 5.0
 # Guess maps by beams of hypotheses of these widths. Each may take time until this share of the time
 # limit is over.
-WIDTHS = {1: 0.8, 4: 0.6, 16: 0.4}
+WIDTHS = {1: 0.8, 4: 0.6, 16: 0.7}
+# The beam that breaks axioms may take time until this share is over.
+BREAKING = 0.8
 # A beam of this width or more ends with the map of least cost, nearly always.
 BROAD = 4
 
@@ -131,9 +133,14 @@ class Weighing:
         if is_long and left > 0 and parts.task.theory.star != "gateways":
             parts.candidates.sketch(0.0)  # only the surest sketch has time
             self.keep_best()
-        for width, share in WIDTHS.items():
-            if width > BROAD and parts.task.theory.several_drives:
-                break  # a beam keeps no more hypotheses then
+        # With several drives, a broad beam keeps as many hypotheses as a wider one.
+        several = parts.task.theory.several_drives
+        widths = {w: share for w, share in WIDTHS.items() if w <= BROAD or not several}
+        widest, narrow = max(widths), math.inf  # and the seconds that the narrowest beam took
+        for width, share in widths.items():
+            began = watch.elapsed()
+            if width < widest and widest * narrow < widths[widest] * left - (began - begun):
+                continue  # there is time for the widest beam
             watch.end_stage_after(begun + share * left)
             if (beam := parts.candidates.beam(width)) is None:
                 break
@@ -143,9 +150,10 @@ class Weighing:
                     self._searched = min(found, default=math.inf), beam.nats
                 self.keep_best()
                 parts.report()
-        watch.end_stage_after(begun + WIDTHS[BROAD] * left)
+            narrow = min(narrow, watch.elapsed() - began)
+        watch.end_stage_after(begun + BREAKING * left)
         with suppress(StageTimeError):
-            if self._searched[1] < math.inf and (beam := parts.candidates.beam(max(WIDTHS))):
+            if self._searched[1] < math.inf and (beam := parts.candidates.beam(widest)):
                 self._broken = self._searched[1] - beam.nats_without_axioms()
         watch.end_stage_after(math.inf)
 
@@ -159,6 +167,8 @@ class Weighing:
             LimitError: A limit is over. What was found so far is kept.
         """
         parts, self._of_labels = self._parts, of_labels
+        if parts.task.theory.has_faults and len(parts.task.trace) > READABLE:
+            raise LimitError("no proof")
         parts.known.status = Status.UNKNOWN  # what was proven is about counts
         self._improved = parts.watch.elapsed()
         parts.watch.use_reserve()

@@ -32,8 +32,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import product
 
-import numpy as np
-
 from ssh_abduction.checker.checker import violations
 from ssh_abduction.data.action import Action
 from ssh_abduction.data.drives import starts_of
@@ -47,9 +45,7 @@ from ssh_abduction.solver.guesses.pieces import fitted
 from ssh_abduction.solver.guesses.reckoning import (
     Hypothesis,
     Reckoning,
-    conditioned,
     first_pose,
-    squares_of,
 )
 from ssh_abduction.solver.steps.faults import with_faults
 from ssh_abduction.solver.steps.log import Log
@@ -151,7 +147,7 @@ class Beam:
 
         Actions still lead to one dstate, and stars at one place still agree.
         """
-        beam = self._onward([self._first()], len(self._trace))
+        beam = self._settled(self._onward([self._first()], len(self._trace)))
         return float(beam[0].nats) if beam else math.inf
 
     def _onward(self, beam: list[Hypothesis], end: int) -> list[Hypothesis]:
@@ -192,7 +188,29 @@ class Beam:
         """Extend a beam to a number of steps, and check it then."""
         begun = len(beam[0].labels)
         longer = self._onward(beam, end)
-        return [found for found in longer if self._map(found, begun) is not None]
+        valid = [found for found in longer if self._map(found, begun) is not None]
+        return self._settled(valid)
+
+    def _settled(self, beam: list[Hypothesis]) -> list[Hypothesis]:
+        """Compute the poses and costs of hypotheses of one drive anew, and sort them."""
+        if not self._reckoning.is_off or self._starts:
+            return beam
+        settled = []
+        for found in beam:
+            look_at_clock()
+            wrong = [t for t, kind in found.faults if kind == "jumped"]
+            trace = self._trace.prefix(len(found.labels)).without_displacements_at(wrong)
+            squares, better = self._reckoning.settled(found, trace)
+            settled.append(replace(better, nats=self._price_of(found) + squares / 2))
+        return sorted(settled, key=lambda found: found.nats)
+
+    def _price_of(self, found: Hypothesis) -> float:
+        """The price of the dstates, places and faults of a hypothesis, in nats."""
+        price = self._price * len(found.places) + self._price_of_place * len(found.position)
+        price += sum(self._fault[kind][t] for t, kind in found.faults)
+        if "misread" in self._fault:
+            price += sum(sum(seen.values()) - max(seen.values()) for seen in found.seen)
+        return price
 
     def _checked(self, beam: list[Hypothesis], end: int, joins: bool = True) -> list[Hypothesis]:
         """Extend a beam to a number of steps, and check each hypothesis at each step.
@@ -207,19 +225,22 @@ class Beam:
             children = (self._child(option, t) for option in self._options_of(beam, t, joins))
             valid = (child for child in children if self._map(child, t) is not None)
             beam = list(self._best(valid, WIDER * self._width))
-        return beam
+        return self._settled(beam)
 
     def _first(self) -> Hypothesis:
-        return Hypothesis(
-            [0],
-            [0],
-            [{self._log.seen[0]: self._doubt(0)}],
-            {},
-            self._sights[:1],
-            [2],
-            [4],
-            *first_pose(),
-            self._price,
+        mean, covariance = first_pose()
+        nowhere = Hypothesis([], [], [], {}, [], [], [], mean, covariance, self._price)
+        n, met = len(mean) - 3, self._reckoning.met(nowhere, 0, None, None)
+        return replace(
+            nowhere,
+            labels=[0],
+            places=[0],
+            seen=[{self._log.seen[0]: self._doubt(0)}],
+            sights=self._sights[:1],
+            position=[n],
+            heading=[n + 2],
+            mean=met[0],
+            covariance=met[1],
         )
 
     def _map(self, found: Hypothesis, since: int) -> SSHMap | None:
@@ -310,7 +331,7 @@ class Beam:
             place = moved.places[known]
             moved = fitted(moved, place, known)
             nats = moved.nats + self._misread(moved, known, t)
-            nats += float(squares_of(moved, [place], known)[0]) / 2
+            nats += float(self._reckoning.squares(moved, t, [place], known)[0]) / 2
             option = _Extension(nats, place, known, moved)
             return [option] if nats < math.inf and self._is_allowed(option, t) else []
         stays = self._stays and self._trace.actions[t - 1].kind == "turn" and not slips
@@ -330,7 +351,7 @@ class Beam:
         if not stays:
             nats = moved.nats + dstate + new_place
             options.append(_Extension(nats, None, None, moved))
-        for place, square, near in _near(moved, places):
+        for place, square, near in self._near(moved, t, places):
             if square / 2 > DEAREST and not stays:
                 continue
             if self._has_places:
@@ -338,14 +359,30 @@ class Beam:
             for s, p in enumerate(moved.places):
                 if p == place and (misread := self._misread(moved, s, t)) < math.inf:
                     facing = fitted(moved, place, s)
-                    nats = moved.nats + misread + float(squares_of(facing, [place], s)[0]) / 2
-                    options.append(_Extension(nats, place, s, facing))
+                    both = float(self._reckoning.squares(facing, t, [place], s)[0])
+                    options.append(_Extension(moved.nats + misread + both / 2, place, s, facing))
         least = min(option.nats for option in options)
         return [
             option
             for option in options
             if option.nats <= least + DEAREST and self._is_allowed(option, t)
         ]
+
+    def _near(
+        self, moved: Hypothesis, t: int, places: Sequence[int]
+    ) -> Iterator[tuple[int, float, Hypothesis]]:
+        """The chi-square if the robot is at each of some places at step t.
+
+        Yields:
+            The place, the chi-square, and the hypothesis, turned to fit the place.
+        """
+        own = [place for place in places if moved.pieces.of_place[place] == moved.pieces.here]
+        squares = self._reckoning.squares(moved, t, own).tolist() if own else []
+        yield from ((place, square, moved) for place, square in zip(own, squares, strict=True))
+        for place in places:
+            if moved.pieces.of_place[place] != moved.pieces.here:
+                turned = fitted(moved, place)
+                yield place, float(self._reckoning.squares(turned, t, [place])[0]), turned
 
     def _is_allowed(self, option: _Extension, t: int) -> bool:
         """Whether no pair of steps that evidence excludes becomes one dstate or place."""
@@ -359,23 +396,21 @@ class Beam:
         """Make an extended hypothesis."""
         moved = option.of
         n = len(moved.mean) - 3
-        mean, covariance = moved.mean, moved.covariance
         position, heading, places, seen = moved.position, moved.heading, moved.places, moved.seen
-        last, keep, sights = [n, n + 1, n + 2], [*range(n)], moved.sights
-        if option.place is not None:
-            rows = [position[option.place], position[option.place] + 1]
-            rows += [] if option.dstate is None else [heading[option.dstate]]
-            mean, covariance = conditioned(mean, covariance, last[: len(rows)], rows)
-            keep += last[len(rows) :]
-        else:
-            keep += last
+        place, there, sights = option.place, option.dstate, moved.sights
+        pose = self._reckoning.met(
+            moved,
+            t,
+            None if place is None else position[place],
+            None if there is None else heading[there],
+        )
+        if place is None:
+            place = len(position)
             position, sights = [*position, n], [*sights, self._sights[t]]
-        place = len(moved.position) if option.place is None else option.place
-        there = option.dstate
         if there is None:
             there = len(places)
             places, seen = [*places, place], [*seen, {}]
-            heading = [*heading, len(keep) - 1]
+            heading = [*heading, len(pose[0]) - 4]
         number, (dstate, action) = self._log.seen[t], (moved.labels[-1], self._log.actions[t - 1])
         links = moved.links
         if (t - 1, "slipped") not in moved.faults[-1:]:
@@ -391,27 +426,11 @@ class Beam:
             sights,
             position,
             heading,
-            mean[keep],
-            covariance[np.ix_(keep, keep)],
+            *pose,
             option.nats,
             moved.faults,
             moved.pieces.grown(place=option.place is None, dstate=option.dstate is None),
         )
-
-
-def _near(moved: Hypothesis, places: Sequence[int]) -> Iterator[tuple[int, float, Hypothesis]]:
-    """The chi-square if the last pose is at each of some places.
-
-    Yields:
-        The place, the chi-square, and the hypothesis, turned to fit the place.
-    """
-    own = [place for place in places if moved.pieces.of_place[place] == moved.pieces.here]
-    squares = squares_of(moved, own).tolist() if own else []
-    yield from ((place, square, moved) for place, square in zip(own, squares, strict=True))
-    for place in places:
-        if moved.pieces.of_place[place] != moved.pieces.here:
-            turned = fitted(moved, place)
-            yield place, float(squares_of(turned, [place])[0]), turned
 
 
 def _shown(seen: dict[int, float]) -> int:

@@ -65,6 +65,8 @@ def completed(
         return SSHMap(tuple(labels), dstates, listed).renumbered()
     dstates = tuple(DState(s, views[s], place=places[s]) for s in range(len(views)))
     bare = SSHMap(tuple(labels), dstates, listed, tuple(sorted(set(places))))
+    if "travel_follows_path" not in theory.axioms:
+        return bare.renumbered()
     courses = _courses(bare, trace, theory, ())
     facing_of = None if courses is None else _facing(_on(bare, courses), trace, theory, facing)
     courses = _courses(bare, trace, theory, facing_of.opposite) if facing_of else None

@@ -22,7 +22,8 @@ from ssh_abduction.data.drives import starts_of
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.solver.equations import noise_of, noises
+from ssh_abduction.solver.equations import noises, spreads_of
+from ssh_abduction.solver.fit import Poses
 from ssh_abduction.solver.guesses.pieces import Pieces
 
 Array: TypeAlias = NDArray[np.float64]
@@ -47,7 +48,8 @@ class Hypothesis:
         sights: For each place, what its first step shows of it.
         position: For each place, the index of its x in the means; y is the next one.
         heading: For each dstate, the index of its heading in the means.
-        mean: The means in metres, radians and standard deviations.
+        mean: The means in metres, radians and standard deviations. The last three are the pose of
+            the robot.
         covariance: Their covariance.
         nats: The cost.
         faults: The steps at which an action slipped or a displacement is wrong, and which.
@@ -69,7 +71,11 @@ class Hypothesis:
 
 
 class Reckoning:
-    """The moves of a trace, and how they change the poses of a hypothesis."""
+    """The moves of a trace, and how they change the poses of a hypothesis.
+
+    Attributes:
+        is_off: Whether the robot is off the poses of its dstates.
+    """
 
     def __init__(self, trace: Trace) -> None:
         self._trace, self._starts = trace, starts_of(trace)
@@ -77,14 +83,15 @@ class Reckoning:
         self._sigma = odometry.scale, odometry.bend
         steps = [t for t in range(1, len(trace)) if trace.steps[t].displacement is not None]
         self._noise = dict(zip(steps, noises(trace, steps), strict=True))
-        # The closures of each step, and their covariances.
-        self._closures: dict[int, list[tuple[Closure, Array]]] = {}
+        self._closures: dict[int, list[Closure]] = {}
         for closure in trace.closures:
-            told = closure, noise_of(closure, odometry)
-            self._closures.setdefault(closure.last, []).append(told)
+            self._closures.setdefault(closure.last, []).append(closure)
+        spreads = spreads_of(trace)
+        self.is_off = bool(spreads.any())
+        self._spreads = spreads + BLUR
 
     def moved(self, found: Hypothesis, t: int, believes: bool = True) -> Hypothesis:
-        """Append the pose after the move to step t to the means of a hypothesis.
+        """Move the robot of a hypothesis to step t. The robot is the last pose of the means.
 
         Args:
             found: The hypothesis of the steps before.
@@ -92,50 +99,44 @@ class Reckoning:
             believes: Whether the displacement of the step is used.
         """
         displacement = self._trace.steps[t].displacement if believes else None
-        here = found.labels[-1]
-        at, heading = found.position[found.places[here]], found.heading[here]
         mean, n = found.mean, len(found.mean)
         dx, dy, turn = displacement or (0.0, 0.0, 0.0)
         way = math.hypot(dx, dy)
         scale = 1 + mean[SCALE] * self._sigma[SCALE]
         drift = mean[BEND] * self._sigma[BEND] * way
-        facing = mean[heading] - drift / 2
+        facing = mean[-1] - drift / 2
         cos, sin = math.cos(facing), math.sin(facing)
         gone = np.array([cos * dx - sin * dy, sin * dx + cos * dy]) / scale
         aside = np.array([-gone[1], gone[0]])
         by = np.zeros((3, n))
-        by[0, at] = by[1, at + 1] = by[2, heading] = 1.0
-        by[:2, heading] = aside
+        by[:, -3:] = np.identity(3)
+        by[:2, -1] = aside
         by[:2, SCALE] = -gone * self._sigma[SCALE] / scale
         by[:2, BEND] = aside * (-way / 2 * self._sigma[BEND])
         by[2, BEND] = -way * self._sigma[BEND]
         rotation = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, scale]]) / scale
         noise = np.diag(UNKNOWN) ** 2 if displacement is None else self._noise[t]
-        covariance = np.empty((n + 3, n + 3))
-        covariance[:n, :n] = found.covariance
-        covariance[n:, :n] = by @ found.covariance
-        covariance[:n, n:] = covariance[n:, :n].T
-        covariance[n:, n:] = covariance[n:, :n] @ by.T + rotation @ noise @ rotation.T
-        pose = [*(mean[at : at + 2] + gone), mean[heading] + turn - drift]
-        piece = t if t in self._starts else found.pieces.of_heading[here]
+        covariance, across = found.covariance.copy(), by @ found.covariance
+        covariance[-3:], covariance[:, -3:] = across, across.T
+        covariance[-3:, -3:] = across @ by.T + rotation @ noise @ rotation.T
+        pose = mean[-3:] + np.array([*gone, turn - drift])
+        piece = t if t in self._starts else found.pieces.of_heading[found.labels[-1]]
         moved = replace(
             found,
-            mean=np.concatenate([mean, pose]),
+            mean=np.concatenate([mean[:-3], pose]),
             covariance=covariance,
             pieces=replace(found.pieces, here=piece),
         )
-        for closure, spread in self._closures.get(t, ()):
-            moved = self._closed(moved, closure, spread)
+        for closure in self._closures.get(t, ()):
+            moved = self._closed(moved, closure)
         return moved
 
-    def _closed(self, moved: Hypothesis, closure: Closure, noise: Array) -> Hypothesis:
-        """Update a hypothesis by a closure that leads to the last pose of its means.
+    def _closed(self, moved: Hypothesis, closure: Closure) -> Hypothesis:
+        """Update a hypothesis by a closure that leads to its robot.
 
-        Args:
-            moved: The hypothesis.
-            closure: The closure.
-            noise: The covariance of the closure, 3 x 3, with the errors of both ends.
+        The pose of the robot at the earlier step is not kept. The dstate there stands for it.
         """
+        noise = np.array(closure.covariance) + np.diag(self._spreads[closure.first])
         mean, n = moved.mean, len(moved.mean) - 3
         there = moved.labels[closure.first]
         at, heading = moved.position[moved.places[there]], moved.heading[there]
@@ -159,47 +160,103 @@ class Reckoning:
             nats=moved.nats + float(off @ solved[:, 0]) / 2,
         )
 
+    def settled(self, found: Hypothesis, trace: Trace) -> tuple[float, Hypothesis]:
+        """Fit the poses of a hypothesis anew, as the equations are linear only near the means.
 
-def squares_of(moved: Hypothesis, places: Sequence[int], dstate: int | None = None) -> Array:
-    """The chi-square if the last pose is at each of some places, or at a dstate of one."""
-    n = len(moved.mean) - 3
-    at = np.array([moved.position[p] for p in places])
-    rows = np.stack([at, at + 1], 1)
-    last = np.array([n, n + 1])
-    if dstate is not None:
-        rows = np.concatenate([rows, [[moved.heading[dstate]]]], 1)
-        last = np.array([n, n + 1, n + 2])
-    off = moved.mean[last] - moved.mean[rows]
-    if dstate is not None:
-        off[:, 2] -= math.tau * np.round(off[:, 2] / math.tau)
-    c = moved.covariance
-    crossed = c[rows[:, :, None], last[None, None, :]]
-    spread = (
-        c[np.ix_(last, last)][None]
-        + c[rows[:, :, None], rows[:, None, :]]
-        - crossed
-        - crossed.transpose(0, 2, 1)
-        + BLUR * np.identity(len(last))
-    )
-    squares: Array = np.einsum("ni,ni->n", off, np.linalg.solve(spread, off[..., None])[..., 0])
-    return squares
+        This is done only if the robot is off the poses of its dstates. Then errors of the heading
+        are large.
+
+        Args:
+            found: The hypothesis.
+            trace: Its steps, without displacements that it treats as wrong.
+
+        Returns:
+            The chi-square, and the hypothesis with new means and covariances.
+        """
+        poses = Poses(trace, found.labels, found.places)
+        steps, dstates, places = len(found.labels), len(found.places), len(found.position)
+        at = np.array([found.mean[[i, i + 1]] for i in found.position])
+        facing, labels = found.mean[found.heading], np.array(found.labels)
+        here = at[np.array(found.places)[labels]]
+        start = np.concatenate(
+            [at.ravel(), here.ravel(), facing, facing[labels], found.mean[[SCALE, BEND]]]
+        )
+        heading = 2 * (places + steps)
+        first = [2 * places, 2 * places + 1, heading + dstates]
+        last = [2 * (places + steps) - 2, 2 * (places + steps) - 1, heading + dstates + steps - 1]
+        order = np.empty(len(found.mean), dtype=int)
+        order[[SCALE, BEND]] = len(start) - 2, len(start) - 1
+        for place, i in enumerate(found.position):
+            order[i : i + 2] = 2 * place, 2 * place + 1
+        order[found.heading] = heading + np.arange(dstates)
+        order[-3:] = last
+        squares, unknown, covariance = poses.settled(start, first, order.tolist())
+        return squares, replace(found, mean=unknown[order], covariance=covariance)
+
+    def squares(
+        self, moved: Hypothesis, t: int, places: Sequence[int], dstate: int | None = None
+    ) -> Array:
+        """The chi-square if the robot is at each of some places at step t, or at a dstate."""
+        at = np.array([moved.position[p] for p in places])
+        rows, last = np.stack([at, at + 1], 1), np.arange(-3, -1)
+        if dstate is not None:
+            rows, last = np.concatenate([rows, [[moved.heading[dstate]]]], 1), np.arange(-3, 0)
+        off = moved.mean[last] - moved.mean[rows]
+        off[:, 2:] -= math.tau * np.round(off[:, 2:] / math.tau)
+        c = moved.covariance
+        crossed = c[rows[:, :, None], last[None, None, :]]
+        spread = (
+            c[np.ix_(last, last)][None]
+            + c[rows[:, :, None], rows[:, None, :]]
+            - crossed
+            - crossed.transpose(0, 2, 1)
+            + np.diag(self._spreads[t, : len(last)])
+        )
+        squares: Array = np.einsum("ni,ni->n", off, np.linalg.solve(spread, off[..., None])[..., 0])
+        return squares
+
+    def met(
+        self, moved: Hypothesis, t: int, position: int | None, heading: int | None
+    ) -> tuple[Array, Array]:
+        """The means and the covariance if the robot is at some position and heading at step t.
+
+        Args:
+            moved: The hypothesis, with its robot moved to step t.
+            t: The step.
+            position: The index of the known position; None to add a new one before the robot.
+            heading: The index of the known heading; None to add a new one behind the position.
+        """
+        n = len(moved.mean) - 3
+        old = [] if position is None else [position, position + 1]
+        old += [] if position is None or heading is None else [heading]
+        mean, covariance = moved.mean, moved.covariance
+        if old:
+            mean, covariance = _conditioned(
+                mean, covariance, [*range(n, n + len(old))], old, self._spreads[t]
+            )
+        new = [*range(n + len(old), n + 3)]  # entries of the robot that become known
+        order = [*range(n), *new, *range(n, n + 3)]
+        covariance = covariance[np.ix_(order, order)]
+        added = range(n, n + len(new))
+        covariance[added, added] += self._spreads[t, len(old) :]
+        return mean[order], covariance
 
 
-def conditioned(
-    mean: Array, covariance: Array, first: Sequence[int], second: Sequence[int]
+def _conditioned(
+    mean: Array, covariance: Array, first: Sequence[int], second: Sequence[int], spreads: Array
 ) -> tuple[Array, Array]:
-    """Condition a Gaussian on equalities of entries. The third entry is an angle."""
+    """Condition a Gaussian on equalities of entries, with some variances. The third is an angle."""
     off = mean[first] - mean[second]
     off[2:] -= math.tau * np.round(off[2:] / math.tau)
     across = covariance[:, first] - covariance[:, second]
-    spread = across[first] - across[second] + BLUR * np.identity(len(off))
+    spread = across[first] - across[second] + np.diag(spreads[: len(off)])
     gain = np.linalg.solve(spread, across.T).T
     conditioned = covariance - gain @ across.T
     return mean - gain @ off, (conditioned + conditioned.T) / 2
 
 
 def first_pose() -> tuple[Array, Array]:
-    """The means and the covariance at the first step, which is the origin."""
+    """The means and the covariance before the first step, with the robot at the origin."""
     mean, covariance = np.zeros(5), np.zeros((5, 5))
     covariance[[SCALE, BEND], [SCALE, BEND]] = 1.0
     return mean, covariance
