@@ -13,12 +13,11 @@ of benchmarks/truth.py.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 
-from instances import maze
-from truth import NOISE, ROOT, Known, Noise, aces3, report, told
+from truth import NOISE, ROOT, Known, Noise, aces3, random_walk, report, told
 
 from simulator.plan_tours import tour
 from simulator.plans import Plan
@@ -63,28 +62,8 @@ def cut(known: Known, drives: int = DRIVES, overlap: int = 2) -> Known:
 def of_mazes(cells: int, steps: int, seeds: Sequence[int], noise: Noise) -> Iterator[Known]:
     """Yield joint traces of random walks in mazes, one for each seed."""
     for seed in seeds:
-        walks = [
-            maze(
-                cells,
-                cells,
-                steps=steps,
-                seed=seed,
-                stars=True,
-                follow=True,
-                odometry=noise.odometry,
-                drive=drive,
-            )
-            for drive in range(DRIVES)
-        ]
-        yield joined(
-            f"maze {cells} x {cells}, {seed}",
-            [Known("", walk.trace, walk.truth, tuple(map(_cell, walk.truth))) for walk in walks],
-        )
-
-
-def _cell(state: object) -> Hashable:
-    assert isinstance(state, tuple)
-    return state[:2]
+        walks = [random_walk(cells, steps, seed, noise, drive) for drive in range(DRIVES)]
+        yield joined(walks[0].name, walks)
 
 
 def of_plans(folder: Path, steps: int, seeds: Sequence[int], noise: Noise) -> Iterator[Known]:

@@ -107,24 +107,37 @@ def is_true(ssh_map: SSHMap, known: Known) -> bool:
 
 def mazes(cells: int, steps: int, seeds: Sequence[int], noise: Noise) -> Iterator[Known]:
     """Yield random walks in mazes, one for each seed."""
-    for seed in seeds:
-        walk = maze(
-            cells,
-            cells,
-            steps=steps,
-            seed=seed,
-            stars=True,
-            follow=True,
-            odometry=noise.odometry,
-            scale=noise.scale,
-            bend=noise.bend,
-        )
-        yield Known(
-            f"maze {cells} x {cells}, {seed}",
-            walk.trace,
-            walk.truth,
-            tuple(state[:2] for state in walk.truth if isinstance(state, tuple)),
-        )
+    return (random_walk(cells, steps, seed, noise) for seed in seeds)
+
+
+def random_walk(cells: int, steps: int, seed: int, noise: Noise, drive: int | None = None) -> Known:
+    """Make a random walk in a maze.
+
+    Args:
+        cells: Width and height of the maze.
+        steps: Steps of the walk.
+        seed: Seed of the maze, and of the walk unless `drive` is given.
+        noise: Errors of the odometry.
+        drive: Number of one of several walks in this maze.
+    """
+    walk = maze(
+        cells,
+        cells,
+        steps=steps,
+        seed=seed,
+        stars=True,
+        follow=True,
+        odometry=noise.odometry,
+        scale=noise.scale,
+        bend=noise.bend,
+        drive=drive,
+    )
+    return Known(
+        f"maze {cells} x {cells}, {seed}",
+        walk.trace,
+        walk.truth,
+        tuple(state[:2] for state in walk.truth if isinstance(state, tuple)),
+    )
 
 
 def plans(folder: Path, steps: int, seeds: Sequence[int], noise: Noise) -> Iterator[Known]:

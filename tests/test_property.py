@@ -84,7 +84,10 @@ def test_checker_rejects_what_the_brute_force_does_not_find(data: st.DataObject)
 
     Where these allow the map, its witnesses may still have to change.
     """
-    trace = data.draw(traces(), label="trace")
+    checker_rejects_foreign_maps(data, data.draw(traces(), label="trace"))
+
+
+def checker_rejects_foreign_maps(data: st.DataObject, trace: Trace) -> None:
     theory = data.draw(theories(trace, fixed=FOREIGN), label="theory of the maps")
     other = data.draw(theories(trace, fixed=FOREIGN), label="theory to check them by")
     consistent = {found for found, _ in consistent_maps(trace, other)}

@@ -12,11 +12,10 @@ from unittest.mock import patch
 import pytest
 import test_weighing
 import truth
-from brute_force import consistent_maps, key
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import FOREIGN, theories, traces
-from test_property import LIMIT, agree
+from strategies import theories, traces
+from test_property import agree, checker_rejects_foreign_maps
 from together import of_mazes
 
 from ssh_abduction import Localiser, OnlineMapper, Solution, Theory, Trace, solve
@@ -86,13 +85,7 @@ def test_the_cheapest_joint_maps_are_those_of_plain_least_squares(data: st.DataO
 def test_the_checker_rejects_joint_maps_that_the_brute_force_does_not_find(
     data: st.DataObject,
 ) -> None:
-    trace = data.draw(joint_traces(), label="trace")
-    theory = data.draw(theories(trace, fixed=FOREIGN), label="theory of the maps")
-    other = data.draw(theories(trace, fixed=FOREIGN), label="theory to check them by")
-    consistent = {found for found, _ in consistent_maps(trace, other)}
-    for ssh_map in solve(trace, theory, max_maps=50, time_limit=LIMIT).maps:
-        if key(ssh_map) not in consistent:
-            assert check(trace, ssh_map, other)
+    checker_rejects_foreign_maps(data, data.draw(joint_traces(), label="trace"))
 
 
 MONDAY = Trace.from_steps("abcd", ["travel", "around", "travel"], name="monday")

@@ -287,7 +287,7 @@ class Weighing:
             enough = 2 * (self._most - least + self._base)
             returns = self._misfit.core(returns[::-1], enough, wrong)
         elif task.theory.has_faults:
-            returns = _course_of(ssh_map)
+            returns = _exactly(ssh_map)
         displacement = displacement_of(task.problem)
         believed = displacement.believed(task.trace, returns, wrong) if displacement else ()
         return frozenset((*returns, *believed)) or None
@@ -390,7 +390,7 @@ def _units_of(first: str) -> int:
     return 10 if first == "tenths" else 1
 
 
-def _course_of(ssh_map: SSHMap) -> list[Equality]:
+def _exactly(ssh_map: SSHMap) -> list[Equality]:
     """For each two steps, whether they are one dstate, and whether they are at one place.
 
     Maps with faults may have other faults, and less of them, if more steps are one dstate. So only

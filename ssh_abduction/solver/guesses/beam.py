@@ -198,9 +198,7 @@ class Beam:
         settled = []
         for found in beam:
             look_at_clock()
-            wrong = [t for t, kind in found.faults if kind == "jumped"]
-            trace = self._trace.prefix(len(found.labels)).without_displacements_at(wrong)
-            squares, better = self._reckoning.settled(found, trace)
+            squares, better = self._reckoning.settled(found, self._believed(found))
             settled.append(replace(better, nats=self._price_of(found) + squares / 2))
         return sorted(settled, key=lambda found: found.nats)
 
@@ -209,7 +207,7 @@ class Beam:
         price = self._price * len(found.places) + self._price_of_place * len(found.position)
         price += sum(self._fault[kind][t] for t, kind in found.faults)
         if "misread" in self._fault:
-            price += sum(sum(seen.values()) - max(seen.values()) for seen in found.seen)
+            price += sum(map(_nats_of_misread, found.seen))
         return price
 
     def _checked(self, beam: list[Hypothesis], end: int, joins: bool = True) -> list[Hypothesis]:
@@ -267,9 +265,14 @@ class Beam:
         ssh_map = with_faults(ssh_map, whole, trace, theory)
         return None if next(violations(whole, ssh_map, theory), None) else ssh_map
 
+    def _believed(self, found: Hypothesis) -> Trace:
+        """The steps of a hypothesis, without the displacements that it treats as wrong."""
+        wrong = [t for t, kind in found.faults if kind == "jumped"]
+        return self._trace.prefix(len(found.labels)).without_displacements_at(wrong)
+
     def _mended(self, found: Hypothesis) -> Trace:
         """The steps of a hypothesis, with its faults corrected."""
-        trace = self._trace.prefix(len(found.labels))
+        trace = self._believed(found)
         if not self._fault:
             return trace
         steps = list(trace.steps)
@@ -282,8 +285,6 @@ class Beam:
         for t, kind in found.faults:
             if kind == "slipped":
                 steps[t] = replace(steps[t], action=Action.that_slipped(t))
-            else:
-                steps[t] = replace(steps[t], displacement=None, covariance=None)
         return replace(trace, steps=tuple(steps))
 
     def _doubt(self, t: int) -> float:
@@ -295,9 +296,8 @@ class Beam:
         seen, number, doubt = found.seen[dstate], self._log.seen[t], self._doubt(t)
         if math.isinf(doubt):
             return 0.0 if number in seen else math.inf
-        before = sum(seen.values()) - max(seen.values())
         after = {**seen, number: seen.get(number, 0.0) + doubt}
-        return sum(after.values()) - max(after.values()) - before
+        return _nats_of_misread(after) - _nats_of_misread(seen)
 
     def _options_of(self, beam: Sequence[Hypothesis], t: int, joins: bool) -> list[_Extension]:
         """The ways to extend the hypotheses of a beam by step t, by their cost."""
@@ -325,7 +325,7 @@ class Beam:
     def _options(self, moved: Hypothesis, t: int, joins: bool) -> list[_Extension]:
         """The ways to extend a hypothesis by step t that cost little."""
         here, action = moved.labels[-1], self._log.actions[t - 1]
-        slips = moved.faults[-1:] == ((t - 1, "slipped"),)
+        slips = _slips(moved, t)
         known = None if slips else moved.links.get((here, action))
         if known is not None:
             place = moved.places[known]
@@ -413,7 +413,7 @@ class Beam:
             heading = [*heading, len(pose[0]) - 4]
         number, (dstate, action) = self._log.seen[t], (moved.labels[-1], self._log.actions[t - 1])
         links = moved.links
-        if (t - 1, "slipped") not in moved.faults[-1:]:
+        if not _slips(moved, t):
             links = {**links, (dstate, action): there}
         if number not in seen[there] or "misread" in self._fault:
             doubt = self._doubt(t) + seen[there].get(number, 0.0)
@@ -431,6 +431,16 @@ class Beam:
             moved.faults,
             moved.pieces.grown(place=option.place is None, dstate=option.dstate is None),
         )
+
+
+def _slips(moved: Hypothesis, t: int) -> bool:
+    """Whether the action that leads to step t, the last one, slipped."""
+    return moved.faults[-1:] == ((t - 1, "slipped"),)
+
+
+def _nats_of_misread(seen: dict[int, float]) -> float:
+    """What it costs that a dstate shows only one of the observations made there."""
+    return sum(seen.values()) - max(seen.values())
 
 
 def _shown(seen: dict[int, float]) -> int:
