@@ -41,7 +41,6 @@ USED = {
         "lazy",
         "core_guided",
         "annealed",
-        "threads",
         "greedy",
     },
     "full": {"prefixes", "path_names", "framing", "ways"},
@@ -53,7 +52,6 @@ USED = {
         "core_guided",
         "sides",
         "annealed",
-        "threads",
         "processes",
     },
 }

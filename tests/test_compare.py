@@ -16,7 +16,6 @@ from math import prod
 from pathlib import Path
 
 import aces
-import clingo
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -37,7 +36,6 @@ from ssh_abduction.rivals.questions import Matter, Question
 from ssh_abduction.rivals.table import Table
 from ssh_abduction.solver import find_backbone
 from ssh_abduction.solver import search as searching
-from ssh_abduction.solver.engines import framed_paths, name_search
 from ssh_abduction.solver.map_list import Priced
 from ssh_abduction.solver.sharing import Backbone, Sharing
 
@@ -394,27 +392,6 @@ def test_ids_and_their_order_are_the_same_in_each_run() -> None:
     ]
     assert runs[0] == runs[1]
     assert runs[0].count("[") == 2
-
-
-def test_the_order_of_a_complete_list_is_the_same_with_any_number_of_threads(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    given: list[int] = []
-    lists = []
-    for threads in (1, 4):
-
-        def give(control: clingo.Control, *, two: bool, threads: int = threads) -> None:
-            given.append(threads)
-            control.configuration.solve.parallel_mode = f"{threads},compete"  # type: ignore[union-attr]
-
-        for module in (framed_paths, name_search):
-            monkeypatch.setattr(module, "give_threads", give)
-        solution = solve(maze(5, 5, steps=100, seed=1, stars=True).trace, max_maps=None)
-        assert solution.complete
-        lists.append([m.id for m in solution.maps])
-    assert len(lists[0]) == 7
-    assert lists[0] == lists[1]
-    assert set(given) == {1, 4}
 
 
 def test_a_list_is_in_order_whatever_order_maps_are_found_in(

@@ -375,7 +375,6 @@ def test_general_stars_switch_off_what_knows_frames_of_four_slots() -> None:
     assert not any((on.names, on.ways, on.sides))
     assert on.prefixes
     assert on.path_names
-    assert on.threads
 
 
 # --- worlds

@@ -3,12 +3,9 @@ says so, whatever the guess."""
 
 from __future__ import annotations
 
-import math
-import time
 from collections.abc import Generator
 from functools import cache
 from itertools import pairwise
-from typing import Any
 from unittest.mock import Mock, patch
 
 import pytest
@@ -32,7 +29,6 @@ from ssh_abduction.solver.engines import (
     small_maps,
 )
 from ssh_abduction.solver.engines.base import Found
-from ssh_abduction.solver.engines.beside import Beside
 from ssh_abduction.solver.engines.causal import CausalEngine
 from ssh_abduction.solver.engines.nearby import NearbySearch
 from ssh_abduction.solver.engines.pinned import Pinned
@@ -57,7 +53,6 @@ def nearby_search(trace: Trace) -> NearbySearch:
     watch.start()
     return NearbySearch(
         watch,
-        Speedups(),
         Pinned(chart, clique, may_be),
         far=lambda node: chart.continuations.apart_from(node, actions=2),
         configuration="tweety",
@@ -91,11 +86,11 @@ def test_from_any_guess_to_a_minimal_map(trace: Trace, data: st.DataObject) -> N
 
 
 @settings(max_examples=15)
-@given(machines(), st.booleans(), st.integers(0, 10_000), st.data())
-def test_a_search_beside_another_changes_no_answer(
-    trace: Trace, beside: bool, cores: int, data: st.DataObject
+@given(machines(), st.integers(0, 10_000), st.data())
+def test_a_search_near_a_guess_changes_no_answer(
+    trace: Trace, cores: int, data: st.DataObject
 ) -> None:
-    """In a thread or before; from any guess, right or wrong."""
+    """From any guess, right or wrong."""
     expected = solve(trace, CAUSAL, max_maps=None, speedups=PLAIN)
     guess = data.draw(
         st.lists(st.integers(-1, 3), min_size=len(trace), max_size=len(trace)), label="guess"
@@ -110,7 +105,6 @@ def test_a_search_beside_another_changes_no_answer(
         ),
         patch.object(small_maps, "annealed", lambda *_, **__: Mock(labels=lambda _: guess)),
         patch.object(small_maps.Chart, "turned", turned),
-        patch.object(engine.Task, "has_processors", beside),
     ):
         found = solve(trace, CAUSAL, max_maps=most or None)
     assert found.status is Status.OPTIMAL
@@ -139,7 +133,7 @@ def test_some_maps_where_the_search_near_a_guess_has_the_proof(seed: int) -> Non
                 CAUSAL,
                 max_maps=most or None,
                 time_limit=60,
-                speedups=Speedups.without("clique,threads,prefixes"),
+                speedups=Speedups.without("clique,prefixes"),
             )
             for most in (5, 100)
         )
@@ -148,43 +142,6 @@ def test_some_maps_where_the_search_near_a_guess_has_the_proof(seed: int) -> Non
     for ssh_map in (*some.maps, *every.maps):
         assert check(trace, ssh_map, CAUSAL) == ()
         assert len(ssh_map.dstates) == every.bound.dstates
-
-
-def either_or(parts: int) -> Trace:
-    """In each part of this world there have to be two dstates that show A, or two that show B:
-    minimal maps have any number of either."""
-    views, actions = ["hall"], list[str]()
-    for part in range(parts):
-        p, c, d, e, f = (f"{name}{part}" for name in "pcdef")
-        tours = (
-            f"A x {p} t {c}",
-            f"A x {p} w {e}",
-            f"B z {p} t {c}",
-            f"B z {p} w {f}",
-            f"{p} t {d}",
-        )
-        for tour, text in enumerate(tours):
-            words = text.split()
-            actions += [f"to {part} {tour}", *words[1::2], "back"]
-            views += [*words[::2], "hall"]
-    return Trace.from_steps(views, [{"name": action} for action in actions])
-
-
-def test_all_ways_are_listed_whichever_views_need_more_names() -> None:
-    """What one answer needs is not taken back for what the next one needs: that would go on for
-    ever."""
-    trace = either_or(4)
-    expected = solve(trace, CAUSAL, max_maps=None)
-    searched = nearby_search(trace)
-    for _ in searched.fewer(expected.maps[0].labels):
-        pass
-    assert expected.cost
-    assert searched.bound == expected.cost.dstates
-    watch = Watch(100.0)
-    watch.start()
-    assert {tuple(labels) for labels in searched.listed(watch)} == {
-        ssh_map.labels for ssh_map in expected.maps
-    }
 
 
 def test_a_causal_maze_is_guessed_by_its_turns() -> None:
@@ -205,27 +162,16 @@ def test_a_causal_maze_is_guessed_by_its_turns() -> None:
     assert check(walk.trace, answer_maps.causal_map(found[-1], walk.trace), CAUSAL) == ()
 
 
-@pytest.mark.parametrize("beside", [True, False])
-def test_a_limit_leaves_the_small_map_found_beside(beside: bool) -> None:
+def test_a_limit_leaves_the_small_map_found_near_a_guess() -> None:
     """It has no more dstates than the states that the robot was in; what is merged at once has more
     than twice as many."""
     walk = maze(4, 4, steps=800, seed=1)
     best: list[int] = []
 
-    class Awaited(Beside):
-        """The other search goes on once there is a small map: it might be through before."""
-
-        def __init__(self, *arguments: Any) -> None:
-            super().__init__(*arguments)
-            while self.running and not best:
-                time.sleep(0.001)
-
     def stop(self: NearbySearch, *_: object) -> Generator[list[int], None, str]:
         """When there is a small map, the time is over."""
         best.append(len(set(self._labels)))
         limited.interrupt()
-        while not self._asker.watch.interrupted:
-            time.sleep(0.001)
         self._asker.watch.check()
         yield []
         return "open"
@@ -239,8 +185,7 @@ def test_a_limit_leaves_the_small_map_found_beside(beside: bool) -> None:
             lambda *_, **__: Mock(labels=lambda chart: _labels_of(chart, walk.truth, truth)),
         ),
         patch.object(NearbySearch, "_asked", stop),
-        patch.multiple(name_search, PATIENCE=1, CORES=1, Beside=Awaited),
-        patch.object(engine.Task, "has_processors", beside),
+        patch.multiple(name_search, PATIENCE=1, CORES=1),
     ):
         solution = limited.solution(tuple(limited))
     assert solution.stopped == "interrupted"
@@ -252,32 +197,6 @@ def test_a_limit_leaves_the_small_map_found_beside(beside: bool) -> None:
         < len(set(Log(walk.trace, CAUSAL).merged())) / 2
     )
     assert check(walk.trace, solution.maps[0], CAUSAL) == ()
-
-
-def test_where_clingo_would_prepare_for_too_long_the_search_beside_goes_on() -> None:
-    """Which proves here what the other one was stopped at."""
-    walk = maze(3, 3, steps=300, seed=0)
-    expected = solve(walk.trace, CAUSAL).cost
-    check_ahead = name_search.Incumbent.check_ahead
-    stopped = []
-
-    def stop(self: name_search.Incumbent, seconds: float) -> None:
-        if self.beside:
-            stopped.append(self)
-            seconds = math.inf
-        check_ahead(self, seconds)
-
-    with (
-        patch.multiple(name_search, PATIENCE=1),
-        patch.object(engine.Task, "has_processors", True),
-        patch.object(name_search.Incumbent, "check_ahead", stop),
-    ):
-        solution = solve(
-            walk.trace, CAUSAL, speedups=Speedups.without("prefixes"), max_maps=1, time_limit=100
-        )
-    assert stopped
-    assert solution.status is Status.OPTIMAL
-    assert solution.cost == expected
 
 
 def test_a_search_of_the_whole_trace_keeps_no_time_back() -> None:
@@ -311,21 +230,6 @@ def _labels_of(chart: Chart, states: tuple[object, ...], number: dict[object, in
     for node, state in zip(chart.node_of, states, strict=True):
         labels[node] = number[state]
     return labels
-
-
-def test_what_goes_wrong_in_the_thread_is_raised_where_the_result_is_asked_for() -> None:
-    trace = Trace.from_steps("abab", ["travel", "right", "travel"])
-
-    def found() -> Generator[list[int]]:
-        yield [0, 1, 0, 1]
-        raise ZeroDivisionError
-
-    beside = Beside(nearby_search(trace), Watch(), found())
-    while beside.running:
-        time.sleep(0.001)
-    with pytest.raises(ZeroDivisionError):
-        beside.check()
-    beside.end()
 
 
 @pytest.mark.parametrize(

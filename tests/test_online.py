@@ -326,7 +326,7 @@ def test_maps_are_guessed_while_the_robot_drives() -> None:
     walk = maze(4, 4, steps=70, seed=1, stars=True)
     trace = walk.trace
     with (
-        patch.object(guessing, "has_processors", lambda _: True),
+        patch.object(guessing, "has_processors", lambda: True),
         patch.object(guesser, "GUESSED", 55),
     ):
         mapper = OnlineMapper(
@@ -375,7 +375,7 @@ def test_a_map_that_is_contradicted_is_mended() -> None:
     assert without < 3 < contradicted
 
 
-@pytest.mark.parametrize("off", ["annealed", "threads", "processes"])
+@pytest.mark.parametrize("off", ["annealed", "processes"])
 def test_nothing_is_guessed_where_that_is_switched_off(off: str) -> None:
     trace = maze(2, 2, steps=60, seed=0, stars=True).trace
     with patch.object(guesser, "GUESSED", 10):
@@ -395,7 +395,7 @@ import threading
 from instances import maze
 from ssh_abduction import OnlineMapper
 from ssh_abduction.online import background_guess as guessing, guesser
-guessing.has_processors = lambda _: True
+guessing.has_processors = lambda: True
 guesser.GUESSED = 30
 
 def begun():
@@ -584,7 +584,7 @@ def test_maps_with_displacements_are_guessed_while_the_robot_drives() -> None:
         return (guessed_map if function is guessing.guessed_map else function)(*args)
 
     with (
-        patch.object(guessing, "has_processors", lambda _: True),
+        patch.object(guessing, "has_processors", lambda: True),
         patch.object(guessing, "in_process", at_once),
         patch.object(guesser, "GUESSED", 25),
         patch.object(annealing, "ANNEALED", ((0.5, 50),)),

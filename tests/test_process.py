@@ -132,10 +132,10 @@ def test_a_process_that_is_killed_stops_the_search() -> None:
 def test_what_is_left_of_the_memory_is_that_of_the_process() -> None:
     """Not what this one has used."""
     held = b"x" * (300 * 2**20)
-    beside = Watch(beside=Watch(memory=peak_memory() + 200))
-    assert in_process(use_memory, 10, watch=beside) == 10
+    limited = Watch(memory=peak_memory() + 200)
+    assert in_process(use_memory, 10, watch=limited) == 10
     with pytest.raises(LimitError, match="memory"):
-        in_process(use_memory, 400, watch=beside)
+        in_process(use_memory, 400, watch=limited)
     del held
 
 

@@ -12,6 +12,7 @@ from itertools import islice, product
 from pathlib import Path
 from unittest.mock import patch
 
+import aces
 import clingo
 import networkx as nx
 import numpy as np
@@ -23,6 +24,7 @@ from strategies import traces
 
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
+from ssh_abduction.cli import main
 from ssh_abduction.data import SolverError
 from ssh_abduction.solver import Search, Status, choosing
 from ssh_abduction.solver.asp.facts import answer_maps, names_lp
@@ -122,7 +124,7 @@ def test_names_read_from_where_actions_lead_are_those_read_whole(seed: int) -> N
         patch.multiple(name_search, PATIENCE=0, CORES=0),
         patch.object(names_lp.NameReader, "read", compared),
     ):
-        speedups = Speedups.without(("annealed", "threads"))
+        speedups = Speedups.without("annealed")
         assert solve(
             moore(8, 2, steps=60, seed=seed).trace, Theory.causal(), max_maps=20, speedups=speedups
         ).complete
@@ -286,6 +288,13 @@ def test_unknown_speedups_are_an_error() -> None:
         Speedups.without("magic")
 
 
+def test_a_removed_speedup_is_left_out_with_a_warning(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.warns(DeprecationWarning, match="threads is removed"):
+        assert Speedups.without("threads,lazy") == Speedups(lazy=False)
+    assert main(["solve", str(aces.PATH), "--set", "without_speedups=threads"]) == 0
+    assert "warning: speedups: threads is removed" in capsys.readouterr().err
+
+
 @settings(max_examples=8)
 @given(traces(max_steps=12))
 def test_steps_merged_by_evidence_make_a_map(trace: Trace) -> None:
@@ -320,9 +329,8 @@ def test_a_limit_leaves_a_map_of_merged_steps() -> None:
         patch.multiple(name_search, PATIENCE=1, CORES=1),
         patch.object(name_program.NameProgram, "more_links", side_effect=[[], KeyboardInterrupt]),
     ):
-        solution = solve(
-            walk.trace, Theory.causal(), speedups=Speedups.without("prefixes,annealed,threads")
-        )
+        speedups = Speedups.without("prefixes,annealed")
+        solution = solve(walk.trace, Theory.causal(), speedups=speedups)
     assert solution.status is Status.FEASIBLE
     assert solution.cost
     assert (
@@ -342,7 +350,7 @@ def test_a_limit_leaves_the_small_map_of_a_guess(seed: int) -> None:
         patch.object(annealing, "STEPS", ((0.75, 300),)),
         patch.object(NearbySearch, "_take", side_effect=KeyboardInterrupt),
     ):
-        solution = solve(walk.trace, Theory.causal(), speedups=Speedups.without("prefixes,threads"))
+        solution = solve(walk.trace, Theory.causal(), speedups=Speedups.without("prefixes"))
     assert solution.status is Status.FEASIBLE
     assert solution.cost
     assert solution.cost.dstates <= 1.2 * len(set(walk.truth))

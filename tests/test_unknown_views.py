@@ -148,7 +148,6 @@ def test_no_speedup_that_reads_views_is_on() -> None:
         "sides",
         "lazy",
         "core_guided",
-        "threads",
         "processes",
         "annealed",
         "greedy",

@@ -116,7 +116,7 @@ def test_reprs_are_short() -> None:
     )
     assert repr(SOLUTION.bound) == "Bound(dstates=19)"
     assert repr(Theory.topological()) == "Theory()"
-    assert repr(Speedups.without("threads")) == "Speedups(threads=False)"
+    assert repr(Speedups.without("sides")) == "Speedups(sides=False)"
     assert repr(RECTANGLE[0]) == "Step(view='v0', action='right')"
     assert (
         repr(solve(misread()[0], Theory.causal(), time_limit=1e-9))

@@ -170,6 +170,7 @@ def _main(arguments: Sequence[str] | None) -> int:
                 "send it to a file"
             )
         with telling(options, for_programs), warnings.catch_warnings(record=True) as caught:
+            warnings.filterwarnings("default", category=DeprecationWarning, module="ssh_abduction")
             try:
                 for note in options.notes:
                     print(f"ssh-abduction: warning: {note}", file=sys.stderr)

@@ -12,7 +12,7 @@ import ctypes
 import gc
 import sys
 from collections.abc import Callable, Generator, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -256,8 +256,6 @@ def run(options: argparse.Namespace) -> int:
             "leave it out for 1"
         )
     speedups = Speedups.without(options.without_speedups)
-    if options.scheduler or options.jobs not in (None, 1):
-        speedups = replace(speedups, threads=False)  # the cores are busy with other traces
     question = Question(
         theory_of(options),
         options.time_limit,

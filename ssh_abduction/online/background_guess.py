@@ -91,7 +91,7 @@ class MapGuess(BackgroundTask[SSHMap]):
         known: SSHMap | None = None,
     ) -> MapGuess | None:
         """Start and return the task; None with only one processor, or without guesses."""
-        wanted = speedups.annealed and speedups.processes and has_processors(speedups)
+        wanted = speedups.annealed and speedups.processes and has_processors()
         return MapGuess(steps, odometry, theory, speedups, known) if wanted else None
 
 

@@ -91,7 +91,7 @@ class BackgroundSolve(BackgroundTask[Solved]):
         trace: Trace, theory: Theory, maps: int | None, speedups: Speedups
     ) -> BackgroundSolve | None:
         """Start and return the task; None with only one processor, or without `processes`."""
-        can_begin = speedups.processes and has_processors(speedups)
+        can_begin = speedups.processes and has_processors()
         return BackgroundSolve(trace, theory, maps, speedups) if can_begin else None
 
 

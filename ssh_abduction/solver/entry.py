@@ -150,11 +150,7 @@ def find_backbone(
             return known
         engine = _labelling_engine(task, solution)
         judging = Judging(task.problem)
-        try:
-            proven = prove_backbone(task, judging, cost, sharing, engine)
-        finally:
-            if engine is not None:
-                engine.settle()
+        proven = prove_backbone(task, judging, cost, sharing, engine)
     # The search may have seen more maps than the solution holds.
     has_learnt = proven or sharing.maps > len(minimal)
     return sharing.backbone(proven=proven) if has_learnt else known

@@ -80,7 +80,6 @@ def by_count(parts: Parts, mended_maps: tuple[SSHMap, ...] | None) -> Generator[
         parts.watch.end_stage_after(math.inf)
     if limits.within and counted_first(parts.task.theory):
         engine = parts.prefixes.engine
-        engine.settle()
         parts.near = NearMinimal(parts.task, parts.judging, limits.most, parts.report, engine.asker)
         yield from parts.near.maps(known.cost, limits.within)
 

@@ -80,10 +80,6 @@ class Mending:
         """A lower bound on the cost of any map, in tenths of dstates; None if none is known yet."""
         return self._causal.bound
 
-    def settle(self) -> None:
-        """Stop clingo's search for causal maps."""
-        self._causal.settle()
-
     def maps(self) -> Iterator[Found]:
         """Yield maps of the whole trace, each better than the one before."""
         if self._task.theory.jumped and self._task.theory.star == "frame":

@@ -103,7 +103,6 @@ class Parts:
         self.watch.end_stage_after(math.inf)
         self.watch.stop()
         engine = self.prefixes.engine
-        engine.settle()
         self.known.raise_bound(engine.bound)
         self.rivals.engine = None if self.rivals.listed or not engine.intact else engine
 

@@ -169,7 +169,6 @@ class Prefixes:
         if self._tell(equalities):
             return
         _log.debug("%s cannot be told so: the readable encodings go on", type(self.engine).__name__)
-        self.engine.settle()
         size, theory = self.engine.size, self._task.theory
         self.engine = StepEngine(
             self._task, readable.most_paths(self._task.trace, theory, len(self._task.trace))

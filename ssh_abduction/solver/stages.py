@@ -112,7 +112,6 @@ class Stages:
             self.mended_maps = mending.minimal_maps(most and most + 1)
         finally:
             known.raise_bound(mending.bound)
-            mending.settle()
         if self.mended_maps:
             first = self.mended_maps[0]
             known.status = Status.OPTIMAL

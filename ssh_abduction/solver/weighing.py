@@ -182,10 +182,7 @@ class Weighing:
         engine = _engine(task, parts)
         engine.grow(len(task.trace))
         prefixes = Prefixes(task, Known(task.theory), judging, engine, 1, parts.report)
-        try:
-            last = prefixes.minimise()
-        finally:
-            prefixes.engine.settle()
+        last = prefixes.minimise()
         if last is None and not self.candidates:
             parts.known.status = Status.UNSATISFIABLE
             return

@@ -16,6 +16,7 @@ False
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from typing import Final
@@ -44,7 +45,6 @@ class Speedups:
     annealed: bool = True
     framing: bool = True
     ways: bool = True
-    threads: bool = True
     processes: bool = True
     greedy: bool = True
 
@@ -63,7 +63,8 @@ class Speedups:
         """Return Speedups that are all on except these.
 
         Args:
-            names: Names of fields, in a list or separated by commas.
+            names: Names of fields, in a list or separated by commas. A name of a removed speed-up
+                changes nothing, and gives a DeprecationWarning.
 
         Raises:
             SolverError: A name is unknown.
@@ -74,11 +75,14 @@ class Speedups:
             )
         off = [name for name in (names.split(",") if isinstance(names, str) else names) if name]
         for name in off:
-            if name not in SPEEDUPS:
+            if name in REMOVED:
+                text = f"speedups: {name} is removed, as it gained nothing; leave it out"
+                warnings.warn(text, DeprecationWarning, stacklevel=2)
+            elif name not in SPEEDUPS:
                 raise SolverError(
                     f"speedups: expected names out of {', '.join(SPEEDUPS)}, got {brief(name)}"
                 )
-        return cls(**dict.fromkeys(off, False))
+        return cls(**dict.fromkeys((name for name in off if name not in REMOVED), False))
 
     def that_hold_for(self, theory: Theory) -> Speedups:
         """Return these speed-ups without those that might change an answer for a theory.
@@ -102,6 +106,8 @@ def checked_speedups(value: object) -> Speedups:
 
 
 SPEEDUPS = tuple(f.name for f in fields(Speedups))
+# Speed-ups of version 0.1.0 that gained nothing.
+REMOVED = ("from_below", "apart", "small_cores", "watched", "one_by_one", "threads")
 
 
 @dataclass(frozen=True)
@@ -372,14 +378,6 @@ TABLE = (
         "core_guided",
         "core_guided",
         "Raise the bound from below, rather than better the map.",
-        _any_theory,
-        NOTHING,
-        EVERY,
-    ),
-    Speedup(
-        "threads",
-        "threads",
-        "Two threads, where a trace is hard and there are two processors.",
         _any_theory,
         NOTHING,
         EVERY,

@@ -16,7 +16,6 @@ from ssh_abduction.runtime.logs import log_of
 from ssh_abduction.solver.asp.limits import POLL, LimitError, Watch, peak_memory
 from ssh_abduction.solver.values import Grounding
 from ssh_abduction.theory import encodings
-from ssh_abduction.theory.speedups import Speedups
 
 # After grounding, clasp prepares the program and cannot be stopped. This takes about these shares
 # of the time and of the memory that grounding took. So begin no search if a limit would be reached
@@ -404,16 +403,8 @@ def new_control(encoding: str, base: str, options: Sequence[str]) -> Control:
     return control
 
 
-def give_threads(control: clingo.Control, *, two: bool) -> None:
-    """Let clasp search with one thread, or with two that exchange what they learn."""
-    configuration: Any = control.configuration.solve
-    configuration.parallel_mode = "2,compete" if two else "1"
-
-
-def has_processors(speedups: Speedups) -> bool:
-    """Whether a search may use two threads: the speed-up is on, and there are two processors."""
-    if not speedups.threads:
-        return False
+def has_processors() -> bool:
+    """Whether there are two processors, so that another process can work meanwhile."""
     from joblib import cpu_count  # loads slowly
 
     return bool(cpu_count() > 1)

@@ -68,8 +68,6 @@ class Watch:
         limit: float | None = None,
         memory: float | None = None,
         on_tick: Callable[[], None] = lambda: None,
-        *,
-        beside: Watch | None = None,
     ) -> None:
         """Set the limits. The clock stands still until `start`.
 
@@ -77,11 +75,7 @@ class Watch:
             limit: Seconds; None for no limit.
             memory: MiB that the process may use at its peak; None for no limit.
             on_tick: Called by `check` every TICK seconds, to report progress.
-            beside: The watch of a main search, if this one is for work that runs beside it; else
-                None. This watch then allows no uninterruptible work that would outlast the main
-                search.
         """
-        self._beside = beside
         self._on_tick = on_tick
         self._next_tick = TICK
         self._limit = limit
@@ -181,14 +175,12 @@ class Watch:
 
     def allows(self, seconds: float) -> bool:
         """Whether there is time for work that takes this many seconds and cannot be interrupted."""
-        if self._allowed is not None and self.elapsed() + seconds > self._allowed:
-            return False
-        return not seconds or self._beside is None or self._beside.left() >= seconds
+        return self._allowed is None or self.elapsed() + seconds <= self._allowed
 
     def memory_left(self) -> float | None:
         """The MiB that are left until the memory limit; None for no limit."""
         if self._memory is None:
-            return self._beside.memory_left() if self._beside else None
+            return None
         return self._memory - peak_memory()
 
     def left(self) -> float:

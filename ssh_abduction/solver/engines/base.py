@@ -8,7 +8,7 @@ from typing import Protocol
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.solver.asp.control import Asker, has_processors
+from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.engines.doubts import Settled
 from ssh_abduction.solver.steps.log import Log
@@ -88,11 +88,6 @@ class Task:
             watch or Watch(),
             speedups,
         )
-
-    @property
-    def has_processors(self) -> bool:
-        """Whether a search may use two threads: `threads` is on, and there are two processors."""
-        return has_processors(self.speedups)
 
 
 class Engine(Protocol):
@@ -180,13 +175,6 @@ class Engine(Protocol):
 
         Returns:
             False if the engine cannot forbid such equalities; then nothing has changed.
-        """
-        ...
-
-    def settle(self) -> None:
-        """Stop all threads of the engine after a search.
-
-        A thread that still runs clingo would abort Python at its exit.
         """
         ...
 

@@ -65,8 +65,5 @@ class CausalEngine:
         self._named.forbid_together([(equality.first, equality.second) for equality in equalities])
         return True
 
-    def settle(self) -> None:
-        self._named.settle()
-
     def _found(self, labels: Sequence[int]) -> Found:
         return Found.of(answer_maps.causal_map(labels, self._task.trace), self._task.theory)

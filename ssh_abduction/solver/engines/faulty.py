@@ -198,9 +198,6 @@ class FaultyEngine:
         )
         return True
 
-    def settle(self) -> None:
-        """Do nothing: clingo stops after each answer."""
-
     def _raise_bound(self, bound: Sequence[int]) -> None:
         """Take over a bound that clingo proved. What holds for the given steps holds for all."""
         if bound and self._most_faults is None:

@@ -21,10 +21,8 @@ contradicted, or there are too many visits. Then paths_framed.lp is asked which 
 clash is a minimal set of nodes whose labels no paths fit. visits.lp gets a rule that forbids it.
 Every map of the topological theory satisfies these rules, so the bounds still hold.
 
-*Beside.* If that takes long, a map is guessed. A second thread searches near the guess and proves
-how many dstates the causal axioms need (`engines/framed_guess.py`). It can then list all labels
-with that number of dstates. Each map of the topological theory has labels in this list. Other
-labels in it fit no frame or no paths, which paths_framed.lp detects.
+*A guess.* If that takes long, a map is guessed, and smaller maps are looked for near the guess
+(`engines/framed_guess.py`).
 
 *Why only some paths.* In a half explored world the causal axioms allow fewer dstates than order and
 sides do, in too many ways to forbid them one by one. The axioms of order and sides of one path need
@@ -41,7 +39,7 @@ from itertools import chain, islice
 from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.engines.base import Found, Task, next_charted_size
 from ssh_abduction.solver.engines.doubts import Settled
-from ssh_abduction.solver.engines.framed_guess import GuessBeside, SoonMaps
+from ssh_abduction.solver.engines.framed_guess import SoonMaps
 from ssh_abduction.solver.engines.framed_paths import Fitted, FramedPaths, Naming
 from ssh_abduction.solver.engines.refusing import all_accepted, first_accepted_of
 from ssh_abduction.solver.engines.sides import FramedSides
@@ -95,20 +93,13 @@ class FramedEngine:
         self._framed = True  # whether the visits fit their frames
         # The minimal cost, and all labels with maps of that cost.
         self._best: tuple[tuple[int, ...], list[Naming]] | None = None
-        self._beside, self._soon_maps = self._helpers()
+        self._soon_maps = self._new_soon_maps()
 
-    def _helpers(self) -> tuple[GuessBeside, SoonMaps]:
-        """Make the guess and the search for maps near it, for a new prefix."""
-        beside = GuessBeside(self._fitting, self._visits, self.asker)
-        soon_maps = SoonMaps(
-            self._fitting,
-            self._visits,
-            beside,
-            self.asker,
-            soon=self._soon,
-            refuse=self._refuse,
+    def _new_soon_maps(self) -> SoonMaps:
+        """Make the search for maps near a guess, for a new prefix."""
+        return SoonMaps(
+            self._fitting, self._visits, self.asker, soon=self._soon, refuse=self._refuse
         )
-        return beside, soon_maps
 
     @property
     def size(self) -> int:
@@ -152,10 +143,9 @@ class FramedEngine:
     def grow(self, size: int) -> None:
         """Make the first `size` steps the prefix."""
         if size != self.size:
-            self._beside.end()
             self._best = None
             self._fitting.forget_time()
-            self._beside, self._soon_maps = self._helpers()
+            self._soon_maps = self._new_soon_maps()
         self._framed = self._visits.grow(size)
         self._unframed_size = size
 
@@ -164,7 +154,6 @@ class FramedEngine:
         if not self._framed:
             return
         first = yield from self._first_with_paths()
-        self._beside.end()
         if first is None:
             return
         best = first.found
@@ -241,10 +230,6 @@ class FramedEngine:
             guess[node] = label
         return self._fitting.separate(chart, kept(chart.apart(), chart.links, guess))
 
-    def settle(self) -> None:
-        """Stop the search in the other thread."""
-        self._beside.end()
-
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
         """Yield the maps of the prefix that have this cost: `enough` of them, or all if it is 0."""
         if not self._framed:
@@ -280,15 +265,6 @@ class FramedEngine:
             besides: Labels to leave out: the dstate of each node.
         """
         known: set[Hashable] = {tuple(besides)}
-        if search := self._beside.proved(dstates):
-            # This search lists all labels, so it need not learn why some of them have no paths.
-            for labels in search.listed(self.asker.watch):
-                if tuple(labels) not in known:
-                    found = self._fitting.some(self._chart, labels)
-                    if found is not None:
-                        yield found.naming
-                known.add(tuple(labels))
-            return
         fitted: dict[tuple[int, ...], Fitted] = {}
 
         def why_not(labels: list[int]) -> list[int] | None:
@@ -319,7 +295,6 @@ class FramedEngine:
 
     def forbid(self, equalities: Collection[Equality]) -> bool:
         """Exclude all maps in which all of these equalities of steps hold, from now on."""
-        self._beside.forget()
         self._best = None
         self._fitting.forbidden.append(equalities)
         node_of = self._chart.node_of

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import clingo
 
-from ssh_abduction.solver.asp.control import Asker, give_threads, mapped
+from ssh_abduction.solver.asp.control import Asker, mapped
 from ssh_abduction.solver.asp.facts import names_lp, path_reader, paths_lp
 from ssh_abduction.solver.engines.base import Found, Task
 from ssh_abduction.solver.engines.doubts import Settled
@@ -146,25 +146,18 @@ class FramedPaths:
             control = self.control(naming.chart, naming.labels, ["--opt-strategy=usc"])
             yield from self.maps(replace(naming, control=control), "opt")
 
-    def maps(
-        self, naming: Naming, mode: str, conflicts: int = -1, *, beside: bool = False
-    ) -> Generator[Found, None, bool]:
+    def maps(self, naming: Naming, mode: str, conflicts: int = -1) -> Generator[Found, None, bool]:
         """Yield maps with these dstates.
 
         Args:
             naming: The dstate of each node, and the control if there is one.
             mode: Clingo's opt-mode; "ignore" for a single map.
             conflicts: Stop after this many conflicts; -1 for no limit.
-            beside: Whether another search runs in a second thread. Then clingo gets only one.
 
         Returns:
             Whether clingo ended before the limit of conflicts.
         """
         control = naming.control or self.control(naming.chart, naming.labels)
-        # Two threads would keep all maps that they list in memory, so they are only for improving.
-        many = len(set(naming.labels)) > MANY_DSTATES
-        two = mode == "opt" and many and not beside and self.task.has_processors
-        give_threads(control, two=two)
         reader = self._reader(naming, control)
         answers = self._asker.answers(
             reader.read,

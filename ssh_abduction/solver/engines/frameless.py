@@ -181,6 +181,3 @@ class FramelessEngine:
                 [labels for labels in self._best[1] if self._named.is_allowed(labels)],
             )
         return True
-
-    def settle(self) -> None:
-        self._named.settle()

@@ -33,9 +33,6 @@ def maps_with_frames(problem: Problem, watch: Watch, speedups: Speedups) -> Iter
     """
     task = Task.of(problem.changed(theory=problem.theory.with_frames()), watch, speedups)
     engine = FramedEngine(task, soon=0.0)
-    try:
-        engine.grow(len(problem.trace))
-        for found in engine.improving_maps():
-            yield found.map.without_headings()
-    finally:
-        engine.settle()
+    engine.grow(len(problem.trace))
+    for found in engine.improving_maps():
+        yield found.map.without_headings()

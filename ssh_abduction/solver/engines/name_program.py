@@ -7,7 +7,7 @@ is followed along the trace (`NameProgram.follow`). If it explains every link, i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, TypeAlias
 
@@ -91,7 +91,6 @@ class NameProgram:
         forbidden: list[list[tuple[int, int]]],
         *,
         fitting: Fitting | None,
-        check_ahead: Callable[[float], None],
     ) -> None:
         """Make a control that has the names, but no node yet.
 
@@ -102,12 +101,10 @@ class NameProgram:
             spares: The number of spare names of each view, not counting the rest.
             forbidden: The forbidden sets of pairs, as in the attribute.
             fitting: Further axioms for labels; None in the causal theory.
-            check_ahead: Called with the seconds that clingo cannot be stopped. Raises LimitError
-                if there is not enough time left.
         """
         self.pinned, self.forbidden = pinned, forbidden
         self._task, self._asker, self._fitting = task, asker, fitting
-        self._spares, self._check_ahead = spares, check_ahead
+        self._spares = spares
         self._known = self._new_control()
 
     @property
@@ -160,7 +157,7 @@ class NameProgram:
             ]
             cores = ["--opt-strategy=usc"] if self._task.speedups.core_guided else []
             base = names_lp.name_facts(names, spare.values(), self.chart.links, choices)
-            self._check_ahead(SECONDS_A_CHARACTER * len(base))
+            self._asker.watch.check(SECONDS_A_CHARACTER * len(base))
             self._asker.control = new_control("names", base, ["--eq=1", *cores])
             return _Known(spare, choices, np.zeros(len(seen), dtype=bool))
 
@@ -174,7 +171,7 @@ class NameProgram:
             self._asker.watch.check()
             with self._asker.grounding_timed():
                 self._give(added[start : start + AT_A_TIME])
-        self._check_ahead(PREPARING * (self._asker.ground_seconds - before))
+        self._asker.watch.check(PREPARING * (self._asker.ground_seconds - before))
 
     def add_links_at(self, nodes: Collection[int]) -> None:
         """Give clingo all links to and from these nodes that it lacks."""

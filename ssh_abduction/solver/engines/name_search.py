@@ -3,24 +3,20 @@
 Clasp raises the lower bound core by core. A core is a set of spare names that cannot all be left
 unused. Cores are small at first, as views share no names.
 
-Meanwhile another thread looks for small maps (`engines/small_maps.py`, `engines/nearby.py`). The
-search ends as soon as some map has as few dstates as the bound. With one processor, steps are
-merged at once, and the guess waits until raising the bound takes long. If no thread looks for
-small maps, clasp uses two threads, which exchange learned clauses.
+If that takes long, small maps are looked for (`engines/small_maps.py`, `engines/nearby.py`): first
+steps are merged, and later a map is guessed. The search ends as soon as some map has as few dstates
+as the bound.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import chain
 
-from ssh_abduction.solver.asp.control import Asker, give_threads
+from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.facts import names_lp
-from ssh_abduction.solver.asp.limits import POLL, LimitError, Watch
+from ssh_abduction.solver.asp.limits import LimitError
 from ssh_abduction.solver.engines.base import Task
-from ssh_abduction.solver.engines.beside import Beside
 from ssh_abduction.solver.engines.name_program import Fitting, NameProgram
 from ssh_abduction.solver.engines.refusing import first_accepted_of
 from ssh_abduction.solver.engines.small_maps import SmallMaps
@@ -28,70 +24,38 @@ from ssh_abduction.solver.steps.chart import Link
 
 # After this many conflicts clingo is given more links: too few links show soon.
 PATIENCE = 2000
-# After this many conflicts with all links and no other thread, look for a map near a guess. Then
-# clingo continues without a limit.
+# After this many conflicts with all links, look for a map near a guess. Then clingo continues
+# without a limit.
 CORES = 10_000
-# Without another thread, try this often with more conflicts: later tries rarely help.
+# Try this often with more conflicts near the guess: later tries rarely help.
 TRIES = 3
 
 
 class Incumbent:
-    """The best known labels, a lower bound, and a search beside that improves both.
+    """The best known labels and a lower bound.
 
     Attributes:
         bound: A lower bound on the dstates; None if unknown.
         labels: Labels of a map with few dstates; None if no map is known.
-        beside: A search near a guess in another thread; None without one.
     """
 
-    def __init__(self, asker: Asker, is_allowed: Callable[[Sequence[int]], bool]) -> None:
+    def __init__(self, is_allowed: Callable[[Sequence[int]], bool]) -> None:
         """Know nothing yet.
 
         Args:
-            asker: Its limits are checked.
             is_allowed: Whether labels agree with evidence about pairs of steps.
         """
         self.bound: int | None = None
         self.labels: list[int] | None = None
-        self.beside: Beside | None = None
-        self._asker, self._is_allowed = asker, is_allowed
+        self._is_allowed = is_allowed
 
     def raise_bound(self, bound: int) -> None:
         """Take this bound if it is higher."""
         self.bound = max(self.bound or 0, bound)
 
-    @property
-    def is_beside(self) -> bool:
-        """Whether the search beside is running."""
-        return self.beside is not None and self.beside.running
-
     def is_settled(self) -> bool:
         """Whether the known labels reach the bound."""
-        if self.beside is not None:
-            self.beside.check()
-            self.take(self.beside.labels, self.beside.bound)
         return self.labels is not None and len(set(self.labels)) <= (self.bound or 0)
-
-    def check_ahead(self, seconds: float) -> None:
-        """Raise LimitError if there is no time for work that cannot be interrupted.
-
-        First let the search beside use the time left.
-
-        Args:
-            seconds: How long the work takes.
-        """
-        if not self._asker.watch.allows(seconds):
-            while self.is_beside and not self.is_settled():
-                self._asker.watch.check()
-                time.sleep(POLL)
-        self._asker.watch.check(seconds)
-
-    def end_beside(self) -> None:
-        """End the search beside, and take its labels and bound."""
-        if self.beside is not None:
-            self.beside.end()
-            self.take(self.beside.labels, self.beside.bound)
-            self.beside = None
 
     def take(self, labels: list[int] | None, bound: int) -> None:
         """Take labels and a bound from a search near a guess, if better.
@@ -175,24 +139,18 @@ class NameSearch:
                     known.labels = labels
                     yield labels
         except (LimitError, KeyboardInterrupt) as end:
-            known.end_beside()
             if known.labels:
                 yield known.labels
             if isinstance(end, KeyboardInterrupt) or not known.is_settled():
                 raise
-        finally:
-            known.end_beside()
 
     def name_more(self, views: Collection[int]) -> None:
         """Add a spare name to each of these views."""
         self._program.name_more(views)
-        self._configure()
 
     def _searched(self) -> Iterator[list[int]]:
-        """As `improving`. End early if the search beside has the fewest dstates."""
+        """As `improving`. End early if a known map has the fewest dstates."""
         found = yield from first_accepted_of(self._cheapest_answer, self._why_not, self._tell_why)
-        if found is None:
-            self._incumbent.end_beside()
         yield found.labels if found else self._incumbent.labels or []
 
     def _cheapest_answer(self) -> Generator[list[int], None, _Answer | None]:
@@ -208,7 +166,6 @@ class NameSearch:
             if self._incumbent.is_settled():
                 return None
             self._program.add(self._program.more_links())
-            self._configure()
 
     def _cheapest(self, conflicts: int) -> tuple[dict[int, int] | None, bool]:
         """The best answer within this many conflicts, and whether it is proven to be the best."""
@@ -270,33 +227,15 @@ class NameSearch:
 
     def _helped(self) -> Iterator[list[int]]:
         """Labels of small maps found in other ways, as clingo's search takes long."""
-        if self._may_help and not self._hard:
-            yield from self._begin_help()
+        if self._may_help and not self._hard and not self._program.pinned.is_long:
+            yield from self._small.merged(self._asker.watch.check)
         self._hard = True
         if self._program.has_all_links and self._may_help and not self._had_all_help:
             self._had_all_help = True
-            if not self._task.has_processors:
-                yield from self._search_alone()
+            yield from self._near_a_guess()
 
-    def _begin_help(self) -> Iterator[list[int]]:
-        """Begin to look for small maps in another thread.
-
-        With one processor, yield labels of a map merged by evidence instead.
-        """
-        is_long = self._program.pinned.is_long
-        if self._task.has_processors:
-            watch = Watch(beside=self._asker.watch)
-            search = self._small.search(watch)
-            near = chain(
-                self._small.merged(watch.check), self._small.near_guess(search, watch.check)
-            )
-            found = self._small.from_beginning(watch.check) if is_long else near
-            self._incumbent.beside = Beside(search, watch, _ever_fewer(found))
-        elif not is_long:
-            yield from self._small.merged(self._asker.watch.check)
-
-    def _search_alone(self) -> Iterator[list[int]]:
-        """Look for small maps near a guess for a while, in this thread."""
+    def _near_a_guess(self) -> Iterator[list[int]]:
+        """Look for small maps near a guess for a while."""
         check, known = self._asker.watch.check, self._incumbent.labels
         if self._program.pinned.is_long:
             yield from _ever_fewer(self._small.from_beginning(check), known)
@@ -304,11 +243,6 @@ class NameSearch:
         search = self._small.search(self._asker.watch)
         yield from _ever_fewer(self._small.near_guess(search, check, TRIES), known)
         self._incumbent.take(None, search.bound or 0)
-
-    def _configure(self) -> None:
-        """Give clasp two threads if the search is hard and nothing runs beside."""
-        if self._hard and not self._incumbent.is_beside and self._task.has_processors:
-            give_threads(self._asker.control, two=True)
 
 
 def _ever_fewer(found: Iterable[list[int]], known: list[int] | None = None) -> Iterator[list[int]]:

@@ -85,7 +85,7 @@ class NamedLabels:
         """
         self.size = 0
         self._task, self._asker, self._given_map, self._fitting = task, asker, given_map, fitting
-        self._incumbent = Incumbent(asker, self.is_allowed)
+        self._incumbent = Incumbent(self.is_allowed)
         # Sets of pairs of steps. In no map are all pairs of one set at one dstate each.
         self._forbidden: list[list[tuple[int, int]]] = []
         self._pinned: Pinned | None = None
@@ -156,7 +156,6 @@ class NamedLabels:
             self._first_spares(pinned),
             self._forbidden,
             fitting=self._fitting,
-            check_ahead=known.check_ahead,
         )
         self._search = NameSearch(self._task, self._asker, self._program, known, self._fitting)
         links: Iterable[Link] = pinned.chart.links
@@ -197,10 +196,6 @@ class NamedLabels:
         if known.labels and not self.is_allowed(known.labels):
             known.labels = None
         self.program.tell_forbidden(len(self._forbidden) - 1)
-
-    def settle(self) -> None:
-        """Stop the search in the other thread."""
-        self._incumbent.end_beside()
 
     def all_of(self, dstates: int, enough: int) -> Generator[list[int], None, None]:
         """Yield all labels with this many dstates, each once. Labels already known come first.

@@ -1,7 +1,7 @@
 """Finds small maps near a guess, and proves that there are none with fewer dstates.
 
-It serves the causal theory, and the causal axioms of theories with frames. `NearbySearch` yields
-ever smaller maps. If it ends with a `bound`, the last map is minimal.
+It serves the causal theory. `NearbySearch` yields ever smaller maps. If it ends with a `bound`, the
+last map is minimal.
 
 If all steps were free to change their dstates, the search would take long. So most steps keep the
 dstates of a known map, and the search tries to save one dstate. If that is impossible, clingo
@@ -17,9 +17,6 @@ dstates in total.
 
 *Claim.* If there is no such map when everything is allowed, the known map is minimal.
 *Proof.* This is the question of `engines/naming.py` for a cost lower by one (see its claim). ∎
-
-If places have frames, the nodes are those of `Chart.framed`, and rotations are links. The maps then
-need not fit a frame, but the bound holds.
 """
 
 from __future__ import annotations
@@ -28,13 +25,12 @@ import random
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing
 from typing import Any, Literal, TypeAlias
 
 import clingo
 import numpy as np
 
-from ssh_abduction.solver.asp.control import Asker, give_threads, has_processors, new_control
+from ssh_abduction.solver.asp.control import Asker, new_control
 from ssh_abduction.solver.asp.facts import names_lp
 from ssh_abduction.solver.asp.facts.atoms import numbers
 from ssh_abduction.solver.asp.limits import Watch
@@ -46,8 +42,6 @@ from ssh_abduction.solver.engines.spare_names import (
     seen_labels,
 )
 from ssh_abduction.solver.steps.apart import Matrix
-from ssh_abduction.solver.steps.chart import numbered
-from ssh_abduction.theory.speedups import Speedups
 
 # At first, give up a question after this many conflicts. Each round of questions doubles it.
 CONFLICTS = 2000
@@ -77,7 +71,6 @@ class NearbySearch:
     def __init__(
         self,
         watch: Watch,
-        speedups: Speedups,
         pinned: Pinned,
         *,
         far: Callable[[int], Matrix] | None,
@@ -87,14 +80,13 @@ class NearbySearch:
 
         Args:
             watch: The limits.
-            speedups: The speed-ups that are on.
             pinned: The nodes, their links, and the clique of nodes that have names of their own.
             far: Returns flags of the nodes at other dstates than a node; None for no such pairs.
             configuration: A configuration of clasp; None for its default.
         """
         self.bound: int | None = None
         self._asker = Asker(watch)
-        self._speedups, self._pinned, self._far = speedups, pinned, far
+        self._pinned, self._far = pinned, far
         self._configuration = configuration
         self._names = SpareNames({}, frozenset(), (), {}, 0)
         self._labels: Labels = []
@@ -150,33 +142,6 @@ class NearbySearch:
                 if self._allowed is None:
                     yield from self._redrawn(CONFLICTS)
                 conflicts, failed = 2 * conflicts, failed + 1
-
-    def listed(self, watch: Watch) -> Iterator[list[int]]:
-        """Yield all labels with the fewest dstates. Some may come twice.
-
-        Args:
-            watch: The limits. `bound` must be known.
-        """
-        self._asker.watch = watch
-        assert self.bound is not None
-        spares = self.bound - len(self._pinned.clique)
-        while True:
-            give_threads(self._asker.control, two=has_processors(self._speedups))
-            with closing(
-                self._asker.answers(
-                    names_lp.read_names,
-                    f"enum,{spares},{spares}",
-                    0,
-                    assumptions=[self._names.ordered],
-                )
-            ) as answers:
-                for answer in answers:
-                    if resting := self._names.rests.intersection(answer.values()):
-                        break
-                    yield numbered(answer[node] for node in range(len(answer)))
-                else:
-                    return
-            self._name_more(resting)
 
     def _take(self, counts: Mapping[int, int]) -> None:
         """Make a new control with names and all links.

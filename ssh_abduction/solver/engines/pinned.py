@@ -9,7 +9,7 @@ import numpy as np
 
 from ssh_abduction.solver.engines.base import AT_ONCE
 from ssh_abduction.solver.steps.apart import Matrix
-from ssh_abduction.solver.steps.chart import Chart, FramedChart
+from ssh_abduction.solver.steps.chart import Chart
 from ssh_abduction.solver.steps.log import Log
 
 
@@ -40,16 +40,6 @@ class Pinned:
         clique = chart.continuations.clique() if largest else [0]
         columns = [chart.continuations.apart_from(step) for step in clique]
         return cls(chart, clique, _not_apart(np.stack(columns, axis=1)))
-
-    @classmethod
-    def framed(cls, chart: FramedChart, clique: Sequence[int]) -> Pinned:
-        """Give each node of a clique a name of its own, in a chart with frames.
-
-        Args:
-            chart: The chart of the nodes.
-            clique: Nodes that are pairwise distinct.
-        """
-        return cls(chart, clique, _not_apart(chart.apart(others=clique)))
 
     @property
     def is_long(self) -> bool:

@@ -49,13 +49,11 @@ class SmallMaps:
     def search(self, watch: Watch) -> NearbySearch:
         """A search near a guess, under these limits.
 
-        In the causal theory clasp's configuration `tweety` proves several times as soon as its
-        default. With frames its default is better, above all to list answers.
+        Clasp's configuration `tweety` proves several times as soon as its default.
         """
         chart = self._pinned.chart
         return NearbySearch(
             watch,
-            self._task.speedups,
             self._pinned,
             far=chart.continuations.excluded_from if chart.excluded else None,
             configuration="tweety",

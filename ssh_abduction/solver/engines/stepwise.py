@@ -172,9 +172,6 @@ class StepEngine:
         self.asker.control.ground([(part, [])])
         self.asker.control.assign_external(questions.of_number(*self._number), True)
 
-    def settle(self) -> None:
-        """Do nothing: clingo stops after each answer."""
-
     def _tell_forbidden(self, number: int) -> None:
         part = f"forbidden_{number}"
         self.asker.control.add(

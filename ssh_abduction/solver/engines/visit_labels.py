@@ -220,18 +220,25 @@ class VisitLabels:
             was stopped.
         """
         while not self._found:
-            if self.known and self.bound == len(set(self.known)):
+            if self.known and self._knows_fewest():
                 self._found.append(self.known)
                 break
             answer = first_accepted(
-                partial(self._best_answer, until), self.program.why_not, self._tell_why
+                partial(self._best_answer, lambda: self._knows_fewest() or until()),
+                self.program.why_not,
+                self._tell_why,
             )
             if answer is None:
                 return None
-            if answer.is_open:
+            if not answer.is_open:
+                self._found.append(self.program.labels(answer.located))
+            elif not self._knows_fewest():
                 return OPEN
-            self._found.append(self.program.labels(answer.located))
         return list(self._found[0])
+
+    def _knows_fewest(self) -> bool:
+        """Whether the known labels have as few dstates as the bound."""
+        return bool(self.known) and len(set(self.known or ())) == self.bound
 
     def _tell_why(self, reason: Refusal) -> None:
         """Give clingo what it lacked when it found a rejected answer: rules or visits."""
@@ -266,10 +273,8 @@ class VisitLabels:
             program.cores.relax(core)
             self._raise_bound()
 
-    def near(self, guess: Sequence[int]) -> Iterator[tuple[int, ...] | None]:
+    def near(self, guess: Sequence[int]) -> Iterator[tuple[int, ...]]:
         """Yield the labels of a guess, and then better and better labels near it.
-
-        Also yields None before each question, so that the caller can do other work meanwhile.
 
         At first clingo is asked for labels that put two visits at one place exactly if the guess
         does. If some places of the guess contradict each other, their visits become free. Once the
@@ -300,7 +305,6 @@ class VisitLabels:
                 patient = False
             if self.known and not patient:
                 patient, avoided = True, set(program.cores.avoided)
-            yield None
             pairs_found, core = self._asker.verdict(program.read, [*place_of, *avoided])
             if core is not None:
                 if fewer := [literal for literal in core if literal in avoided]:
