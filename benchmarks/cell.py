@@ -128,7 +128,7 @@ def of_solution(solution: Solution, trace: Trace, theory: Theory) -> dict[str, A
         "dstates": solution.cost.dstates if solution.cost else None,
         "bound": solution.bound.dstates,
         "proven": proven,
-        "prefix": solution.prefix,
+        "prefix": solution.effort.prefix,
         "ground": round(solution.seconds.ground, 5),
         "solve": round(solution.seconds.solve, 5),
     }

@@ -54,7 +54,7 @@ def main() -> None:
             base = base or seconds
             whole = f"{median(trace, theory, prefixes=False):.3f}" if steps <= AT_ONCE else "–"
             print(
-                f"{name:16} {steps:7} {solve(trace, theory).prefix:7} {seconds:8.3f} "
+                f"{name:16} {steps:7} {solve(trace, theory).effort.prefix:7} {seconds:8.3f} "
                 f"{seconds / base:13.1f} {whole:>11}"
             )
 

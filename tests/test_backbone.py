@@ -190,7 +190,7 @@ def test_every_engine_leaves_what_it_takes_to_reason(frame_after: float, engine:
     assert len(every.backbone.dstates.always) == len(trace)
     assert every.backbone.dstates.differing
     assert search._parts.rivals.sharing.maps < 16
-    assert (first.prefix < len(trace)) == (engine is StepEngine)
+    assert (first.effort.prefix < len(trace)) == (engine is StepEngine)
 
 
 def test_a_maze_with_stars_is_reasoned_about_by_its_labels() -> None:

@@ -78,3 +78,12 @@ def test_a_theory_is_read_from_a_file(tmp_path: Path, capsys: pytest.CaptureFixt
     toml.write_text("boundary = 3\n")
     assert main(["solve", ACES, "--theory", str(toml)]) == 1
     assert "mine.toml: boundary: expected one of" in capsys.readouterr().err
+
+
+def test_counts_of_a_search_are_read_by_their_old_names() -> None:
+    solution = solve(TRACE)
+    for name in ("prefix", "grounding", "evidence"):
+        with pytest.warns(DeprecationWarning, match=f"use Solution.effort.{name}"):
+            assert getattr(solution, name) == getattr(solution.effort, name)
+    with pytest.raises(AttributeError, match="'Solution' object has no attribute 'maze'"):
+        solution.maze  # type: ignore[attr-defined]  # noqa: B018

@@ -148,7 +148,7 @@ def test_a_square_whose_corners_look_alike_is_a_square() -> None:
     assert (solution.cost.dstates, solution.cost.places) == (8, 4)  # type: ignore[union-attr]
     assert solution.complete
     assert solution.count == 1
-    assert solution.evidence["displacement"]["pairs"] > 0
+    assert solution.effort.evidence["displacement"]["pairs"] > 0
     assert solution.maps[0].labels == tuple(step % 8 for step in range(19))
 
 

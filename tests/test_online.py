@@ -168,7 +168,7 @@ def test_circuits_are_replayed(theory: Theory) -> None:
     assert answers[-1].maps == solve(rectangle(800), theory).maps
     assert all(a.status is Status.OPTIMAL and a.complete for a in answers)
     assert mapper.searches < 12
-    assert mapper.solution.prefix < 16
+    assert mapper.solution.effort.prefix < 16
 
 
 def test_a_star_seen_from_another_side_is_no_contradiction() -> None:
@@ -549,8 +549,8 @@ def test_the_trace_settles_displacements_as_it_grows(
             anew.bound,
         )
         assert set(answer.maps) == set(anew.maps)
-        assert {name: said["pairs"] for name, said in answer.evidence.items()} == {
-            name: said["pairs"] for name, said in anew.evidence.items()
+        assert {name: said["pairs"] for name, said in answer.effort.evidence.items()} == {
+            name: said["pairs"] for name, said in anew.effort.evidence.items()
         }
     assert [answer.theory.displacement for answer in answers[:6]] == ["none"] * 4 + ["use"] * 2
     assert answers[3].theory.prefer[-1] == ("dstates" if theory.level == "causal" else "places")
@@ -626,6 +626,6 @@ def test_the_first_step_settles_the_stars() -> None:
 def test_the_same_steps_give_the_same_answers() -> None:
     trace = drive(*TOURS["plus"], stars=False)
     first, second = (
-        [(a.maps, a.cost, a.prefix) for a in follow(trace, Theory())[1]] for _ in range(2)
+        [(a.maps, a.cost, a.effort.prefix) for a in follow(trace, Theory())[1]] for _ in range(2)
     )
     assert first == second

@@ -62,7 +62,9 @@ def test_a_certificate_is_worked_out_when_asked_for(length: int) -> None:
     certificate = solution.certificate
     assert certificate is not None
     assert certificate.clique == tuple(
-        Continuations(log.seen[: solution.prefix], log.actions[: solution.prefix - 1]).clique()
+        Continuations(
+            log.seen[: solution.effort.prefix], log.actions[: solution.effort.prefix - 1]
+        ).clique()
     )
     assert solution.cost is not None
     assert certificate.bound == solution.cost.dstates

@@ -97,7 +97,7 @@ def test_prefixes_give_what_solving_at_once_gives(tour: str, theory: Theory) -> 
         at_once.bound,
         True,
     )
-    assert at_once.prefix == len(trace)
+    assert at_once.effort.prefix == len(trace)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -210,7 +210,7 @@ def test_a_number_of_maps_is_whole(maps: Any) -> None:
 @pytest.mark.parametrize("theory", THEORIES.values(), ids=THEORIES)
 def test_fifty_circuits_need_no_longer_prefix_than_two(theory: Theory) -> None:
     two, fifty = solve(rectangle(16), theory), solve(rectangle(400), theory)
-    assert fifty.prefix == two.prefix < 16
+    assert fifty.effort.prefix == two.effort.prefix < 16
     assert fifty.cost == two.cost
     assert len(fifty.maps[0].labels) == 401
     assert check(rectangle(400), fifty.maps[0], theory) == ()
@@ -222,7 +222,7 @@ def test_a_thousand_circuits(theory: Theory) -> None:
     solution = solve(trace, theory)
     assert solution.status is Status.OPTIMAL
     assert solution.complete
-    assert solution.prefix < 16
+    assert solution.effort.prefix < 16
     assert check(trace, solution.maps[0], theory) == ()
 
 
@@ -232,7 +232,7 @@ def test_a_surprise_after_many_circuits_is_not_missed() -> None:
     circuits = rectangle(48)
     surprised = Trace.from_steps([*circuits.views[:-1], "surprise"], circuits.actions)  # type: ignore[list-item]
     solution = solve(surprised, Theory.causal(), max_maps=None)
-    assert solution.prefix == len(surprised)
+    assert solution.effort.prefix == len(surprised)
     assert solution.status is Status.OPTIMAL
     for ssh_map in solution.maps:
         assert check(surprised, ssh_map, Theory.causal()) == ()

@@ -56,8 +56,8 @@ def headline(solution: Solution, count: int, explanation: Explanation | None) ->
         )
     why = f" ({solution.stopped})" if solution.stopped else ""
     seconds = (
-        f"{solution.seconds.total:.2f} s, {solution.prefix} of {solution.steps} steps given to "
-        "clingo"
+        f"{solution.seconds.total:.2f} s, {solution.effort.prefix} of {solution.steps} steps "
+        "given to clingo"
     )
     bound = ", ".join(
         f"at least {counted(v, k)}" if k != "cost" else f"a cost of at least {v:g} dstates"
@@ -109,7 +109,7 @@ def by_displacements(solution: Solution) -> Iterator[str]:
 
     There are no lines if displacements are not used.
     """
-    said = solution.evidence.get("displacement")
+    said = solution.effort.evidence.get("displacement")
     if said is None:
         return
     sets = f" and {counted(said['refused'], 'sets')} of two returns" if said["refused"] else ""

@@ -175,7 +175,7 @@ class MapKeeper:
             theory=self.theory,
             steps=steps,
             effort=Effort(
-                prefix=asked.prefix,
+                prefix=asked.effort.prefix,
                 seconds=Seconds(
                     time.perf_counter() - began,
                     asked.seconds.ground if was_asked else 0.0,
@@ -184,7 +184,7 @@ class MapKeeper:
                 evidence=said_by(
                     self._problem.evidence,
                     self.trace,
-                    {name: said["refused"] for name, said in asked.evidence.items()},
+                    {name: said["refused"] for name, said in asked.effort.evidence.items()},
                 ),
             ),
             stopped=None if minimal.complete else asked.stopped,

@@ -170,10 +170,12 @@ def _labelling_engine(task: Task, solution: Solution) -> Engine | None:
     engine = new_engine(task)
     if isinstance(engine, StepEngine):
         # The search needed only a prefix, or the theory has no such engine.
-        if not (takes_all(task) and task.speedups.ways and solution.prefix == solution.steps):
+        if not (
+            takes_all(task) and task.speedups.ways and solution.effort.prefix == solution.steps
+        ):
             return None
         from ssh_abduction.solver.engines.frameless import FramelessEngine  # loads numpy
 
         engine = FramelessEngine(task, solution.maps[0].labels)
-    engine.grow(solution.prefix)
+    engine.grow(solution.effort.prefix)
     return engine

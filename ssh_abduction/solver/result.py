@@ -6,9 +6,10 @@ Importing this module does not load clingo.
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.checker.claims import contradictions
 from ssh_abduction.checker.joins import Join, joins_by_minimality, sentence_of
@@ -42,7 +43,6 @@ from ssh_abduction.solver.values import (
     Bound,
     Cost,
     Effort,
-    Grounding,
     Level,
     Seconds,
     Status,
@@ -121,8 +121,8 @@ class Solution(MapSequence):
                 + cards.map_card(self.partial)
             )
         took = (
-            f"{self.seconds.total:.2f} s, {self.prefix} of {counted(self.steps, 'steps')} given "
-            "to clingo"
+            f"{self.seconds.total:.2f} s, {self.effort.prefix} of {counted(self.steps, 'steps')} "
+            "given to clingo"
         )
         return cards.card(self.headline, *parts, cards.paragraph(took))
 
@@ -318,28 +318,19 @@ class Solution(MapSequence):
         return len(self.maps)
 
     @property
-    def prefix(self) -> int:
-        """The number of first steps of the trace that were given to clingo."""
-        return self.effort.prefix
-
-    @property
     def seconds(self) -> Seconds:
         """The wall-clock time of the search: `total`, `ground` and `solve`, in seconds."""
         return self.effort.seconds
 
-    @property
-    def grounding(self) -> Grounding:
-        """The numbers of rules and atoms of the ground program that clingo solved last."""
-        return self.effort.grounding
+    if not TYPE_CHECKING:  # so that type checkers reject unknown attributes
 
-    @property
-    def evidence(self) -> Mapping[str, Mapping[str, int]]:
-        """For each kind of evidence, by name, how much it excluded.
-
-        "pairs" is the number of excluded pairs of steps. "refused" is the number of sets of
-        equalities that were rejected during the search.
-        """
-        return self.effort.evidence
+        def __getattr__(self, name):
+            """Return a count of `effort` by the name that it had in version 0.1.0."""
+            if name not in ("prefix", "grounding", "evidence"):
+                raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+            text = f"Solution.{name} is deprecated; use Solution.effort.{name}"
+            warnings.warn(text, DeprecationWarning, stacklevel=2)
+            return getattr(self.effort, name)
 
     def to_dict(self) -> dict[str, Any]:
         """The answer as plain data, as `solve --json` prints it (docs/reference/formats.md).

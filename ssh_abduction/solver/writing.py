@@ -89,8 +89,8 @@ def ending(solution: Solution, count: int, backbone: Backbone | None) -> dict[st
         "count": count,
         "cost": solution.cost.to_dict() if solution.cost else None,
         "bound": solution.bound.to_dict(),
-        "prefix": solution.prefix,
-        "grounding": asdict(solution.grounding),
+        "prefix": solution.effort.prefix,
+        "grounding": asdict(solution.effort.grounding),
         "seconds": {
             k: round(getattr(solution.seconds, k), 6) for k in ("total", "ground", "solve")
         },
@@ -118,8 +118,8 @@ def ending(solution: Solution, count: int, backbone: Backbone | None) -> dict[st
         end["stopped"] = solution.stopped
     if solution.partial:
         end["partial"] = solution.partial.to_dict()
-    if solution.evidence:
-        end["evidence"] = {name: dict(said) for name, said in solution.evidence.items()}
+    if solution.effort.evidence:
+        end["evidence"] = {name: dict(said) for name, said in solution.effort.evidence.items()}
     if solution.warnings:
         end["warnings"] = list(solution.warnings)
     if recorded is not None and recorded.explanation is not None:

@@ -223,17 +223,13 @@ class VisitLabels:
             if self.known and self._knows_fewest():
                 self._found.append(self.known)
                 break
-            answer = first_accepted(
-                partial(self._best_answer, lambda: self._knows_fewest() or until()),
-                self.program.why_not,
-                self._tell_why,
-            )
+            best = partial(self._best_answer, lambda: self._knows_fewest() or until())
+            answer = first_accepted(best, self.program.why_not, self._tell_why)
             if answer is None:
                 return None
-            if not answer.is_open:
-                self._found.append(self.program.labels(answer.located))
-            elif not self._knows_fewest():
+            if answer.is_open and not self._knows_fewest():
                 return OPEN
+            self._found += [] if answer.is_open else [self.program.labels(answer.located)]
         return list(self._found[0])
 
     def _knows_fewest(self) -> bool:
