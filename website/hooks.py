@@ -62,6 +62,8 @@ THEMES: dict[str, tuple[str, ...]] = {
             "Progress",
             "Backbone",
             "find_backbone",
+            "find_regions",
+            "with_regions",
             "fault_front",
         )
     ),

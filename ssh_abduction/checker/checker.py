@@ -16,7 +16,7 @@ The checker shares nothing with the encodings or the solver, so it catches their
 axioms are those of docs/explanation/theory.md, after Kuipers & Beeson (AAAI 2002) and Remolina &
 Kuipers (AIJ 2004). `AXIOMS` maps the name of each axiom to its check. The checks are in `causal`,
 `topological`, `sides`, `stars`, `clashes` and `evidence`; `coherence` checks that the map fits the
-trace.
+trace. `regions` checks the regions of a map that lists them.
 
 A map lists one place, one course (path and direction) and one heading for each dstate, even if the
 theory leaves out the axiom that forbids several. The other axioms are checked on the listed ones.
@@ -34,6 +34,7 @@ from ssh_abduction.checker import (
     clashes,
     coherence,
     evidence,
+    regions,
     sides,
     stars,
     topological,
@@ -86,7 +87,8 @@ def check(trace: Trace, ssh_map: SSHMap, theory: Theory | None = None) -> tuple[
     Returns:
         The violations; empty if the map is right. Violations of `map_explains_trace` come first:
         the map does not fit the trace, or its numbers do not fit each other. Violations of the
-        axioms follow in the order of the theory. Axioms that `unchecked` names are skipped.
+        axioms follow in the order of the theory; those of axioms about regions come last. Axioms
+        that `unchecked` names are skipped.
 
     Raises:
         TraceError, TheoryError: The trace lacks something that the theory needs.
@@ -119,6 +121,8 @@ def violations(trace: Trace, ssh_map: SSHMap, theory: Theory) -> Iterator[Violat
     checks = [(COHERENCE, test) for test in coherence.CHECKS] + [
         (name, AXIOMS[name]) for name in theory.axioms if name in AXIOMS
     ]
+    # Regions follow from a map and decide nothing. They are checked if the map lists them.
+    checks += [*regions.AXIOMS.items()] if ssh_map.regions is not None else []
     for name, test in checks:
         look_at_clock()
         for steps, message in test(reading):

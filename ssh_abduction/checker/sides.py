@@ -9,7 +9,7 @@ that takes part: leaving out any of them resolves the contradiction.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -68,7 +68,7 @@ class Conflict:
 _Right = Mapping[Course, Mapping[int, Branch]]
 
 
-def _branches(m: Reading) -> list[Branch]:
+def branches_of(m: Reading) -> list[Branch]:
     """List the branches that turns show, then those that the axiom symmetric_sides adds."""
     if "branch_side" not in m.axioms:
         return []
@@ -89,23 +89,35 @@ def _branches(m: Reading) -> list[Branch]:
     return list(found.values())
 
 
-def _right_of(m: Reading) -> dict[Course, dict[int, Branch]]:
-    """Find the places to the right of each course, each with the branch that leads to it."""
+def right_of(
+    m: Reading, after: Callable[[int, Course], Iterable[int]]
+) -> dict[Course, dict[int, Branch]]:
+    """Find the places to the right of each course, each with the branch that leads to it.
+
+    Args:
+        m: The reading.
+        after: Returns the places after a place on a course.
+    """
     excused = {frozenset(pair) for pair in m.map.excused if is_pair(pair)}
     if m.theory.boundary != "defeasible":
         excused = set()
     found: dict[Course, dict[int, Branch]] = defaultdict(dict)
-    for b in _branches(m) if "side_of_branch" in m.axioms else ():
-        path, direction = b.branch
-        if frozenset((b.course[0], path)) not in excused and path in m.orders:
-            for q in m.orders[path].after(b.place, direction):
+    for b in branches_of(m) if "side_of_branch" in m.axioms else ():
+        if frozenset((b.course[0], b.branch[0])) not in excused:
+            for q in after(b.place, b.branch):
                 found[b.course].setdefault(q, b)
     return found
 
 
+def _ahead(m: Reading, place: int, course: Course) -> Iterable[int]:
+    """Find the places after a place on a course, by the order that the map lists."""
+    path, direction = course
+    return m.orders[path].after(place, direction) if path in m.orders else ()
+
+
 def _conflicts(m: Reading) -> list[Conflict]:
     """Find the places whose sides contradict another axiom."""
-    right = _right_of(m)
+    right = right_of(m, partial(_ahead, m))
     disjoint = _both_sides(m, right) if "sides_disjoint" in m.axioms else ()
     between = _on_and_beside(m, right) if "path_between_sides" in m.axioms else ()
     return [*disjoint, *between]

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     )
     from ssh_abduction.data.maps import DState, Fault, Fit, MapPath, Pose, SSHMap
     from ssh_abduction.data.odometry import Odometry
+    from ssh_abduction.data.regions import Region
     from ssh_abduction.data.star import Star
     from ssh_abduction.data.trace import Action, Step, Trace
 
@@ -46,6 +47,7 @@ _HOMES = {  # module: the names that this package exports from it
         "SSHMap",
     ),
     "odometry": ("Odometry",),
+    "regions": ("Region",),
     "star": ("Star",),
     "trace": (
         "Action",
@@ -67,6 +69,7 @@ __all__ = [
     "Odometry",
     "Pose",
     "RangeError",
+    "Region",
     "SSHMap",
     "SolverError",
     "Star",

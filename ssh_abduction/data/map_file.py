@@ -14,6 +14,7 @@ from ssh_abduction.data.errors import MapError, brief, is_writable, named
 from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.data.files import HalfCharacter, NotFinite, parse_json, write_file
 from ssh_abduction.data.map_parts import FAULTS, DState, Fault, Fit, MapPath, Pose
+from ssh_abduction.data.regions import Region
 
 # What files of solutions and of single maps begin with.
 SOLUTION_FORMAT, MAP_FORMAT, VERSION = "ssh-solution", "ssh-map", 1
@@ -194,6 +195,7 @@ def map_fields(data: Any, where: str) -> dict[str, Any]:
             record, "faults", lambda x, name: _fault(read, x, len(labels), name), optional=True
         ),
         "fit": _fit(read, record, len(dstates)),
+        "regions": _regions(read, record, {*places}, {*path_ids}),
     }
 
 
@@ -270,6 +272,35 @@ def _fault(read: FieldReader, value: Any, steps: int, name: str) -> Fault:
     )
     cost = read.number(record.get("cost", 0), f"{name}.cost")
     return Fault(step, record["kind"], seen, expected, cost)
+
+
+def _regions(
+    read: FieldReader, record: Mapping[str, Any], places: set[int], paths: set[int]
+) -> tuple[Region, ...] | None:
+    """Convert and check the regions of a map; None if the file has none, as early versions."""
+    if record.get("regions") is None:
+        return None
+    return read.each(record, "regions", lambda r, name: _region(read, r, name, places, paths))
+
+
+def _region(read: FieldReader, value: Any, name: str, places: set[int], paths: set[int]) -> Region:
+    """Convert and check a region. Its places and paths must be those of the map."""
+    data = read.mapping(value, name)
+    number = int(name.removeprefix("regions[").removesuffix("]"))
+    if data.get("id") != number:
+        raise read.wrong(f"{name}.id", f"{number}, its number in the list", data.get("id"))
+    inner = FieldReader(f"{read.where}: {name}")
+    within = inner.each(data, "places", inner.integer)
+    bounds = inner.each(data, "bounds", lambda x, part: _pair(inner, x, part), optional=True)
+    inside = inner.each(data, "inside", inner.integer, optional=True)
+    door = inner.optional(data.get("door"), "door")
+    if not within or not {*within, *(() if door is None else (door,))} <= places:
+        raise inner.wrong("places", "some places of the map", [*within, door])
+    if any(h not in paths or d not in (1, -1) for h, d in bounds):
+        raise inner.wrong("bounds", "pairs of a path of the map and 1 or -1", [*bounds])
+    if any(not 0 <= i < number for i in inside):
+        raise inner.wrong("inside", "numbers of earlier regions", [*inside])
+    return Region(number, within, bounds, door, inside)
 
 
 def _fit(read: FieldReader, record: Mapping[str, Any], dstates: int) -> Fit | None:

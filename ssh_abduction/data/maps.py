@@ -7,7 +7,8 @@ renaming.
 
 Equality compares the dstates with their places and paths, the links, and the faults. It does not
 compare the orders of paths, the headings, and the excused pairs. These only show that the map is
-consistent, and for one map several may do so. Nor does equality compare the fit.
+consistent, and for one map several may do so. Nor does equality compare the fit, and the regions,
+which follow from the rest and the trace.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from ssh_abduction.data.map_file import (
 )
 from ssh_abduction.data.map_parts import FAULTS, DState, Fault, Fit, MapPath, Pose
 from ssh_abduction.data.notebook import in_output
+from ssh_abduction.data.regions import Region, renumbered, right_of
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted
 
@@ -75,6 +77,8 @@ class SSHMap:
             side_of_branch.
         fit: How well the map agrees with the displacements; None if none were used.
         faults: The parts of the trace that the map treats as wrong, sorted by step.
+        regions: Sets of places that directed paths bound, or that one place cuts off; the largest
+            first. None if they were not derived (`ssh_abduction.solver.find_regions`).
     """
 
     labels: tuple[int, ...]
@@ -85,6 +89,7 @@ class SSHMap:
     excused: tuple[tuple[int, int], ...] = field(default=(), compare=False)
     fit: Fit | None = field(default=None, compare=False)
     faults: tuple[Fault, ...] = ()
+    regions: tuple[Region, ...] | None = field(default=None, compare=False, repr=False)
 
     def __repr__(self) -> str:
         parts = [counted(len(self.dstates), "dstates")]
@@ -137,6 +142,29 @@ class SSHMap:
                 f"name a step of the trace that was mapped"
             )
         return self.dstates[self.labels[step]].place
+
+    def right_of(self, path: int, direction: int) -> tuple[int, ...]:
+        """Return the places that are known to lie right of a path in a direction.
+
+        Args:
+            path: The id of the path.
+            direction: +1 or -1. The places left of the path in +1 lie right of it in -1.
+
+        Raises:
+            MapError: The map has no such path or direction, or no regions.
+        """
+        known = [p.id for p in self.paths]
+        if not (is_whole(path) and path in known and is_whole(direction) and abs(direction) == 1):
+            raise MapError(
+                f"path, direction: expected the id of a path and 1 or -1, got {brief(path)} and "
+                f"{brief(direction)}; the map has the paths {brief(known)}"
+            )
+        if self.regions is None:
+            raise MapError(
+                "regions: expected a map with regions, got one without; "
+                "take ssh_abduction.solver.with_regions(map, trace)"
+            )
+        return right_of(self.regions, path, direction)
 
     @property
     def pieces(self) -> tuple[tuple[int, ...], ...]:
@@ -209,6 +237,9 @@ class SSHMap:
             excused=tuple((path.get(h, h), path.get(g, g)) for h, g in self.excused),
             fit=fit,
             faults=self.faults,
+            regions=None
+            if self.regions is None
+            else renumbered(self.regions, place, path, {h for h, d in faced.items() if d == -1}),
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -241,6 +272,8 @@ class SSHMap:
             data["faults"] = [
                 {k: v for k, v in asdict(fault).items() if v is not None} for fault in self.faults
             ]
+        if self.regions is not None:
+            data["regions"] = [region.to_dict() for region in self.regions]
         if self.fit:
             data["fit"] = self.fit.to_dict()
             data["poses"] = [

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.judging import InternalError, Judging
     from ssh_abduction.solver.ranking import Ranking
     from ssh_abduction.solver.recorded import drives_in, joins_in, theory_in
+    from ssh_abduction.solver.regions import find_regions, with_regions
     from ssh_abduction.solver.result import Solution
     from ssh_abduction.solver.search import Search
     from ssh_abduction.solver.sharing import SORTS, Backbone, Shared, Sharing, Sort, stretches
@@ -93,6 +94,10 @@ _HOMES = {  # module: the names that this package exports from it
         "drives_in",
         "joins_in",
         "theory_in",
+    ),
+    "regions": (
+        "find_regions",
+        "with_regions",
     ),
     "result": ("Solution",),
     "search": ("Search",),
@@ -181,6 +186,7 @@ __all__ = [
     "facts",
     "fault_front",
     "find_backbone",
+    "find_regions",
     "has_processors",
     "in_process",
     "joins_in",
@@ -191,6 +197,7 @@ __all__ = [
     "stretches",
     "summary_of",
     "theory_in",
+    "with_regions",
     "workers",
     "written_map",
 ]

@@ -214,7 +214,10 @@ class Search:
         return self._parts.engine.asker.grounding
 
     def __iter__(self) -> Iterator[SSHMap]:
-        return self._given(Ranking(self.trace) if self.theory.displacement == "use" else None)
+        from ssh_abduction.solver.regions import Deriving  # after the search, which needs none
+
+        ranking = Ranking(self.trace) if self.theory.displacement == "use" else None
+        return map(Deriving(self.trace, self.theory).mapped, self._given(ranking))
 
     def unranked(self) -> Iterator[SSHMap]:
         """Iterate over the maps in the order in which they are found, instead of over the search.

@@ -91,9 +91,9 @@ def folder() -> Path:
 
 
 def path(name: str) -> str:
-    """Return the path of a readable encoding or, if none has this name, of a fast one."""
-    readable = folder() / f"{name}.lp"
-    return str(readable if readable.exists() else folder() / "fast" / f"{name}.lp")
+    """Return the path of a readable encoding or, if none has this name, of another one."""
+    files = [folder() / part / f"{name}.lp" for part in ("", "derived", "fast")]
+    return str(next((file for file in files if file.exists()), files[-1]))
 
 
 @cache
@@ -120,6 +120,12 @@ def axioms() -> tuple[Axiom, ...]:
         for level in levels()
         for axiom in axioms_in((folder() / f"{level}.lp").read_text(encoding="utf-8"), level)
     )
+
+
+@cache
+def region_axioms() -> tuple[Axiom, ...]:
+    """Return the axioms by which regions follow from a map. No search for maps has them."""
+    return tuple(axioms_in(Path(path("regions")).read_text(encoding="utf-8"), "regions"))
 
 
 def axioms_in(text: str, level: str) -> list[Axiom]:

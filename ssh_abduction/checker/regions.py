@@ -1,0 +1,178 @@
+"""Checks of the axioms about regions: sets of places beside paths, or behind one place.
+
+The check derives all regions from the trace and the labels, and compares them with the listed ones.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TypeAlias
+
+from ssh_abduction.checker.moves import Course, along, course_of, opposite
+from ssh_abduction.checker.reading import Check, Found, Reading
+from ssh_abduction.checker.sides import Branch, right_of
+from ssh_abduction.data.regions import Region, listed
+
+_Places: TypeAlias = frozenset[int]
+_Node: TypeAlias = tuple[str, int]  # ("place", its id) or ("path", its id)
+
+
+def known_sides(m: Reading) -> Mapping[Course, Mapping[int, Branch]]:
+    """Find the places known to lie right of each course, each with the branch that leads to it.
+
+    Only travels tell the order of places here. The order that a map lists may have more, but then
+    another order would do as well.
+    """
+    follows: dict[Course, dict[int, set[int]]] = defaultdict(lambda: defaultdict(set))
+    for _, course, p, q in m.along_travels if "travel_orders" in m.axioms else ():
+        follows[course][p].add(q)
+        follows[opposite(course)][q].add(p)
+
+    def after(place: int, course: Course) -> set[int]:
+        next_of = follows[course]
+        reached = set(next_of[place])
+        waiting = list(reached) if "order_transitive" in m.axioms else []
+        while waiting:
+            new = next_of[waiting.pop()] - reached
+            reached |= new
+            waiting += new
+        return reached - {place}
+
+    return right_of(m, after)
+
+
+def _beside(m: Reading) -> dict[_Places, str]:
+    """Find the regions that single courses bound, each with a sentence."""
+    sides = m.once(known_sides)
+    return {
+        frozenset(places): f"They are what is known to lie right of {along(course)}."
+        for course, places in sides.items()
+        if places
+    }
+
+
+def _between(m: Reading) -> dict[_Places, str]:
+    """Find the regions that all courses beside a place bound together, each with a sentence."""
+    sides = m.once(known_sides)
+    found = {}
+    for p in {p for places in sides.values() for p in places}:
+        bounds = [set(places) for places in sides.values() if p in places]
+        places = frozenset(set.intersection(*bounds))
+        found[places] = f"They lie right of all the directed paths that place {p} lies right of."
+    return found
+
+
+def _behind(m: Reading) -> dict[_Places, int]:
+    """Find the regions that one place cuts off, each with this place."""
+    links = _links(m)
+    parts: dict[_Places, int] = {}
+    for node in [node for node in links if node[0] == "place"]:
+        behind = {_places(_reached(links, start, node)) for start in links[node]}
+        whole = 1 + len(frozenset().union(*behind))
+        parts |= {part: node[1] for part in behind if part and 2 * len(part) < whole}
+    return {
+        part: door
+        for part, door in parts.items()
+        if all(2 * len(part) <= len(around) for around in parts if part < around)
+    }
+
+
+def _links(m: Reading) -> dict[_Node, set[_Node]]:
+    """Link each place with its paths, and with the places that travels along no path reach."""
+    links: dict[_Node, set[_Node]] = defaultdict(set)
+    pairs = [
+        (("place", s.place), ("path", course[0]))
+        for s in m.states.values()
+        if s.place is not None and (course := course_of(s))
+    ]
+    for move in m.travels:
+        p, q = move.source.place, move.target.place
+        if p is not None and q is not None and p != q and course_of(move.source) is None:
+            pairs.append((("place", p), ("place", q)))
+    for one, other in pairs:
+        links[one].add(other)
+        links[other].add(one)
+    return links
+
+
+def _reached(links: Mapping[_Node, set[_Node]], start: _Node, closed: _Node) -> set[_Node]:
+    """Find the nodes that links lead to from a node, without a closed one."""
+    reached = {start}
+    waiting = [start]
+    while waiting:
+        new = links[waiting.pop()] - reached - {closed}
+        reached |= new
+        waiting += new
+    return reached
+
+
+def _places(nodes: Iterable[_Node]) -> _Places:
+    return frozenset(number for sort, number in nodes if sort == "place")
+
+
+def _bounds(m: Reading, places: _Places) -> set[Course]:
+    sides = m.once(known_sides)
+    return {course for course, beside in sides.items() if places <= beside.keys()}
+
+
+def _missing(m: Reading, expected: Mapping[_Places, str]) -> Found:
+    """Yield the regions that an axiom derives and the map does not list."""
+    there = {frozenset(region.places) for region in m.map.regions or ()}
+    for places, why in expected.items():
+        if places not in there:
+            yield _steps(m, places), f"The map lists no region of {_told(places)}. {why}"
+
+
+def _wrong(m: Reading, region: Region) -> Iterator[str]:
+    """Yield a sentence for each field of a region that is wrong."""
+    places = frozenset(region.places)
+    if set(region.bounds) != _bounds(m, places):
+        yield "is not right of exactly the directed paths that it lists"
+    if not {places} & {*m.once(_beside), *m.once(_between), *m.once(_behind)}:
+        yield "follows from no axiom"
+    regions = m.map.regions or ()
+    around = [r for r in regions if places < set(r.places)]
+    smallest = [r.id for r in around if not any(set(o.places) < set(r.places) for o in around)]
+    if sorted(region.inside) != sorted(smallest):
+        yield "is not inside exactly the regions that it lists"
+
+
+def region_beside(m: Reading) -> Found:
+    """Check that the places known to lie right of each directed path are a region."""
+    yield from _missing(m, m.once(_beside))
+    for region in m.map.regions or ():
+        for wrong in _wrong(m, region):
+            yield _steps(m, region.places), f"Region {region.id} {wrong}."
+
+
+def region_between(m: Reading) -> Found:
+    """Check that the places beside all the directed paths that a place is beside are a region."""
+    yield from _missing(m, m.once(_between))
+
+
+def region_behind(m: Reading) -> Found:
+    """Check that the places which one place cuts off are a region."""
+    doors = m.once(_behind)
+    yield from _missing(m, {p: f"All links to them lead through place {doors[p]}." for p in doors})
+    for region in m.map.regions or ():
+        if region.door not in (None, doors.get(frozenset(region.places))):
+            yield (
+                _steps(m, region.places),
+                f"Region {region.id} is not cut off by place {region.door}.",
+            )
+        elif region.door is None and frozenset(region.places) in doors:
+            yield _steps(m, region.places), f"Region {region.id} lists no door."
+
+
+def _steps(m: Reading, places: Iterable[int]) -> list[int]:
+    return [step for place in places for step in m.steps_at(place)]
+
+
+def _told(places: _Places) -> str:
+    return f"place{'' if len(places) == 1 else 's'} {listed(sorted(places))}"
+
+
+AXIOMS: dict[str, Check] = {
+    check.__name__: check for check in (region_beside, region_between, region_behind)
+}

@@ -1,0 +1,165 @@
+"""Regions of a map: sets of places that directed paths bound, or that one place cuts off.
+
+>>> regions = of_members({("beside", 0, 1): {4, 5}, ("between", 4): {4}, ("behind", 3): {4, 5}})
+>>> for region in regions:
+...     print(region)
+region 0: places 4 and 5, right of path 0+, behind place 3
+region 1: place 4, right of path 0+, in region 0
+
+A region bounded by directed paths is the set of places that are known to lie right of all of them.
+A place on no known side of a path is in no such region. A region behind a place can be left only
+through this place, as far as the robot knows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
+
+# What makes places a region: ("beside", path, direction), ("between", place) or ("behind", place).
+Reason: TypeAlias = tuple[str, int] | tuple[str, int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Region:
+    """A set of places of a map.
+
+    Attributes:
+        id: Its number. A region comes after all regions that contain it.
+        places: The ids of its places, ascending.
+        bounds: The directed paths, as pairs of a path and a direction (+1 or -1), that all its
+            places are known to lie right of.
+        door: The place through which all known ways lead to the region; None if there is none. The
+            door is not in the region.
+        inside: The ids of the smallest regions that contain all its places and more.
+    """
+
+    id: int
+    places: tuple[int, ...]
+    bounds: tuple[tuple[int, int], ...] = ()
+    door: int | None = None
+    inside: tuple[int, ...] = ()
+
+    def __str__(self) -> str:
+        places = f"place{'' if len(self.places) == 1 else 's'} {listed(self.places)}"
+        told = [f"region {self.id}: {places}"]
+        if self.bounds:
+            told.append(f"right of {listed(map(course_named, self.bounds))}")
+        if self.door is not None:
+            told.append(f"behind place {self.door}")
+        if self.inside:
+            plural = "" if len(self.inside) == 1 else "s"
+            told.append(f"in region{plural} {listed(self.inside)}")
+        return ", ".join(told)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the region as plain data, without fields that are empty."""
+        data: dict[str, Any] = {"id": self.id, "places": [*self.places]}
+        if self.bounds:
+            data["bounds"] = [[*course] for course in self.bounds]
+        if self.door is not None:
+            data["door"] = self.door
+        if self.inside:
+            data["inside"] = [*self.inside]
+        return data
+
+
+def of_members(members: Mapping[Reason, Collection[int]]) -> tuple[Region, ...]:
+    """Make regions of sets of places: one region of equal sets, and the order by inclusion.
+
+    Args:
+        members: For each reason, the places that it makes a region. An empty set makes none.
+
+    Returns:
+        The regions, the largest first. All directed paths that bound a set are its bounds.
+    """
+    right: dict[tuple[int, int], set[int]] = {}
+    doors: dict[frozenset[int], int] = {}
+    for reason, places in members.items():
+        if reason[0] == "beside" and len(reason) == 3 and places:
+            right[reason[1], reason[2]] = set(places)
+        elif reason[0] == "behind" and places:
+            doors[frozenset(places)] = reason[1]
+    sets = {frozenset(places) for places in members.values() if places}
+    ordered = sorted(sets, key=lambda places: (-len(places), sorted(places)))
+    return tuple(
+        Region(
+            i,
+            tuple(sorted(places)),
+            tuple(sorted(course for course, beside in right.items() if places <= beside)),
+            doors.get(places),
+            _smallest_around(places, ordered[:i]),
+        )
+        for i, places in enumerate(ordered)
+    )
+
+
+def _smallest_around(places: frozenset[int], before: Iterable[frozenset[int]]) -> tuple[int, ...]:
+    """Find which of the sets before contain these places, without those that contain another."""
+    around = {i: other for i, other in enumerate(before) if places < other}
+    return tuple(
+        i for i, other in around.items() if not any(within < other for within in around.values())
+    )
+
+
+def right_of(regions: Iterable[Region], path: int, direction: int) -> tuple[int, ...]:
+    """Find the places that are known to lie right of a path in a direction.
+
+    Args:
+        regions: The regions of a map.
+        path: The id of the path.
+        direction: +1 or -1. The places left of the path in direction +1 are right of it in -1.
+
+    Returns:
+        The ids of the places, ascending.
+    """
+    found = {q for r in regions if (path, direction) in r.bounds for q in r.places}
+    return tuple(sorted(found))
+
+
+def regions_at(regions: Iterable[Region], place: int) -> tuple[Region, ...]:
+    """Find the regions that contain a place, the largest first."""
+    return tuple(region for region in regions if place in region.places)
+
+
+def renumbered(
+    regions: Iterable[Region],
+    place: Mapping[int | None, int],
+    path: Mapping[int | None, int],
+    flipped: Collection[int | None],
+) -> tuple[Region, ...]:
+    """Return the same regions with other numbers of places and paths.
+
+    Args:
+        regions: The regions.
+        place: The new number of each place.
+        path: The new number of each path.
+        flipped: The old numbers of the paths whose directions are exchanged.
+    """
+    new = [
+        replace(
+            region,
+            places=tuple(sorted(place[p] for p in region.places)),
+            bounds=tuple(sorted((path[h], -d if h in flipped else d) for h, d in region.bounds)),
+            door=None if region.door is None else place[region.door],
+        )
+        for region in regions
+    ]
+    new.sort(key=lambda region: (-len(region.places), region.places))
+    number = {region.id: i for i, region in enumerate(new)}
+    return tuple(
+        replace(region, id=i, inside=tuple(sorted(number[k] for k in region.inside)))
+        for i, region in enumerate(new)
+    )
+
+
+def course_named(course: tuple[int, int]) -> str:
+    """Name a directed path: "path 2+" is path 2 in direction +1."""
+    return f"path {course[0]}{'+' if course[1] == 1 else '-'}"
+
+
+def listed(parts: Iterable[object]) -> str:
+    """List things in words: "1, 2 and 3"."""
+    *first, last = map(str, parts)
+    return f"{', '.join(first)} and {last}" if first else last

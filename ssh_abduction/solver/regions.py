@@ -1,0 +1,107 @@
+r"""Derive the regions of maps that were found. See encodings/derived/regions.lp for the axioms.
+
+>>> from ssh_abduction import Trace, solve
+>>> trace = Trace.from_steps("abcd", ["travel", "right", "travel"])
+>>> (corner,) = solve(trace)
+>>> print(*find_regions(corner, trace), sep="\n")
+region 0: place 0, right of path 1+, behind place 1
+region 1: place 2, right of path 0+, behind place 1
+>>> corner.right_of(0, 1)
+(2,)
+
+Regions follow from a map and its trace. They cannot change which maps there are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import replace
+from typing import TypeAlias
+
+from ssh_abduction.data.maps import SSHMap, check_of_trace, checked_map
+from ssh_abduction.data.regions import Region, of_members
+from ssh_abduction.data.trace import Trace, checked_trace
+from ssh_abduction.runtime.clock import look_at_clock
+from ssh_abduction.solver.asp.control import Control
+from ssh_abduction.solver.asp.facts.regions_lp import members_in, region_facts
+from ssh_abduction.theory import encodings
+from ssh_abduction.theory.settle import settle
+from ssh_abduction.theory.theory import Theory
+
+# A search derives the regions of its first maps, as far as this takes about a third of a second. To
+# derive those of n dstates takes about STARTING + n² units of 3.5 microseconds.
+UNITS, STARTING = 100_000, 1000
+
+_Key: TypeAlias = tuple[tuple[object, ...], ...]
+
+
+def find_regions(ssh_map: SSHMap, trace: Trace, theory: Theory | None = None) -> tuple[Region, ...]:
+    """Derive the regions of a map: places beside paths, and places behind one place.
+
+    Args:
+        ssh_map: A map of the trace.
+        trace: The trace. It tells which actions are turns.
+        theory: The theory of the map; Theory.topological() by default. Without its axioms about
+            sides, no place is known to lie beside a path.
+
+    Returns:
+        The regions, the largest first; empty if the map has no places.
+
+    Raises:
+        MapError: The map is not of the trace.
+        TraceError, TheoryError: The trace lacks something that the theory needs.
+
+    Reference:
+        Remolina & Kuipers 2004, "Towards a general theory of topological maps" (boundary regions).
+    """
+    checked_map(ssh_map)
+    check_of_trace([ssh_map], checked_trace(trace), "map", views=False)
+    theory = settle(trace, theory).theory
+    return derived(ssh_map, trace, axioms_for_regions(theory))
+
+
+def with_regions(ssh_map: SSHMap, trace: Trace, theory: Theory | None = None) -> SSHMap:
+    """Return the same map with its field `regions`, as `find_regions` derives them."""
+    return replace(ssh_map, regions=find_regions(ssh_map, trace, theory))
+
+
+def axioms_for_regions(theory: Theory) -> frozenset[str]:
+    """The names of the axioms that derive regions: those of the theory and those of regions.lp."""
+    return frozenset({*theory.axioms, *(axiom.name for axiom in encodings.region_axioms())})
+
+
+def derived(ssh_map: SSHMap, trace: Trace, axioms: Collection[str]) -> tuple[Region, ...]:
+    """Derive the regions of a map by these axioms."""
+    if not ssh_map.places:
+        return ()
+    look_at_clock()
+    control = Control()
+    control.load_encodings("regions")
+    control.add("base", [], region_facts(ssh_map, trace, axioms))
+    control.ground([("base", [])])
+    return of_members(members_in(control))
+
+
+class Deriving:
+    """Adds regions to the maps of one search. Maps with the same places and courses share them."""
+
+    def __init__(self, trace: Trace, theory: Theory) -> None:
+        self._trace = trace
+        self._axioms = axioms_for_regions(theory)
+        self._known: dict[_Key, tuple[Region, ...]] = {}
+        self._left = UNITS
+
+    def mapped(self, ssh_map: SSHMap) -> SSHMap:
+        """The same map with its regions; without them if it has no places, or too many dstates."""
+        key = (
+            tuple((s.place, s.path, s.direction) for s in ssh_map.dstates),
+            ssh_map.links,
+            ssh_map.excused,
+        )
+        if key not in self._known:
+            units = STARTING + len(ssh_map.dstates) ** 2
+            if units > self._left or not ssh_map.places:
+                return ssh_map
+            self._left -= units
+            self._known[key] = derived(ssh_map, self._trace, self._axioms)
+        return replace(ssh_map, regions=self._known[key])
