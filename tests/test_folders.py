@@ -29,7 +29,7 @@ def log_at(path: Path, content: str) -> str:
 
 def map_in(folder: Path, log: str, **more: object) -> None:
     """Leave what a finished run of this log leaves."""
-    run = {"settings": json.loads(json.dumps(QUESTION.settings)), "digest": digest(log), **more}
+    run = {"settings": json.loads(json.dumps(QUESTION.settings)), "digest": digest([log]), **more}
     write_run(folder, [("maps.json", b""), (RUN, json.dumps(run).encode())])
 
 
@@ -152,15 +152,15 @@ def test_a_log_that_is_not_there_takes_no_name(tmp_path: Path) -> None:
 def test_bags_whose_files_have_the_same_names_and_sizes_are_two_logs(tmp_path: Path) -> None:
     for name in "ab":
         log_at(tmp_path / name / "bag" / "bag_0.db3", name)
-    assert digest(str(tmp_path / "a" / "bag")) != digest(str(tmp_path / "b" / "bag"))
+    assert digest([str(tmp_path / "a" / "bag")]) != digest([str(tmp_path / "b" / "bag")])
 
 
 def test_an_interrupted_run_is_not_done(tmp_path: Path) -> None:
     log = log_at(tmp_path / "run.log", "x")
     map_in(tmp_path / "whole", log, interrupted=False)
     map_in(tmp_path / "part", log, interrupted=True)
-    assert is_done(tmp_path / "whole", log, QUESTION.settings)
-    assert not is_done(tmp_path / "part", log, QUESTION.settings)
+    assert is_done(tmp_path / "whole", [log], QUESTION.settings)
+    assert not is_done(tmp_path / "part", [log], QUESTION.settings)
 
 
 @pytest.mark.parametrize("at", range(1, 5))

@@ -210,7 +210,13 @@ def test_maps_of_logs_say_it_too() -> None:
     log = MagicMock(warnings=(), __len__=lambda _: 9)
     files = {"run.json": b'{"log": {}}'}
     done = MagicMock(
-        solution=solution, imported=imported, seconds={}, notes=(), files=lambda: dict(files)
+        solution=solution,
+        imported=imported,
+        log=log,
+        seconds={},
+        notes=(),
+        joined="",
+        files=lambda: dict(files),
     )
     question = MapQuestion(None, {}, {}, 0.5, None, 0, ladder=False)
-    assert told in question._told(0, "a.log", log, done, None).line
+    assert told in question._told(0, ["a.log"], done, None).line

@@ -55,6 +55,7 @@ class Imported:
         visits: Stays at distinctive places, in order.
         seconds: Processor time in seconds, by stage: track, places, trace, views.
         notes: Sentences on suspicious features of the odometry and the track.
+        starts: Scans, besides the first one, at which a drive starts.
     """
 
     trace: Trace
@@ -63,6 +64,7 @@ class Imported:
     visits: tuple[Visit, ...]
     seconds: Mapping[str, float]
     notes: tuple[str, ...] = ()
+    starts: tuple[int, ...] = ()
 
 
 def import_log(

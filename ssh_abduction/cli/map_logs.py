@@ -14,7 +14,8 @@ def add_parser(verbs: Verbs) -> None:
         "Find the minimal maps of a building from a robot's log. Writes trace.jsonl, "
         "maps.json, page.html, report.html and run.json into a folder. With several logs, "
         "each gets its own folder, and its result is one line. Logs that are already mapped with "
-        "the same settings are skipped."
+        "the same settings are skipped. With --together, the logs are drives through one building, "
+        "and get one map."
     )
     parser = verbs.add_parser("map", help="map a building from a robot's log", description=text)
     parser.add_argument(
@@ -25,6 +26,11 @@ def add_parser(verbs: Verbs) -> None:
             "a CARMEN log, a g2o-style log with scans, a ROS 1 bag, a ROS 2 bag or MCAP; may be "
             "compressed by gzip, bzip2, xz or zstd"
         ),
+    )
+    parser.add_argument(
+        "--together",
+        action="store_true",
+        help="the logs are drives through one building: find their joint maps",
     )
     parser.add_argument(
         "-o",

@@ -11,7 +11,7 @@ import contextlib
 import hashlib
 import json
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,7 +24,14 @@ from ssh_abduction.cli.import_log import WIDTH, named_after, reading_of
 from ssh_abduction.cli.jobs import StopFlag, answers_here, final_code, in_a_line
 from ssh_abduction.cli.options import choices_of, theory_of
 from ssh_abduction.cli.outcome import exit_code, on_ctrl_c, warn
-from ssh_abduction.cli.run_folders import check_folder, digest, folders_of, is_done, write_run
+from ssh_abduction.cli.run_folders import (
+    check_folder,
+    digest,
+    distinct,
+    folders_of,
+    is_done,
+    write_run,
+)
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import AbductionError, SolverError, named
 from ssh_abduction.runtime.program import interrupted_code
@@ -32,7 +39,6 @@ from ssh_abduction.solver import Stop, check_limit, workers
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
-    from perception.readers.scans import RobotLog
     from ssh_abduction.robot_logs.log_maps import LogMap, LogMapping
 from ssh_abduction.robot_logs.log_picture import paths_mean_something
 
@@ -128,59 +134,79 @@ class MapQuestion:
         try:
             if given_up():
                 return self._given_up(number, path)
+            rest = (given_up, answer_last, tell)
             if content is None:
-                return self._mapped(number, path, path, digest(path), given_up, answer_last, tell)
+                return self._mapped(number, [path], [path], digest([path]), *rest)
             sent = hashlib.sha256(content).hexdigest()
-            if Path(path).exists() and digest(path) == sent:
-                return self._mapped(number, path, path, sent, given_up, answer_last, tell)
+            if Path(path).exists() and digest([path]) == sent:
+                return self._mapped(number, [path], [path], sent, *rest)
             with tempfile.TemporaryDirectory() as folder:
                 here = Path(folder) / Path(path).name[-KEPT:]
                 here.write_bytes(content)
-                return self._mapped(number, path, str(here), sent, given_up, answer_last, tell)
+                return self._mapped(number, [path], [str(here)], sent, *rest)
         except Exception as error:  # one bad log must not stop the others
             return self.failed(number, path, error)
+
+    def answer_together(
+        self,
+        paths: Sequence[str],
+        answer_last: Callable[[MapAnswer], None],
+        tell: Callable[[str], None],
+    ) -> MapAnswer:
+        """Map the logs of several drives through one building together.
+
+        Args:
+            paths: The files or folders of the logs, one a drive.
+            answer_last: As in `answer`.
+            tell: As in `answer`.
+
+        Raises:
+            AbductionError: A log cannot be read or imported, or the logs do not go together.
+        """
+        return self._mapped(0, paths, paths, digest(paths), lambda: False, answer_last, tell)
 
     def _mapped(
         self,
         number: int,
-        path: str,
-        here: str,
+        paths: Sequence[str],
+        files: Sequence[str],
         content: str | None,
         given_up: Callable[[], bool],
         answer_last: Callable[[MapAnswer], None],
         tell: Callable[[str], None],
     ) -> MapAnswer:
-        """Map one log.
+        """Map one log, or several together.
 
         Args:
             number: The index of the log.
-            path: The log as the user named it.
-            here: The file to read, which may be a copy.
-            content: The digest of the log before it is read; None if there is none. If the log
-                changes later, the next call sees another digest and maps the log again.
+            paths: The logs as the user named them.
+            files: The files to read, which may be copies.
+            content: The digest of the logs before they are read; None if there is none. If a log
+                changes later, the next call sees another digest and maps them again.
             given_up: Returns whether the answer is not needed any more.
             answer_last: Takes the answer if the process has to end because clingo does not stop.
             tell: Takes each warning about the log as soon as it is known.
         """
-        begun: list[tuple[RobotLog, LogMapping]] = []  # one entry, once the log is read
+        begun: list[LogMapping] = []  # one entry, once the logs are read
+        names = [named_after(path) for path in paths]
 
         def interrupt() -> None:
-            for _, mapping in begun:
+            for mapping in begun:
                 mapping.interrupt()
 
         def end() -> None:
             # End at once if nothing is known yet, or if this is the second Ctrl-C.
-            if not begun or begun[0][1].search is None or begun[0][1].interrupted:
+            if not begun or begun[0].search is None or begun[0].interrupted:
                 raise KeyboardInterrupt
             interrupt()
 
         def last_words(_: Stop) -> tuple[MapAnswer, int]:
             known = [
-                self._told(number, path, log, mapping.known(), content)
-                for log, mapping in begun
+                self._told(number, paths, mapping.known(), content)
+                for mapping in begun
                 if mapping.search is not None
             ]
-            return known[0] if known else self._given_up(number, path), interrupted_code()
+            return known[0] if known else self._given_up(number, paths[0]), interrupted_code()
 
         guard = Guard(interrupt, last_words, None, None, given_up=given_up, print_last=answer_last)
         # A worker process does not handle Ctrl-C: its parent stops it.
@@ -189,40 +215,49 @@ class MapQuestion:
                 from perception.readers.logs import read_log
                 from ssh_abduction.robot_logs.log_maps import LogMapping, map_log
 
-                log = read_log(here, **self.reading)
-                begun.append((log, LogMapping()))
-                for warning in log.warnings:
-                    tell(warning)
+                logs = [read_log(file, **self.reading) for file in files]
+                begun.append(LogMapping())
+                for log, name in zip(logs, names, strict=True):
+                    for warning in log.warnings:
+                        tell(warning if len(logs) == 1 else f"{name}: {warning}")
                 done = map_log(
-                    log,
+                    logs if len(logs) > 1 else logs[0],
                     self.theory,
                     choices=self.choices,
                     width=self.width,
-                    name=named_after(path),
+                    name=names if len(logs) > 1 else names[0],
                     time_limit=self.limit,
                     max_maps=self.maps or None,
                     with_ladder=self.ladder,
-                    mapping=begun[0][1],
+                    mapping=begun[0],
                     tell=tell,
                 )
-            return self._told(number, path, log, done, content)
+            return self._told(number, paths, done, content)
 
     def _told(
-        self, number: int, path: str, log: RobotLog, done: LogMap, content: str | None
+        self, number: int, paths: Sequence[str], done: LogMap, content: str | None
     ) -> MapAnswer:
-        """Make the answer for a log that was mapped."""
-        files = done.files()
+        """Make the answer for a log that was mapped, or for several that were mapped together."""
+        files, log = done.files(), done.log
         run = json.loads(files["run.json"])
-        run["log"]["source"], run["settings"], run["digest"] = path, self.settings, content
+        run["log"]["source"], run["settings"], run["digest"] = (
+            " + ".join(paths),
+            self.settings,
+            content,
+        )
+        for drive, path in zip(run.get("drives", ()), paths, strict=False):
+            drive["source"] = path
         files["run.json"] = (json.dumps(run, indent=2, ensure_ascii=False) + "\n").encode()
         cost, solution = done.solution.cost, done.solution
-        paths = (
+        told_paths = (
             f"{counted(cost.paths, 'paths')}, " if cost and paths_mean_something(solution) else ""
         )
         found = (
             "no map"
             if cost is None
-            else (f"{counted(cost.places, 'places')}, {paths}{counted(cost.dstates, 'dstates')}")
+            else (
+                f"{counted(cost.places, 'places')}, {told_paths}{counted(cost.dstates, 'dstates')}"
+            )
         )
         how = (
             f"{solution.status.value}, {solution.weighed.sentence}"
@@ -232,9 +267,11 @@ class MapQuestion:
         )
         if told := sentence_of(solution.by_minimality, solution.count):
             how += f"; {told}"
-        total = sum(done.seconds.values())
+        if done.joined:
+            how += f"; {done.joined}"
+        total, visits = sum(done.seconds.values()), counted(len(done.imported.visits), "visits")
         line = (
-            f"{named(path)}: {found}; {how}; {counted(len(done.imported.visits), 'visits')} in "
+            f"{' + '.join(map(named, paths))}: {found}; {how}; {visits} in "
             f"{counted(len(log), 'scans')}, {done.imported.track.way[-1]:.0f} m; {total:.1f} s"
         )
         code = interrupted_code() if done.interrupted else exit_code(solution)
@@ -299,6 +336,8 @@ def run(options: argparse.Namespace) -> int:
         options.maps,
         options.ladder,
     )
+    if options.together:
+        return _together(question, options)
     folders, same = folders_of(options.logs, Path(options.output))
     for path, other in same.items():
         print(f"{named(path)}: the same log as {named(other)}, in {named(str(folders[other]))}")
@@ -306,13 +345,13 @@ def run(options: argparse.Namespace) -> int:
     left = [
         path
         for path in folders
-        if options.again or not is_done(folders[path], path, question.settings)
+        if options.again or not is_done(folders[path], [path], question.settings)
     ]
     for path in folders:
         if path not in left:
             print(f"{named(path)}: done already, in {named(str(folders[path]))}")
     if len(options.logs) == 1 and options.jobs is None and options.scheduler is None:
-        return _alone(question, left, folders)
+        return max([0, *(_here(question, [path], folders[path]) for path in left)])
     codes: list[int] = []
     asked = len(left)
     for path in [*left]:
@@ -332,16 +371,38 @@ def run(options: argparse.Namespace) -> int:
     return final_code(codes, asked, stop, "logs")
 
 
-def _alone(question: MapQuestion, left: list[str], folders: dict[str, Path]) -> int:
-    """Map a single log in this process, and return the exit code.
+def _together(question: MapQuestion, options: argparse.Namespace) -> int:
+    """Map all logs together, and return the exit code."""
+    if options.jobs is not None or options.scheduler is not None:
+        raise AbductionError(
+            "--together: expected one search for all logs, got --jobs or --scheduler; leave "
+            "them out"
+        )
+    logs, same = distinct(options.logs)
+    warn([f"{named(log)}: the same log as {named(other)}; it is left out" for log, other in same])
+    names: dict[str, str] = {}
+    for log in logs:
+        if (other := names.setdefault(named_after(log), log)) != log:
+            raise AbductionError(
+                f"{named(log)}: expected another name than that of {named(other)}, as logs name "
+                "the drives; rename one of them"
+            )
+    folder = Path(options.output)
+    if not options.again and is_done(folder, logs, question.settings):
+        print(f"{counted(len(logs), 'logs')}: done already, in {named(str(folder))}")
+        return 0
+    return _here(question, logs, folder)
+
+
+def _here(question: MapQuestion, logs: Sequence[str], folder: Path) -> int:
+    """Map a log, or several together, in this process, and return the exit code.
 
     Args:
         question: The settings.
-        left: The log; empty if it is already mapped.
-        folders: The folder of each log.
+        logs: The logs, one a drive.
+        folder: The folder to write.
     """
-
-    told: set[str] = set()  # warnings that were printed while the log was mapped
+    told: set[str] = set()  # warnings that were printed while the logs were mapped
 
     def tell(warning: str) -> None:
         told.add(warning)
@@ -351,19 +412,19 @@ def _alone(question: MapQuestion, left: list[str], folders: dict[str, Path]) -> 
         if answer.code == EXIT_ERROR:
             raise AbductionError(answer.line)
         try:
-            write_run(folders[left[0]], answer.files)
+            write_run(folder, answer.files)
         except OSError as error:
-            raise AbductionError(unwritten(error, folders[left[0]])) from None
-        _say(answer, folders[left[0]])
+            raise AbductionError(unwritten(error, folder)) from None
+        _say(answer, folder)
         warn([warning for warning in answer.warnings if warning not in told])
 
-    codes = [0]
-    for path in left:
-        check_folder(folders[path])
-        answer = question.answer(0, path, answer_last=keep, tell=tell)
-        keep(answer)
-        codes.append(answer.code)
-    return max(codes)
+    check_folder(folder)
+    if len(logs) == 1:
+        answer = question.answer(0, logs[0], answer_last=keep, tell=tell)
+    else:
+        answer = question.answer_together(logs, answer_last=keep, tell=tell)
+    keep(answer)
+    return answer.code
 
 
 def _kept(

@@ -87,7 +87,7 @@ def folders_of(logs: Sequence[str], folder: Path) -> tuple[dict[str, Path], dict
         The folder of each log. And for each log that is left out, another log with the same
         content.
     """
-    contents = {path: _content(path) for path in dict.fromkeys(logs)}
+    contents = {path: _content([path]) for path in dict.fromkeys(logs)}
     runs = _runs_in(folder)
     owners = {_key(place) for places in runs.values() for place in places}
     new = {
@@ -134,12 +134,26 @@ def folders_of(logs: Sequence[str], folder: Path) -> tuple[dict[str, Path], dict
     return {path: found[path] for path in contents if path in found}, same
 
 
-def is_done(folder: Path, path: str, settings: dict[str, Any]) -> bool:
-    """Whether a folder holds a finished run of a log with the same settings.
+def distinct(logs: Sequence[str]) -> tuple[list[str], list[tuple[str, str]]]:
+    """Find logs with the same content.
+
+    Args:
+        logs: The paths of the logs.
+
+    Returns:
+        The first log of each content; and each other log with the first one of its content.
+    """
+    first: dict[str, str] = {}  # by content; a log that cannot be read is like no other one
+    owners = [(log, first.setdefault(_content([log]) or log, log)) for log in logs]
+    return [*first.values()], [(log, other) for log, other in owners if log != other]
+
+
+def is_done(folder: Path, logs: Sequence[str], settings: dict[str, Any]) -> bool:
+    """Whether a folder holds a finished run of these logs with the same settings.
 
     Args:
         folder: The folder.
-        path: The log.
+        logs: The log, or the logs that are mapped together.
         settings: The settings, from `MapQuestion.settings`.
     """
     run = _run_in(folder)
@@ -148,14 +162,15 @@ def is_done(folder: Path, path: str, settings: dict[str, Any]) -> bool:
         run.get("settings") == json.loads(json.dumps(settings))
         and not run.get("interrupted")
         and content is not None
-        and content == _content(path)
+        and content == _content(logs)
     )
 
 
-def digest(path: str) -> str | None:
-    """Compute the SHA-256 digest of the unpacked content of a log.
+def digest(logs: Sequence[str]) -> str | None:
+    """Compute the SHA-256 digest of the unpacked content of logs.
 
-    For a folder, it is the digest of the names and contents of its files.
+    For a folder, it is the digest of the names and contents of its files. For several logs, it is
+    the digest of the digests and the names of the drives.
 
     Returns:
         The digest as hexadecimal text; None for a pipe, which can be read only once.
@@ -163,6 +178,14 @@ def digest(path: str) -> str | None:
     Raises:
         LogError: The log cannot be unpacked.
     """
+    if len(logs) == 1:
+        return _digest_of(logs[0])
+    digests = [_digest_of(path) for path in logs]
+    lines = [f"{named_after(path)} {found}" for path, found in zip(logs, digests, strict=True)]
+    return None if None in digests else hashlib.sha256("\n".join(lines).encode()).hexdigest()
+
+
+def _digest_of(path: str) -> str | None:
     from perception.readers.lines import opened
 
     whole = hashlib.sha256()
@@ -201,10 +224,10 @@ def _run_in(folder: Path) -> dict[str, Any]:
     return {}
 
 
-def _content(path: str) -> str | None:
-    """Compute the digest of a log; None if the log cannot be read, or only once."""
+def _content(logs: Sequence[str]) -> str | None:
+    """Compute the digest of logs; None if one cannot be read, or only once."""
     with suppress(OSError, AbductionError):
-        return digest(path)
+        return digest(logs)
     return None
 
 

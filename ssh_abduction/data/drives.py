@@ -174,7 +174,14 @@ def together(traces: Iterable[Trace], names: Iterable[str] | None = None) -> Tra
     for name, drive in zip(called, drives, strict=True):
         if steps:
             steps[-1] = replace(steps[-1], action=Action(name, "start"))
-        steps += [replace(drive[0], displacement=None, covariance=None), *drive[1:]]
+        begin = len(steps)
+        steps += [
+            replace(step, action=Action.that_slipped(begin + t))
+            if step.action is not None and step.action.slipped
+            else step
+            for t, step in enumerate(drive)
+        ]
+        steps[begin] = replace(steps[begin], displacement=None, covariance=None)
     return Trace(
         tuple(steps),
         name=" + ".join(called),
@@ -182,6 +189,11 @@ def together(traces: Iterable[Trace], names: Iterable[str] | None = None) -> Tra
         odometry=next((trace.odometry for trace in parts if trace.odometry), None),
         drive=called[0],
         closures=tuple(closures),
+        extra={
+            name: value
+            for name, value in parts[0].extra.items()
+            if all(trace.extra.get(name) == value for trace in parts)
+        },
     )
 
 
@@ -235,7 +247,7 @@ def _check_alike(traces: Sequence[Trace], names: Sequence[str]) -> None:
                 )
     actions: dict[str, tuple[int, Action]] = {}
     for i, trace in enumerate(traces):
-        for action in dict.fromkeys(a for a in trace.actions if not a.starts):
+        for action in dict.fromkeys(a for a in trace.actions if not a.unlinked):
             first, other = actions.setdefault(action.name, (i, action))
             if action != other or action.name in names:
                 other_use = "the name of a drive" if action.name in names else other.to_json()
@@ -263,6 +275,16 @@ def _odometry(trace: Trace) -> Odometry | None:
     return trace.odometry or (Odometry() if trace.has_displacements else None)
 
 
+def _header(name: str) -> Callable[[Trace], object]:
+    """Make a function that reads a field of the header, if some image is in the trace itself."""
+
+    def read(trace: Trace) -> object:
+        has_images = any(step.image is not None for step in trace.steps)
+        return trace.extra.get(name, "none") if has_images else None
+
+    return read
+
+
 def _sidecar(trace: Trace) -> str | None:
     """The file that images are in, if the steps name them by numbers."""
     return trace.images if any(isinstance(step.image, int) for step in trace.steps) else None
@@ -275,4 +297,6 @@ _RECORDED: tuple[tuple[str, Callable[[Trace], object], str], ...] = (
     ("displacement", _displacements, "add them, or leave them out (Trace.without_displacements)"),
     ("odometry", _odometry, "give all traces one odometry"),
     ("images", _sidecar, "put the images of all traces into one file"),
+    ("beams", _header("beams"), "take images of one laser"),
+    ("panorama", _header("panorama"), "take images of one camera"),
 )

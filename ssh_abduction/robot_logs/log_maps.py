@@ -12,17 +12,23 @@ import itertools
 import json
 import math
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from statistics import median
 from typing import Any
 
+import numpy as np
+
+from perception.errors import LogError
 from perception.places.distinctive import WIDTH
 from perception.places.importing import Imported, import_log
+from perception.places.joining import join_logs
 from perception.readers.scans import RobotLog
 from perception.recognition import recogniser as new_recogniser
 from perception.store import written
+from ssh_abduction.data.checks import all_instances
+from ssh_abduction.data.drives import drives_of, sentence_of
 from ssh_abduction.data.files import json_line
 from ssh_abduction.evaluation.ladder import Rung, UnderWay, ladder, rungs
 from ssh_abduction.page.html import view_page
@@ -80,12 +86,31 @@ PATHS = (
 BARE = Theory.topological().replace(star="none", boundary="none", without=PATHS)
 
 
+@dataclass(frozen=True, slots=True)
+class LoggedDrive:
+    """What was imported from the log of a drive.
+
+    Attributes:
+        name: The name of the drive.
+        scans: The number of its scans.
+        metres: How far the robot drove.
+        visits: The number of its visits to distinctive places.
+        steps: The number of its steps in the trace.
+    """
+
+    name: str
+    scans: int
+    metres: float
+    visits: int
+    steps: int
+
+
 @dataclass(frozen=True, eq=False)
 class LogMap:
     """The minimal maps of a robot's log, and how they were made.
 
     Attributes:
-        log: The robot's log.
+        log: The robot's log. The scans of several drives follow each other.
         imported: The trace of the log, and how it was made.
         solution: The minimal maps. Those whose loops close best come first.
         rungs: The rungs of the ladder, each with one more kind of evidence than the last; empty
@@ -105,6 +130,29 @@ class LogMap:
     limit: float
     notes: tuple[str, ...] = ()
     interrupted: bool = False
+
+    @property
+    def drives(self) -> tuple[LoggedDrive, ...]:
+        """The drives, in order."""
+        trace, visits = self.imported.trace, self.imported.visits
+        begins = (0, *self.imported.starts)
+        stops = (*self.imported.starts, len(self.log))
+        return tuple(
+            LoggedDrive(
+                drive.name,
+                stop - begin,
+                round(float(np.ptp(self.imported.track.way[begin:stop])), 1),
+                sum(begin <= visit.scan < stop for visit in visits),
+                drive.stop - drive.first,
+            )
+            for drive, begin, stop in zip(drives_of(trace), begins, stops, strict=True)
+        )
+
+    @property
+    def joined(self) -> str:
+        """Which drives the first map joins, in words; empty for a single drive or without a map."""
+        maps = self.solution.maps
+        return sentence_of(drives_of(self.imported.trace), maps[0]) if maps else ""
 
     @property
     def drove(self) -> float | None:
@@ -140,6 +188,7 @@ class LogMap:
             "seconds": dict(self.seconds),
             "limit": round(self.limit, 1),
             "drove": self.drove,
+            **({"drives": [asdict(drive) for drive in self.drives]} if self.joined else {}),
         }
 
     def files(self) -> dict[str, bytes]:
@@ -240,29 +289,31 @@ class LogMapping(UnderWay):
 
 @renamed_parameters("limit", "maps")
 def map_log(
-    log: RobotLog,
+    log: RobotLog | Sequence[RobotLog],
     theory: Theory | None = None,
     *,
     choices: Mapping[str, Any] | None = None,
     width: float = WIDTH,
-    name: str | None = None,
+    name: str | Sequence[str] | None = None,
     time_limit: float | None = None,
     max_maps: int | None = MAPS,
     with_ladder: bool = True,
     mapping: LogMapping | None = None,
     tell: Callable[[str], None] = lambda note: None,
 ) -> LogMap:
-    """Find the minimal maps of a building from a robot's log.
+    """Find the minimal maps of a building from a robot's log, or the joint maps of several logs.
 
     Ctrl-C during a search ends the mapping with the best map so far. `interrupted` of the result is
     then true.
 
     Args:
-        log: The robot's log.
+        log: The robot's log; or the logs of several drives through one building. Nothing needs to
+            be known of where a drive starts.
         theory: The axioms. None is BARE, which has neither stars nor sides.
         choices: Values of fields of Theory, by name. They replace those of the theory.
         width: The width of the robot in metres. Narrower parts of the free space are no ways.
-        name: The name of the trace; None for no name.
+        name: The name of the trace, or the names of the drives. None for no name, or for "drive 1",
+            "drive 2" and so on.
         time_limit: Seconds for the search for minimal maps. None takes what the import leaves of a
             twentieth of the time that the robot drove, but at least 5. If that yields no map, the
             search is given up to 64 times as long.
@@ -273,13 +324,14 @@ def map_log(
         tell: Takes each note on the log and on the search as soon as it is known.
 
     Raises:
-        LogError: The log cannot be imported.
+        LogError: A log cannot be imported.
+        TraceError: Two drives have one name, or their logs differ in what they record.
         TheoryError: The theory does not suit the trace.
     """
     mapping = mapping or LogMapping()
 
-    # 1. Trace: import the log.
-    imported = import_log(log, width, name, tell)
+    # 1. Trace: import the logs.
+    log, imported = _imported(log, name, width, tell)
     trace, seconds, notes = imported.trace, dict(imported.seconds), imported.notes
     _log.info("%d visits, %d steps", len(imported.visits), len(trace))
 
@@ -324,3 +376,29 @@ def map_log(
         )
         seconds["ladder"] = round(time.process_time() - begin, 3)
     return outcome(solution, mapping.interrupted)
+
+
+def _imported(
+    given: RobotLog | Sequence[RobotLog],
+    name: str | Sequence[str] | None,
+    width: float,
+    tell: Callable[[str], None],
+) -> tuple[RobotLog, Imported]:
+    """Import the logs that `map_log` was given. Return the joint log, and its import."""
+    if isinstance(given, RobotLog):
+        return given, import_log(given, width, None if name is None else str(name), tell)
+    logs = all_instances("log", given, RobotLog, LogError, mend="read one with read_log")
+    if not logs:
+        raise LogError("log: expected at least one log, got none; read one with read_log")
+    names = [f"drive {i + 1}" for i in range(len(logs))] if name is None else list(name)
+    if len(names) != len(logs):
+        raise LogError(f"name: expected {len(logs)}, one a drive, got {len(names)}")
+
+    def telling(drive: str) -> Callable[[str], None]:
+        return lambda note: tell(f"{drive}: {note}")
+
+    parts = [
+        import_log(log, width, drive, telling(drive))
+        for log, drive in zip(logs, names, strict=True)
+    ]
+    return join_logs(logs, parts)

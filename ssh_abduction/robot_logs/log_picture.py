@@ -2,15 +2,17 @@
 
 Edges follow the course of the robot. Travels between the same two places whose courses lie close
 together are one edge. Places show their disc and their gateways. Places at which nothing was ever
-decided are drawn as dots.
+decided are drawn as dots. Each of several drives has a colour of its own.
 """
 
 from __future__ import annotations
 
 import math
+from bisect import bisect
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +20,11 @@ from scipy.spatial import cKDTree
 
 from perception.places.importing import Imported
 from perception.readers.scans import Pose, RobotLog
+from ssh_abduction.data.drives import Drive, drives_of, starts_of
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import between, moved
-from ssh_abduction.output.drawing import ALARM, COLOURS, page, text, titled
+from ssh_abduction.output.drawing import ALARM, COLOURS, escaped, page, text, titled
+from ssh_abduction.robot_logs.drive_frames import laid_over
 from ssh_abduction.solver import Solution
 
 Array = NDArray[np.float64]
@@ -53,7 +57,8 @@ def figure(log: RobotLog, imported: Imported, solution: Solution) -> str:
     Returns:
         A figure in HTML, with the picture as SVG.
     """
-    sheet = _Sheet.of(log, imported)
+    drives = drives_of(imported.trace)
+    sheet = _Sheet.of(log, imported, solution.maps[0] if solution.maps else None)
     marks = [*sheet.walls_and_way()]
     if solution.maps:
         marks += _map_marks(sheet, imported, solution)
@@ -65,16 +70,33 @@ def figure(log: RobotLog, imported: Imported, solution: Solution) -> str:
         if sheet.is_corrected
         else "the poses of the track, which drifts"
     )
+    if len(drives) > 1:
+        poses += ". Drives lie over each other where the map joins them"
     if not solution.maps:
         caption = f"The visits over the scans, at {poses}."
     else:
         colours = "Colours are paths. " if paths_mean_something(solution) else ""
+        if len(drives) > 1:
+            colours = f"Colours are drives: {legend(drives)}. "
         caption = (
             f"The first map over the scans, at {poses}. Numbers are places, ticks their gateways, "
             f"and lines the edges along the robot's course. {colours}Dots are places at which the "
             "robot only passed through. Red shows the probability of a doubtful join."
         )
     return f"<figure>{picture}<figcaption>{caption}</figcaption></figure>"
+
+
+def colour_of(drive: int) -> str:
+    """Return the colour of a drive, by its index."""
+    return COLOURS[drive % len(COLOURS)]
+
+
+def legend(drives: Sequence[Drive]) -> str:
+    """Write the names of drives in HTML, each with a dot in its colour."""
+    return ", ".join(
+        f'<span style="color:{colour_of(k)}">●</span> {escaped(drive.name)}'
+        for k, drive in enumerate(drives)
+    )
 
 
 def paths_mean_something(solution: Solution) -> bool:
@@ -99,20 +121,25 @@ def doubtful_joins(solution: Solution) -> list[tuple[int, int, float]]:
     return sorted((join for join in joins if join[2] < SURE), key=lambda join: join[2])
 
 
-def undecided_places(ssh_map: SSHMap) -> frozenset[int]:
+def undecided_places(ssh_map: SSHMap, starts: Sequence[int] = ()) -> frozenset[int]:
     """Find the places at which nothing was ever decided.
 
     The robot came from one of two neighbours and went on to the other, at every visit. It neither
     turned around there, nor began or ended a drive.
+
+    Args:
+        ssh_map: The map.
+        starts: The steps, besides step 0, at which a drive starts.
     """
-    stays: list[int] = []
-    for place in place_of_steps(ssh_map):
-        if place is not None and stays[-1:] != [place]:
-            stays.append(place)
+    places = place_of_steps(ssh_map)
     through = defaultdict[int, set[frozenset[int]]](set)
-    for before, place, after in zip(stays, stays[1:], stays[2:], strict=False):
-        through[place].add(frozenset((before, after)))
-    ends = {*stays[:1], *stays[-1:]}
+    ends: set[int] = set()
+    for first, stop in pairwise([0, *starts, len(places)]):
+        drive = [place for place in places[first:stop] if place is not None]
+        stays = [place for place, _ in groupby(drive)]
+        for before, place, after in zip(stays, stays[1:], stays[2:], strict=False):
+            through[place].add(frozenset((before, after)))
+        ends.update(stays[:1], stays[-1:])
     return frozenset(
         place
         for place, pairs in through.items()
@@ -131,6 +158,7 @@ class _Sheet:
         walls: (n, 2) points of walls.
         unit: Units of the page in a metre.
         is_corrected: Whether the poses are corrected ones.
+        bounds: The first scan of each drive, and the number of scans.
     """
 
     poses: Sequence[Pose]
@@ -139,13 +167,14 @@ class _Sheet:
     walls: Array
     unit: float
     is_corrected: bool
+    bounds: Sequence[int]
 
     @classmethod
-    def of(cls, log: RobotLog, imported: Imported) -> _Sheet:
+    def of(cls, log: RobotLog, imported: Imported, ssh_map: SSHMap | None) -> _Sheet:
         track: list[Pose] = [_pose(row) for row in imported.track.poses]
         corrected = [scan.corrected for scan in log.scans if scan.corrected is not None]
         is_corrected = len(corrected) == len(log)
-        poses = corrected if is_corrected else track
+        poses = laid_over(corrected if is_corrected else track, imported, ssh_map)
         walls = _walls(log, poses)
         spots, turns = [], []
         for visit in imported.visits:
@@ -155,7 +184,12 @@ class _Sheet:
             turns.append(poses[visit.scan][2] - track[visit.scan][2])
         extent = np.ptp(np.concatenate([walls, [pose[:2] for pose in poses]]), axis=0).max()
         unit = min(METRE, LARGEST / max(float(extent), 1.0))
-        return cls(poses, turns, spots, walls, unit, is_corrected)
+        bounds = (0, *imported.starts, len(log))
+        return cls(poses, turns, spots, walls, unit, is_corrected, bounds)
+
+    def drive_of(self, scan: int) -> int:
+        """The index of the drive of a scan."""
+        return bisect(self.bounds, scan) - 1
 
     def on_page(self, point: Sequence[float]) -> Point:
         return point[0] * self.unit, -point[1] * self.unit
@@ -172,7 +206,10 @@ class _Sheet:
             f'<path d="{dots}" stroke="{WALL}" stroke-width="{width:.1f}" stroke-linecap="square" '
             'fill="none"/>'
         )
-        yield f'<path d="{_line(map(self.on_page, self.poses))}" stroke="{WAY}" fill="none"/>'
+        for k, (begin, stop) in enumerate(pairwise(self.bounds)):
+            way = _line(map(self.on_page, self.poses[begin:stop]))
+            colour = WAY if len(self.bounds) == 2 else colour_of(k)
+            yield f'<path d="{way}" stroke="{colour}" stroke-opacity=".6" fill="none"/>'
 
 
 def _map_marks(sheet: _Sheet, imported: Imported, solution: Solution) -> Iterator[str]:
@@ -189,13 +226,15 @@ def _map_marks(sheet: _Sheet, imported: Imported, solution: Solution) -> Iterato
     doubts: dict[int | None, float] = {}
     for _, second, probability in doubtful_joins(solution):
         doubts.setdefault(places[second], probability)
-    hidden = undecided_places(ssh_map) - doubts.keys()
+    hidden = undecided_places(ssh_map, starts_of(imported.trace)) - doubts.keys()
     shown = {place: middle for place, middle in middles.items() if place not in hidden}
     path_of = {state.id: state.path for state in ssh_map.dstates}
     colourful = paths_mean_something(solution)
     for step, course in _edges(sheet, imported, places, visit_of, shown):
         path = path_of[ssh_map.labels[step]] or 0
         colour = COLOURS[path % len(COLOURS)] if colourful else EDGE
+        if len(sheet.bounds) > 2:
+            colour = colour_of(sheet.drive_of(imported.visits[visit_of[step]].scan))
         yield (
             f'<path d="{_line(map(sheet.on_page, course))}" stroke="{colour}" stroke-width="4" '
             'stroke-opacity=".8" stroke-linejoin="round" fill="none"/>'
@@ -218,6 +257,8 @@ def _edges(
 ) -> Iterator[tuple[int, Array]]:
     """Yield the edges: the step at which the robot first set out, and the course, (n, 2) metres.
 
+    An edge that several drives took comes once for each drive.
+
     Args:
         sheet: The poses.
         imported: The trace, and how it was made.
@@ -226,7 +267,7 @@ def _edges(
         middles: (2,) the point of each place to which edges lead. At other places, edges follow
             the course of the robot through the place.
     """
-    known: dict[frozenset[int], list[Array]] = defaultdict(list)
+    known: dict[tuple[int, frozenset[int]], list[Array]] = defaultdict(list)
     for t, action in enumerate(imported.trace.actions):
         first, last = places[t], places[t + 1]
         if action.kind != "travel" or first is None or last is None:
@@ -247,8 +288,9 @@ def _edges(
         )
         if len(course) < 2:
             continue
-        if not any(_is_beside(course, other) for other in known[frozenset((first, last))]):
-            known[frozenset((first, last))].append(course)
+        alike = known[sheet.drive_of(begin.scan), frozenset((first, last))]
+        if not any(_is_beside(course, other) for other in alike):
+            alike.append(course)
             yield t, course
 
 

@@ -8,15 +8,19 @@ the log has them. The map itself was made without corrected poses.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from perception.places.importing import Imported
 from perception.readers.scans import RobotLog
 from ssh_abduction.checker.joins import sentence_of
+from ssh_abduction.data.drives import drives_of
+from ssh_abduction.data.drives import sentence_of as sentence_of_drives
 from ssh_abduction.data.words import counted
 from ssh_abduction.evaluation.ladder import Rung
 from ssh_abduction.output.drawing import escaped
+from ssh_abduction.rivals.drive_joins import joins_of_drives
+from ssh_abduction.rivals.listing import Listing
 from ssh_abduction.robot_logs.log_picture import (
     SURE,
     doubtful_joins,
@@ -61,6 +65,7 @@ def report(
         f"<h1>{escaped(name)}</h1>",
         *map(_paragraph, [_summary(solution, run), *run["notes"]]),
         figure(log, imported, solution),
+        *_drives(imported, solution, run),
         "<h2>What each kind of evidence is worth</h2>" + _ladder(rungs) if rungs else "",
         "<h2>Doubtful joins</h2>" + _doubts(solution) if solution.weighed else "",
         "<h2>Rival maps</h2>" + _paragraph(solution.summary or "There is no other minimal map.")
@@ -105,6 +110,42 @@ def _summary(solution: Solution, run: Mapping[str, Any]) -> str:
     paths = f", {cost.paths} paths" if paths_mean_something(solution) else ""
     size = f"{cost.places} places{paths}, {cost.dstates} distinctive states"
     return f"{seen} {size}: {proven}."
+
+
+def _drives(imported: Imported, solution: Solution, run: Mapping[str, Any]) -> Iterator[str]:
+    """Make a table of the drives, and a table of the places that drives have in common."""
+    drives = drives_of(imported.trace)
+    if len(drives) < 2 or not solution.maps:
+        return
+    places = place_of_steps(solution.maps[0])
+    at = [set(places[drive.first : drive.stop]) for drive in drives]
+    rows = []
+    for k, (drive, told) in enumerate(zip(drives, run["drives"], strict=True)):
+        others = set().union(*at[:k], *at[k + 1 :])
+        counts = (told["scans"], f"{told['metres']:g} m", told["visits"], told["steps"])
+        rows.append((drive.name, *counts, len(at[k]), len(at[k] & others)))
+    head = ("drive", "scans", "way", "visits", "steps", "places", "shared with other drives")
+    told_map = sentence_of_drives(drives, solution.maps[0])
+    yield "<h2>Drives</h2>" + _table(head, rows) + _paragraph(f"{told_map.capitalize()}.")
+    yield "<h2>Joins between drives</h2>" + _joins_of_drives(solution)
+
+
+def _joins_of_drives(solution: Solution) -> str:
+    """Make the table of the places that two drives have in common, with their probabilities."""
+    pairs = joins_of_drives(Listing.of(solution))
+    rows = [
+        (
+            f"{pair.first}:{join.first}",
+            f"{pair.second}:{join.second}",
+            f"{join.share:.2f}",
+            "" if join not in pair.forced else "forced" if pair.proven else "in all maps found",
+        )
+        for pair in pairs
+        for join in (*pair.forced, *pair.possible)
+    ]
+    alone = [str(pair) for pair in pairs if not pair.forced and not pair.possible]
+    head = ("step", "and step", "probability", "")
+    return (_table(head, rows) if rows else "") + "".join(_paragraph(f"{one}.") for one in alone)
 
 
 def _ladder(rungs: Sequence[Rung]) -> str:

@@ -1,0 +1,116 @@
+"""Joins the logs of several drives through one building to one log.
+
+The scans of one drive follow those of another. Nothing is known of how the frames of two drives
+relate. So the track of each drive begins where the track before it ends, without any meaning.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import accumulate, chain
+
+import numpy as np
+
+from perception.places.importing import Imported, with_views
+from perception.places.track import Array, Track
+from perception.readers.scans import RobotLog
+from ssh_abduction.data.drives import together
+from ssh_abduction.data.trace import Trace
+
+
+def join_logs(logs: Sequence[RobotLog], parts: Sequence[Imported]) -> tuple[RobotLog, Imported]:
+    """Join logs that were imported one by one. The views are made of the images of all drives.
+
+    Args:
+        logs: The logs, as they were read, one a drive.
+        parts: The result of `import_log` for each. The names of their traces name the drives.
+
+    Returns:
+        The joint log, and its joint import. Their visits and scans are numbered over all drives.
+        In the trace, `visit` is such a number, and `scan` is the number within the drive.
+
+    Raises:
+        TraceError: Two drives have one name, or the traces differ in what they record.
+    """
+    if len(logs) == 1:
+        return logs[0], parts[0]
+    names = [part.trace.name for part in parts]
+    log = RobotLog(
+        tuple(chain.from_iterable(log.scans for log in logs)),
+        tuple(chain.from_iterable(log.damaged for log in logs)),
+        ", ".join(dict.fromkeys(log.format for log in logs)),
+        ", ".join(log.source for log in logs),
+        _named(names, [log.notes for log in logs]),
+    )
+    begins = [0, *accumulate(len(part.track.poses) for part in parts)][: len(parts)]
+    track, shifts = _joint_track([part.track for part in parts], begins)
+    visits = tuple(
+        replace(visit, middle=visit.middle + shift).later(begin)
+        for part, shift, begin in zip(parts, shifts, begins, strict=True)
+        for visit in part.visits
+    )
+    counts = [0, *accumulate(len(part.visits) for part in parts)]
+    traces = [_counted_from(n, part.trace) for n, part in zip(counts, parts, strict=False)]
+    return log, Imported(
+        with_views(together(traces)),
+        track,
+        parts[0].width,
+        visits,
+        _total([part.seconds for part in parts]),
+        _named(names, [part.notes for part in parts]),
+        tuple(begins[1:]),
+    )
+
+
+def _named(names: Sequence[str | None], notes: Sequence[Sequence[str]]) -> tuple[str, ...]:
+    """Begin each note with the name of its drive."""
+    return tuple(
+        f"{name}: {note}" for name, some in zip(names, notes, strict=True) for note in some
+    )
+
+
+def _joint_track(tracks: Sequence[Track], begins: Sequence[int]) -> tuple[Track, list[Array]]:
+    """Join tracks.
+
+    Args:
+        tracks: The tracks of the drives.
+        begins: The number of the first scan of each drive, over all drives.
+
+    Returns:
+        The track, which is broken where a drive starts; and (2,) by how many metres each track was
+        shifted.
+    """
+    poses = [tracks[0].poses]
+    shifts = [np.zeros(2)]
+    for track in tracks[1:]:
+        shifts.append(poses[-1][-1, :2] - track.poses[0, :2])
+        poses.append(track.poses + np.array([*shifts[-1], 0.0]))
+    starts = frozenset(begins[1:])
+
+    def joint(found: Sequence[Sequence[int]]) -> tuple[int, ...]:
+        pairs = zip(begins, found, strict=True)
+        return tuple(sorted(starts.union(cut + begin for begin, some in pairs for cut in some)))
+
+    return Track(
+        np.concatenate(poses),
+        np.concatenate([track.covariances for track in tracks]),
+        np.concatenate([track.shares for track in tracks]),
+        joint([track.cuts for track in tracks]),
+        joint([track.breaks for track in tracks]),
+    ), shifts
+
+
+def _counted_from(first: int, trace: Trace) -> Trace:
+    """Copy a trace, with its visits numbered from `first`."""
+    steps = (
+        replace(step, extra={**step.extra, "visit": int(step.extra["visit"]) + first})
+        for step in trace.steps
+    )
+    return replace(trace, steps=tuple(steps))
+
+
+def _total(seconds: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Add up the times of each stage."""
+    return {stage: round(math.fsum(times[stage] for times in seconds), 3) for stage in seconds[0]}

@@ -1,0 +1,184 @@
+"""Logs of several drives through one building: one map, and the drives over each other."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from coarse import every_second_beam
+
+from perception.errors import LogError
+from perception.places.importing import Imported, import_log
+from perception.places.joining import join_logs
+from perception.readers.scans import RobotLog
+from perception.readers.writers import write_carmen
+from simulator.tours import record
+from simulator.world import World
+from ssh_abduction.cli import main
+from ssh_abduction.cli.run_folders import digest, distinct
+from ssh_abduction.cli.simulate import scans_of
+from ssh_abduction.data import Trace, drives_of
+from ssh_abduction.data.drives import starts_of
+from ssh_abduction.data.odometry import between, moved
+from ssh_abduction.evaluation import evaluate_visits
+from ssh_abduction.robot_logs.drive_frames import BESIDE, laid_over
+from ssh_abduction.robot_logs.log_maps import map_log
+from ssh_abduction.robot_logs.log_picture import colour_of
+from ssh_abduction.solver import Solution
+
+SHARED = 30  # scans that both drives have
+
+
+@pytest.fixture(scope="module")
+def halves() -> tuple[RobotLog, RobotLog]:
+    """A drive through a house, cut into two that share a part."""
+    scans = every_second_beam(scans_of(record(World.named("doors"), every=0.5)))
+    middle = len(scans) // 2
+    return RobotLog(scans[: middle + SHARED], source="monday"), RobotLog(
+        scans[middle - SHARED :], source="tuesday"
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(halves: tuple[RobotLog, RobotLog], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The output of `map --together` for both drives."""
+    folder = tmp_path_factory.mktemp("logs")
+    logs = []
+    for log in halves:
+        logs.append(str(folder / f"{log.source}.log"))
+        write_carmen(Path(logs[-1]), log.scans)
+    command = ["map", *logs, "--together", "-o", str(folder / "building"), "--time-limit", "5"]
+    main([*command, "--set", "ladder=false"])
+    return folder / "building"
+
+
+@pytest.fixture(scope="module")
+def joint(halves: tuple[RobotLog, RobotLog]) -> tuple[RobotLog, Imported, list[Imported]]:
+    parts = [import_log(log, name=log.source) for log in halves]
+    return *join_logs(halves, parts), parts
+
+
+def test_joint_logs_number_scans_and_visits_over_all_drives(
+    joint: tuple[RobotLog, Imported, list[Imported]], halves: tuple[RobotLog, RobotLog]
+) -> None:
+    log, imported, parts = joint
+    assert len(log) == sum(map(len, halves)) == len(imported.track.poses)
+    assert imported.starts == (len(halves[0]),)
+    assert set(imported.starts) <= set(imported.track.breaks)
+    ways = [part.track.way[-1] for part in parts]
+    assert imported.track.way[-1] == pytest.approx(sum(ways))
+    assert [step.extra["visit"] for step in imported.trace][-1] == len(imported.visits) - 1
+    for step in imported.trace:
+        visit = imported.visits[step.extra["visit"]]
+        robot = imported.track.poses[visit.scan]
+        np.testing.assert_allclose(
+            moved(tuple(robot), step.extra["seen"])[:2], visit.middle, atol=1e-3
+        )
+
+
+def test_a_single_log_stays_as_it_is(halves: tuple[RobotLog, RobotLog]) -> None:
+    part = import_log(halves[0])
+    assert join_logs(halves[:1], [part]) == (halves[0], part)
+
+
+def test_one_map_joins_two_drives(folder: Path) -> None:
+    run = json.loads((folder / "run.json").read_text())
+    assert [drive["name"] for drive in run["drives"]] == ["monday", "tuesday"]
+    assert [drive["source"][-4:] for drive in run["drives"]] == [".log"] * 2
+    assert sum(drive["visits"] for drive in run["drives"]) == run["visits"]
+    trace, solution = Trace.load(folder / "trace.jsonl"), Solution.load(folder / "maps.json")
+    assert [drive.name for drive in drives_of(trace)] == ["monday", "tuesday"]
+    assert trace.extra["beams"] == {"first": -90, "step": 1}
+    (judged,) = evaluate_visits(solution.maps[:1], trace).maps
+    assert judged.places.precision == 1.0
+    ssh_map, (start,) = solution.maps[0], starts_of(trace)
+    assert len(ssh_map.pieces) == 1
+    # Steps of two drives within a metre of each other are at one place.
+    near = [
+        (i, j)
+        for i in range(start)
+        for j in range(start, len(trace))
+        if math.dist(trace[i].truth["pose"][:2], trace[j].truth["pose"][:2]) < 1
+    ]
+    assert len(near) > 10
+    assert all(ssh_map.place_of(i) == ssh_map.place_of(j) for i, j in near)
+
+
+def test_the_report_shows_drives_in_their_colours_and_their_joins(folder: Path) -> None:
+    report = (folder / "report.html").read_text()
+    for k in range(2):
+        assert f'stroke="{colour_of(k)}"' in report
+        assert f'<span style="color:{colour_of(k)}">' in report
+    assert "<h2>Drives</h2><table>" in report
+    assert "The map joins all 2 drives: monday, tuesday." in report
+    assert "<h2>Joins between drives</h2><table>" in report
+    assert "<td>monday:" in report
+    assert "<td>tuesday:" in report
+
+
+def test_a_run_of_the_same_logs_is_done(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    logs = [str(folder.parent / f"{name}.log") for name in ("monday", "tuesday")]
+    command = ["map", *logs, "--together", "-o", str(folder), "--time-limit", "5"]
+    assert main([*command, "--set", "ladder=false"]) == 0
+    assert "2 logs: done already" in capsys.readouterr().out
+    assert digest(logs) != digest(logs[::-1])
+
+
+def test_drives_are_laid_over_each_other(
+    joint: tuple[RobotLog, Imported, list[Imported]], folder: Path
+) -> None:
+    log, imported, _ = joint
+    ssh_map = Solution.load(folder / "maps.json").maps[0]
+    track = [tuple(pose) for pose in imported.track.poses.tolist()]
+    (start,) = imported.starts
+    shared = range(start - 2 * SHARED, start)
+    twins = [(scan, scan + 2 * SHARED) for scan in shared]  # each scan is in both drives
+
+    def apart(poses: list[tuple[float, float, float]]) -> float:
+        return max(math.dist(poses[a][:2], poses[b][:2]) for a, b in twins)
+
+    assert apart(track) > 5
+    laid = laid_over(track, imported, ssh_map)
+    assert apart(laid) < 0.5
+    # The drives keep their shapes.
+    for first, last in ((0, start - 1), (start, len(log) - 1)):
+        np.testing.assert_allclose(
+            between(laid[first], laid[last]), between(track[first], track[last]), atol=1e-6
+        )
+    beside = laid_over(track, imported, None)
+    left, right = np.array(beside[:start]), np.array(beside[start:])
+    assert right[:, 0].min() == pytest.approx(left[:, 0].max() + BESIDE)
+
+
+def test_logs_that_do_not_go_together_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for folder, text in (("a", "one"), ("b", "two")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "run.log").write_text(text)
+    logs = [str(tmp_path / folder / "run.log") for folder in "ab"]
+    out = ["--together", "-o", str(tmp_path / "building")]
+    assert main(["map", *logs, *out]) == 1
+    assert "expected another name than that of" in capsys.readouterr().err
+    assert main(["map", *logs, *out, "--jobs", "2"]) == 1
+    assert "--together: expected one search for all logs" in capsys.readouterr().err
+    assert distinct([logs[0], logs[1], logs[0]]) == ([*logs], [])
+    (tmp_path / "b" / "run.log").write_text("one")
+    assert distinct(logs) == ([logs[0]], [(logs[1], logs[0])])
+
+
+@pytest.mark.parametrize(
+    ("given", "names", "said"),
+    [
+        ([], None, "log: expected at least one log, got none"),
+        (["monday.log"], None, r"log\[0\]: expected a RobotLog, got 'monday.log'"),
+        ([RobotLog(())], ["one", "two"], "name: expected 1, one a drive, got 2"),
+    ],
+)
+def test_map_log_says_what_it_takes(given: Any, names: Any, said: str) -> None:
+    with pytest.raises(LogError, match=said):
+        map_log(given, name=names)
