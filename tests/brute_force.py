@@ -161,6 +161,8 @@ def consistent_maps(trace: Trace, theory: Theory) -> Iterator[tuple[Key, Counts]
             continue
         if "closure" in on and not _closures_agree(trace, theory, labels, 3):
             continue
+        if "other_floor" in on and not _lifts_lead_away(trace, labels, labels):
+            continue
         dstates = max(labels) + 1
         if theory.level == "causal":
             yield (labels, (None,) * dstates, (None,) * dstates), Counts(dstates, 0, 0, 0)
@@ -177,6 +179,8 @@ def consistent_maps(trace: Trace, theory: Theory) -> Iterator[tuple[Key, Counts]
                 continue
             where = [places[label] for label in labels]
             if "closure" in on and not _closures_agree(trace, theory, where, 2):
+                continue
+            if "other_floor" in on and not _lifts_lead_away(trace, labels, where):
                 continue
             headings = (
                 list(_headings(labels, places, trace.actions, stars, on))
@@ -223,6 +227,23 @@ def _as_asserted(labels: Labels, places: tuple[int, ...] | None, theory: Theory)
         and all(labels[i] != labels[j] for i, j in different + elsewhere)
         and (places is None or all(places[labels[i]] != places[labels[j]] for i, j in elsewhere))
     )
+
+
+def _lifts_lead_away(trace: Trace, labels: Labels, where: Sequence[int]) -> bool:
+    """Whether the floors of the steps, merged until nothing changes, differ at each lift."""
+    floor = list(range(len(labels)))
+    pairs = [(i, j) for j in range(len(labels)) for i in range(j)]
+    joined = [(i, j) for i, j in pairs if labels[i] == labels[j] or where[i] == where[j]]
+    joined += [
+        (t, t + 1)
+        for t, action in enumerate(trace.actions)
+        if action.kind not in ("lift", "stairs", "start")
+    ]
+    for _ in floor:
+        for i, j in joined:
+            floor[i] = floor[j] = min(floor[i], floor[j])
+    lifts = [t for t, action in enumerate(trace.actions) if action.kind in ("lift", "stairs")]
+    return all(floor[t] != floor[t + 1] for t in lifts)
 
 
 def _stars_alike(trace: Trace, labels: Labels) -> bool:

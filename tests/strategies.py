@@ -223,6 +223,7 @@ def choices_of(field: str, trace: Trace) -> st.SearchStrategy[Any]:
         "prices": st.just(PRICES),
         "unknown_views": st.just(False),  # the trace says it
         "several_drives": st.just(False),
+        "lifts": st.just(False),
         "same": _seldom(_pairs(len(trace))),
         "different": _pairs(len(trace)),
         "elsewhere": _pairs(len(trace)),

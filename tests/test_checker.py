@@ -19,7 +19,13 @@ from ssh_abduction.theory import encodings
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory
 
-ACTIONS = {"T": "travel", "R": "right", "L": "left", "A": "around"}
+ACTIONS = {
+    "T": "travel",
+    "R": "right",
+    "L": "left",
+    "A": "around",
+    "U": {"name": "up", "kind": "lift"},
+}
 ALL_OPEN = (1, 1, 1, 1)
 TOPOLOGICAL = Theory.topological()
 NO_SIDES = TOPOLOGICAL.replace(boundary="none")
@@ -185,6 +191,7 @@ SHIFTED = replace(
 BROKEN = {
     "one_pose": case(TOPOLOGICAL, SPUN, "0 0", "0"),
     "closure": case(TOPOLOGICAL, SHIFTED, "0 0", "0"),
+    "other_floor": case(TOPOLOGICAL, seen("a U b"), "0 1", "0 0"),
     "one_star": case(
         Theory.causal().replace(star="alike"), seen("a R a", [(0, 90), (0, 120)]), "0 0", "."
     ),

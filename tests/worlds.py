@@ -8,7 +8,13 @@ from collections.abc import Iterable
 from ssh_abduction import Trace
 
 HEADINGS = "NESW"
-ACTIONS = {"T": "travel", "R": "right", "L": "left", "A": "around"}
+ACTIONS = {
+    "T": "travel",
+    "R": "right",
+    "L": "left",
+    "A": "around",
+    "U": {"name": "up", "kind": "lift"},
+}
 QUARTERS = {"R": 1, "A": 2, "L": 3}
 Streets = dict[str, dict[str, str]]
 

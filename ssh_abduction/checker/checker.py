@@ -15,8 +15,8 @@
 The checker shares nothing with the encodings or the solver, so it catches their mistakes. The
 axioms are those of docs/explanation/theory.md, after Kuipers & Beeson (AAAI 2002) and Remolina &
 Kuipers (AIJ 2004). `AXIOMS` maps the name of each axiom to its check. The checks are in `causal`,
-`topological`, `sides`, `stars`, `clashes` and `evidence`; `coherence` checks that the map fits the
-trace. `regions` checks the regions of a map that lists them.
+`topological`, `sides`, `stars`, `clashes`, `floors` and `evidence`; `coherence` checks that the map
+fits the trace. `regions` checks the regions of a map that lists them.
 
 A map lists one place, one course (path and direction) and one heading for each dstate, even if the
 theory leaves out the axiom that forbids several. The other axioms are checked on the listed ones.

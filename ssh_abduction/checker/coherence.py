@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from ssh_abduction.checker.faults import faults_are_allowed
+from ssh_abduction.checker.floors import floors_are_listed
 from ssh_abduction.checker.moves import course_of, heading_of
 from ssh_abduction.checker.reading import Check, Found, Reading
 from ssh_abduction.checker.sides import is_pair
@@ -167,4 +168,5 @@ CHECKS: tuple[Check, ...] = (
     excused_are_pairs_of_paths,
     orders_list_places_once,
     frames_start_at_first_visit,
+    floors_are_listed,
 )

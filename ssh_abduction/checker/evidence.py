@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from ssh_abduction.checker.floors import other_floor
 from ssh_abduction.checker.moves import Move, heading_of
 from ssh_abduction.checker.planarity import Edges
 from ssh_abduction.checker.reading import Check, Found, Reading
@@ -190,6 +191,7 @@ AXIOMS: dict[str, Check] = {
         asserted,
         closure,
         one_pose,
+        other_floor,
         planar,
     )
 }

@@ -31,6 +31,7 @@ from ssh_abduction.cli.outcome import (
 from ssh_abduction.cli.text import by_displacements, compared, describe, describe_backbone, headline
 from ssh_abduction.data.drives import sentence_of, together
 from ssh_abduction.data.errors import AbductionError
+from ssh_abduction.data.floors import floors_in_words
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.no_map import Explanation
@@ -355,6 +356,8 @@ def _lines(
         and sentence_of(solution.drives, solution.maps[0])
     ):
         yield joined
+    if solution.maps and (told := floors_in_words(solution.maps[0])):
+        yield told
     if solution.weighed is None and solution.sureness:  # else the headline says it
         yield solution.sureness
     if solution.status is Status.UNSATISFIABLE:

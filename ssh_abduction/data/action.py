@@ -10,10 +10,10 @@ from ssh_abduction.data.checks import a_whole_number, an_object
 from ssh_abduction.data.errors import TraceError, brief, is_finite, is_whole, is_writable
 from ssh_abduction.data.star import SPREAD, near_quarter
 
-Kind: TypeAlias = Literal["travel", "turn", "start"]
+Kind: TypeAlias = Literal["travel", "turn", "lift", "stairs", "start"]
 TurnDirection: TypeAlias = Literal["right", "left", "around"]
 
-_KINDS = ("travel", "turn", "start")
+_KINDS = ("travel", "turn", "lift", "stairs", "start")
 _TURNS = ("right", "left", "around")
 _FIELDS = ("name", "kind", "turn", "gateway", "bearing")
 _QUARTERS = (None, "right", "around", "left")
@@ -27,8 +27,9 @@ class Action:
 
     Attributes:
         name: The name. Actions of a trace with the same name must be equal.
-        kind: "travel", "turn", or None for other actions. "start" is no action of the robot: the
-            next step begins another drive, which the name names, and may be anywhere.
+        kind: "travel", "turn", or None for other actions. A "lift" or "stairs" leads to another
+            floor. "start" is no action of the robot: the next step begins another drive, which the
+            name names, and may be anywhere.
         turn: The direction of a turn: "right", "left" or "around".
         extra: Fields of the trace file that this package does not know.
         gateway: For a turn right or left, the number of the gateway (way out of a place) that it
@@ -50,7 +51,7 @@ class Action:
             raise TraceError(f"action.name: expected a text, got {brief(name)}; name the action")
         if not isinstance(kind, str | None) or kind not in (None, *_KINDS):
             raise TraceError(
-                f'action.kind: expected "travel", "turn" or "start", got {brief(kind)}; '
+                f"action.kind: expected one of {', '.join(_KINDS)}, got {brief(kind)}; "
                 f"leave it out for other actions"
             )
         if not isinstance(turn, str | None) or turn not in (None, *_TURNS):
@@ -121,12 +122,27 @@ class Action:
         return self.kind == "start"
 
     @property
+    def changes_floor(self) -> bool:
+        """Whether the next step is on another floor."""
+        return self.kind in ("lift", "stairs")
+
+    @property
+    def breaks_frame(self) -> bool:
+        """Whether the next step has a frame of its own: on another floor, or of another drive."""
+        return self.starts or self.changes_floor
+
+    @property
     def unlinked(self) -> bool:
         """Whether nothing is known of how the next step relates to this one.
 
         This holds if the action slipped, or if the next step begins another drive.
         """
         return self.starts or self.slipped
+
+    @property
+    def leaves_paths(self) -> bool:
+        """Whether no path leads from this step to the next, and both may be at any places."""
+        return self.unlinked or self.changes_floor
 
     @property
     def in_quarters(self) -> bool:

@@ -58,6 +58,15 @@ def starts_of(trace: Trace) -> tuple[int, ...]:
     return tuple(t for t, action in enumerate(checked_trace(trace).actions, 1) if action.starts)
 
 
+def frames_of(trace: Trace) -> tuple[int, ...]:
+    """List the steps, besides step 0, at which a drive or a stretch after a lift begins.
+
+    Each has a frame of its own.
+    """
+    actions = checked_trace(trace).actions
+    return tuple(t for t, action in enumerate(actions, 1) if action.breaks_frame)
+
+
 def drives_of(trace: Trace) -> tuple[Drive, ...]:
     """List the drives of a trace, in order. Most traces have one."""
     starts = starts_of(trace)

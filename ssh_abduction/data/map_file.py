@@ -225,9 +225,11 @@ def _dstate(read: FieldReader, value: Any, name: str) -> DState:
     if heading is not None and not 0 <= heading < 360:
         raise read.wrong(f"{name}.heading", "a slot, 0 to 3, or degrees, 0 to 359", heading)
     place = read.optional(record.get("place"), f"{name}.place")
-    return DState(
-        read.integer(record.get("id"), f"{name}.id"), view, place, path, direction, heading
-    )
+    floor = read.optional(record.get("floor"), f"{name}.floor")
+    if floor is not None and floor < 0:
+        raise read.wrong(f"{name}.floor", "the number of a floor, from 0", floor)
+    number = read.integer(record.get("id"), f"{name}.id")
+    return DState(number, view, place, path, direction, heading, floor)
 
 
 def _path(read: FieldReader, value: Any, name: str) -> MapPath:

@@ -23,6 +23,7 @@ class DState:
         heading: With star=frame, the slot that it faces: the directions at its place are numbered
             0 to 3, clockwise. With star=gateways, degrees from 0 to 359, clockwise from the
             heading of the first dstate at its place. Otherwise None.
+        floor: The number of its floor; None if the trace has no lifts.
     """
 
     id: int
@@ -31,6 +32,7 @@ class DState:
     path: int | None = None
     direction: int | None = None
     heading: int | None = field(default=None, compare=False)
+    floor: int | None = field(default=None, compare=False)
 
     @property
     def shown(self) -> View:

@@ -191,6 +191,19 @@ class SSHMap:
             pieces.append(tuple(sorted(reached)))
         return tuple(pieces)
 
+    @property
+    def floors(self) -> tuple[tuple[int, ...], ...]:
+        """The ids of the dstates on each floor, in order of first visit; empty without lifts.
+
+        Travels, turns and common places connect the dstates of a floor. If two drives, or two
+        visits by different lifts, share no place of a floor, the map has two floors for it.
+        """
+        found: dict[int, list[int]] = {}
+        for s in self.dstates:
+            if s.floor is not None:
+                found.setdefault(s.floor, []).append(s.id)
+        return tuple(tuple(found[floor]) for floor in sorted(found))
+
     def without_headings(self) -> SSHMap:
         """Return the same map without headings, for a theory in which places have no frames."""
         return replace(self, dstates=tuple(replace(s, heading=None) for s in self.dstates))
@@ -206,6 +219,7 @@ class SSHMap:
         number = {s.id: i for i, s in enumerate(visited)}
         place = _numbered([*(s.place for s in visited), *self.places])
         path = _numbered([*(s.path for s in visited), *(p.id for p in self.paths)])
+        floor = _numbered(s.floor for s in visited)
         faced: dict[int | None, int | None] = {}  # the direction in which each path was first faced
         for s in visited:
             faced.setdefault(s.path, s.direction)
@@ -218,6 +232,7 @@ class SSHMap:
                 path.get(s.path),
                 None if s.direction is None else 1 if s.direction == faced[s.path] else -1,
                 s.heading,
+                floor.get(s.floor),
             )
             for s in visited
         )
@@ -252,6 +267,7 @@ class SSHMap:
                 "path": s.path,
                 "direction": s.direction,
                 **({} if s.heading is None else {"heading": s.heading}),
+                **({} if s.floor is None else {"floor": s.floor}),
             }
             for s in self.dstates
         ]

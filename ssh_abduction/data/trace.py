@@ -125,6 +125,8 @@ class Trace:
                 )
             if action.starts:
                 self._check_start(i, action.name, types)
+            if action.breaks_frame:
+                self._check_frame(i, action)
             first, known = types.setdefault(action.name, (i, action))
             if known != action:
                 raise TraceError(
@@ -140,9 +142,13 @@ class Trace:
                 f"{self.at(i)}: action: expected a new name for this drive, got {brief(name)}, the "
                 "name of an earlier drive or action; rename it"
             )
+
+    def _check_frame(self, i: int, action: Action) -> None:
+        """Check that no displacement leads from step i to a step with a frame of its own."""
         if (moved := self.steps[i + 1].displacement) is not None:
+            where = "the first step of a drive" if action.starts else "the first step of a floor"
             raise TraceError(
-                f"{self.at(i + 1)}: displacement: expected none on the first step of a drive, got "
+                f"{self.at(i + 1)}: displacement: expected none on {where}, got "
                 f"{brief(moved)}; leave it out"
             )
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, get_args
 
 from ssh_abduction.data.checks import an_instance, one_of
 from ssh_abduction.data.errors import SolverError, TheoryError, brief
+from ssh_abduction.data.floors import with_floors
 from ssh_abduction.data.maps import SSHMap, checked_maps
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.data.words import counted
@@ -232,8 +233,9 @@ class Search:
         for cost, level in groupby(self._found(), key=lambda priced: priced[1]):
             maps = (ssh_map for ssh_map, _ in level)
             for ssh_map in ranking.ranked(maps, self.over) if ranking else maps:
-                self._answer.take_down(ssh_map, cost)
-                yield ssh_map
+                on_floors = with_floors(ssh_map, self.trace)
+                self._answer.take_down(on_floors, cost)
+                yield on_floors
 
     def _found(self) -> Iterator[Priced]:
         """Run the search, and yield each map with its preferred counts as it is found.
@@ -408,5 +410,6 @@ class Search:
             known.status = Status.FEASIBLE
         known.stopped = stopped
         # clingo cannot say how large its program is while another thread is in it.
-        solution = self._answer.solution(() if best is None else (best,), Grounding(0, 0))
+        maps = () if best is None else (with_floors(best, self.trace),)
+        solution = self._answer.solution(maps, Grounding(0, 0))
         return replace(solution, complete=known.status is Status.UNSATISFIABLE)

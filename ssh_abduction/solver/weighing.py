@@ -133,8 +133,8 @@ class Weighing:
         if is_long and left > 0 and parts.task.theory.star != "gateways":
             parts.candidates.sketch(0.0)  # only the surest sketch has time
             self.keep_best()
-        # With several drives, a broad beam keeps as many hypotheses as a wider one.
-        several = parts.task.theory.several_drives
+        # With several drives or floors, a broad beam keeps as many hypotheses as a wider one.
+        several = parts.task.theory.several_drives or parts.task.theory.lifts
         widths = {w: share for w, share in WIDTHS.items() if w <= BROAD or not several}
         widest, narrow = max(widths), math.inf  # and the seconds that the narrowest beam took
         for width, share in widths.items():

@@ -108,7 +108,13 @@ def settle(trace: Trace, theory: Theory | None = None, known: Problem | None = N
         weigh=_weigh_of(theory, displacement),
         unknown_views=None in views,
         several_drives=any(action.starts for action in trace.actions),
+        lifts=any(action.changes_floor for action in trace.actions),
     )
+    if settled.lifts and settled.slipped:
+        raise TheoryError(
+            "slipped: expected no actions that slip where a trace has lifts, as they could lead to "
+            f"other floors, got {settled.slipped:g}; leave it out (--slipped 0)"
+        )
     counts = ["dstates" if count == "tenths" else count for count in settled.priorities]
     prefer = tuple(c for c in counts if c in theory.prefer or c != "excuses")
     settled = replace(settled, prefer=prefer)

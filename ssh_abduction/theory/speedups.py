@@ -238,6 +238,10 @@ GATEWAYS = frozenset(
 NOTHING: frozenset[str] = frozenset()
 # The start of a drive is an action that occurs once and is neither travel nor turn.
 DRIVES = "the field several_drives"
+# A lift leads to one dstate, as any action. It is neither travel nor turn.
+LIFTS = "the field lifts"
+# Fields that a trace sets, and that the Python code around each fast encoding knows.
+OF_TRACES = (DRIVES, LIFTS)
 # Axioms about links, observations and pairs of steps only. If a map satisfies them, so does the map
 # of its first steps. Nothing links two drives, so they may be cut, too.
 SURVIVE_A_CUT = FRAMES | {
@@ -255,11 +259,12 @@ SURVIVE_A_CUT = FRAMES | {
     "one_star",
     "one_pose",
     "closure",
-    DRIVES,
+    "other_floor",
+    *OF_TRACES,
 }
 # Kinds of evidence about steps only: they say which steps are different dstates or at different
 # places, and which labels contradict each other.
-PAIRS_OF_STEPS = ("asserted", "one_star", "one_pose", "closure", "planar")
+PAIRS_OF_STEPS = ("asserted", "one_star", "one_pose", "closure", "planar", "other_floor")
 
 TABLE = (
     Speedup(
@@ -293,7 +298,7 @@ TABLE = (
         "Causal theory: give the dstates names before clingo is asked.",
         _is_causal,
         CAUSAL,
-        _kept_by("names", and_also=(*PAIRS_OF_STEPS, DRIVES)),
+        _kept_by("names", and_also=(*PAIRS_OF_STEPS, *OF_TRACES)),
     ),
     Speedup(
         "named dstates with faults",
@@ -312,7 +317,7 @@ TABLE = (
                 "the field slipped",
                 "asserted same",
                 *PAIRS_OF_STEPS,
-                DRIVES,
+                *OF_TRACES,
             ),
         ),
     ),
@@ -339,7 +344,7 @@ TABLE = (
         "Places with frames: settle dstates, as visits that are one, before places and paths.",
         _has_frames,
         FRAMES,
-        _kept_by("visits", "sides_framed", "paths_framed", and_also=(*PAIRS_OF_STEPS, DRIVES)),
+        _kept_by("visits", "sides_framed", "paths_framed", and_also=(*PAIRS_OF_STEPS, *OF_TRACES)),
     ),
     Speedup(
         "ways",
@@ -348,7 +353,9 @@ TABLE = (
         "paths, with names.",
         _has_bare_places,
         PLACES,
-        _kept_by("names", "sides_frameless", "paths_frameless", and_also=(*PAIRS_OF_STEPS, DRIVES)),
+        _kept_by(
+            "names", "sides_frameless", "paths_frameless", and_also=(*PAIRS_OF_STEPS, *OF_TRACES)
+        ),
     ),
     Speedup(
         "clique",

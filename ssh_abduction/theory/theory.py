@@ -67,7 +67,7 @@ SPOKEN_FOR = {
     *ASSERTIONS,
 }
 # The fields that the trace decides, not the user.
-SETTLED = ("returns", "unknown_views", "several_drives")
+SETTLED = ("returns", "unknown_views", "several_drives", "lifts")
 
 
 @dataclass(frozen=True)
@@ -115,6 +115,7 @@ class Theory:
         rules: Your own rules: paths of files that use the predicates of the encodings, or Rules.
         unknown_views: Whether the view of some step is unknown. It is set from the trace.
         several_drives: Whether the trace has several drives. It is set from the trace.
+        lifts: Whether the trace has actions that lead to other floors. It is set from the trace.
         same: Pairs of steps known to be one dstate.
         different: Pairs of steps known to be different dstates.
         elsewhere: Pairs of steps known to be at different places.
@@ -148,6 +149,7 @@ class Theory:
     jumped: float = 0.0
     unknown_views: bool = False
     several_drives: bool = False
+    lifts: bool = False
     weigh: Literal["auto", "cost", "count"] = "auto"
     prices: tuple[float, float, float] = PRICES
 

@@ -80,7 +80,7 @@ class Task:
         """
         speedups = (speedups or Speedups()).that_hold_for(problem.theory)
         # `sides` treats each link between visits as a travel.
-        if speedups.sides and any(action.unlinked for action in problem.trace.actions):
+        if speedups.sides and any(action.leaves_paths for action in problem.trace.actions):
             speedups = replace(speedups, sides=False)
         return Task(
             problem,

@@ -5,8 +5,8 @@ distribution of the positions of its places, the headings of its dstates, and th
 displacements share. It costs the prices of its dstates and places, and half of the chi-square of
 its returns, as a map does (`solver/weighing.py`).
 
-With several drives, each begins a piece with a frame of its own (`pieces.py`). It may join others
-at any step.
+Each drive, and each stretch after a lift, begins a piece with a frame of its own (`pieces.py`). It
+may join others at any step.
 
 A closure says how a step lies relative to an earlier one. It moves the poses of a hypothesis when
 the later step comes, and its misfit adds to the cost.
@@ -34,7 +34,7 @@ from itertools import product
 
 from ssh_abduction.checker.checker import violations
 from ssh_abduction.data.action import Action
-from ssh_abduction.data.drives import starts_of
+from ssh_abduction.data.drives import frames_of
 from ssh_abduction.data.gateways import rotations
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.star import Star
@@ -55,8 +55,8 @@ from ssh_abduction.theory.settle import Problem
 CHECKED_EVERY = 8
 # If no hypothesis is left, look for this many times as many.
 WIDER = 2
-# With several drives, it is open how they are joined. So keep LOST times as many hypotheses, but at
-# most ALIKE that join them alike.
+# With several drives or floors, it is open how they are joined. So keep LOST times as many
+# hypotheses, but at most ALIKE that join them alike.
 LOST, ALIKE = 32, 4
 # Of the beams at earlier looks, this many hypotheses are kept.
 SPARE = 2
@@ -105,7 +105,7 @@ class Beam:
         self._price, self._price_of_place = theory.prices[:2]
         if not self._has_places:
             self._price_of_place = 0.0
-        self._reckoning, self._starts = Reckoning(trace), starts_of(trace)
+        self._reckoning, self._frames = Reckoning(trace), frames_of(trace)
         self.nats = math.inf
         self._sights = [self._sight(step) for step in trace.steps]
         # For each kind of fault, what it costs at each step in nats.
@@ -160,18 +160,18 @@ class Beam:
     def _best(self, found: Iterator[Hypothesis], width: int) -> Iterator[Hypothesis]:
         """The first `width` hypotheses.
 
-        With several drives, the first hypotheses for each choice of how drives are joined: at most
-        ALIKE, and LOST times as many in all. Those that leave a drive loose come on top. They cost
-        more until they join it to others.
+        With several drives or floors, the first hypotheses for each choice of how they are joined:
+        at most ALIKE, and LOST times as many in all. Those that leave one loose come on top. They
+        cost more until they join it to others.
         """
         most = width
-        if self._starts:
+        if self._frames:
             width = min(width, ALIKE)
             most = LOST * width
         count: Counter[tuple[object, ...]] = Counter()
         for hypothesis in found:
             pieces, enough = hypothesis.pieces, count.total() >= most
-            if enough and not self._starts:
+            if enough and not self._frames:
                 return
             if count[pieces.joins] < width and (pieces.is_loose or not enough):
                 count[pieces.joins] += 1
@@ -192,8 +192,8 @@ class Beam:
         return self._settled(valid)
 
     def _settled(self, beam: list[Hypothesis]) -> list[Hypothesis]:
-        """Compute the poses and costs of hypotheses of one drive anew, and sort them."""
-        if not self._reckoning.is_off or self._starts:
+        """Compute the poses and costs of hypotheses with one frame anew, and sort them."""
+        if not self._reckoning.is_off or self._frames:
             return beam
         settled = []
         for found in beam:
@@ -314,7 +314,7 @@ class Beam:
         """A hypothesis after the move to step t, with and without a fault of the move."""
         moved = self._reckoning.moved(found, t)
         yield moved
-        if "slipped" in self._fault and t not in self._starts:
+        if "slipped" in self._fault and t not in self._frames:
             faults, price = (*found.faults, (t - 1, "slipped")), self._fault["slipped"][t - 1]
             yield replace(moved, faults=faults, nats=moved.nats + price)
         if "jumped" in self._fault and self._trace.steps[t].displacement is not None:
@@ -336,7 +336,7 @@ class Beam:
             return [option] if nats < math.inf and self._is_allowed(option, t) else []
         stays = self._stays and self._trace.actions[t - 1].kind == "turn" and not slips
         there = moved.places[here]
-        leaves = self._leaves and not slips and t not in self._starts
+        leaves = self._leaves and not slips and t not in self._frames
         misreads = "misread" in self._fault
         if stays:
             places = [there]

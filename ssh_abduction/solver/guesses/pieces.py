@@ -1,9 +1,9 @@
 """The pieces of a hypothesis about several drives, and how they are turned when they are joined.
 
-A *piece* is a part of a hypothesis whose poses are in one frame. Each drive begins a new piece. If
-it comes to a dstate of another piece, the heading there fixes the two frames to each other. If the
-two pieces have only a place in common, this place is a *hinge*: the drive may have any heading. The
-next place that the two pieces have in common decides.
+A *piece* is a part of a hypothesis whose poses are in one frame. Each drive begins a new piece, and
+so does each stretch after a lift. If it comes to a dstate of another piece, the heading there fixes
+the two frames to each other. If the two pieces have only a place in common, this place is a
+*hinge*: the drive may have any heading. The next place that the two pieces have in common decides.
 
 The equations of a hypothesis are linear in the neighbourhood of the means (`reckoning.py`). So
 before two pieces are joined, the means of one are turned until they agree with the other.
@@ -25,7 +25,7 @@ NEAR = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Pieces:
-    """Which poses of a hypothesis are in one frame. Pieces are named by first steps of drives.
+    """Which poses of a hypothesis are in one frame. Pieces are named by their first steps.
 
     Attributes:
         here: The piece that the robot is in.

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssh_abduction.data.closure import Closure
-from ssh_abduction.data.drives import starts_of
+from ssh_abduction.data.drives import frames_of
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Trace
@@ -78,7 +78,7 @@ class Reckoning:
     """
 
     def __init__(self, trace: Trace) -> None:
-        self._trace, self._starts = trace, starts_of(trace)
+        self._trace, self._frames = trace, frames_of(trace)
         odometry = trace.odometry or Odometry()
         self._sigma = odometry.scale, odometry.bend
         steps = [t for t in range(1, len(trace)) if trace.steps[t].displacement is not None]
@@ -120,7 +120,7 @@ class Reckoning:
         covariance[-3:], covariance[:, -3:] = across, across.T
         covariance[-3:, -3:] = across @ by.T + rotation @ noise @ rotation.T
         pose = mean[-3:] + np.array([*gone, turn - drift])
-        piece = t if t in self._starts else found.pieces.of_heading[found.labels[-1]]
+        piece = t if t in self._frames else found.pieces.of_heading[found.labels[-1]]
         moved = replace(
             found,
             mean=np.concatenate([mean[:-3], pose]),

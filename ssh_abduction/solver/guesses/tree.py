@@ -196,7 +196,7 @@ class Sketch:
         """Decide where an action leads that has no link yet, and return the dstate there."""
         if self._theory.level == "causal":
             return self._new(step, 0, 0)
-        if action.unlinked:
+        if action.leaves_paths:
             return self._new_place(step)
         if action.kind == "travel":
             return self._travel(here, step)

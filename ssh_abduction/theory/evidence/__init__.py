@@ -24,6 +24,7 @@ from ssh_abduction.theory.evidence.alike import Alike
 from ssh_abduction.theory.evidence.asserted import Asserted
 from ssh_abduction.theory.evidence.closure import Closure
 from ssh_abduction.theory.evidence.displacement import Displacement
+from ssh_abduction.theory.evidence.floors import Floors
 from ssh_abduction.theory.evidence.planar import Planar
 from ssh_abduction.theory.evidence.protocol import Equality, Evidence
 from ssh_abduction.theory.pairs import NO_PAIRS, Pairs
@@ -31,7 +32,7 @@ from ssh_abduction.theory.pairs import NO_PAIRS, Pairs
 if TYPE_CHECKING:
     from ssh_abduction.theory.theory import Theory
 
-KINDS: tuple[type[Evidence], ...] = (Asserted, Alike, Displacement, Closure, Planar)
+KINDS: tuple[type[Evidence], ...] = (Asserted, Alike, Displacement, Closure, Floors, Planar)
 
 __all__ = [
     "KINDS",
@@ -42,6 +43,7 @@ __all__ = [
     "Displacement",
     "Equality",
     "Evidence",
+    "Floors",
     "Pairs",
     "Planar",
     "evidence_of",

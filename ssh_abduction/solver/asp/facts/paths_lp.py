@@ -36,7 +36,7 @@ def paths_framed_facts(
     unlinked = {
         chart.node_of[t]
         for t, action in enumerate(trace.actions[: len(chart.node_of) - 1])
-        if action.unlinked
+        if action.leaves_paths
     }
     facts = [f"rotated({s},{x},{-action})." for s, action, x in chart.links if action < 0]
     facts += [f"travelled({s},{x})." for s, _, x in chart.travels if s not in unlinked]
@@ -89,7 +89,7 @@ def paths_frameless_facts(
     facts += [
         f"turn({s},{action.turn},{x})." if action.turn else f"travel({s},{x})."
         for s, action, x in done
-        if action.kind and not action.starts
+        if action.kind in ("travel", "turn")
     ]
     return "\n".join([*facts, *preferred(theory)])
 

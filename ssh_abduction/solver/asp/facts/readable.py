@@ -61,8 +61,8 @@ def run_by_steps() -> Symbol:
 def most_paths(trace: Trace, theory: Theory, steps: int) -> int:
     """The greatest number of paths that a map of the first steps can have.
 
-    A path can begin only at the first step of a drive, and where a turn right or left (or an action
-    that slipped) ends.
+    A path can begin only at the first step of a drive, and where a turn right or left, a lift, or
+    an action that slipped ends.
 
     Args:
         trace: The trace.
@@ -72,7 +72,8 @@ def most_paths(trace: Trace, theory: Theory, steps: int) -> int:
     if TRAVELS_AND_TURNS & theory.given_up:
         return steps
     return 1 + sum(
-        action.turn in ("right", "left") or action.unlinked for action in trace.actions[: steps - 1]
+        action.turn in ("right", "left") or action.leaves_paths
+        for action in trace.actions[: steps - 1]
     )
 
 
@@ -198,8 +199,7 @@ def query(t: int) -> Symbol:
 
 
 def _kind_fact(action: Action) -> str:
-    return (
-        f"kind({constant(action.name)},travel)."
-        if action.kind == "travel"
-        else f"turns({constant(action.name)},{action.turn})."
-    )
+    name = constant(action.name)
+    if action.changes_floor:
+        return f"kind({name},lift)."
+    return f"kind({name},travel)." if action.kind == "travel" else f"turns({name},{action.turn})."

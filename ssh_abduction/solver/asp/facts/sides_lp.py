@@ -30,7 +30,7 @@ def sides_frameless_facts(theory: Theory, actions: Mapping[int, Action]) -> str:
     kinds = [
         f"turns({a},{action.turn})." if action.turn else f"travels({a})."
         for a, action in actions.items()
-        if action.kind and not action.starts
+        if action.kind in ("travel", "turn")
     ]
     return "\n".join([*kinds, sides_framed_facts(theory)])
 

@@ -1,0 +1,62 @@
+"""Check that lifts lead to other floors, and that a map lists its floors correctly."""
+
+from __future__ import annotations
+
+from ssh_abduction.checker.reading import Found, Reading
+
+_LIFTS = ("lift", "stairs")
+
+
+def floors_of(m: Reading) -> dict[int, int]:
+    """Name the floor of each dstate by the first dstate there.
+
+    Links that are no lifts, and common places, connect the dstates of a floor.
+    """
+    beside: dict[int, set[int]] = {s: set() for s in m.states}
+    pairs = [(t.source.id, t.target.id) for t in m.moves if t.action.kind not in _LIFTS]
+    for s in m.states.values():
+        pairs += [
+            (s.id, x.id) for x in m.states.values() if s.place is not None and s.place == x.place
+        ]
+    for one, other in pairs:
+        beside[one].add(other)
+        beside[other].add(one)
+    floor: dict[int, int] = {}
+    for first in sorted(beside, key=lambda label: m.first.get(label, len(m.trace))):
+        reached = [] if first in floor else [first]
+        while reached:
+            label = reached.pop()
+            floor[label] = first
+            reached += [x for x in beside[label] if x not in floor]
+    return floor
+
+
+def other_floor(m: Reading) -> Found:
+    """Check that no links but lifts, and no common places, join the two ends of a lift."""
+    floor = m.once(floors_of)
+    for t in m.moves:
+        if t.action.kind in _LIFTS and floor[t.source.id] == floor[t.target.id]:
+            yield (
+                t.steps,
+                f"{t} leads to another floor, but other links or places join both dstates.",
+            )
+
+
+def floors_are_listed(m: Reading) -> Found:
+    """Check that a map lists the floor of each dstate by first visit, or lists no floors."""
+    listed = {s.id: s.floor for s in m.map.dstates}
+    if not m.theory.lifts:
+        if any(floor is not None for floor in listed.values()):
+            yield [], "The map lists floors, but the trace has no lifts."
+        return
+    if all(floor is None for floor in listed.values()):
+        return
+    number: dict[int, int] = {}
+    for i, s in m.visited:
+        floor = number.setdefault(m.once(floors_of)[s.id], len(number))
+        if listed.get(s.id) != floor:
+            yield (
+                [i],
+                f"Dstate {s.id} is on floor {listed.get(s.id)} in the map, but its links and "
+                f"places say floor {floor}.",
+            )

@@ -1,0 +1,103 @@
+"""Lifts as evidence: a lift leads to another floor.
+
+A *stretch* is the steps between two lifts of a drive. The stretches before and after a lift are on
+different floors. So no two of their steps are at one place. Two stretches are on one floor if they
+have a dstate or a place in common, or if other stretches connect them in this way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import product
+from typing import TYPE_CHECKING, ClassVar
+
+from ssh_abduction.data.floors import stretches_of
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.trace import Trace
+from ssh_abduction.theory.evidence.protocol import Equality
+from ssh_abduction.theory.pairs import Pairs
+
+if TYPE_CHECKING:
+    from ssh_abduction.theory.theory import Theory
+
+
+@dataclass(frozen=True)
+class Floors:
+    """Evidence from actions that lead to other floors."""
+
+    name: ClassVar[str] = "floors"
+    axiom: ClassVar[str] = "other_floor"
+
+    @classmethod
+    def of(cls, theory: Theory) -> Floors:
+        return cls()
+
+    def remembering(self, known: Floors) -> Floors:
+        return self
+
+    def pairs(self, trace: Trace) -> Pairs:
+        return _pairs(stretches_of(trace), _lifted(trace))
+
+    def facts(self, trace: Trace, start: int, stop: int) -> str:
+        stretches, lifted = stretches_of(trace), _lifted(trace)
+        facts = [f"stretch({t},{stretches[t]})." for t in range(start, stop)]
+        return "\n".join([*facts, *(f"lifted({t})." for t in lifted if start <= t < stop)])
+
+    def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
+        stretches = stretches_of(trace)
+        beside: dict[int, dict[int, Equality]] = {}  # stretches that meet, and where
+        for found in _meetings(ssh_map):
+            one, other = stretches[found.first], stretches[found.second]
+            beside.setdefault(one, {}).setdefault(other, found)
+            beside.setdefault(other, {}).setdefault(one, found)
+        for t in _lifted(trace):
+            if t < len(ssh_map.labels) and (way := _way(stretches[t - 1], stretches[t], beside)):
+                return frozenset(way)
+        return None
+
+
+def _lifted(trace: Trace) -> tuple[int, ...]:
+    """The steps that a lift leads to."""
+    return tuple(t for t, action in enumerate(trace.actions, 1) if action.changes_floor)
+
+
+@lru_cache(maxsize=8)
+def _pairs(stretches: tuple[int, ...], lifted: tuple[int, ...]) -> Pairs:
+    """The pairs of steps on stretches that one lift separates."""
+    steps: dict[int, list[int]] = {}
+    for t, stretch in enumerate(stretches):
+        steps.setdefault(stretch, []).append(t)
+    return Pairs.of(
+        elsewhere=[
+            pair for t in lifted for pair in product(steps[stretches[t - 1]], steps[stretches[t]])
+        ]
+    )
+
+
+def _meetings(ssh_map: SSHMap) -> Iterator[Equality]:
+    """Yield each step at a known dstate or place, with the first step there."""
+    dstates: dict[int, int] = {}
+    places: dict[int, int] = {}
+    for t, label in enumerate(ssh_map.labels):
+        place = ssh_map.dstates[label].place
+        if (first := dstates.setdefault(label, t)) != t:
+            yield Equality(first, t)
+        elif place is not None and (first := places.setdefault(place, t)) != t:
+            yield Equality(first, t, "place")
+
+
+def _way(one: int, other: int, beside: dict[int, dict[int, Equality]]) -> list[Equality]:
+    """The fewest meetings that connect two stretches; empty if none connect them."""
+    came: dict[int, int] = {one: one}
+    queue = [one]
+    for stretch in queue:
+        new = [near for near in beside.get(stretch, ()) if near not in came]
+        came.update(dict.fromkeys(new, stretch))
+        queue += new
+    way: list[Equality] = []
+    while other in came and other != one:
+        way.append(beside[came[other]][other])
+        other = came[other]
+    return way

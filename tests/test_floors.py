@@ -1,0 +1,149 @@
+"""Lifts and stairs lead to other floors, and each floor has a frame of its own."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from unittest.mock import patch
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import theories, traces
+from test_property import agree, checker_rejects_foreign_maps
+
+from ssh_abduction import SSHMap, Theory, Trace, solve
+from ssh_abduction.checker.checker import check
+from ssh_abduction.data import Action, MapError, TheoryError, TraceError
+from ssh_abduction.solver import choosing, prefixes
+from ssh_abduction.solver.asp.facts.readable import program
+from ssh_abduction.theory.evidence import Equality, Floors
+from ssh_abduction.theory.settle import settle
+
+UP, DOWN = Action("up", "lift"), Action("down", "stairs")
+
+
+@st.composite
+def traces_with_lifts(draw: st.DrawFn) -> Trace:
+    """Tiny traces in which one to four actions are lifts."""
+    trace = draw(traces().filter(lambda trace: len(trace) > 1))
+    last = len(trace) - 1
+    lifted = draw(st.sets(st.integers(1, last), min_size=1, max_size=min(4, last)))
+    steps = list(trace.steps)
+    for t in lifted:
+        steps[t - 1] = replace(steps[t - 1], action=draw(st.sampled_from([UP, DOWN])))
+        steps[t] = replace(steps[t], displacement=None, covariance=None)
+    return replace(trace, steps=tuple(steps))
+
+
+@settings(max_examples=15)
+@given(st.data())
+def test_the_solver_lists_the_maps_with_floors_of_the_brute_force(data: st.DataObject) -> None:
+    trace = data.draw(traces_with_lifts(), label="trace")
+    theory = data.draw(theories(trace), label="theory")
+    first_prefix = data.draw(st.sampled_from([1, 3, prefixes.FIRST_PREFIX]), label="first prefix")
+    few_steps = data.draw(st.sampled_from([0, choosing.FEW_STEPS]), label="few steps")
+    stepwise = data.draw(st.sampled_from([-1.0, choosing.STEPWISE]), label="seconds step by step")
+    with (
+        patch.object(prefixes, "FIRST_PREFIX", first_prefix),
+        patch.multiple(choosing, FEW_STEPS=few_steps, STEPWISE=stepwise),
+    ):
+        agree(trace, theory)
+
+
+@settings(max_examples=8)
+@given(st.data())
+def test_the_checker_rejects_maps_with_floors_that_the_brute_force_does_not_find(
+    data: st.DataObject,
+) -> None:
+    checker_rejects_foreign_maps(data, data.draw(traces_with_lifts(), label="trace"))
+
+
+SHAFT = Trace.from_steps("ababab", ["travel", UP, "travel", DOWN, "travel"])
+"""Up from b and down from b: the second floor is never seen again."""
+
+
+@pytest.mark.parametrize("theory", [Theory.causal(), Theory()])
+def test_floors_are_listed_saved_and_read(theory: Theory, tmp_path: Path) -> None:
+    (ssh_map, *_) = solve(SHAFT, theory).maps
+    assert ssh_map.floors == ((0, 1), (2, 3))
+    assert ssh_map.labels == (0, 1, 2, 3, 0, 1)
+    ssh_map.save(tmp_path / "map.json")
+    read = SSHMap.load(tmp_path / "map.json")
+    assert read.floors == ssh_map.floors
+    assert read.renumbered().floors == ssh_map.floors
+    data = json.loads((tmp_path / "map.json").read_text())
+    assert [s["floor"] for s in data["dstates"]] == [0, 0, 1, 1]
+    data["dstates"][0]["floor"] = -1
+    with pytest.raises(MapError, match=r"dstates\[0\].floor: expected the number of a floor"):
+        SSHMap.from_dict(data)
+    assert solve(SHAFT[:2], theory).maps[0].floors == ()
+
+
+def test_a_lift_is_deterministic_and_leads_along_no_path() -> None:
+    """The lift leads from the first b to an a. Later, it leads from this b to this a."""
+    trace = Trace.from_steps("ababa", ["travel", UP, DOWN, UP])
+    assert [m.labels for m in solve(trace, Theory.causal()).maps] == [(0, 1, 2, 1, 2)]
+    (ssh_map, *_) = solve(trace).maps
+    assert ssh_map.floors == ((0, 1), (2,))
+    assert [s.path for s in ssh_map.dstates] == [0, 0, None]
+
+
+def test_legs_that_meet_elsewhere_are_one_floor() -> None:
+    """Steps 0 and 2 are on one floor as step 3 is at the place of step 1, so 0 and 3 are apart."""
+    trace = Trace.from_steps("abab", [UP, DOWN, UP])
+    problem = settle(trace, Theory.causal())
+    (floors,) = (evidence for evidence in problem.evidence if isinstance(evidence, Floors))
+    wrong = solve(trace, Theory.causal().replace(without=("other_floor",))).maps[0]
+    joined = replace(wrong, labels=(0, 1, 1, 0))
+    assert floors.refuse(trace, joined) == {Equality(1, 2)}
+    assert floors.refuse(trace, wrong) is None
+    pairs = floors.pairs(trace)
+    assert pairs.elsewhere == {1: frozenset({0}), 2: frozenset({1}), 3: frozenset({2})}
+
+
+def test_the_checker_judges_the_listed_floors() -> None:
+    theory = Theory.causal()
+    (ssh_map, *_) = solve(SHAFT, theory).maps
+    assert check(SHAFT, ssh_map, theory) == ()
+    wrong = replace(ssh_map, dstates=tuple(replace(s, floor=0) for s in ssh_map.dstates))
+    (violation, *_) = check(SHAFT, wrong, theory)
+    assert violation.axiom == "map_explains_trace"
+    assert "its links and places say floor 1" in violation.message
+    flat = SHAFT[:2]
+    listed = replace(solve(flat, theory).maps[0], dstates=wrong.dstates[:2])
+    assert any("no lifts" in v.message for v in check(flat, listed, theory))
+
+
+def test_each_floor_has_a_frame_of_its_own() -> None:
+    with pytest.raises(TraceError, match="step 1: displacement: expected none on the first step"):
+        Trace.from_steps("ab", [UP], displacements=[(1, 0, 0)])
+    # Two floors, one above the other: at no distance, and still two places.
+    moved = [(5.0, 0.0, 0.0), None, (-5.0, 0.0, 0.0), None, (5.0, 0.0, 0.0)]
+    trace = Trace.from_steps(
+        "ababab", ["travel", UP, "travel", DOWN, "travel"], displacements=moved
+    )
+    (ssh_map, *_) = solve(trace).maps
+    assert ssh_map.floors == ((0, 1), (2, 3))
+    assert ssh_map.labels == (0, 1, 2, 3, 0, 1)
+
+
+def test_actions_that_slip_are_refused_with_lifts() -> None:
+    with pytest.raises(TheoryError, match="slipped: expected no actions that slip"):
+        solve(SHAFT, Theory.causal().replace(slipped=1.0))
+
+
+def test_a_misread_view_is_on_its_own_floor() -> None:
+    """A wrong view does not excuse a place on another floor."""
+    trace = Trace.from_steps("abab", ["travel", UP, DOWN])
+    (ssh_map, *_) = solve(trace, Theory.causal().replace(misread=0.5)).maps
+    assert len(ssh_map.floors) == 2
+    assert check(trace, ssh_map, Theory.causal().replace(misread=0.5)) == ()
+
+
+def test_the_readable_program_says_what_a_lift_is() -> None:
+    text = program(settle(SHAFT, Theory()))
+    assert 'kind("up",lift).' in text
+    assert "stretch(3,2)." in text
+    assert "lifted(2)." in text
