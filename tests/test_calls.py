@@ -389,6 +389,7 @@ def good(call: str, parameter: inspect.Parameter) -> Any:
         "difference.other": ssh_map,
         "evaluate.maps": solution.maps,
         "evaluate_visits.maps": solution.maps,
+        "explain_place.place": 0,
         "explain_trace.trace": trace,
         "fault_front.most": 1,
         "fault_front.theory": Theory.causal(),

@@ -30,7 +30,7 @@ from ssh_abduction.cli import solve as solving
 from ssh_abduction.cli.text import compared
 from ssh_abduction.data import MapError
 from ssh_abduction.data.maps import DState, Fault, Fit, MapPath
-from ssh_abduction.rivals import Comparison, Listing, difference
+from ssh_abduction.rivals import Comparison, Listing, difference, shared_sides
 from ssh_abduction.rivals.factors import deciding, independent
 from ssh_abduction.rivals.questions import Matter, Question
 from ssh_abduction.rivals.table import Table
@@ -454,6 +454,9 @@ def test_the_shell_prints_what_python_says(
     printed = json.loads(capsys.readouterr().out)
     joins = printed.pop("by_minimality")
     assert joins == [join.to_dict() for join in solution.by_minimality]
+    sides = shared_sides(Listing.of(solution))
+    assert sides is not None
+    assert printed.pop("sides") == json.loads(json.dumps(sides.to_dict()))
     assert printed == json.loads(json.dumps(found.to_dict()))
     told = difference(solution.maps[0], solution.maps[2], ("map 1", "map 3"))
     for names in (("1", "3"), (found.ids[0], found.ids[2])):

@@ -61,6 +61,7 @@ def run(options: argparse.Namespace) -> int:
     from ssh_abduction.rivals.differences import difference
     from ssh_abduction.rivals.drive_joins import joins_of_drives
     from ssh_abduction.rivals.listing import Listing
+    from ssh_abduction.rivals.sides import shared_sides
 
     maps, others = (
         within(options.maps),
@@ -94,10 +95,14 @@ def run(options: argparse.Namespace) -> int:
     drives = joins_of_drives(listing)
     if drives:
         told["drives"] = [pair.to_dict() for pair in drives]
+    sides = shared_sides(listing)
+    if sides is not None:
+        told["sides"] = sides.to_dict()
     if options.json:
         print(json_line({**told, **found.to_dict()}))
         return 0
-    print("\n".join([*_lines(found), *map(str, drives)]))
+    differing = [f"  {sides}"] if sides is not None and sides.possible else []
+    print("\n".join([*_lines(found), *differing, *map(str, drives)]))
     if listing.sureness:
         print(listing.sureness)
     return 0
@@ -171,6 +176,7 @@ def _lines(found: Comparison) -> Iterator[str]:
         yield f"  only in maps that are not listed: {depending(found.unlisted)}"
     if found.others:
         yield found.others.sentence
-        if not found.others.best.same:
-            yield "the first maps of both differ:"
-            yield from (f"  {line}" for line in found.others.best.lines)
+        best = found.others.best
+        if best.lines:
+            yield f"the first maps of both differ{' in what follows from them' * best.same}:"
+            yield from (f"  {line}" for line in best.lines)

@@ -1,12 +1,14 @@
 """ssh-abduction explain TRACE [STEP STEP]: why two steps are one dstate or not.
 
-Without steps, it explains why the trace has no map.
+Without steps, it explains why the trace has no map. With a place, and perhaps a path, it explains
+on which side of paths the place lies.
 """
 
 from __future__ import annotations
 
 import argparse
-from typing import Any
+import re
+from typing import Any, TypeAlias
 
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.options import Verbs, add_theory, number_steps, theory_of
@@ -16,11 +18,16 @@ from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.mend import TraceExplanation, TraceQuestion
 from ssh_abduction.explain.pairs import PairQuestion
+from ssh_abduction.explain.sides import PlaceExplanation, PlaceQuestion
 from ssh_abduction.explain.verdict import PairExplanation, Verdict
 from ssh_abduction.runtime.program import interrupted_code
 from ssh_abduction.solver import Stop
 
 EXIT_NO_MAP, EXIT_UNKNOWN = 20, 30
+# A place, and perhaps a path, in the words of the command line: "p7 path2".
+_PLACE = re.compile(r"p(\d+)(?: path(\d+))?")
+
+Answer: TypeAlias = PairExplanation | TraceExplanation | PlaceExplanation
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -28,7 +35,9 @@ def add_parser(verbs: Verbs) -> None:
         "Explain why two steps of a trace are one dstate in every map, or different dstates "
         "in every map, and name the axioms that force it. If maps differ in this, report which "
         "maps have one dstate and which have two, and the cost of either. Without steps, explain "
-        "why the trace has no map, and which single observation could be wrong."
+        "why the trace has no map, and which single observation could be wrong. With a place such "
+        "as p7, and perhaps a path such as path2, say on which side of the path the place lies, "
+        "and which turn shows it."
     )
     parser = verbs.add_parser(
         "explain",
@@ -43,7 +52,8 @@ def add_parser(verbs: Verbs) -> None:
         metavar="step",
         help=(
             "the numbers of two steps, from 0, or DRIVE:STEP in a joint trace; leave them out to "
-            "learn why there is no map"
+            "learn why there is no map. Or a place and a path of the first minimal map: p7 path2; "
+            "or a place alone, for all paths and regions"
         ),
     )
     parser.add_argument(
@@ -77,10 +87,11 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    if len(options.steps) not in (0, 2):
+    named = _PLACE.fullmatch(" ".join(options.steps))
+    if not named and len(options.steps) not in (0, 2):
         raise AbductionError(
             f"steps: expected two, or none, got {len(options.steps)}; name the two steps that are "
-            "to be explained"
+            "to be explained, or a place and a path, as in p7 path2"
         )
     trace = Trace.load(options.trace)
     number_steps(options, trace)
@@ -89,8 +100,12 @@ def run(options: argparse.Namespace) -> int:
         "time_limit": options.time_limit,
         "memory_limit": options.memory_limit,
     }
-    question: PairQuestion | TraceQuestion
-    if options.steps:
+    question: PairQuestion | TraceQuestion | PlaceQuestion
+    if named:
+        place, path = (None if n is None else int(n) for n in named.groups())
+        assert place is not None
+        question = PlaceQuestion(trace, place, path, theory, **limits)
+    elif options.steps:
         first, second = (step_named(trace, step) for step in options.steps)
         question = PairQuestion(
             trace, first, second, theory, max_maps=options.maps or None, **limits
@@ -112,21 +127,32 @@ def run(options: argparse.Namespace) -> int:
     return _exit_code(answer)
 
 
-def _as_text(explanation: PairExplanation | TraceExplanation) -> str:
+def _as_text(explanation: Answer) -> str:
     return f"{explanation}\n"
 
 
-def _as_json(explanation: PairExplanation | TraceExplanation) -> str:
+def _as_json(explanation: Answer) -> str:
     return dump(explanation.to_dict()) + "\n"
 
 
-def _exit_code(explanation: PairExplanation | TraceExplanation) -> int:
+def _exit_code(explanation: Answer) -> int:
+    if isinstance(explanation, PlaceExplanation):
+        if explanation.stopped == "interrupted":
+            return interrupted_code()
+        return (
+            0
+            if explanation.maps
+            else EXIT_NO_MAP
+            if explanation.possible is False
+            else EXIT_UNKNOWN
+        )
     if isinstance(explanation, PairExplanation):
         no_map, known = explanation.verdict is Verdict.NO_MAP, explanation.proven
     else:
         no_map, known = explanation.possible is False, explanation.possible is not None
     if explanation.stopped == "interrupted":
         return interrupted_code()
-    if not known or (no_map and explanation.clash is None):
+    has_clash = isinstance(explanation, PlaceExplanation) or explanation.clash is not None
+    if not known or (no_map and not has_clash):
         return EXIT_UNKNOWN
     return EXIT_NO_MAP if no_map else 0

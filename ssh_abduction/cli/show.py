@@ -7,11 +7,11 @@ import argparse
 from ssh_abduction.cli.options import Verbs, check_number
 from ssh_abduction.cli.text import describe
 from ssh_abduction.data.map_file import read_json
-from ssh_abduction.data.maps import maps_of
+from ssh_abduction.data.maps import SSHMap, maps_of
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = "Print the dstates, places, paths and links of maps."
+    text = "Print the dstates, places, paths, links and regions of maps."
     parser = verbs.add_parser(
         "show", help="print the dstates, places, paths and links of maps", description=text
     )
@@ -32,7 +32,13 @@ def run(options: argparse.Namespace) -> int:
         print("no map")
         return 0
     if options.map:
-        print(describe(maps[options.map - 1]))
+        print(_with_regions(maps[options.map - 1]))
     else:
-        print("\n\n".join(f"map {i + 1}\n{describe(m)}" for i, m in enumerate(maps)))
+        print("\n\n".join(f"map {i + 1}\n{_with_regions(m)}" for i, m in enumerate(maps)))
     return 0
+
+
+def _with_regions(ssh_map: SSHMap) -> str:
+    """Describe a map and its regions: sets of places beside paths, or behind one place."""
+    regions = [f"  {region}" for region in ssh_map.regions or ()]
+    return "\n".join([describe(ssh_map), *regions])

@@ -1,4 +1,4 @@
-"""Explain why two steps are one dstate or not, and why a trace has no map and what mends it."""
+"""Explain why steps are one dstate, where a place lies, and why a trace has no map."""
 
 from ssh_abduction import lazy_names
 
@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from ssh_abduction.explain.mend import explain_trace
     from ssh_abduction.explain.no_map import Explanation, explain, why_apart
     from ssh_abduction.explain.pairs import explain_pair
+    from ssh_abduction.explain.sides import PlaceExplanation, explain_place
 
 _HOMES = {
     "mend": ("explain_trace",),
@@ -17,11 +18,14 @@ _HOMES = {
         "why_apart",
     ),
     "pairs": ("explain_pair",),
+    "sides": ("PlaceExplanation", "explain_place"),
 }
 __all__ = [
     "Explanation",
+    "PlaceExplanation",
     "explain",
     "explain_pair",
+    "explain_place",
     "explain_trace",
     "why_apart",
 ]

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from ssh_abduction.rivals.experiment import Experiment
     from ssh_abduction.rivals.explore import next_experiment
     from ssh_abduction.rivals.listing import Listing
+    from ssh_abduction.rivals.sides import SharedSides, shared_sides
 
 _HOMES = {
     "comparison": (
@@ -25,6 +26,7 @@ _HOMES = {
     "experiment": ("Experiment",),
     "explore": ("next_experiment",),
     "listing": ("Listing",),
+    "sides": ("SharedSides", "shared_sides"),
 }
 __all__ = [
     "Comparison",
@@ -32,10 +34,12 @@ __all__ = [
     "DrivePair",
     "Experiment",
     "Listing",
+    "SharedSides",
     "compare",
     "difference",
     "joins_of_drives",
     "next_experiment",
+    "shared_sides",
 ]
 
 __getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)

@@ -23,6 +23,7 @@ import networkx as nx
 from ssh_abduction.data.checks import a_list, a_text
 from ssh_abduction.data.errors import MapError, brief, printable
 from ssh_abduction.data.maps import Fault, SSHMap, checked_map
+from ssh_abduction.rivals.sides import Beside, only_in
 from ssh_abduction.rivals.table import NONE, Table
 from ssh_abduction.solver import Sort, stretches
 
@@ -90,6 +91,8 @@ class Difference:
         faults: For each map, the faults that the other map lacks.
         chi2: The chi-square of each map; None if one of them has no fit.
         has_places: For each map, whether it has places.
+        sides: For each map, the places that it knows to lie beside a path and the other one does
+            not; empty if a map has no regions.
     """
 
     ids: tuple[str, str]
@@ -100,6 +103,7 @@ class Difference:
     faults: tuple[tuple[Fault, ...], tuple[Fault, ...]]
     chi2: tuple[float, float] | None = None
     has_places: tuple[bool, bool] = (True, True)
+    sides: tuple[tuple[Beside, ...], tuple[Beside, ...]] = ((), ())
 
     @property
     def same(self) -> bool:
@@ -127,6 +131,10 @@ class Difference:
             ]
             more = f", and {len(links) - TOLD} more" if len(links) > TOLD else ""
             told += [f"links: only in {name} {', '.join(some)}{more}"] if some else []
+        for name, sides in zip(self.names, self.sides, strict=True):
+            more = f", and {len(sides) - TOLD} more" if len(sides) > TOLD else ""
+            some = [*map(str, sides[:TOLD])]
+            told += [f"sides: only {name} knows that {', '.join(some)}{more}"] if some else []
         if any(self.has_places) and not all(self.has_places):
             told.append(f"places and paths: only in {self.names[self.has_places.index(True)]}")
         if self.chi2 and self.chi2[0] != self.chi2[1]:
@@ -152,6 +160,7 @@ class Difference:
             "changes": [change.to_dict() for change in self.changes],
             "links": [[list(link) for link in links] for links in self.links],
             "has_places": list(self.has_places),
+            "sides": [[beside.to_dict() for beside in sides] for sides in self.sides],
             "faults": [
                 [{k: v for k, v in asdict(fault).items() if v is not None} for fault in faults]
                 for faults in self.faults
@@ -230,6 +239,7 @@ def difference(
         faults=(faults[0], faults[1]),
         chi2=(first.fit.chi2, other.fit.chi2) if first.fit and other.fit else None,
         has_places=(bool(first.places), bool(other.places)),
+        sides=only_in(first, other),
     )
 
 

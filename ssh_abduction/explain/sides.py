@@ -1,0 +1,269 @@
+"""Explain on which side of a path a place lies, and behind which place it lies.
+
+>>> from ssh_abduction import Trace
+>>> corner = Trace.from_steps("abcd", ["travel", "right", "travel"])
+>>> print(explain_place(corner, 2, 0))
+place 2 lies right of path 0+: step 1 turned right from path 0+ onto path 1+ at place 1, and place 2 is ahead on path 1+
+
+Numbers are those of the first minimal map. In other maps the same place is the one of its first
+step, and the same path is the one that is faced at the first step along it.
+"""  # noqa: E501 - one line of output
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+from ssh_abduction.checker.moves import Course
+from ssh_abduction.checker.reading import Reading
+from ssh_abduction.checker.regions import known_sides
+from ssh_abduction.checker.sides import Branch
+from ssh_abduction.data.checks import a_whole_number
+from ssh_abduction.data.errors import MapError
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.regions import course_named, listed, regions_at
+from ssh_abduction.data.trace import Trace
+from ssh_abduction.explain.question import Question
+from ssh_abduction.solver import Stop, with_regions
+from ssh_abduction.theory.theory import Theory, checked_theory
+
+# The side of a path on which a place is known to lie; "on" if it is on the path.
+_Side: TypeAlias = str | None
+LISTED = 100  # at most this many minimal maps are asked for the side
+
+
+def explain_place(
+    trace: Trace,
+    place: int,
+    path: int | None = None,
+    theory: Theory | None = None,
+    *,
+    time_limit: float | None = None,
+    memory_limit: int | None = None,
+) -> PlaceExplanation:
+    """Explain on which side of a path a place lies, or in which regions it lies.
+
+    Args:
+        trace: The trace, with views.
+        place: The id of a place in the first minimal map.
+        path: The id of a path in that map; None to explain all paths and all regions of the place.
+        theory: The theory; Theory.topological() if None.
+        time_limit: Seconds; None for no limit.
+        memory_limit: MiB; None for no limit.
+
+    Returns:
+        A reason for each side that is known, and the number of minimal maps that agree.
+
+    Raises:
+        MapError: The map has no such place or path.
+        TraceError, TheoryError: As `solve` does.
+    """
+    return PlaceQuestion(
+        trace,
+        place,
+        path,
+        checked_theory(theory),
+        time_limit=time_limit,
+        memory_limit=memory_limit,
+    ).answer()
+
+
+@dataclass(frozen=True, slots=True)
+class PathSide:
+    """The side of a path on which a place lies, and why.
+
+    Attributes:
+        path: The id of the path.
+        side: "right" or "left" in direction +1, "on" if the place is on the path, None if unknown.
+        steps: The step whose turn shows the side and the next one; empty if no turn does.
+        sentence: The side and its reason in words.
+        agree: The number of listed minimal maps that have the same side.
+    """
+
+    path: int
+    side: _Side
+    steps: tuple[int, ...]
+    sentence: str
+    agree: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the side as plain data, as `explain --json` prints it."""
+        return {
+            "path": self.path,
+            "side": self.side,
+            "steps": list(self.steps),
+            "sentence": self.sentence,
+            "agree": self.agree,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class PlaceExplanation:
+    """Where a place lies: its sides of paths, and the regions around it.
+
+    Attributes:
+        place: The id of the place.
+        sides: The sides that were asked for.
+        regions: A sentence for each region that contains the place; empty if one path was asked.
+        maps: The number of listed minimal maps; 0 if no map was found.
+        possible: Whether the trace has a map; None if a limit ended the search before.
+        stopped: The limit that ended the search; None if it ended by itself.
+    """
+
+    place: int
+    sides: tuple[PathSide, ...]
+    regions: tuple[str, ...]
+    maps: int
+    possible: bool | None
+    stopped: Stop | None
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """The answer in words, a tuple of sentences."""
+        if not self.maps:
+            why = "the trace has no map" if self.possible is False else "no map was found in time"
+            return (f"{why}, so nothing is known about place {self.place}",)
+        told = []
+        for side in self.sides:
+            few = side.agree < self.maps
+            also = f"; this holds in {side.agree} of {self.maps} minimal maps" if few else ""
+            told.append(f"{side.sentence}{also}")
+        return (*told, *self.regions) or (
+            f"place {self.place} lies on no known side of a path, and in no region",
+        )
+
+    def __str__(self) -> str:
+        return "\n".join(self.sentences)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the explanation as plain data, as `explain --json` prints it."""
+        return {
+            "place": self.place,
+            "sides": [side.to_dict() for side in self.sides],
+            "regions": list(self.regions),
+            "maps": self.maps,
+            "possible": self.possible,
+            "stopped": self.stopped,
+            "sentences": list(self.sentences),
+        }
+
+
+class PlaceQuestion(Question[PlaceExplanation]):
+    """The search for the maps of a trace and the sides of a place. See `explain_place`."""
+
+    def __init__(
+        self,
+        trace: Trace,
+        place: int,
+        path: int | None = None,
+        theory: Theory | None = None,
+        *,
+        time_limit: float | None = None,
+        memory_limit: int | None = None,
+    ) -> None:
+        super().__init__(trace, theory, time_limit, memory_limit)
+        a_whole_number("place", place, MapError, 0)
+        if path is not None:
+            a_whole_number("path", path, MapError, 0)
+        self._place, self._path = place, path
+        self._maps: tuple[SSHMap, ...] = ()
+        self._possible: bool | None = None
+
+    def _find_out(self) -> None:
+        search = self._solved(self.trace, self.theory, LISTED, self._watch.left())
+        solution = search.solution(tuple(search))
+        self._ended(search)
+        maps = self._maps = solution.minimal_maps or solution.maps
+        self._possible = bool(maps) or (None if search.stopped else False)
+
+    def known(self, why: Stop | None = None) -> PlaceExplanation:
+        """Return what is known so far. Raises MapError if the map has no such place or path."""
+        sides, regions = self._told() if self._maps else ((), ())
+        return PlaceExplanation(
+            self._place, sides, regions, len(self._maps), self._possible, why or self.stopped
+        )
+
+    def _told(self) -> tuple[tuple[PathSide, ...], tuple[str, ...]]:
+        first = self._maps[0]
+        paths = [h.id for h in first.paths]
+        _check("place", self._place, first.places)
+        if self._path is not None:
+            _check("path", self._path, paths)
+        readings = [Reading(self.trace, m, self.theory) for m in self._maps]
+        asked = paths if self._path is None else [self._path]
+        sides = [_path_side(readings, self._place, path) for path in asked]
+        if self._path is not None:
+            return tuple(sides), ()
+        around = regions_at(with_regions(first, self.trace, self.theory).regions or (), self._place)
+        regions = tuple(
+            f"place {self._place} lies in {region}"
+            + ("" if region.door is None else f": all links to it lead through place {region.door}")
+            for region in around
+        )
+        return tuple(side for side in sides if side.side in ("right", "left")), regions
+
+
+def _check(name: str, number: int, known: Iterable[int]) -> None:
+    """Raise MapError if the first map has no such place or path."""
+    known = [*known]
+    if number not in known:
+        some = f"{name}s {listed(known)}" if known else f"no {name}s"
+        raise MapError(
+            f"{name}: expected one of the first minimal map, got {number}; the map has {some}"
+        )
+
+
+def _path_side(readings: list[Reading], place: int, path: int) -> PathSide:
+    """Find the side of a path on which a place lies in the first map, and how many maps agree."""
+    first, *others = readings
+    side, branch = _side_of(first, place, (path, 1))
+    at = next(t for t, s in first.visited if s.place == place)
+    along = next((t, s.direction) for t, s in first.visited if s.path == path)
+    agree = 1
+    for m in others:
+        there, facing = m.map.place_of(at), m.states[m.map.labels[along[0]]]
+        if there is None or facing.path is None or facing.direction is None:
+            continue
+        course = facing.path, facing.direction * (along[1] or 1)
+        agree += _side_of(m, there, course)[0] == side
+    told = _sentence(place, path, side, branch)
+    return PathSide(path, side, branch.turn.steps if branch else (), told, agree)
+
+
+def _side_of(m: Reading, place: int, course: Course) -> tuple[_Side, Branch | None]:
+    """Find the side of a course on which a place lies, and the branch that leads to it."""
+    if place in m.along.get(course[0], ()):
+        return "on", None
+    sides = m.once(known_sides)
+    for side, way in (("right", course), ("left", (course[0], -course[1]))):
+        if place in sides.get(way, {}):
+            return side, sides[way][place]
+    return None, None
+
+
+def _sentence(place: int, path: int, side: _Side, branch: Branch | None) -> str:
+    """Say on which side of a path in direction +1 a place lies, and why."""
+    name = course_named((path, 1))
+    if side == "on":
+        return f"place {place} is on path {path}"
+    if branch is None:
+        return (
+            f"no turn shows on which side of path {path} place {place} lies: no path that leaves "
+            f"path {path} by a turn is known to have place {place} ahead"
+        )
+    turn = branch.turn
+    source, target = turn.source, turn.target
+    onto = [
+        course_named((s.path, s.direction))
+        for s in (source, target)
+        if s.path is not None and s.direction is not None
+    ]
+    told = (
+        f"step {turn.step} turned {turn.action.turn} from {onto[0]} onto {onto[1]} "
+        f"at place {branch.place}"
+    )
+    ahead = course_named(branch.branch)
+    leaves = "" if ahead == onto[1] else f", so {ahead} leaves {name} on the {side} there"
+    where = f"place {place} lies {side} of {name}"
+    return f"{where}: {told}{leaves}, and place {place} is ahead on {ahead}"

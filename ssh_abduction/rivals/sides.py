@@ -1,0 +1,180 @@
+"""Which places rival maps know to lie right or left of a path: all maps, or some.
+
+>>> from ssh_abduction import Trace, solve
+>>> found = shared_sides(Listing.of(solve(Trace.load("examples/aces3-route.jsonl"))))
+>>> len(found.forced), len(found.possible), found.proven
+(16, 15, True)
+>>> print(found.forced[0])
+the place of step 0 lies right of the path of step 2
+
+Maps number places and paths differently. So a place is named by the first step there, and a path
+with a direction by the first step along it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias
+
+from ssh_abduction.data.checks import an_instance
+from ssh_abduction.data.errors import MapError
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.regions import right_of
+from ssh_abduction.data.words import counted
+from ssh_abduction.rivals.listing import Listing
+
+SHOWN = 6  # a sentence names at most this many sides
+
+_Side: TypeAlias = Literal["right", "left"]
+
+
+@dataclass(frozen=True, slots=True)
+class Beside:
+    """A place that lies beside a path, as the robot faces along the path at a step.
+
+    Attributes:
+        step: The first step at the place.
+        along: The first step along the path.
+        side: The side of the path on which the place lies.
+        share: The share of the compared maps that know it.
+    """
+
+    step: int
+    along: int
+    side: _Side
+    share: float = 1.0
+
+    def __str__(self) -> str:
+        where = f"the place of step {self.step} lies {self.side} of the path of step {self.along}"
+        return where if self.share == 1 else f"{where} ({self.share:.0%})"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data, as `compare --json` prints it."""
+        return {name: getattr(self, name) for name in self.__slots__}
+
+
+@dataclass(frozen=True, slots=True)
+class SharedSides:
+    """The places beside paths that minimal maps know.
+
+    Attributes:
+        forced: Those that all of these maps know.
+        possible: Those that some maps know.
+        proven: Whether these are all minimal maps, and all of them list regions.
+    """
+
+    forced: tuple[Beside, ...]
+    possible: tuple[Beside, ...]
+    proven: bool
+
+    def __str__(self) -> str:
+        maps = "maps" if self.proven else "maps that were found"
+        forced = f"{counted(len(self.forced), 'places')} beside a path in all {maps}"
+        if not self.possible:
+            return forced
+        more = len(self.possible) - SHOWN
+        some = [*map(str, self.possible[:SHOWN]), *([f"and {more} more"] if more > 0 else [])]
+        return f"{forced}, {len(self.possible)} in some: {'; '.join(some)}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data, as `compare --json` prints it."""
+        return {
+            "forced": [side.to_dict() for side in self.forced],
+            "possible": [side.to_dict() for side in self.possible],
+            "proven": self.proven,
+        }
+
+
+def shared_sides(listing: Listing) -> SharedSides | None:
+    """Find the places that minimal maps know to lie beside a path, in all of them or in some.
+
+    Args:
+        listing: The maps.
+
+    Returns:
+        The places beside paths; None if no map lists regions.
+    """
+    an_instance("listing", listing, Listing, MapError, mend="make one with Listing.of")
+    minimal = listing.maps[: listing.minimal]
+    with_regions = [m for m in minimal if m.regions is not None]
+    if not with_regions:
+        return None
+    found = _sides(with_regions)
+    count = len(with_regions)
+    named = [
+        Beside(i, j, side, sides.count(side) / count)
+        for (i, j), sides in found.items()
+        for side in ("right", "left")
+        if side in sides
+    ]
+    proven = listing.complete is True and count == len(minimal)
+    return SharedSides(
+        tuple(side for side in named if side.share == 1),
+        tuple(sorted((s for s in named if s.share < 1), key=lambda s: (-s.share, s.step))),
+        proven,
+    )
+
+
+def only_in(first: SSHMap, other: SSHMap) -> tuple[tuple[Beside, ...], tuple[Beside, ...]]:
+    """Find the places beside paths that only the first map knows, and those only the other knows.
+
+    Both are empty if a map has no regions.
+    """
+    if first.regions is None or other.regions is None:
+        return (), ()
+    here, there = (
+        tuple(
+            Beside(i, j, side)
+            for (i, j), sides in _sides([first, other]).items()
+            if (side := sides[k]) is not None and sides[1 - k] != side
+        )
+        for k in (0, 1)
+    )
+    return here, there
+
+
+def _sides(maps: Sequence[SSHMap]) -> dict[tuple[int, int], list[_Side | None]]:
+    """For each place and path, named by steps, the side of the path in each map."""
+    beside = [
+        {
+            (path.id, d): {*right_of(m.regions or (), path.id, d)}
+            for path in m.paths
+            for d in (1, -1)
+        }
+        for m in maps
+    ]
+    states = [[m.dstates[label] for label in m.labels] for m in maps]
+    steps = range(len(maps[0].labels))
+    places: dict[tuple[int | None, ...], int] = {}
+    courses: dict[tuple[tuple[int, int] | None, ...], int] = {}
+    for t in steps:
+        places.setdefault(tuple(of[t].place for of in states), t)
+        here = tuple(_course(of[t].path, of[t].direction) for of in states)
+        back = tuple(course and (course[0], -course[1]) for course in here)
+        if back not in courses:
+            courses.setdefault(here, t)
+    found: dict[tuple[int, int], list[_Side | None]] = {}
+    for at, i in places.items():
+        for along, j in courses.items():
+            sides = [
+                _side(right, place, course)
+                for right, place, course in zip(beside, at, along, strict=True)
+            ]
+            if any(sides):
+                found[i, j] = sides
+    return found
+
+
+def _course(path: int | None, direction: int | None) -> tuple[int, int] | None:
+    return None if path is None or direction is None else (path, direction)
+
+
+def _side(
+    right: dict[tuple[int, int], set[int]], place: int | None, course: tuple[int, int] | None
+) -> _Side | None:
+    if course is None:
+        return None
+    if place in right[course]:
+        return "right"
+    return "left" if place in right[course[0], -course[1]] else None

@@ -1,0 +1,180 @@
+"""Sides of paths: why a place lies right or left of a path, and what rival maps know of it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from test_regions import BLOCK, CORNER, LOG, TOUR, trace_of
+from worlds import written
+
+from ssh_abduction import Theory, Trace, solve
+from ssh_abduction.cli import main
+from ssh_abduction.data import MapError
+from ssh_abduction.explain import explain_place
+from ssh_abduction.rivals import Listing, difference, shared_sides
+
+ACES3 = Path(__file__).parent.parent / "examples" / "aces3-route.jsonl"
+
+
+@pytest.mark.parametrize(
+    ("text", "place", "path", "said"),
+    [
+        (
+            CORNER,
+            2,
+            0,
+            "place 2 lies right of path 0+: step 1 turned right from path 0+ onto path 1+ at place "
+            "1, and place 2 is ahead on path 1+",
+        ),
+        (
+            CORNER,
+            3,
+            1,
+            "place 3 lies left of path 1+: step 3 turned left from path 1+ onto path 2+ at place "
+            "2, and place 3 is ahead on path 2+",
+        ),
+        (
+            CORNER,
+            0,
+            1,
+            "place 0 lies right of path 1+: step 1 turned right from path 0+ onto path 1+ at place "
+            "1, so path 0- leaves path 1+ on the right there, and place 0 is ahead on path 0-",
+        ),
+        (CORNER, 1, 0, "place 1 is on path 0"),
+        (
+            CORNER,
+            3,
+            0,
+            "no turn shows on which side of path 0 place 3 lies: no path that leaves path 0 by a "
+            "turn is known to have place 3 ahead",
+        ),
+    ],
+)
+def test_why_a_place_lies_on_a_side(text: str, place: int, path: int, said: str) -> None:
+    assert str(explain_place(written(text), place, path)) == said
+
+
+def test_a_place_lists_its_sides_and_regions() -> None:
+    told = explain_place(written(BLOCK), 0).sentences
+    assert [sentence.partition(":")[0] for sentence in told] == [
+        "place 0 lies right of path 2+",
+        "place 0 lies right of path 3+",
+        "place 0 lies in region 0",
+        "place 0 lies in region 1",
+        "place 0 lies in region 4",
+    ]
+    told = explain_place(trace_of(TOUR), 1, theory=LOG).sentences
+    assert told[-1].endswith("behind place 0, in region 0: all links to it lead through place 0")
+
+
+def test_how_many_minimal_maps_have_a_side() -> None:
+    trace = Trace.load(ACES3)
+    maps = solve(trace).maps
+    for place in maps[0].places:
+        for found in explain_place(trace, place).sides:
+            step = next(t for t, s in enumerate(maps[0].labels) if maps[0].place_of(t) == place)
+            along = next(
+                t for t, s in enumerate(maps[0].labels) if maps[0].dstates[s].path == found.path
+            )
+            agree = 0
+            for m in maps:
+                s = m.dstates[m.labels[along]]
+                assert s.path is not None
+                assert s.direction is not None
+                way = s.direction if found.side == "right" else -s.direction
+                agree += m.place_of(step) in m.right_of(s.path, way)
+            assert found.agree == agree
+
+
+def test_a_trace_without_a_map_says_nothing_of_places() -> None:
+    found = explain_place(written("a T b A c A d"), 0)
+    assert str(found) == "the trace has no map, so nothing is known about place 0"
+
+
+def test_a_place_that_is_not_there() -> None:
+    with pytest.raises(MapError, match="place: expected one of the first minimal map, got 9"):
+        explain_place(written(CORNER), 9)
+    with pytest.raises(MapError, match=r"path: .* got 7; the map has paths 0, 1 and 2"):
+        explain_place(written(CORNER), 0, 7)
+
+
+def test_explain_in_the_shell(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    written(CORNER).save("corner.jsonl")
+    assert main(["explain", "corner.jsonl", "p2", "path0"]) == 0
+    assert capsys.readouterr().out.startswith("place 2 lies right of path 0+: step 1 turned right")
+    assert main(["explain", "corner.jsonl", "p2", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["sides"][0]["steps"] == [1, 2]
+    assert main(["explain", "corner.jsonl", "p9"]) == 1
+    assert "expected one of the first minimal map, got 9" in capsys.readouterr().err
+    written("a T b A c A d").save("none.jsonl")
+    assert main(["explain", "none.jsonl", "p0"]) == 20
+    assert main(["explain", "corner.jsonl", "p2", "path0", "path1"]) == 1
+    assert "or a place and a path, as in p7 path2" in capsys.readouterr().err
+
+
+def test_show_lists_regions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    solve(written(CORNER)).save(tmp_path / "maps.json")
+    assert main(["show", str(tmp_path / "maps.json")]) == 0
+    assert "\n  region 0: place 0, right of path 1+, behind place 1\n" in capsys.readouterr().out
+
+
+def test_sides_that_all_rivals_know_and_some() -> None:
+    found = shared_sides(Listing.of(solve(Trace.load(ACES3))))
+    assert found is not None
+    assert found.proven
+    assert {0.25, 0.5, 0.75} >= {side.share for side in found.possible} > {0.5}
+    assert "16 places beside a path in all maps, 15 in some: " in str(found)
+    # A single map is sure of all that it knows.
+    single = shared_sides(Listing.of(solve(written(BLOCK))))
+    assert single is not None
+    assert [(side.step, side.along, side.side) for side in single.forced][:2] == [
+        (0, 3, "right"),
+        (0, 5, "right"),
+    ]
+    assert not single.possible
+    assert shared_sides(Listing.of(solve(written(BLOCK), Theory.causal()))) is None
+
+
+def test_maps_that_differ_in_sides_only() -> None:
+    ssh_map = solve(written(CORNER))[0]
+    blind = replace(ssh_map, regions=())
+    found = difference(ssh_map, blind)
+    assert found.same
+    assert [str(side) for side in found.sides[0]][:1] == [
+        "the place of step 0 lies right of the path of step 2"
+    ]
+    assert found.sides[1] == ()
+    assert "only the first map knows that the place of step 0 lies right" in str(found)
+    assert not difference(ssh_map, replace(ssh_map, regions=None)).lines
+
+
+def test_compare_names_sides_in_some_maps(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    trace = Trace.load(ACES3)
+    solve(trace).save("maps.json")
+    assert main(["compare", "maps.json"]) == 0
+    assert "  16 places beside a path in all maps, 15 in some: " in capsys.readouterr().out
+    assert main(["compare", "maps.json", "--json"]) == 0
+    sides = json.loads(capsys.readouterr().out)["sides"]
+    assert (len(sides["forced"]), len(sides["possible"]), sides["proven"]) == (16, 15, True)
+
+
+def test_compare_two_files_that_differ_in_sides_only(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    solution = solve(written(CORNER))
+    solution.save("maps.json")
+    replace(solution, maps=(replace(solution[0], regions=()),)).save("blind.json")
+    assert main(["compare", "maps.json", "blind.json"]) == 0
+    out = capsys.readouterr().out
+    assert "the map is the same in both" in out
+    assert "the first maps of both differ in what follows from them:" in out
