@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import combinations, pairwise, product
 from pathlib import Path
 from unittest.mock import patch
@@ -18,10 +19,12 @@ from strategies import TOYS, theories, traces
 from ssh_abduction import OnlineMapper, Solution, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.misfit import false_costs, misfit
-from ssh_abduction.data import Odometry, SolverError, TheoryError
-from ssh_abduction.solver import Status, weighing
+from ssh_abduction.data import MapError, Odometry, SolverError, TheoryError
+from ssh_abduction.data.fields import FieldReader
+from ssh_abduction.solver import Search, Status, weighing
 from ssh_abduction.solver.fit import Poses, fit
 from ssh_abduction.solver.misfit import Misfit
+from ssh_abduction.solver.weighed import Rival, Weighed
 from ssh_abduction.theory.settle import settle
 
 EQUAL = 1e-6
@@ -291,6 +294,40 @@ def test_the_checker_and_the_solver_have_one_misfit(data: st.DataObject) -> None
     where = dict(zip(names, places, strict=True))
     poses = Poses(known.trace, names, [where[name] for name in range(len(where))])
     assert misfit(known.trace, names, places) == pytest.approx(poses.misfit(), rel=1e-5, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("factor", "offset", "least", "most"),
+    [(1.0, 0.01, 1.0, 1.0), (0.6, 0.01, 1.5, 2.25), (0.6, 0.0, math.inf, math.inf)],
+)
+def test_misfits_may_exceed_what_is_said_where_the_robot_is_off_its_dstates(
+    route: truth.Known,
+    weighed_route: Solution,
+    factor: float,
+    offset: float,
+    least: float,
+    most: float,
+) -> None:
+    """The odometry is worse than it says, by a factor."""
+    said = {name: factor * value for name, value in truth.NOISE.items()}
+    odometry = Odometry(**{**DEFAULT, **said, "scale": 0.05, "bend": 0.0035, "offset": offset})
+    search = Search(replace(route.trace, odometry=odometry))
+    assert search._weighing is not None
+    search._weighing.add(weighed_route.maps[0])
+    with patch.object(weighing, "IMPROBABLE", 0.2):
+        assert least <= search._weighing._excess() <= most
+
+
+def test_an_excess_misfit_makes_the_best_map_less_sure() -> None:
+    rivals = Rival(10.0, (0, 1, 0), (0, 1, 0)), Rival(14.0, (0, 1, 2), (0, 1, 2))
+    sure, less = (Weighed(0.0, 0.0, rivals, True, 0.0, excess) for excess in (1.0, 2.0))
+    assert sure.weights == pytest.approx([1 / (1 + math.exp(-4)), 1 / (1 + math.exp(4))])
+    assert less.weights == pytest.approx([1 / (1 + math.exp(-2)), 1 / (1 + math.exp(2))])
+    assert less.confidence < sure.confidence
+    read = FieldReader("here")
+    assert Weighed.from_dict(read, less.to_dict(), 3).excess == 2.0
+    with pytest.raises(MapError, match=r"weighed.excess: expected a number of at least 1, got 0.5"):
+        Weighed.from_dict(read, {**less.to_dict(), "excess": 0.5}, 3)
 
 
 def test_a_robot_that_drives_counts() -> None:

@@ -156,8 +156,9 @@ def closures_among(closures: Sequence[Closure], steps: Sequence[int]) -> tuple[C
         steps: The steps that are kept, ascending.
     """
     number = {step: k for k, step in enumerate(steps)}
+    kept = [c for c in closures if c.first in number and c.last in number]
     return tuple(
-        replace(closure, first=number[closure.first], last=number[closure.last])
-        for closure in closures
-        if closure.first in number and closure.last in number
+        # To make a closure anew takes long, as its covariance is checked.
+        c if number[c.last] == c.last else replace(c, first=number[c.first], last=number[c.last])
+        for c in kept
     )

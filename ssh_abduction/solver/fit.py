@@ -23,10 +23,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Sequence
+from contextlib import suppress
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 from scipy.sparse.linalg import lsqr, splu
@@ -50,6 +52,8 @@ SWEEPS, HELD = 20, 1e-2
 # poses that nothing is known of.
 LEAST_DAMPING, MOST_DAMPING, ROUNDS, STILL, NEARLY = 1e-9, 1e8, 100, 1e-13, 1e-4
 HELD_STILL = 1e-9
+# With at most so many unknowns, covariances come from a dense matrix. That is faster.
+DENSE = 3000
 
 
 def fit(trace: Trace, ssh_map: SSHMap) -> Fit:
@@ -471,11 +475,26 @@ class Poses:
         information = (information + held * _identity(len(free))).tocsc()
         is_free = ~np.isin(wanted, fixed)
         rows = np.searchsorted(free, np.asarray(wanted)[is_free])
-        columns = np.zeros((len(free), len(rows)))
-        columns[rows, np.arange(len(rows))] = 1.0
         covariance: Array = np.zeros((len(wanted), len(wanted)))
-        covariance[np.ix_(is_free, is_free)] = splu(information).solve(columns)[rows]
+        covariance[np.ix_(is_free, is_free)] = _inverse(information, rows)
         return covariance
+
+
+def _inverse(matrix: Any, rows: NDArray[np.intp]) -> Array:
+    """Some rows, and the same columns, of the inverse of a symmetric sparse matrix."""
+    if matrix.shape[0] <= DENSE:
+        # With these rows last, the end of the Cholesky factor is the factor of what is wanted.
+        order = np.concatenate([np.setdiff1d(np.arange(matrix.shape[0]), rows), rows])
+        with suppress(np.linalg.LinAlgError):
+            factor = np.linalg.cholesky(matrix.toarray()[np.ix_(order, order)])
+            first = len(order) - len(rows)
+            root = solve_triangular(factor[first:, first:], np.identity(len(rows)), lower=True)
+            inverse: Array = root.T @ root
+            return inverse
+    columns = np.zeros((matrix.shape[0], len(rows)))
+    columns[rows, np.arange(len(rows))] = 1.0
+    solved: Array = splu(matrix).solve(columns)[rows]
+    return solved
 
 
 def _identity(size: int) -> csr_array:

@@ -293,8 +293,12 @@ class Search:
 
     def _weigh(self, weighing: Weighing) -> None:
         """Find the maps of least cost: guess some, find some minimal map by counting, and prove."""
+        from threadpoolctl import threadpool_limits
+
         watch = self._parts.watch
-        weighing.guess()
+        # The matrices are small: threads of BLAS would mostly wait for each other.
+        with threadpool_limits(1, user_api="blas"):
+            weighing.guess()
         if watch.left() < math.inf:
             watch.end_stage_after(watch.elapsed() + COUNTING_SHARE * watch.left())
         with suppress(StageTimeError):

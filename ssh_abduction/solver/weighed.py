@@ -63,6 +63,8 @@ class Weighed:
             improbable. Such a map is seldom false, also if it is not proven to cost least.
         broken: How many nats less a map costs that breaks axioms; 0 if none costs less than the
             best map, -inf if none was sought.
+        excess: How many times as large the misfit is as the standard deviations say. Probabilities
+            divide costs by it.
     """
 
     bound: float
@@ -70,6 +72,7 @@ class Weighed:
     rivals: tuple[Rival, ...]
     searched: bool = False
     broken: float = -math.inf
+    excess: float = 1.0
 
     @property
     def nats(self) -> float:
@@ -79,7 +82,7 @@ class Weighed:
     @cached_property
     def weights(self) -> tuple[float, ...]:
         """The probability of each rival, if there were no others."""
-        likely = [math.exp(self.nats - rival.nats) for rival in self.rivals]
+        likely = [math.exp((self.nats - rival.nats) / self.excess) for rival in self.rivals]
         return tuple(weight / sum(likely) for weight in likely)
 
     @property
@@ -97,7 +100,7 @@ class Weighed:
         """
         is_likely = self.proven or self.searched
         unknown = 0.0 if is_likely else math.exp(min(self.nats - self.bound, MOST))
-        broken = math.exp(min(self.broken - BROKEN, MOST))
+        broken = math.exp(min((self.broken - BROKEN) / self.excess, MOST))
         return 1 / (1 / self.weights[0] + unknown + broken)
 
     def probability(self, first: int, second: int, of: str = "dstate") -> float:
@@ -160,6 +163,7 @@ class Weighed:
             "within": round(self.within, 6),
             "searched": self.searched,
             **({"broken": round(self.broken, 6)} if math.isfinite(self.broken) else {}),
+            **({"excess": round(self.excess, 6)} if self.excess > 1 else {}),
             "confidence": round(self.confidence, 6),
             "rivals": [rival.to_dict() for rival in self.rivals],
         }
@@ -185,7 +189,10 @@ class Weighed:
         )
         bound, within = (_number(read, record, name, "weighed") for name in ("bound", "within"))
         broken = _number(read, record, "broken", "weighed") if "broken" in record else -math.inf
-        return cls(bound, within, rivals, record.get("searched") is True, broken)
+        excess = _number(read, record, "excess", "weighed") if "excess" in record else 1.0
+        if excess < 1:
+            raise read.wrong("weighed.excess", "a number of at least 1", excess)
+        return cls(bound, within, rivals, record.get("searched") is True, broken, excess)
 
 
 def _percent(probability: float) -> str:

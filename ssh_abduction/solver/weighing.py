@@ -37,6 +37,7 @@ from ssh_abduction.solver.asp.limits import LimitError, StageTimeError
 from ssh_abduction.solver.choosing import FEW_STEPS, READABLE, new_engine, takes_all
 from ssh_abduction.solver.engines.base import Engine, Found, Task
 from ssh_abduction.solver.engines.stepwise import StepEngine
+from ssh_abduction.solver.equations import spreads_of
 from ssh_abduction.solver.estimating import CostOf, Course, estimated
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
@@ -60,6 +61,9 @@ WITHIN = math.log(100)
 RIVALS = 50
 # A misfit is improbable if a true map is worse with less than this probability.
 IMPROBABLE = 0.01
+# Where the robot is off the poses of its dstates, by errors with heavy tails, a misfit may be this
+# many times as large as expected: standard deviations are 1.5 times too small.
+EXCESS = 2.25
 # Without a time limit, give the proof up when no better map was found for this many seconds, and
 # this many times as long as it took to find the best one.
 PATIENCE, MORE = 10.0, 5.0
@@ -148,12 +152,15 @@ class Weighing:
                 found = [self.add(ssh_map) for ssh_map in parts.candidates.maps_of(beam)]
                 if width >= BROAD:
                     self._searched = min(found, default=math.inf), beam.nats
+                    # A beam without axioms would be the same if the checker refused nothing.
+                    self._broken = -math.inf if beam.refuses else 0.0
                 self.keep_best()
                 parts.report()
             narrow = min(narrow, watch.elapsed() - began)
         watch.end_stage_after(begun + BREAKING * left)
         with suppress(StageTimeError):
-            if self._searched[1] < math.inf and (beam := parts.candidates.beam(widest)):
+            is_open = self._searched[1] < math.inf and math.isinf(self._broken)
+            if is_open and (beam := parts.candidates.beam(widest)):
                 self._broken = self._searched[1] - beam.nats_without_axioms()
         watch.end_stage_after(math.inf)
 
@@ -328,25 +335,34 @@ class Weighing:
         for candidate in self.candidates:
             rival = _rival_of(candidate)
             rivals.setdefault((rival.dstates, rival.places), rival)
-        found = list(rivals.values())
+        found, excess = list(rivals.values()), self._excess()
         return Weighed(
             bound=self.bound,
             within=self._within if self.proven else 0.0,
             rivals=(*found, *self._estimated(found[0], set(rivals))),
-            searched=self._is_searched_and_closes(),
+            searched=self._is_searched() and excess < math.inf,
             broken=self._broken,
+            excess=excess if excess < math.inf else 1.0,
         )
 
-    def _is_searched_and_closes(self) -> bool:
-        """Whether a broad beam ended with the best map, and its misfit is not improbable."""
+    def _is_searched(self) -> bool:
+        """Whether a broad beam ended with the best map, and maps that break axioms were sought."""
         is_best = self._searched[0] <= self.candidates[0].nats + EQUAL
-        if not is_best or not math.isfinite(self._broken):
-            return False
+        return is_best and math.isfinite(self._broken)
+
+    def _excess(self) -> float:
+        """How many times as large the misfit of the returns of the best map is as expected.
+
+        It is 1 if the misfit is not improbable, and inf if it is too large to be trusted.
+        """
         best = self.candidates[0].map
         returns = self._misfit.returns_of(best)
         square = self._misfit.of_map(best) - self._misfit.of_returns([], jumped(best))
         freedom = sum(3 if found.of == "dstate" else 2 for found in returns)
-        return freedom == 0 or float(gammaincc(freedom / 2, max(square, 0.0) / 2)) >= IMPROBABLE
+        if not freedom or gammaincc(freedom / 2, max(square, 0.0) / 2) >= IMPROBABLE:
+            return 1.0
+        is_off = spreads_of(self._parts.task.trace).any()
+        return square / freedom if is_off and square <= EXCESS * freedom else math.inf
 
     def _estimated(self, best: Rival, known: Collection[Course]) -> Iterator[Rival]:
         """Rivals that were not found. If all within some nats are, one below them breaks axioms."""

@@ -86,6 +86,7 @@ class Beam:
 
     Attributes:
         nats: The cost of the best hypothesis of the whole trace; inf before there is one.
+        refuses: Whether the checker refused a hypothesis.
     """
 
     def __init__(self, problem: Problem, log: Log, width: int) -> None:
@@ -106,7 +107,7 @@ class Beam:
         if not self._has_places:
             self._price_of_place = 0.0
         self._reckoning, self._frames = Reckoning(trace), frames_of(trace)
-        self.nats = math.inf
+        self.nats, self.refuses = math.inf, False
         self._sights = [self._sight(step) for step in trace.steps]
         # For each kind of fault, what it costs at each step in nats.
         self._fault = {
@@ -189,6 +190,7 @@ class Beam:
         begun = len(beam[0].labels)
         longer = self._onward(beam, end)
         valid = [found for found in longer if self._map(found, begun) is not None]
+        self.refuses |= len(valid) < len(longer)
         return self._settled(valid)
 
     def _settled(self, beam: list[Hypothesis]) -> list[Hypothesis]:
