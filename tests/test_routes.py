@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import json
 import random
-from itertools import product
+from dataclasses import replace
+from itertools import groupby, product
+from pathlib import Path
 
 import pytest
-from worlds import rectangle
+from worlds import rectangle, written
 
 from ssh_abduction import SSHMap, Theory, Trace, route, solve
 from ssh_abduction.cli import main
 from ssh_abduction.data import MapError
 from ssh_abduction.data.maps import DState, Fit, MapPath, Pose
+from ssh_abduction.solver import with_regions
 
 
 @pytest.fixture(scope="module")
@@ -183,3 +186,107 @@ def test_the_command_prints_what_python_finds(
     assert "never tried" not in told or "implied" in told
     assert main(["route", file, "--to", "44"]) == 1
     assert "0 to" in capsys.readouterr().err
+
+
+def maze(seed: int, side: int = 4, steps: int = 150) -> SSHMap:
+    """The true map of a random walk through a maze without loops, with its regions."""
+    chance = random.Random(seed)
+    doors: set[frozenset[tuple[int, int]]] = set()
+    reached, waiting = {(0, 0)}, [(0, 0)]
+    while waiting:
+        x, y = waiting[-1]
+        near = [(x + 1, y), (x - 1, y), (x, y + 1), (x, y - 1)]
+        new = [p for p in near if p not in reached and min(p) >= 0 and max(p) < side]
+        if not new:
+            waiting.pop()
+            continue
+        doors.add(frozenset(((x, y), there := chance.choice(new))))
+        reached.add(there)
+        waiting.append(there)
+    ways = ((0, 1), (1, 0), (0, -1), (-1, 0))
+
+    def ahead(at: tuple[int, int], way: int) -> tuple[int, int] | None:
+        there = (at[0] + ways[way][0], at[1] + ways[way][1])
+        return there if frozenset((at, there)) in doors else None
+
+    def first_of(at: tuple[int, int], way: int) -> tuple[int, int]:
+        """The place where the street in this way, or against it, begins."""
+        while (there := ahead(at, way % 2 + 2)) is not None:
+            at = there
+        return at
+
+    faced = [((0, 0), 0)]
+    actions = []
+    for _ in range(steps):
+        at, way = faced[-1]
+        there = ahead(at, way)
+        action = chance.choice(["travel"] * 3 * (there is not None) + ["right", "left"])
+        actions.append(action)
+        turn = {"right": 1, "left": 3}.get(action, 0)
+        faced.append((there or at, way) if action == "travel" else (at, (way + turn) % 4))
+    states = list(dict.fromkeys(faced))
+    places = list(dict.fromkeys(at for at, _ in states))
+    street = {(at, way): (first_of(at, way), way % 2) for at, way in states}
+    is_street = {s for s in states if ahead(*s) or ahead(s[0], (s[1] + 2) % 4)}
+    streets = list(dict.fromkeys(street[s] for s in states if s in is_street))
+    dstates = tuple(
+        DState(
+            i,
+            f"{at} {way}",
+            places.index(at),
+            streets.index(street[at, way]) if (at, way) in is_street else None,
+            (1 if way < 2 else -1) if (at, way) in is_street else None,
+        )
+        for i, (at, way) in enumerate(states)
+    )
+    paths = tuple(
+        MapPath(
+            i, tuple(places.index(at) for at in sorted({s[0] for s in is_street if street[s] == h}))
+        )
+        for i, h in enumerate(streets)
+    )
+    labels = tuple(states.index(s) for s in faced)
+    links = {(labels[i], action, labels[i + 1]) for i, action in enumerate(actions)}
+    found = SSHMap(labels, dstates, tuple(sorted(links)), tuple(range(len(places))), paths)
+    trace = Trace.from_steps([f"{at} {way}" for at, way in faced], actions)
+    return with_regions(found.renumbered(), trace)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_coarse_route_agrees_with_the_fine_one(seed: int) -> None:
+    ssh_map = maze(seed)
+    assert ssh_map.regions
+    told = 0
+    for start, goal in product(ssh_map.places, repeat=2):
+        for by in ("places", "actions"):
+            try:
+                plain = route(replace(ssh_map, regions=None), f"p{start}", f"p{goal}", by=by)
+            except MapError:
+                with pytest.raises(MapError):
+                    route(ssh_map, f"p{start}", f"p{goal}", by=by)
+                continue
+            found = route(ssh_map, f"p{start}", f"p{goal}", by=by)
+            assert plain.legs == ()
+            # Regions make no route longer, and each goes through the doors in their order.
+            assert found.moves == plain.moves
+            doors = [leg.door for leg in found.legs if leg.door is not None]
+            places = iter(place for place, _ in groupby(found.places))
+            assert all(door in places for door, _ in groupby(doors))
+            told += len(found.legs)
+    assert told
+
+
+def test_a_route_says_the_regions_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    solve(written("a T b R c T d L e T f")).save(tmp_path / "maps.json")
+    ends = ["--from", "p0", "--to", "p3", "--by", "places"]
+    assert main(["route", str(tmp_path / "maps.json"), *ends]) == 0
+    assert capsys.readouterr().out.splitlines()[1] == (
+        "by regions: leave region 0 through place 1; pass from right to left of path 1+; "
+        "enter region 3 through place 2"
+    )
+    assert main(["route", str(tmp_path / "maps.json"), *ends, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["legs"] == [
+        {"move": "leave", "region": 0, "door": 1},
+        {"move": "pass", "path": 1, "starts": "right"},
+        {"move": "enter", "region": 3, "door": 2},
+    ]

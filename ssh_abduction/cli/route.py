@@ -13,7 +13,8 @@ from ssh_abduction.data.files import json_line
 def add_parser(verbs: Verbs) -> None:
     text = (
         "Find the shortest route through a map: the actions from one dstate or place to "
-        "another, and the views to expect on the way."
+        "another, and the views to expect on the way. If the map lists regions, say first which "
+        "regions the route leaves and enters, and which paths it passes."
     )
     parser = verbs.add_parser("route", help="which actions lead there?", description=text)
     parser.add_argument(
@@ -83,6 +84,8 @@ def run(options: argparse.Namespace) -> int:
         print(json_line(found.to_dict()))
         return 0
     print(printable(found.sentence))
+    if found.legs:
+        print(f"by regions: {'; '.join(map(str, found.legs))}")
     if found.moves:
         rows = [
             [

@@ -90,6 +90,10 @@ class MoveGraph:
             "ssh-abduction show lists them"
         )
 
+    def nodes_in(self, places: AbstractSet[int]) -> set[Node]:
+        """Find all nodes that are at these places."""
+        return {node for node in self._graph if self.course(node)[0] in places}
+
     def nodes_at_places_of(self, nodes: AbstractSet[Node]) -> set[Node]:
         """Find all nodes that are at the same places as the given nodes."""
         places = {self._place(node) for node in nodes}

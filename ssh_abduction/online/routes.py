@@ -32,6 +32,7 @@ from ssh_abduction.data.errors import MapError, brief, printable
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import View
 from ssh_abduction.data.words import counted
+from ssh_abduction.online.coarse import Leg, coarse_route, off_the_way
 from ssh_abduction.online.move_graph import MoveGraph, Node
 from ssh_abduction.rivals.listing import Listing, Maps
 
@@ -86,6 +87,8 @@ class Route:
             Each map begins where it has the robot at the steps that this map has at `start`. Empty
             if some move was never tried.
         maps: The number of maps that were compared.
+        legs: The coarse route: the regions to leave and to enter, and the paths to pass. Empty if
+            the map has no regions.
     """
 
     map: int
@@ -97,6 +100,7 @@ class Route:
     moves: tuple[Move, ...]
     agree: tuple[int, ...] = ()
     maps: int = 1
+    legs: tuple[Leg, ...] = ()
 
     @property
     def actions(self) -> tuple[str | None, ...]:
@@ -166,6 +170,7 @@ class Route:
             **({} if length is None else {"metres": round(length, 4)}),
             "known": self.is_known,
             "moves": [move.to_dict() for move in self.moves],
+            **({"legs": [leg.to_dict() for leg in self.legs]} if self.legs else {}),
             "agree": list(self.agree),
             "maps": self.maps,
         }
@@ -216,7 +221,16 @@ def route(
                 f"avoid: expected other dstates and places than those of {name}, got the same; "
                 "take it out of what is avoided"
             )
-    way = graph.shortest(here - closed, there - closed, closed)
+    start_place, goal_place = _place_of(graph, here), _place_of(graph, there)
+    aside: set[Node] = set()
+    legs: tuple[Leg, ...] = ()
+    if start_place is not None and goal_place is not None:
+        # First the coarse route by regions, then the fine one. Without implied turns, a robot may
+        # have to enter a region only to turn around, so nothing is closed then.
+        legs = coarse_route(ssh_map, start_place, goal_place)
+        if by == "places":
+            aside = graph.nodes_in(off_the_way(ssh_map, start_place, goal_place))
+    way = graph.shortest(here - closed, there - closed, closed | aside)
     if way is None:
         _raise_no_route(graph, here, there, closed, told)
     moves = tuple(_move(graph, a, b) for a, b in pairwise(way))
@@ -233,7 +247,14 @@ def route(
         moves=moves,
         agree=_agreeing(ssh_map, first, moves, listing.maps) if is_known else (),
         maps=len(listing.maps),
+        legs=legs,
     )
+
+
+def _place_of(graph: MoveGraph, nodes: AbstractSet[Node]) -> int | None:
+    """Find the place of these nodes; None if they have no place, or several."""
+    places = {graph.course(node)[0] for node in nodes}
+    return places.pop() if len(places) == 1 else None
 
 
 def told_action(move: Move) -> str:
