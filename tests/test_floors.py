@@ -16,6 +16,9 @@ from test_property import agree, checker_rejects_foreign_maps
 from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data import Action, MapError, TheoryError, TraceError
+from ssh_abduction.output import to_networkx, to_svg
+from ssh_abduction.output.export import export_map
+from ssh_abduction.output.layout import layout
 from ssh_abduction.solver import choosing, prefixes
 from ssh_abduction.solver.asp.facts.readable import program
 from ssh_abduction.theory.evidence import Equality, Floors
@@ -147,3 +150,25 @@ def test_the_readable_program_says_what_a_lift_is() -> None:
     assert 'kind("up",lift).' in text
     assert "stretch(3,2)." in text
     assert "lifted(2)." in text
+
+
+def test_floors_are_drawn_below_each_other_and_exported() -> None:
+    moved = [(5.0, 0.0, 0.0), None, (5.0, 0.0, 0.0), (5.0, 0.0, 0.0)]
+    trace = Trace.from_steps("abcde", ["travel", UP, "travel", "travel"], displacements=moved)
+    for ssh_map in (*solve(trace).maps[:1], *solve(trace.without_displacements()).maps[:1]):
+        found = layout(ssh_map)
+        assert found.metric == (ssh_map.fit is not None)
+        heights = [y for _, y, _ in found.dstates]
+        assert max(heights[2:]) < min(heights[:2]) - 1
+        drawing = to_svg(ssh_map)
+        assert "floor 0" in drawing
+        assert "floor 1" in drawing
+        assert "floor 2" not in drawing
+        graph = to_networkx(ssh_map)
+        assert [graph.nodes[s]["floor"] for s in graph] == [0, 0, 1, 1, 1]
+        assert [node["floor"] for _, node in to_networkx(ssh_map, "places").nodes(data=True)] == [
+            0, 0, 1, 1, 1,
+        ]  # fmt: skip
+        nodes = json.loads(export_map(ssh_map, "nav2", level="dstates"))["features"][:5]
+        assert [n["properties"]["metadata"]["floor"] for n in nodes] == [0, 0, 1, 1, 1]
+    assert "floor" not in to_svg(solve(trace[:2]).maps[0])

@@ -16,6 +16,7 @@ Point: TypeAlias = tuple[float, float]
 
 # In units of the page: the margin around the picture, and the radius of a place.
 MARGIN, RADIUS = 80.0, 17.0
+FLOOR = 52.0  # in the same units, how far the name of a floor is above its dstates
 # The colours of paths, in turn. The first six are of the palette of Okabe & Ito, which people with
 # colour blindness can distinguish.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f", "#8c564b")
@@ -140,6 +141,30 @@ def links_of(ssh_map: SSHMap) -> dict[tuple[int, int], str]:
         if source != target:
             actions.setdefault((source, target), []).append(action)
     return {ends: ", ".join(names) for ends, names in actions.items()}
+
+
+def floor_marks(ssh_map: SSHMap, at: Sequence[Point]) -> tuple[list[str], list[Point]]:
+    """Draw the names of floors and, in a map with places, lifts as dashed lines.
+
+    Args:
+        ssh_map: The map.
+        at: The point of each dstate on the page.
+
+    Returns:
+        The marks, and the points that the page has to include. Both are empty without floors.
+    """
+    marks, points = [], []
+    floor = [s.floor for s in ssh_map.dstates]
+    for source, action, target in ssh_map.links:
+        if ssh_map.places and floor[source] != floor[target]:
+            dashed = {"stroke_dasharray": "6 5", "opacity": 0.8}
+            mark = element("path", d=line(at[source], at[target]), stroke="#999", **dashed)
+            marks.append(titled(action, mark))
+    for i, members in enumerate(ssh_map.floors):
+        x, y = min(at[s][0] for s in members), min(at[s][1] for s in members) - FLOOR
+        points.append((x, y))
+        marks.append(text(x, y, f"floor {i}", "#222", size=16, weight="bold", halo=True))
+    return marks, points
 
 
 def escaped(label: str) -> str:

@@ -28,8 +28,8 @@ def to_networkx(
         ssh_map: The map.
         level: The kind of graph.
             "causal" is a MultiDiGraph. Each dstate (distinctive state: a place and a direction) is
-            a node with the attributes view, place, path, direction and heading. Each link is an
-            edge with the attribute action. Unknown attributes are left out.
+            a node with the attributes view, place, path, direction, heading and floor. Each link is
+            an edge with the attribute action. Unknown attributes are left out.
             "topological" is a bipartite Graph with the nodes ("place", p) and ("path", h). Each
             place on a path gives an edge with the attribute index, its position in the order of
             the path.
@@ -81,6 +81,7 @@ def _causal(ssh_map: SSHMap) -> nx.MultiDiGraph[Any]:
             "path": s.path,
             "direction": s.direction,
             "heading": s.heading,
+            "floor": s.floor,
         }
         graph.add_node(s.id, **{k: v for k, v in facts.items() if v is not None})
     for source, action, target in ssh_map.links:
@@ -107,7 +108,9 @@ def _places(ssh_map: SSHMap, turns: Trace | Turns | None) -> nx.MultiGraph[Any]:
     graph: nx.MultiGraph[Any] = nx.MultiGraph(metric=found.metric)
     for place in ssh_map.places:
         dstates = tuple(s.id for s in ssh_map.dstates if s.place == place)
-        graph.add_node(place, pos=found.places[place], dstates=dstates)
+        floor = ssh_map.dstates[dstates[0]].floor if dstates else None
+        level = {} if floor is None else {"floor": floor}
+        graph.add_node(place, pos=found.places[place], dstates=dstates, **level)
     for path in ssh_map.paths:
         streets = travelled(ssh_map, path)
         for index, (p, q) in enumerate(pairwise(path.order)):

@@ -14,8 +14,8 @@ straight: the parts whose places the robot's travels join.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
@@ -31,6 +31,7 @@ from ssh_abduction.output.turns import Turns, degrees_of
 
 FARTHEST = 1e7  # metres: a robot's positions are nearer than this
 GAP = 1.5  # distance in the drawing between parts of a map that nothing connects
+STOREY = 0.25  # distance between two floors, as a share of the extent of the largest one
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +80,7 @@ def layout(ssh_map: SSHMap, turns: Trace | Turns | None = None) -> Layout:
     degrees = degrees_of(turns)
     poses = located(ssh_map)
     if poses is None:
-        return _Drawing(ssh_map, degrees).layout()
+        return _floor_by_floor(ssh_map, _Drawing(ssh_map, degrees).layout())
     first = {s.place: s.id for s in reversed(ssh_map.dstates)}  # the first dstate of each place
     return Layout(
         {p: (poses[first[p]].x, poses[first[p]].y) for p in ssh_map.places},
@@ -92,7 +93,8 @@ def located(ssh_map: SSHMap) -> tuple[Pose, ...] | None:
     """Return the poses of the dstates if the map can be drawn at them; None otherwise.
 
     A map cannot be drawn at its poses if displacements between its parts are missing. Each part
-    then has poses relative to its own first dstate.
+    then has poses relative to its own first dstate. Floors are moved, so that each is drawn below
+    the one before.
     """
     poses = ssh_map.fit.poses if ssh_map.fit else ()
     if not poses or any(
@@ -101,13 +103,59 @@ def located(ssh_map: SSHMap) -> tuple[Pose, ...] | None:
         return None
     if set(ssh_map.places) - {s.place for s in ssh_map.dstates}:
         return None
-    here = ssh_map.dstates[ssh_map.labels[0]]
+    first = {ssh_map.dstates[s].floor: ssh_map.dstates[s] for s in reversed(ssh_map.labels)}
     for s in ssh_map.dstates:
-        pose = poses[s.id]
+        pose, here = poses[s.id], first[s.floor]
         is_origin = pose.x == pose.y == pose.heading == 0.0 and not any(pose.spread)
         if is_origin and s.id != here.id and (s.place is None or s.place != here.place):
             return None
-    return poses
+    moves = _moves_of_floors(ssh_map, [(pose.x, pose.y) for pose in poses])
+    return tuple(
+        replace(pose, x=pose.x + moves[s.id][0], y=pose.y + moves[s.id][1])
+        for s, pose in zip(ssh_map.dstates, poses, strict=True)
+    )
+
+
+def _moves_of_floors(ssh_map: SSHMap, at: Sequence[Point], least: float = 0.0) -> list[Point]:
+    """Find how far to move each dstate, so that each floor is below the one before.
+
+    Args:
+        ssh_map: The map.
+        at: The position of each dstate, with y up.
+        least: The least distance between two floors.
+    """
+    moves = [(0.0, 0.0)] * len(at)
+    boxes = [_box([at[s] for s in floor]) for floor in ssh_map.floors]
+    extent = max((max(x1 - x0, y1 - y0) for x0, y0, x1, y1 in boxes), default=0.0)
+    gap = max(STOREY * extent, least)
+    below = None  # the least y of the floor above, where it is drawn
+    for floor, (x0, y0, _, y1) in zip(ssh_map.floors, boxes, strict=True):
+        move = (0.0, 0.0) if below is None else (boxes[0][0] - x0, below - gap - y1)
+        below = y0 + move[1]
+        for s in floor:
+            moves[s] = move
+    return moves
+
+
+def _box(points: Sequence[Point]) -> tuple[float, float, float, float]:
+    """The least x and y, and the greatest x and y, of some points."""
+    xs, ys = zip(*points, strict=True)
+    return min(xs), min(ys), max(xs), max(ys)
+
+
+def _floor_by_floor(ssh_map: SSHMap, found: Layout) -> Layout:
+    """Move the floors of a drawing, so that each is below the one before."""
+    moves = _moves_of_floors(ssh_map, [(x, y) for x, y, _ in found.dstates], GAP)
+    of_place = {s.place: moves[s.id] for s in ssh_map.dstates}
+    places = {
+        p: (x + of_place[p][0], y + of_place[p][1]) if p in of_place else (x, y)
+        for p, (x, y) in found.places.items()
+    }
+    dstates = tuple(
+        (x + dx, y + dy, heading)
+        for (x, y, heading), (dx, dy) in zip(found.dstates, moves, strict=True)
+    )
+    return replace(found, places=places, dstates=dstates)
 
 
 def travelled(ssh_map: SSHMap, path: MapPath) -> list[tuple[int, int]]:
@@ -180,7 +228,10 @@ class _Drawing:
         """Lay out a map without places: linked dstates are near (Kamada & Kawai 1989)."""
         graph: nx.Graph[Any] = nx.Graph()
         graph.add_nodes_from(s.id for s in self.map.dstates)
-        graph.add_edges_from((s, x) for s, _, x in self.map.links if s != x)
+        floor = [s.floor for s in self.map.dstates]
+        graph.add_edges_from(
+            (s, x) for s, _, x in self.map.links if s != x and floor[s] == floor[x]
+        )
         graph.add_edges_from(pairwise([min(part) for part in nx.connected_components(graph)]))
         found = (
             nx.kamada_kawai_layout(graph) if len(graph) > 1 else dict.fromkeys(graph, (0.0, 0.0))

@@ -21,6 +21,7 @@ from ssh_abduction.output.drawing import (
     element,
     fault_mark,
     faults_of,
+    floor_marks,
     line,
     links_of,
     page,
@@ -100,12 +101,14 @@ class _Picture:
         ]
         labels = self.place_labels(spots) + self.dstate_labels()
         labels += self.path_labels(spots) if self.map.places else self.link_labels()
+        floors, named = floor_marks(self.map, [self.on_page(pose) for pose in self.poses])
+        self.points += named
         faults = [
             fault_mark(*self.along(self.map.dstates[s], END), said, self.unit)
             for s, said in faults_of(self.map).items()
         ]
         return page(
-            [*lines, *ellipses, *arrows, *dots, *labels, *faults, *self.scale_bar()],
+            [*lines, *ellipses, *arrows, *dots, *labels, *floors, *faults, *self.scale_bar()],
             self.points,
             MARGIN,
         )

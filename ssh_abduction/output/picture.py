@@ -19,6 +19,7 @@ from ssh_abduction.output.drawing import (
     element,
     fault_mark,
     faults_of,
+    floor_marks,
     line,
     links_of,
     page,
@@ -55,7 +56,9 @@ def to_svg(ssh_map: SSHMap, turns: Trace | Turns | None = None) -> str:
     if (poses := located(ssh_map)) is not None:
         return metric_svg(ssh_map, poses)
     found = layout(ssh_map, turns)
-    return page(*(_topological(ssh_map, found) if ssh_map.places else _causal(ssh_map, found)))
+    marks, points = (_topological if ssh_map.places else _causal)(ssh_map, found)
+    floors, named = floor_marks(ssh_map, [_on_page(x, y) for x, y, _ in found.dstates])
+    return page([*floors, *marks], [*points, *named])
 
 
 def _on_page(x: float, y: float) -> Point:

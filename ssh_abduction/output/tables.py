@@ -37,11 +37,12 @@ def to_pandas(ssh_map: SSHMap) -> pd.DataFrame:
             "path": s.path,
             "direction": s.direction,
             "heading": s.heading,
+            "floor": s.floor,
         }
         if ssh_map.fit and ssh_map.fit.poses:
             pose = ssh_map.fit.poses[s.id]
             row |= {"x": pose.x, "y": pose.y, "pose_heading": pose.heading}
         rows.append(row)
     table = pd.DataFrame(rows, index=pd.RangeIndex(len(rows), name="step"))
-    whole = ["place", "path", "direction", "heading"]
+    whole = ["place", "path", "direction", "heading", "floor"]
     return table.astype(dict.fromkeys(whole, "Int64"))  # integers that may be missing

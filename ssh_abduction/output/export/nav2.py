@@ -47,6 +47,7 @@ def _node(stop: Stop, roads: Roads, frame: str) -> dict[str, Any]:
         "metric": roads.metric,
         "views": " ".join(map(str, stop.views)),
         "heading": round(stop.heading, DIGITS),
+        **({} if stop.floor is None else {"floor": stop.floor}),
     }
     return {"id": stop.id, "frame": frame, "metadata": metadata}
 

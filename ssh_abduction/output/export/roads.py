@@ -31,6 +31,7 @@ class Stop:
         heading: Radians counterclockwise from x; 0 if it is unknown. A place has the heading of its
             first dstate with a known heading.
         views: The views of its dstates, in their order.
+        floor: The number of its floor; None if the map has no floors.
     """
 
     id: int
@@ -38,6 +39,7 @@ class Stop:
     y: float
     heading: float
     views: tuple[View, ...]
+    floor: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +109,7 @@ class Roads:
             stops, ends = _places(ssh_map, drawn), _streets(ssh_map)
         else:
             stops = tuple(
-                Stop(s.id, x, y, heading or 0.0, () if s.view is None else (s.view,))
+                Stop(s.id, x, y, heading or 0.0, () if s.view is None else (s.view,), s.floor)
                 for s, (x, y, heading) in zip(ssh_map.dstates, drawn.dstates, strict=True)
             )
             # Sort in reverse, so that the first action by name remains if several join two dstates.
@@ -117,14 +119,16 @@ class Roads:
                 if s != x
             }
         at = {stop.id: (stop.x, stop.y) for stop in stops}
+        floor = {stop.id: stop.floor for stop in stops}
         place = {s.id: s.place for s in ssh_map.dstates} if level == "dstates" else {}
         roads = tuple(
             Road(
                 a,
                 b,
-                length := math.dist(at[a], at[b]),
+                # Floors are drawn apart, so the distance along a lift means nothing.
+                length := math.dist(at[a], at[b]) if floor[a] == floor[b] else LEAST,
                 *what,
-                turns=_is_turn(place.get(a), place.get(b), length),
+                turns=floor[a] == floor[b] and _is_turn(place.get(a), place.get(b), length),
             )
             for (a, b), what in sorted(ends.items())
         )
@@ -160,7 +164,8 @@ def _places(ssh_map: SSHMap, drawn: Layout) -> tuple[Stop, ...]:
         headings = (drawn.dstates[s.id][2] for s in members)
         heading = next((h for h in headings if h is not None), 0.0)
         views = tuple(s.view for s in members if s.view is not None)
-        stops.append(Stop(p, *drawn.places[p], heading, views))
+        floor = members[0].floor if members else None
+        stops.append(Stop(p, *drawn.places[p], heading, views, floor))
     return tuple(stops)
 
 
