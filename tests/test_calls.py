@@ -42,7 +42,16 @@ from ssh_abduction import (
     solve,
     view_page,
 )
-from ssh_abduction.data import Action, Closure, Odometry, Step
+from ssh_abduction.data import (
+    Action,
+    Closure,
+    Corrections,
+    Odometry,
+    Said,
+    Step,
+    drives_of,
+    save_corrections,
+)
 from ssh_abduction.evaluation import evaluate_visits
 from ssh_abduction.evaluation.ladder import ladder
 from ssh_abduction.learning.learner import BootstrapLearner
@@ -124,6 +133,11 @@ RIGHT: dict[str, set[str]] = {
     "Camera.shot.hour": {"3.5"},
     "Certificate.to_dict.trace": {"None"},
     "Closure.last": {"huge"},
+    "Corrections.known_in.drives": EMPTY,
+    "Corrections.named.drives": EMPTY,
+    "Corrections.with_gateway.is_open": {"True"},
+    "Corrections.with_gateway.seen": EMPTY,
+    "Corrections.with_name.name": {"nonsense", "folder"},
     "Cost.preferred_by.theory": {"None"},
     "Explorer.explore.steps": {"huge"},
     "Odometry.of.value": {"dict"},
@@ -136,6 +150,12 @@ RIGHT: dict[str, set[str]] = {
     "Search.continuing.theory": {"None"},
     "Speedups.that_hold_for.theory": {"None"},
     "Speedups.without.names": {"empty text", "dict", *EMPTY},
+    "SSHMap.called.number": {"huge"},
+    "SSHMap.name_of.number": {"None", "huge"},
+    "SSHMap.numbered.number": {"huge"},
+    "Listing.named_beside.path": TEXTS,
+    "load_corrections.path": {"empty text", "folder"},
+    "save_corrections.path": {"empty text", "nonsense", "folder"},
     "Step.image": {"list", "array", "huge", "[1, 2]"},
     "Theory.from_dict.data": {"dict"},
     "Theory.prefer": {"list"},
@@ -175,6 +195,11 @@ RIGHT: dict[str, set[str]] = {
 # The package makes these values: nobody needs their constructors, which take what they are given.
 # Their methods are swept.
 MADE_BY_THE_PACKAGE = {
+    "Corrections",
+    "Name",
+    "Naming",
+    "Passage",
+    "Said",
     "DrivePair",
     "Drive",
     "Fault",
@@ -296,6 +321,7 @@ def receiver(name: str) -> Any:
         "Certificate": lambda: solution.certificate,
         "Chances": Chances,
         "Comparison": lambda: made["comparison"],
+        "Corrections": lambda: Corrections.for_drives(trace),
         "Cost": lambda: solution.cost,
         "Difference": lambda: difference(ssh_map, ssh_map),
         "Evaluation": lambda: evaluate(solution.maps, trace),
@@ -343,12 +369,27 @@ def good(call: str, parameter: inspect.Parameter) -> Any:
         "BootstrapLearner.predict.X": made["drive"],
         "BootstrapLearner.score.X": made["drive"],
         "BootstrapLearner.theory": Theory.causal(),
+        "Corrections.check_drives.known": {"drive 1": None},
+        "Corrections.with_gateway.is_open": False,
+        "Corrections.with_gateway.seen": [("monday:1", 90.0)],
+        "Corrections.with_name.kind": "place",
+        "Corrections.with_name.step": "monday:1",
+        "Corrections.with_pair.first": "monday:1",
+        "Corrections.with_pair.kind": "same",
+        "Corrections.with_pair.second": "monday:2",
+        "Corrections.without.sentence": Said("same", ("monday:1", "monday:2")),
+        "load_corrections.path": "corrections.yaml",
+        "save_corrections.corrections": Corrections.for_drives(trace),
+        "SSHMap.called.kind": "place",
+        "SSHMap.name_of.kind": "place",
+        "SSHMap.numbered.kind": "place",
         "Explorer.explore.steps": 2,
         "Explorer.margin": 0,
         "Explorer.theory": Theory.causal(),
         "Listing.check_same_trace.other": made["listing"],
         "Listing.from_dict.data": solution.to_dict(),
         "Listing.load.path": "solution.json",
+        "Listing.named_beside.path": "solution.json",
         "Listing.number.name": "1",
         "Listing.of.source": solution,
         "OnlineMapper.theory": Theory.causal(),
@@ -414,6 +455,8 @@ def good(call: str, parameter: inspect.Parameter) -> Any:
         "last": 1,
         "kind": "misread",
         "least": 0.1,
+        "number": 0,
+        "drives": drives_of(trace),
         "length": 2,
         "listing": made["listing"],
         "light": Light.at(12.0),
@@ -514,6 +557,7 @@ def _in_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made["trace"].save("trace.jsonl")
     made["map"].save("map.json")
     made["solution"].save("solution.json")
+    save_corrections(Corrections.for_drives(made["trace"]), "corrections.yaml")
     Path("theory.toml").write_text('star = "none"')
 
 

@@ -32,7 +32,7 @@ from ssh_abduction.data import (
     drives_of,
     together,
 )
-from ssh_abduction.data.drives import sentence_of
+from ssh_abduction.data.drives import fingerprints_of, sentence_of
 from ssh_abduction.rivals import Listing, joins_of_drives
 from ssh_abduction.solver import choosing, prefixes
 from ssh_abduction.solver.fit import Poses
@@ -178,7 +178,9 @@ def test_drives_that_share_nothing_are_pieces(tmp_path: Path) -> None:
     solution.save(tmp_path / "maps.json")
     data = json.loads((tmp_path / "maps.json").read_text())
     assert data["maps"][0]["pieces"] == [[0, 1, 2, 3], [4, 5, 6]]
-    assert data["drives"][1] == {"name": "far", "first": 4, "stop": 7}
+    fingerprint = fingerprints_of(far)["far"]
+    told = {"name": "far", "first": 4, "stop": 7, "fingerprint": fingerprint}
+    assert data["drives"][1] == told
     read = Solution.load(tmp_path / "maps.json")
     assert read.drives == solution.drives
     assert read == solution

@@ -25,7 +25,7 @@ def add_parser(verbs: Verbs) -> None:
         dest="start",
         metavar="A",
         help=(
-            "start: the number of a dstate, or a place such as p3, which means any dstate there "
+            "start: the number of a dstate, or a place by number or name, such as p3 or kitchen "
             "(default: the robot's last dstate)"
         ),
     )
@@ -34,7 +34,7 @@ def add_parser(verbs: Verbs) -> None:
         dest="goal",
         metavar="B",
         required=True,
-        help="goal: the number of a dstate, or a place such as p3, which means any dstate there",
+        help="goal: the number of a dstate, or a place by number or name, such as p3 or kitchen",
     )
     parser.add_argument(
         "--avoid",
@@ -87,12 +87,13 @@ def run(options: argparse.Namespace) -> int:
     if found.legs:
         print(f"by regions: {'; '.join(map(str, found.legs))}")
     if found.moves:
+        chosen = listing.maps[found.map - 1]
         rows = [
             [
                 told_action(move),
                 "" if move.dstate is None else move.dstate,
                 "not known" if move.view is None else move.view,
-                "" if move.place is None else move.place,
+                "" if move.place is None else chosen.numbered("place", move.place),
                 course(move.path, move.direction),
                 *([] if move.metres is None else [f"{move.metres:.2f}"]),
                 "" if move.known else "never tried",

@@ -6,8 +6,11 @@ import argparse
 
 from ssh_abduction.cli.options import Verbs, check_number
 from ssh_abduction.cli.text import describe
+from ssh_abduction.data.corrections_file import named_beside
+from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.maps import SSHMap, maps_of
+from ssh_abduction.solver import drives_in
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -26,7 +29,11 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    maps = maps_of(read_json(options.maps), str(options.maps))
+    data, where = read_json(options.maps), str(options.maps)
+    found = maps_of(data, where)
+    steps = len(found[0].labels) if found else 0
+    drives = drives_in(FieldReader(where), data, steps) if found else ()
+    maps = named_beside(found, drives, options.maps)
     check_number(options.map, maps, options.maps)
     if not maps:
         print("no map")

@@ -7,12 +7,14 @@ import contextlib
 import logging
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 from typing import Any
 
 from ssh_abduction.cli.guard import Guard
+from ssh_abduction.cli.obeying import Obeying
 from ssh_abduction.cli.options import Verbs, add_theory, number_steps, theory_of
 from ssh_abduction.cli.outcome import (
     Given,
@@ -97,6 +99,14 @@ def add_parser(verbs: Verbs) -> None:
         metavar="TRACE",
         help="with --together: also write the joint trace to this file",
     )
+    parser.add_argument(
+        "--corrections",
+        metavar="FILE",
+        help=(
+            "obey the names and corrections in this file, or in a folder (default: "
+            "corrections.yaml beside the file of --output, if it exists)"
+        ),
+    )
     front = (
         "report the fewest dstates of a map with at most 0, 1, … K faults (steps treated as "
         "wrong), by the causal theory; with --misread or --slipped, only faults of these kinds. "
@@ -175,11 +185,12 @@ def run(options: argparse.Namespace) -> int:
     number_steps(options, trace)
     theory = theory_of(options)
     theory.check_steps(trace)
+    obeying = Obeying.of(options, trace, theory)
     with contextlib.ExitStack() as until_printed:
         with _progress(options.json) as on_progress:
             search = Search(
-                trace,
-                theory,
+                obeying.trace,
+                obeying.theory,
                 time_limit=options.time_limit,
                 max_maps=options.maps or None,
                 within=options.within,
@@ -190,13 +201,13 @@ def run(options: argparse.Namespace) -> int:
             )
             # Ctrl-C must not cut the output, as half of it would be useless.
             until_printed.enter_context(on_ctrl_c(search.interrupt))
-            printed = (_Json if options.json else _Text)(search)
+            printed = (_Json if options.json else _Text)(search, obeying)
             guard = Guard(
                 search.interrupt, printed.last_words, options.time_limit, options.memory_limit
             )
             until_printed.enter_context(guard)
             explanation = printed.searched(guard.say)
-        solution = search.solution(tuple(printed.kept))
+        solution = obeying.with_names(search.solution(tuple(printed.kept)))
         guard.say(partial(printed.end, solution, explanation))
         warn(warnings_of(search, solution))
         if options.output is not None:
@@ -220,9 +231,9 @@ class _Text:
         kept: The first maps that were found. Further maps are only counted.
     """
 
-    def __init__(self, search: Search) -> None:
+    def __init__(self, search: Search, obeying: Obeying) -> None:
         self.kept: list[SSHMap] = []
-        self._search = search
+        self._search, self._obeying = search, obeying
         self._room = HELD_DSTATES
 
     def searched(self, _: Callable[[Callable[[], str]], None]) -> Explanation | None:
@@ -235,7 +246,8 @@ class _Text:
 
     def end(self, solution: Solution, explanation: Explanation | None) -> str:
         """Make the whole output as text."""
-        return _text(_lines(self._search, solution, explanation, self._search.backbone))
+        lines = _lines(self._search, solution, explanation, self._search.backbone)
+        return _text(chain(lines, self._obeying.blamed(explanation)))
 
     def last_words(self, why: Stop) -> tuple[str, int]:
         """Make the output for a process that must end although its search does not stop.
@@ -263,8 +275,8 @@ class _Json:
     order in which they are found.
     """
 
-    def __init__(self, search: Search) -> None:
-        self._search = search
+    def __init__(self, search: Search, obeying: Obeying) -> None:
+        self._search, self._obeying = search, obeying
         self._held: list[Given] = []
         self._room = HELD_DSTATES
         self._maps = 0  # maps that were printed
@@ -286,7 +298,7 @@ class _Json:
         """
         say(self._opening)
         for ssh_map in self._search:
-            given = given_by(self._search, ssh_map)
+            given = given_by(self._search, self._obeying.named(ssh_map))
             if self._maps:
                 say(partial(self._line, given))
                 continue
@@ -304,11 +316,10 @@ class _Json:
     def _end(
         self, solution: Solution, explanation: Explanation | None, backbone: Backbone | None
     ) -> str:
-        return (
-            "\n],"
-            + dump(ending(self._search, solution, explanation, self._maps, backbone))[1:]
-            + "\n"
-        )
+        end = ending(self._search, solution, explanation, self._maps, backbone)
+        if blamed := self._obeying.blamed(explanation):
+            end["corrections"] = blamed
+        return f"\n],{dump(end)[1:]}\n"
 
     def last_words(self, why: Stop) -> tuple[str, int]:
         """Complete the JSON printed so far, as the process must end and its search does not stop.
@@ -341,7 +352,7 @@ class _Json:
         return ("," if self._maps > 1 else "") + "\n" + dump(told(given))
 
 
-def _text(lines: Iterator[str]) -> str:
+def _text(lines: Iterable[str]) -> str:
     return "".join(f"{line}\n" for line in lines)
 
 

@@ -159,8 +159,9 @@ def describe(ssh_map: SSHMap) -> str:
             f"  {counted(len(ssh_map.dstates), 'dstates')}, and "
             f"{'; '.join(printable(str(fault)) for fault in ssh_map.faults)}"
         )
-    if ssh_map.paths:
-        parts += [f"  path {p.id}: places {' – '.join(map(str, p.order))}" for p in ssh_map.paths]
+    for p in ssh_map.paths:
+        order = " – ".join(ssh_map.numbered("place", place) for place in p.order)
+        parts.append(printable(f"  {ssh_map.called('path', p.id)}: places {order}"))
     if ssh_map.excused:
         parts += [f"  excused from sides: paths {h} and {g}" for h, g in ssh_map.excused]
     leads: dict[int, list[str]] = {}
@@ -170,7 +171,7 @@ def describe(ssh_map: SSHMap) -> str:
         [
             s.id,
             s.shown,
-            "" if s.place is None else s.place,
+            "" if s.place is None else ssh_map.numbered("place", s.place),
             course(s.path, s.direction),
             ", ".join(leads.get(s.id, [])),
         ]

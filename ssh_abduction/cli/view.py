@@ -103,7 +103,7 @@ def run(options: argparse.Namespace) -> int:
         raise AbductionError(f"port: expected 0 to 65535, got {options.port}; name a free port")
     data = read_json(options.maps)
     source = "standard input" if options.maps == "-" else options.maps
-    listing = Listing.from_dict(data, source)
+    listing = Listing.from_dict(data, source).named_beside(options.maps)
     trace = Trace.load(options.trace) if options.trace is not None else None
     theory = (
         Theory.from_dict(data["theory"]) if isinstance(data, dict) and "theory" in data else None

@@ -10,6 +10,8 @@ TYPE_CHECKING = False
 
 if TYPE_CHECKING:
     from ssh_abduction.data.closure import Closure
+    from ssh_abduction.data.corrections import Corrections, Naming, Passage, Said
+    from ssh_abduction.data.corrections_file import load_corrections, save_corrections
     from ssh_abduction.data.drives import Drive, by_drive, drives_of, together
     from ssh_abduction.data.errors import (
         AbductionError,
@@ -20,7 +22,7 @@ if TYPE_CHECKING:
         TheoryError,
         TraceError,
     )
-    from ssh_abduction.data.maps import DState, Fault, Fit, MapPath, Pose, SSHMap
+    from ssh_abduction.data.maps import DState, Fault, Fit, MapPath, Name, Pose, SSHMap
     from ssh_abduction.data.odometry import Odometry
     from ssh_abduction.data.regions import Region
     from ssh_abduction.data.star import Star
@@ -28,6 +30,8 @@ if TYPE_CHECKING:
 
 _HOMES = {  # module: the names that this package exports from it
     "closure": ("Closure",),
+    "corrections": ("Corrections", "Naming", "Passage", "Said"),
+    "corrections_file": ("load_corrections", "save_corrections"),
     "drives": ("Drive", "by_drive", "drives_of", "together"),
     "errors": (
         "AbductionError",
@@ -43,6 +47,7 @@ _HOMES = {  # module: the names that this package exports from it
         "Fault",
         "Fit",
         "MapPath",
+        "Name",
         "Pose",
         "SSHMap",
     ),
@@ -59,6 +64,7 @@ __all__ = [
     "AbductionError",
     "Action",
     "Closure",
+    "Corrections",
     "DState",
     "Drive",
     "Fault",
@@ -66,11 +72,15 @@ __all__ = [
     "LocaliserError",
     "MapError",
     "MapPath",
+    "Name",
+    "Naming",
     "Odometry",
+    "Passage",
     "Pose",
     "RangeError",
     "Region",
     "SSHMap",
+    "Said",
     "SolverError",
     "Star",
     "Step",
@@ -79,6 +89,8 @@ __all__ = [
     "TraceError",
     "by_drive",
     "drives_of",
+    "load_corrections",
+    "save_corrections",
     "together",
 ]
 

@@ -16,17 +16,19 @@ robot: nothing is known of how the first step of a drive relates to any step of 
 
 from __future__ import annotations
 
+import hashlib
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from itertools import accumulate, pairwise
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from ssh_abduction.data.action import Action
 from ssh_abduction.data.checks import a_list, a_text, all_instances
 from ssh_abduction.data.errors import TraceError, brief
+from ssh_abduction.data.files import json_line
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.star import is_four
@@ -35,6 +37,9 @@ from ssh_abduction.data.trace import Trace, checked_trace
 
 T = TypeVar("T")
 
+SEEN = "star_seen"  # the field of a step that keeps the star before a person corrected it
+# The fields of a step that a solver reads.
+_READ = frozenset({"view", "action", "star", "displacement", "covariance", "confidence"})
 ALONE = "drive 1"  # the name of the only drive of a trace without a name
 
 
@@ -46,11 +51,17 @@ class Drive:
         name: The name of the drive.
         first: Its first step.
         stop: The step after its last one.
+        fingerprint: A digest of its steps, in solutions that were read from a file; else None.
     """
 
     name: str
     first: int
     stop: int
+    fingerprint: str | None = field(default=None, compare=False)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the drive as plain data, as `solve --json` prints it."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
 
 
 def starts_of(trace: Trace) -> tuple[int, ...]:
@@ -70,10 +81,38 @@ def frames_of(trace: Trace) -> tuple[int, ...]:
 def drives_of(trace: Trace) -> tuple[Drive, ...]:
     """List the drives of a trace, in order. Most traces have one."""
     starts = starts_of(trace)
-    first = trace.drive or trace.name or ALONE
-    names = [first, *(trace.actions[t - 1].name for t in starts)]
+    names = [_name(trace) or ALONE, *(trace.actions[t - 1].name for t in starts)]
     bounds = pairwise([0, *starts, len(trace)])
     return tuple(Drive(name, *bound) for name, bound in zip(names, bounds, strict=True))
+
+
+def fingerprints_of(trace: Trace) -> dict[str, str]:
+    """Return a digest of the steps of each drive, 16 hexadecimal digits, by the drive's name.
+
+    It does not depend on the other drives of a joint trace, nor on corrections of stars.
+    """
+    return {
+        drive.name: _fingerprint(trace.steps[drive.first : drive.stop])
+        for drive in drives_of(trace)
+    }
+
+
+def with_fingerprints(trace: Trace) -> tuple[Drive, ...]:
+    """List the drives of a trace, each with its fingerprint."""
+    found = fingerprints_of(trace)
+    return tuple(replace(drive, fingerprint=found[drive.name]) for drive in drives_of(trace))
+
+
+def _fingerprint(steps: Sequence[Step]) -> str:
+    """Return a digest of what a solver reads of the steps of a drive, as the robot saw them."""
+    lines = [step.to_json() for step in steps]
+    for i, (step, line) in enumerate(zip(steps, lines, strict=True)):
+        if SEEN in step.extra:
+            line["star"] = step.extra[SEEN]
+        kept = _READ if i else _READ - {"displacement", "covariance"}
+        kept = kept if i < len(steps) - 1 else kept - {"action"}
+        lines[i] = {name: value for name, value in line.items() if name in kept}
+    return hashlib.sha256("\n".join(map(json_line, lines)).encode()).hexdigest()[:16]
 
 
 def by_drive(trace: Trace, values: Sequence[T]) -> dict[str, tuple[T, ...]]:
@@ -107,19 +146,30 @@ def step_named(trace: Trace, name: str) -> int:
     Raises:
         TraceError: There is no such step.
     """
+    return step_of(drives_of(trace), name)
+
+
+def step_of(drives: Sequence[Drive], name: str) -> int:
+    """Return the number of a step of some drives, as `step_named`. Raises TraceError."""
     a_text("name", name, TraceError)
     drive_name, colon, number = name.rpartition(":")
-    drives = {drive.name: drive for drive in drives_of(trace)}
-    drive = drives.get(drive_name) if colon else Drive("", 0, len(trace))
+    by_name = {drive.name: drive for drive in drives}
+    drive = by_name.get(drive_name) if colon else Drive("", 0, drives[-1].stop)
     if drive is None:
         raise TraceError(
-            f"step {brief(name)}: expected a drive out of {', '.join(drives)}, got "
+            f"step {brief(name)}: expected a drive out of {', '.join(by_name)}, got "
             f"{brief(drive_name)}"
         )
     steps = drive.stop - drive.first
     if not (number.isascii() and number.isdecimal()) or int(number) >= steps:
         raise TraceError(f"step {brief(name)}: expected a number from 0 to {steps - 1}")
     return drive.first + int(number)
+
+
+def step_name(drives: Sequence[Drive], step: int) -> str:
+    """Return the name of a step, such as "tuesday:14". This inverts `step_of`."""
+    drive = next(drive for drive in drives if step < drive.stop)
+    return f"{drive.name}:{step - drive.first}"
 
 
 def joined_drives(drives: Sequence[Drive], ssh_map: SSHMap) -> tuple[tuple[str, ...], ...]:
@@ -206,14 +256,18 @@ def together(traces: Iterable[Trace], names: Iterable[str] | None = None) -> Tra
     )
 
 
+def _name(trace: Trace) -> str | None:
+    """Return the name of the first drive of a trace; None if neither it nor its file has one."""
+    return trace.drive or trace.name or (trace.source and Path(trace.source).stem)
+
+
 def _names(traces: Sequence[Trace], names: Iterable[str] | None) -> list[str]:
     """Return the names of all drives, or raise TraceError if two are the same."""
     if names is None:
         found: list[str] = []
         for trace in traces:
             drives = drives_of(trace)
-            alone = trace.drive or trace.name or (trace.source and Path(trace.source).stem)
-            found += [d.name for d in drives] if len(drives) > 1 else [alone or ""]
+            found += [d.name for d in drives] if len(drives) > 1 else [_name(trace) or ""]
         found = [name or f"drive {i + 1}" for i, name in enumerate(found)]
     else:
         found = [

@@ -13,7 +13,7 @@ from ssh_abduction.data.checks import a_path
 from ssh_abduction.data.errors import MapError, brief, is_writable, named
 from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.data.files import HalfCharacter, NotFinite, parse_json, write_file
-from ssh_abduction.data.map_parts import FAULTS, DState, Fault, Fit, MapPath, Pose
+from ssh_abduction.data.map_parts import FAULTS, NAMED, DState, Fault, Fit, MapPath, Name, Pose
 from ssh_abduction.data.regions import Region
 
 # What files of solutions and of single maps begin with.
@@ -196,6 +196,7 @@ def map_fields(data: Any, where: str) -> dict[str, Any]:
         ),
         "fit": _fit(read, record, len(dstates)),
         "regions": _regions(read, record, {*places}, {*path_ids}),
+        "names": read.each(record, "names", lambda x, name: _name(read, x, name), optional=True),
     }
 
 
@@ -303,6 +304,15 @@ def _region(read: FieldReader, value: Any, name: str, places: set[int], paths: s
     if any(not 0 <= i < number for i in inside):
         raise inner.wrong("inside", "numbers of earlier regions", [*inside])
     return Region(number, within, bounds, door, inside)
+
+
+def _name(read: FieldReader, value: Any, name: str) -> Name:
+    """Convert and check the name of a place, path or region."""
+    record = read.mapping(value, name)
+    kind = next((kind for kind in NAMED if kind in record), None)
+    if kind is None or not isinstance(record.get("name"), str):
+        raise read.wrong(name, f"a name, and one of {', '.join(NAMED)}", value)
+    return Name(kind, read.integer(record[kind], f"{name}.{kind}"), record["name"])
 
 
 def _fit(read: FieldReader, record: Mapping[str, Any], dstates: int) -> Fit | None:

@@ -8,6 +8,8 @@ from typing import Literal
 from ssh_abduction.data.observation import View
 
 FAULTS = ("misread", "misseen", "slipped", "jumped")
+# What a person can name.
+NAMED = ("place", "path", "region")
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +54,21 @@ class MapPath:
 
     id: int
     order: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Name:
+    """A name that a person gave.
+
+    Attributes:
+        kind: What has the name: "place", "path" or "region".
+        id: The number of the place, path or region.
+        text: The name.
+    """
+
+    kind: str
+    id: int
+    text: str
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,7 +22,7 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from ssh_abduction.data.checks import all_instances, an_instance
+from ssh_abduction.data.checks import a_whole_number, all_instances, an_instance, one_of
 from ssh_abduction.data.errors import MapError, brief, is_whole, named
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.map_file import (
@@ -34,7 +34,7 @@ from ssh_abduction.data.map_file import (
     read_json,
     write_map,
 )
-from ssh_abduction.data.map_parts import FAULTS, DState, Fault, Fit, MapPath, Pose
+from ssh_abduction.data.map_parts import FAULTS, NAMED, DState, Fault, Fit, MapPath, Name, Pose
 from ssh_abduction.data.notebook import in_output
 from ssh_abduction.data.regions import Region, renumbered, right_of
 from ssh_abduction.data.trace import Trace
@@ -48,6 +48,7 @@ __all__ = [
     "Fault",
     "Fit",
     "MapPath",
+    "Name",
     "Pose",
     "SSHMap",
     "check_of_trace",
@@ -79,6 +80,7 @@ class SSHMap:
         faults: The parts of the trace that the map treats as wrong, sorted by step.
         regions: Sets of places that directed paths bound, or that one place cuts off; the largest
             first. None if they were not derived (`ssh_abduction.solver.find_regions`).
+        names: The names that a person gave to places, paths and regions.
     """
 
     labels: tuple[int, ...]
@@ -90,6 +92,7 @@ class SSHMap:
     fit: Fit | None = field(default=None, compare=False)
     faults: tuple[Fault, ...] = ()
     regions: tuple[Region, ...] | None = field(default=None, compare=False, repr=False)
+    names: tuple[Name, ...] = field(default=(), compare=False)
 
     def __repr__(self) -> str:
         parts = [counted(len(self.dstates), "dstates")]
@@ -165,6 +168,39 @@ class SSHMap:
                 "take ssh_abduction.solver.with_regions(map, trace)"
             )
         return right_of(self.regions, path, direction)
+
+    def name_of(self, kind: str, number: int | None) -> str | None:
+        """Return the name that a person gave to a place, path or region; None if it has none.
+
+        Args:
+            kind: "place", "path" or "region".
+            number: Its number; None has no name.
+
+        Raises:
+            MapError: `kind` is none of these.
+        """
+        one_of("kind", kind, NAMED, MapError)
+        if number is None:
+            return None
+        a_whole_number("number", number, MapError, 0)
+        return next((n.text for n in self.names if (n.kind, n.id) == (kind, number)), None)
+
+    def called(self, kind: str, number: int) -> str:
+        """Return words for a place, path or region, such as "place 4 (kitchen)".
+
+        Raises:
+            MapError: An argument is wrong.
+        """
+        return f"{kind} {self.numbered(kind, number)}"
+
+    def numbered(self, kind: str, number: int) -> str:
+        """Return the number of a place, path or region with its name, such as "4 (kitchen)".
+
+        Raises:
+            MapError: An argument is wrong.
+        """
+        name = self.name_of(kind, a_whole_number("number", number, MapError))
+        return str(number) if name is None else f"{number} ({name})"
 
     @property
     def pieces(self) -> tuple[tuple[int, ...], ...]:
@@ -255,6 +291,10 @@ class SSHMap:
             regions=None
             if self.regions is None
             else renumbered(self.regions, place, path, {h for h, d in faced.items() if d == -1}),
+            names=tuple(
+                replace(n, id={"place": place, "path": path}.get(n.kind, {}).get(n.id, n.id))
+                for n in self.names
+            ),
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -282,6 +322,8 @@ class SSHMap:
         # Fields that most maps lack are written only if they are there.
         if len(pieces := self.pieces) > 1:
             data["pieces"] = [list(piece) for piece in pieces]
+        if self.names:
+            data["names"] = [{n.kind: n.id, "name": n.text} for n in self.names]
         if self.excused:
             data["excused"] = [list(pair) for pair in self.excused]
         if self.faults:

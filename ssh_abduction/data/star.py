@@ -17,7 +17,7 @@ ahead, right, back or left, a star is also four openings, which the fast engines
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from math import ceil
 from typing import Any, TypeAlias
@@ -210,6 +210,43 @@ def is_four(entries: Sequence[Entry]) -> bool:
     return len(entries) == 4 and all(
         x is None or (not isinstance(x, Gateway) and x in (0, 1)) for x in entries
     )
+
+
+def with_gateway(star: Sequence[Entry], bearing: float, *, is_open: bool) -> tuple[Entry, ...]:
+    """Return a star in which the gateway in some direction is open or closed.
+
+    Args:
+        star: The star.
+        bearing: The direction in degrees, clockwise from ahead.
+        is_open: Whether the gateway is open. Then it is added if the star lacks it, else removed.
+
+    Raises:
+        TraceError: The star has only four directions, and this is none of them.
+    """
+    if is_four(star):
+        quarter = near_quarter(bearing)
+        if quarter is None:
+            raise TraceError(
+                f"star: expected ahead, right, back or left, got {bearing:g} degrees; take one"
+            )
+        return (*star[:quarter], int(is_open), *star[quarter + 1 :])
+    entries = [e if isinstance(e, Gateway) else Gateway(float(e or 0)) for e in star]
+    off = [abs((e.bearing - bearing + 180) % 360 - 180) for e in entries]
+    nearest = min(range(len(off)), key=off.__getitem__, default=None)
+    if nearest is None or off[nearest] > max(entries[nearest].spread, QUARTER):
+        return (*star, bearing % 360) if is_open else tuple(star)
+    if is_open:
+        known = star[nearest]
+        changed = replace(known, open=True) if isinstance(known, Gateway) else known
+        return (*star[:nearest], changed, *star[nearest + 1 :])
+    return tuple(_without(entry, nearest) for i, entry in enumerate(star) if i != nearest)
+
+
+def _without(entry: Entry, removed: int) -> Entry:
+    """Return an entry of a star from which the entry with some index was removed."""
+    if not isinstance(entry, Gateway) or entry.opposite is None or entry.opposite < removed:
+        return entry
+    return replace(entry, opposite=None if entry.opposite == removed else entry.opposite - 1)
 
 
 def near_quarter(bearing: float) -> int | None:

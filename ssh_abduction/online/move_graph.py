@@ -69,7 +69,7 @@ class MoveGraph:
         """Find the dstates that a user names.
 
         Args:
-            name: The number of a dstate, or a place such as "p3" for all dstates there.
+            name: The number of a dstate; or a place for all dstates there: "p3", or its name.
             field: The parameter that the name was given for, for messages.
 
         Returns:
@@ -79,12 +79,18 @@ class MoveGraph:
             MapError: There is no such dstate or place. The message names those that exist.
         """
         count, text = len(self.map.dstates), str(name)
+        own = next((n.id for n in self.map.names if (n.kind, n.text) == ("place", name)), None)
+        if own is not None:
+            return self._dstates_at(own, field), self.map.called("place", own)
         if isinstance(name, str) and text[:1] == "p" and _is_number(text[1:]):
-            return self._dstates_at(int(text[1:]), field), f"place {int(text[1:])}"
+            place = int(text[1:])
+            return self._dstates_at(place, field), self.map.called("place", place)
         is_number = is_whole(name) or (isinstance(name, str) and _is_number(text))
         if is_number and 0 <= int(text) < count:
             return {int(text)}, f"dstate {int(text)}"
         places = f", or a place as p{self.map.places[0]}" if self.map.places else ""
+        names = [n.text for n in self.map.names if n.kind == "place"]
+        places += f", or {', '.join(names)}" if names else ""
         raise MapError(
             f"{field}: expected a dstate, 0 to {count - 1}{places}, got {brief(name)}; "
             "ssh-abduction show lists them"

@@ -189,12 +189,12 @@ def route(
 
     Args:
         maps: A solution, maps of one trace, or one map.
-        start: The number of a dstate, or a place such as "p3", which means any dstate there; None
-            for the dstate of the last step.
-        goal: The number of a dstate, or a place such as "p3", which means any dstate there.
+        start: The number of a dstate, or a place, such as "p3" or "kitchen", which means any dstate
+            there; None for the dstate of the last step.
+        goal: The number of a dstate, or a place, such as "p3" or "kitchen".
         by: What to minimise. "actions" and "metres" use links only, so the robot did each move
             before. "places" minimises travels, and also uses moves that the paths of the map imply.
-        avoid: Dstates, and places such as "p3", that the route must not visit.
+        avoid: Dstates, and places such as "p3" or "kitchen", that the route must not visit.
         map: The number of the map to use, from 1, or its id.
 
     Raises:

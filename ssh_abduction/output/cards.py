@@ -45,7 +45,12 @@ def map_card(ssh_map: SSHMap) -> str:
     topological = bool(ssh_map.places)
     head = ("dstate", "view", *(("place", "path") if topological else ()), "links")
     rows = [
-        (s.id, s.shown, *(_where(s) if topological else ()), ", ".join(leads.get(s.id, ())))
+        (
+            s.id,
+            s.shown,
+            *(_where(s, ssh_map) if topological else ()),
+            ", ".join(leads.get(s.id, ())),
+        )
         for s in ssh_map.dstates
     ]
     dstates = folded(counted(len(rows), "dstates"), table(head, rows, "dstates"))
@@ -133,7 +138,7 @@ def _image(step: Step) -> object:
     return "" if step.image is None else step.image
 
 
-def _where(s: DState) -> tuple[object, object]:
+def _where(s: DState, ssh_map: SSHMap) -> tuple[object, object]:
     """The place of a dstate, and its path with the sign of the direction; "" if unknown."""
     course = "" if s.path is None else f"{s.path}{'+' if s.direction == 1 else '-'}"
-    return "" if s.place is None else s.place, course
+    return "" if s.place is None else ssh_map.numbered("place", s.place), course

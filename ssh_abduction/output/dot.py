@@ -17,10 +17,12 @@ def to_dot(ssh_map: SSHMap) -> str:
     """
     checked_map(ssh_map)
     lines = ["digraph map {", "  node [shape=box, style=rounded];"]
-    lines += [f"  {_node(s)}" for s in ssh_map.dstates if s.place is None]
+    lines += [f"  {_node(s, ssh_map)}" for s in ssh_map.dstates if s.place is None]
     for p in ssh_map.places:
-        inside = " ".join(_node(s) for s in ssh_map.dstates if s.place == p)
-        lines.append(f"  subgraph cluster_{p} {{ label={_quoted(f'place {p}')}; {inside} }}")
+        inside = " ".join(_node(s, ssh_map) for s in ssh_map.dstates if s.place == p)
+        lines.append(
+            f"  subgraph cluster_{p} {{ label={_quoted(ssh_map.called('place', p))}; {inside} }}"
+        )
     lines += [
         f"  {source} -> {target} [label={_quoted(action)}];"
         for source, action, target in ssh_map.links
@@ -28,8 +30,10 @@ def to_dot(ssh_map: SSHMap) -> str:
     return "\n".join([*lines, "}"])
 
 
-def _node(s: DState) -> str:
+def _node(s: DState, ssh_map: SSHMap) -> str:
     course = "" if s.path is None else f"\npath {s.path}{'+' if s.direction == 1 else '-'}"
+    name = ssh_map.name_of("path", s.path)
+    course += "" if name is None else f" ({name})"
     return f"{s.id} [label={_quoted(f'{s.id}: {s.shown}{course}')}];"
 
 

@@ -28,16 +28,18 @@ def to_networkx(
         ssh_map: The map.
         level: The kind of graph.
             "causal" is a MultiDiGraph. Each dstate (distinctive state: a place and a direction) is
-            a node with the attributes view, place, path, direction, heading and floor. Each link is
-            an edge with the attribute action. Unknown attributes are left out.
+            a node with the attributes view, place, path, direction, heading, floor, place_name and
+            path_name. Each link is an edge with the attribute action. Unknown attributes are left
+            out.
             "topological" is a bipartite Graph with the nodes ("place", p) and ("path", h). Each
             place on a path gives an edge with the attribute index, its position in the order of
             the path.
             "places" is a MultiGraph. Each place is a node with the attributes pos (x to the right,
             y up) and dstates. Each two neighbours on a path give an edge with the path's id as its
             key. Its attributes are path; order, the index of the first neighbour; travelled,
-            whether the robot went from one to the other; and metres, if the map has poses. The
-            attribute `graph["metric"]` says whether positions are metres.
+            whether the robot went from one to the other; and metres, if the map has poses. Places
+            and paths that a person named have the attribute name. The attribute
+            `graph["metric"]` says whether positions are metres.
         turns: How actions turn, as in `to_svg`. It decides the positions of "places" if the map
             has no poses.
 
@@ -61,8 +63,12 @@ def to_graphml(ssh_map: SSHMap) -> str:
     graph: nx.MultiDiGraph[Any] = nx.MultiDiGraph()
     causal = to_networkx(ssh_map)
     for s, data in causal.nodes(data=True):
-        view = {"view": xml_text(str(data["view"]))} if "view" in data else {}
-        graph.add_node(s, **{**data, **view})
+        texts = {
+            name: xml_text(str(data[name]))
+            for name in ("view", "place_name", "path_name")
+            if name in data
+        }
+        graph.add_node(s, **{**data, **texts})
     for source, target, action in causal.edges(data="action"):
         name = key = xml_text(action)
         if graph.has_edge(source, target, name):  # two names that differ in what XML cannot hold
@@ -82,6 +88,8 @@ def _causal(ssh_map: SSHMap) -> nx.MultiDiGraph[Any]:
             "direction": s.direction,
             "heading": s.heading,
             "floor": s.floor,
+            "place_name": ssh_map.name_of("place", s.place),
+            "path_name": ssh_map.name_of("path", s.path),
         }
         graph.add_node(s.id, **{k: v for k, v in facts.items() if v is not None})
     for source, action, target in ssh_map.links:
@@ -92,8 +100,10 @@ def _causal(ssh_map: SSHMap) -> nx.MultiDiGraph[Any]:
 def _topological(ssh_map: SSHMap) -> nx.Graph[Any]:
     """Make the bipartite graph of places and paths."""
     graph: nx.Graph[Any] = nx.Graph()
-    graph.add_nodes_from((("place", p) for p in ssh_map.places), bipartite=0)
-    graph.add_nodes_from((("path", p.id) for p in ssh_map.paths), bipartite=1)
+    for place in ssh_map.places:
+        graph.add_node(("place", place), bipartite=0, **_named(ssh_map, "place", place))
+    for path in ssh_map.paths:
+        graph.add_node(("path", path.id), bipartite=1, **_named(ssh_map, "path", path.id))
     for path in ssh_map.paths:
         for index, place in enumerate(path.order):
             graph.add_edge(("place", place), ("path", path.id), index=index)
@@ -109,12 +119,14 @@ def _places(ssh_map: SSHMap, turns: Trace | Turns | None) -> nx.MultiGraph[Any]:
     for place in ssh_map.places:
         dstates = tuple(s.id for s in ssh_map.dstates if s.place == place)
         floor = ssh_map.dstates[dstates[0]].floor if dstates else None
-        level = {} if floor is None else {"floor": floor}
-        graph.add_node(place, pos=found.places[place], dstates=dstates, **level)
+        more: dict[str, Any] = {} if floor is None else {"floor": floor}
+        more |= _named(ssh_map, "place", place)
+        graph.add_node(place, pos=found.places[place], dstates=dstates, **more)
     for path in ssh_map.paths:
         streets = travelled(ssh_map, path)
         for index, (p, q) in enumerate(pairwise(path.order)):
             facts: dict[str, Any] = {
+                **_named(ssh_map, "path", path.id),
                 "path": path.id,
                 "order": index,
                 "travelled": (min(p, q), max(p, q)) in streets,
@@ -123,3 +135,9 @@ def _places(ssh_map: SSHMap, turns: Trace | Turns | None) -> nx.MultiGraph[Any]:
                 facts["metres"] = math.dist(found.places[p], found.places[q])
             graph.add_edge(p, q, key=path.id, **facts)
     return graph
+
+
+def _named(ssh_map: SSHMap, kind: str, number: int) -> dict[str, str]:
+    """Return the attribute `name` of a place or path; empty if a person gave it none."""
+    name = ssh_map.name_of(kind, number)
+    return {} if name is None else {"name": xml_text(name)}

@@ -147,7 +147,9 @@ class _Picture:
             stroke="#222",
             stroke_width=f"{1.8 * self.unit:.1f}",
         )
-        return titled(f"place {site}" if site >= 0 else f"dstate {-1 - site}", circle)
+        return titled(
+            self.map.called("place", site) if site >= 0 else f"dstate {-1 - site}", circle
+        )
 
     def ellipse(self, spot: Point, spread: tuple[float, float, float]) -> list[str]:
         """Draw an ellipse of two standard deviations around a point of the page.
@@ -301,7 +303,9 @@ class _Picture:
                 for far in (17, 22, 30)
                 for k in (-1, 1, 3, 5, 0, 2, 4, 6)
             ]
-            marks += self.label(str(place), around, "#000", 15, "bold")
+            name = self.map.name_of("place", place)
+            label = str(place) if name is None else f"{place} {name}"
+            marks += self.label(label, around, "#000", 15, "bold")
         return marks
 
     def dstate_labels(self) -> list[str]:
@@ -341,7 +345,9 @@ class _Picture:
                         beside.append(
                             (ax + (bx - ax) * share - uy * away, ay + (by - ay) * share + ux * away)
                         )
-            marks += self.label(f"path {path.id}", beside, COLOURS[path.id % len(COLOURS)], 12)
+            marks += self.label(
+                self.map.called("path", path.id), beside, COLOURS[path.id % len(COLOURS)], 12
+            )
         return marks
 
     def link_labels(self) -> list[str]:

@@ -32,8 +32,9 @@ from ssh_abduction.output.metric_picture import metric_svg
 from ssh_abduction.output.turns import Turns, degrees_of
 
 # Distances in units of the page. SPACING is between neighbouring places, DSTATE from the centre of
-# a place to the name of a dstate, LANE from the line of a path to the marks of its dstates.
-SPACING, DSTATE, LANE = 130.0, 38.0, 9.0
+# a place to the name of a dstate, LANE from the line of a path to the marks of its dstates, NAME
+# from the centre of a place to the name that a person gave it.
+SPACING, DSTATE, LANE, NAME = 130.0, 38.0, 9.0, 22.0
 # The largest number of characters of a view below a dstate. A longer view is cut at the beginning,
 # because long names often begin alike.
 LONGEST_LABEL = 20
@@ -76,6 +77,8 @@ def _topological(ssh_map: SSHMap, found: Layout) -> tuple[list[str], list[Point]
     for place, (x, y) in spots.items():
         marks.append(_circle(x, y, "#222"))
         marks.append(text(x, y, str(place), "#222", size=15, weight="bold"))
+        if (name := ssh_map.name_of("place", place)) is not None:
+            marks.append(text(x, y + NAME, name, "#222", size=12, weight="bold"))
         marks += _dstates(ssh_map, place, (x, y), found)
     return lines + marks, list(spots.values())
 
@@ -122,7 +125,13 @@ def _path_name(ssh_map: SSHMap, path: MapPath, spots: dict[int, Point]) -> list[
     colour = COLOURS[path.id % len(COLOURS)]
     return [
         element("path", d="M-7,-6 L7,0 L-7,6 Z", fill=colour, transform=placed((mx, my), angle)),
-        text(mx - (by - ay) * far, my + (bx - ax) * far, f"path {path.id}", colour, halo=True),
+        text(
+            mx - (by - ay) * far,
+            my + (bx - ax) * far,
+            ssh_map.called("path", path.id),
+            colour,
+            halo=True,
+        ),
     ]
 
 

@@ -16,7 +16,8 @@ def to_pandas(ssh_map: SSHMap) -> pd.DataFrame:
 
     Returns:
         A table with the columns dstate, view, place, path, direction and heading. If the map has
-        poses, also x and y (metres) and pose_heading (radians). The index is named step.
+        poses, also x and y (metres) and pose_heading (radians). If it has names, also place_name.
+        The index is named step.
 
     Raises:
         MapError: `ssh_map` is not a map, or pandas is not installed.
@@ -39,6 +40,8 @@ def to_pandas(ssh_map: SSHMap) -> pd.DataFrame:
             "heading": s.heading,
             "floor": s.floor,
         }
+        if ssh_map.names:
+            row["place_name"] = ssh_map.name_of("place", s.place)
         if ssh_map.fit and ssh_map.fit.poses:
             pose = ssh_map.fit.poses[s.id]
             row |= {"x": pose.x, "y": pose.y, "pose_heading": pose.heading}

@@ -81,6 +81,8 @@ def content_of(
             "places": places.number(tuple((s.place, s.path, s.direction) for s in ssh_map.dstates)),
             "orders": orders.number(tuple((path.id, path.order) for path in ssh_map.paths)),
         }
+        if ssh_map.names:
+            one["names"] = {f"{n.kind} {n.id}": n.text for n in ssh_map.names}
         if ssh_map.fit:
             one["chi2"] = round(ssh_map.fit.chi2, 1)
         if ssh_map.faults:

@@ -13,11 +13,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
 from ssh_abduction.checker.joins import Join, sentence_of
-from ssh_abduction.data.checks import a_flag, a_text, an_instance
+from ssh_abduction.data.checks import a_flag, a_path, a_text, an_instance
+from ssh_abduction.data.corrections_file import named_beside
 from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.errors import MapError, brief, is_whole, named
 from ssh_abduction.data.fields import FieldReader
@@ -123,7 +124,20 @@ class Listing:
         Raises:
             MapError: The file cannot be read, or does not hold maps of one trace.
         """
-        return cls.from_dict(read_json(path), "standard input" if str(path) == "-" else named(path))
+        where = "standard input" if str(path) == "-" else named(path)
+        return cls.from_dict(read_json(path), where).named_beside(path)
+
+    def named_beside(self, path: str | os.PathLike[str]) -> Listing:
+        """Return this listing with the names in the file of corrections beside a file of maps.
+
+        Args:
+            path: The file of the maps, or "-".
+
+        Raises:
+            MapError: The file of corrections is malformed.
+        """
+        a_path("path", path, MapError)
+        return replace(self, maps=named_beside(self.maps, self.drives, path))
 
     @classmethod
     def from_dict(cls, data: Any, where: str = "maps") -> Listing:

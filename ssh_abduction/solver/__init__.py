@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.front import Front, Point, fault_front
     from ssh_abduction.solver.guesses.tree import Sketch
     from ssh_abduction.solver.judging import InternalError, Judging
+    from ssh_abduction.solver.obeying import obeyed, with_names
     from ssh_abduction.solver.ranking import Ranking
     from ssh_abduction.solver.recorded import drives_in, joins_in, theory_in
     from ssh_abduction.solver.regions import find_regions, with_regions
@@ -88,6 +89,7 @@ _HOMES = {  # module: the names that this package exports from it
         "InternalError",
         "Judging",
     ),
+    "obeying": ("obeyed", "with_names"),
     "ranking": ("Ranking",),
     "recorded": (
         "drives_in",
@@ -190,6 +192,7 @@ __all__ = [
     "has_processors",
     "in_process",
     "joins_in",
+    "obeyed",
     "observation",
     "opening",
     "resident_memory",
@@ -197,6 +200,7 @@ __all__ = [
     "stretches",
     "summary_of",
     "theory_in",
+    "with_names",
     "with_regions",
     "workers",
     "written_map",

@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 
 from ssh_abduction.data.checks import an_instance
+from ssh_abduction.data.corrections import Corrections
 from ssh_abduction.data.drives import together
 from ssh_abduction.data.errors import SolverError
 from ssh_abduction.data.maps import check_of_trace
@@ -25,6 +26,7 @@ from ssh_abduction.solver.choosing import READABLE, may_name, new_engine, takes_
 from ssh_abduction.solver.engines.base import Engine, Task
 from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.judging import Judging
+from ssh_abduction.solver.obeying import obeyed, with_names
 from ssh_abduction.solver.result import Solution
 from ssh_abduction.solver.search import Search
 from ssh_abduction.solver.sharing import Backbone, Sharing
@@ -45,6 +47,7 @@ def solve(
     memory_limit: int | None = None,
     speedups: Speedups = ALL,
     on_progress: Callable[[Progress], None] | None = None,
+    corrections: Corrections | None = None,
 ) -> Solution:
     """Find the minimal maps of a trace.
 
@@ -64,6 +67,7 @@ def solve(
         memory_limit: MiB of memory. The search stops when the process reaches this peak.
         speedups: The speed-ups that are on. None of them changes the answer.
         on_progress: A function that is called now and then with a `Progress`.
+        corrections: Names and corrections of a person, to be obeyed.
 
     Returns:
         The maps, their cost, and what is proven about them.
@@ -73,6 +77,7 @@ def solve(
         TheoryError: The theory needs stars or displacements, but the trace has none; or the theory
             names steps that the trace does not have.
         SolverError: A limit, `max_maps` or `within` is out of range.
+        MapError: The corrections are of other drives, or contradict the trace.
 
     Reference:
         Kuipers & Beeson 2002, "Bootstrap Learning for Place Recognition", step 2.
@@ -80,6 +85,8 @@ def solve(
     theory = checked_theory(theory)
     joint = together(trace) if isinstance(trace, list | tuple) else checked_trace(trace)
     theory.check_steps(joint)
+    if corrections is not None:
+        joint, theory = obeyed(corrections, joint, theory)
     search = Search(
         joint,
         theory,
@@ -90,7 +97,8 @@ def solve(
         speedups=speedups,
         on_progress=on_progress,
     )
-    return search.solution(tuple(search))
+    solution = search.solution(tuple(search))
+    return solution if corrections is None else with_names(corrections, solution, joint)
 
 
 def find_backbone(

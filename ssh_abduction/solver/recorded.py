@@ -123,7 +123,10 @@ def drives_in(read: FieldReader, record: Mapping[str, Any], steps: int) -> tuple
         if not isinstance(written.get("name"), str):
             raise read.wrong(f"{name}.name", "a text", written.get("name"))
         first, stop = (read.integer(written.get(key), f"{name}.{key}") for key in ("first", "stop"))
-        return Drive(written["name"], first, stop)
+        fingerprint = written.get("fingerprint")
+        if not isinstance(fingerprint, str | None):
+            raise read.wrong(f"{name}.fingerprint", "a text", fingerprint)
+        return Drive(written["name"], first, stop, fingerprint)
 
     found = read.each(record, "drives", drive, optional=True)
     bounds = [0, *(drive.stop for drive in found)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
+from ssh_abduction.data.drives import with_fingerprints
 from ssh_abduction.data.map_file import SOLUTION_FORMAT, VERSION
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.sharing import Backbone
@@ -96,8 +97,9 @@ def ending(solution: Solution, count: int, backbone: Backbone | None) -> dict[st
         },
     }
     end["summary"] = summary_of(solution, count, backbone)
-    if len(solution.drives) > 1:
-        end["drives"] = [asdict(drive) for drive in solution.drives]
+    trace = solution.trace
+    if drives := solution.drives if trace is None else with_fingerprints(trace):
+        end["drives"] = [drive.to_dict() for drive in drives]
     # Leave out fields that would say nothing.
     if backbone and not (solution.minimal_listed and count == 1):
         end["backbone"] = backbone.to_dict()

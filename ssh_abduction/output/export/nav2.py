@@ -48,13 +48,19 @@ def _node(stop: Stop, roads: Roads, frame: str) -> dict[str, Any]:
         "views": " ".join(map(str, stop.views)),
         "heading": round(stop.heading, DIGITS),
         **({} if stop.floor is None else {"floor": stop.floor}),
+        **({} if stop.name is None else {"name": stop.name}),
     }
     return {"id": stop.id, "frame": frame, "metadata": metadata}
 
 
 def _edge(road: Road, number: int) -> dict[str, Any]:
     """Make an edge. Its metadata leave out what is unknown, as Nav2 reads no null."""
-    known = {"action": road.action, "path": road.path, "direction": road.direction}
+    known = {
+        "action": road.action,
+        "path": road.path,
+        "direction": road.direction,
+        "path_name": road.name,
+    }
     metadata = {
         "travelled": road.action is not None,
         **{field: value for field, value in known.items() if value is not None},

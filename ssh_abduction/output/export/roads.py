@@ -32,6 +32,7 @@ class Stop:
             first dstate with a known heading.
         views: The views of its dstates, in their order.
         floor: The number of its floor; None if the map has no floors.
+        name: The name that a person gave to its place; None if it has none.
     """
 
     id: int
@@ -40,6 +41,7 @@ class Stop:
     heading: float
     views: tuple[View, ...]
     floor: int | None = None
+    name: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +57,7 @@ class Road:
         direction: The direction along this path, +1 or -1; None if there is none.
         turns: Whether the road is a turn on the spot: both stops are dstates of one place or, if a
             place is unknown, at one point.
+        name: The name that a person gave to its path; None if it has none.
     """
 
     start: int
@@ -64,6 +67,7 @@ class Road:
     path: int | None
     direction: int | None
     turns: bool = False
+    name: str | None = None
 
     @property
     def cost(self) -> float:
@@ -109,7 +113,15 @@ class Roads:
             stops, ends = _places(ssh_map, drawn), _streets(ssh_map)
         else:
             stops = tuple(
-                Stop(s.id, x, y, heading or 0.0, () if s.view is None else (s.view,), s.floor)
+                Stop(
+                    s.id,
+                    x,
+                    y,
+                    heading or 0.0,
+                    () if s.view is None else (s.view,),
+                    s.floor,
+                    ssh_map.name_of("place", s.place),
+                )
                 for s, (x, y, heading) in zip(ssh_map.dstates, drawn.dstates, strict=True)
             )
             # Sort in reverse, so that the first action by name remains if several join two dstates.
@@ -129,6 +141,7 @@ class Roads:
                 length := math.dist(at[a], at[b]) if floor[a] == floor[b] else LEAST,
                 *what,
                 turns=floor[a] == floor[b] and _is_turn(place.get(a), place.get(b), length),
+                name=ssh_map.name_of("path", what[1]),
             )
             for (a, b), what in sorted(ends.items())
         )
@@ -165,7 +178,8 @@ def _places(ssh_map: SSHMap, drawn: Layout) -> tuple[Stop, ...]:
         heading = next((h for h in headings if h is not None), 0.0)
         views = tuple(s.view for s in members if s.view is not None)
         floor = members[0].floor if members else None
-        stops.append(Stop(p, *drawn.places[p], heading, views, floor))
+        name = ssh_map.name_of("place", p)
+        stops.append(Stop(p, *drawn.places[p], heading, views, floor, name))
     return tuple(stops)
 
 

@@ -37,6 +37,9 @@ def tmap2(roads: Roads, name: str, frame: str, updated: datetime | None = None) 
     """
     title = {"places": "place", "dstates": "dstate"}[roads.level]
     names = {stop.id: f"{title}-{stop.id}" for stop in roads.stops}
+    if roads.level == "places":  # programs go to a place by its name
+        own = {stop.id: stop.name for stop in roads.stops if stop.name is not None}
+        names |= {number: name for number, name in own.items() if name not in names.values()}
     leaving: dict[int, list[Road]] = {stop.id: [] for stop in roads.stops}
     for road in roads.roads:
         leaving[road.start].append(road)
@@ -105,6 +108,7 @@ def _node(
                 "xy_goal_tolerance": NEAR,
                 "yaw_goal_tolerance": facing,
                 "views": " ".join(map(str, stop.views)),
+                **({} if stop.name is None else {"place_name": stop.name}),
             },
             "restrictions_planning": "True",
             "restrictions_runtime": "True",
@@ -138,6 +142,7 @@ def _edge(road: Road, names: dict[int, str]) -> dict[str, Any]:
             "length": _rounded(road.length),
             "travelled": road.action is not None,
             **({} if road.action is None else {"robot_action": road.action}),
+            **({} if road.name is None else {"path_name": road.name}),
         },
     }
 

@@ -89,8 +89,9 @@ function mapFigure(i, rival) {
   figure.nodes = [...ssh.places].map(([p, at]) => ({
     at,
     name: `${p}`,
+    own: ssh.names[`place ${p}`],
     kind: kindOf(`p${ssh.ofPlace.get(p) ?? []}`),
-    title: `place ${p}: ${stretches(ssh.ofPlace.get(p) ?? [])}`,
+    title: `${ssh.called("place", p)}: ${stretches(ssh.ofPlace.get(p) ?? [])}`,
   }));
   figure.arrows = ssh.dstates.map((s) => {
     const kind = kindOf(`d${s.steps}`, s.path),
@@ -115,8 +116,10 @@ function mapFigure(i, rival) {
       kind: `${kindOf(key, path)}${travelled ? "" : " order"}`.trim(),
       colour: other ? null : path % COLOURS,
       path,
+      called: ssh.called("path", path),
       title:
-        `path ${path}, from place ${from} to place ${to}` +
+        `${ssh.called("path", path)}, from ${ssh.called("place", from)} to ` +
+        ssh.called("place", to) +
         (travelled ? "" : ": only the order of the path says so, nobody travelled there"),
     }));
   for (const { from, to, actions, key } of ssh.links.values())

@@ -100,6 +100,11 @@ function mapOf(i) {
     layout,
     faults: (told.faults ?? []).map((k) => data.faults[k]),
     chi2: told.chi2,
+    called: (kind, number) => {
+      const name = told.names?.[`${kind} ${number}`];
+      return name === undefined ? `${kind} ${number}` : `${kind} ${number} (${name})`;
+    },
+    names: told.names ?? {},
     id: told.id,
   };
   if (decoded.size > 40) decoded.delete(decoded.keys().next().value);

@@ -48,6 +48,16 @@ function paintFigure(figure) {
         figure.base,
       );
   });
+  figure.nodes.forEach((node, k) => {
+    const r = radiusAt(node.at);
+    if (node.own)
+      label(figure, node.own, spots[k], r + 2, [
+        [0, 1],
+        [0, -1],
+        [1, 0],
+        [-1, 0],
+      ]);
+  });
   paintMarks(figure, see, radiusAt);
   const named = new Set();
   for (const m of figure.marks)
@@ -78,7 +88,7 @@ function paintFigure(figure) {
         [0.5, 0.35, 0.65].some((part) =>
           label(
             figure,
-            `path ${street.path}`,
+            street.called,
             [ax + (bx - ax) * part, ay + (by - ay) * part],
             6,
             [

@@ -1,0 +1,80 @@
+"""ssh-abduction correct MAPS: say what a standing map has wrong."""
+
+from __future__ import annotations
+
+import argparse
+
+from ssh_abduction.cli.options import Verbs
+from ssh_abduction.cli.standing import Standing, told
+from ssh_abduction.data.corrections import PAIRS
+from ssh_abduction.data.errors import MapError, brief, named, printable
+from ssh_abduction.data.words import counted
+
+HELPS = {
+    "same": "steps I and J, such as monday:12,tuesday:3, are one dstate; may be given again",
+    "different": "steps I and J are different dstates; may be given again",
+    "elsewhere": "steps I and J are at different places; may be given again",
+    "open": "a gateway is open; may be given again",
+    "closed": (
+        "a gateway is closed: a place and a direction on the drawn map, such as 'p4 north', or a "
+        "step and a direction from the robot, such as 'monday:12 left'; may be given again"
+    ),
+}
+
+
+def add_parser(verbs: Verbs) -> None:
+    text = (
+        "Say what a map has wrong. It is written to corrections.yaml beside the map. solve obeys "
+        "this file where it writes a map beside it (-o), and with --corrections."
+    )
+    parser = verbs.add_parser("correct", help="say what a map has wrong", description=text)
+    parser.add_argument("maps", help="file that solve -o wrote, or a folder with maps.json")
+    for name, words in HELPS.items():
+        metavar = "I,J" if name in PAIRS else "GATEWAY"
+        parser.add_argument(f"--{name}", action="append", metavar=metavar, help=words)
+    parser.add_argument(
+        "--name",
+        action="append",
+        nargs=2,
+        metavar=("WHAT", "NAME"),
+        help="name a place or a path, as the verb name does; may be given again",
+    )
+    parser.add_argument(
+        "--map",
+        default="1",
+        metavar="I",
+        help="the number of the map, from 1, or its id (default: 1)",
+    )
+    parser.set_defaults(run=run)
+    parser.epilog = "Without an option, it prints what was said so far."
+
+
+def run(options: argparse.Namespace) -> int:
+    standing = Standing.load(options.maps, options.map)
+    said = standing.corrections
+    for kind in PAIRS:
+        for pair in getattr(options, kind) or ():
+            said = said.with_pair(kind, *_pair(standing, kind, pair))
+    for is_open, gateways in ((True, options.open), (False, options.closed)):
+        for gateway in gateways or ():
+            said = said.with_gateway(is_open, standing.gateway(gateway))
+    for what, name in options.name or ():
+        said = said.with_name(name, *standing.thing(what))
+    if said == standing.corrections:
+        print("\n".join(map(printable, told(said))) or "nothing was said")
+        return 0
+    file = standing.save(said)
+    print(
+        printable(f"{named(file)}: {counted(sum(1 for _ in told(said)), 'sentences')}; solve again")
+    )
+    return 0
+
+
+def _pair(standing: Standing, kind: str, pair: str) -> tuple[str, str]:
+    """Read a pair of steps. Raise MapError if it is none."""
+    steps = [standing.step(step.strip()) for step in pair.split(",")]
+    if len(steps) != 2 or steps[0] == steps[1]:
+        raise MapError(
+            f"--{kind}: expected two steps such as monday:12,tuesday:3, got {brief(pair)}; name two"
+        )
+    return steps[0], steps[1]

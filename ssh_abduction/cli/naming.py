@@ -1,0 +1,38 @@
+"""ssh-abduction name MAPS WHAT NAME: name a place or a path of a standing map."""
+
+from __future__ import annotations
+
+import argparse
+
+from ssh_abduction.cli.options import Verbs
+from ssh_abduction.cli.standing import Standing
+from ssh_abduction.data.errors import named, printable
+
+
+def add_parser(verbs: Verbs) -> None:
+    text = (
+        "Name a place or a path of a map. The name is written to corrections.yaml beside the map, "
+        "by a step of a drive: so it stays where it belongs when the map is solved again."
+    )
+    parser = verbs.add_parser("name", help="name a place or a path", description=text)
+    parser.add_argument("maps", help="file that solve -o wrote, or a folder with maps.json")
+    parser.add_argument(
+        "what",
+        help="a place such as p4, a path such as path2, or a step such as monday:12, for its place",
+    )
+    parser.add_argument("name", help='the name, such as "kitchen"')
+    parser.add_argument(
+        "--map",
+        default="1",
+        metavar="I",
+        help="the number of the map, from 1, or its id (default: 1)",
+    )
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    standing = Standing.load(options.maps, options.map)
+    kind, step = standing.thing(options.what)
+    file = standing.save(standing.corrections.with_name(options.name, kind, step))
+    print(printable(f"the {kind} of {step} is {options.name!r}, in {named(file)}"))
+    return 0

@@ -1,0 +1,108 @@
+"""Names and corrections of a person, as solve obeys and reports them."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import dataclass, replace
+
+from ssh_abduction.cli.standing import told
+from ssh_abduction.data.corrections import Corrections, Passage, Said
+from ssh_abduction.data.corrections_file import beside, load_corrections
+from ssh_abduction.data.drives import drives_of, step_of
+from ssh_abduction.data.errors import named, printable
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.trace import Trace
+from ssh_abduction.data.words import counted
+from ssh_abduction.explain.no_map import Explanation, explain
+from ssh_abduction.solver import Solution, obeyed, with_names
+from ssh_abduction.theory.theory import Theory
+
+
+@dataclass(frozen=True)
+class Obeying:
+    """The corrections that a search obeys.
+
+    Attributes:
+        corrections: The corrections.
+        trace: The trace, with its stars corrected.
+        theory: The theory, with the pairs of steps that a person asserts.
+        as_seen: The trace as it was recorded.
+        without: The theory without these pairs.
+    """
+
+    corrections: Corrections
+    trace: Trace
+    theory: Theory
+    as_seen: Trace
+    without: Theory
+
+    @classmethod
+    def of(cls, options: argparse.Namespace, trace: Trace, theory: Theory) -> Obeying:
+        """Read the corrections that --corrections names, or those beside the output.
+
+        Raises:
+            MapError: The file is malformed, is of other drives, or contradicts the trace.
+        """
+        file = options.corrections or beside(options.output)
+        if file is None:
+            return cls(Corrections(), trace, theory, trace, theory)
+        said = load_corrections(file)
+        corrected = cls(said, *obeyed(said, trace, theory), trace, theory)
+        corrected.say()
+        return corrected
+
+    def say(self) -> None:
+        """Print on stderr how many sentences are obeyed."""
+        known = self.corrections.known_in(drives_of(self.trace))
+        here, all_of_them = (sum(1 for _ in told(said)) for said in (known, self.corrections))
+        aside = f"; {all_of_them - here} are of drives that are not solved" * (here < all_of_them)
+        source = named(self.corrections.source)
+        print(
+            printable(f"obeying {counted(here, 'sentences')} of {source}{aside}"), file=sys.stderr
+        )
+
+    def named(self, ssh_map: SSHMap) -> SSHMap:
+        """Return a map with the names that a person gave."""
+        return self.corrections.named(ssh_map, drives_of(self.trace))
+
+    def with_names(self, solution: Solution) -> Solution:
+        """Return a solution whose maps have the names that a person gave."""
+        return with_names(self.corrections, solution, self.trace)
+
+    def blamed(self, explanation: Explanation | None) -> list[str]:
+        """List the sentences of the person that take part in why there is no map.
+
+        Sentences are left out one by one, as long as the stretch of the explanation has no map.
+        """
+        said = self.corrections.known_in(drives_of(self.trace)) if self.corrections else None
+        if explanation is None or said is None:
+            return []
+        stretch = range(explanation.first, explanation.last + 1)
+        kept = replace(said, pairs=(), gateways=())
+        if self._has_no_map(kept, stretch):
+            return []
+        kept = said
+        sentences: list[Said | Passage] = [*said.pairs, *said.gateways]
+        for sentence in sentences:
+            fewer = kept.without(sentence)
+            kept = fewer if self._has_no_map(fewer, stretch) else kept
+        source = named(said.source or "corrections")
+        return [
+            f"{source}: {sentence}: it contradicts the trace{self._seen(sentence)}"
+            for sentence in sentences
+            if sentence in kept.pairs or sentence in kept.gateways
+        ]
+
+    def _has_no_map(self, said: Corrections, stretch: range) -> bool:
+        trace, theory = obeyed(said, self.as_seen, self.without)
+        part = theory.of_steps(stretch.start, len(stretch))
+        return explain(trace[stretch.start : stretch.stop], part) is not None
+
+    def _seen(self, said: Said | Passage) -> str:
+        """Say what the robot saw at the steps of a pair."""
+        if isinstance(said, Passage):
+            return ""
+        drives = drives_of(self.trace)
+        seen = [self.trace.steps[step_of(drives, step)].view for step in said.steps]
+        return f" ({', '.join(f'{s} shows {v}' for s, v in zip(said.steps, seen, strict=True))})"

@@ -1,0 +1,213 @@
+"""A standing map, as the verbs name, correct and solve --onto see it, with its corrections."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from ssh_abduction.cli.options import read_maps
+from ssh_abduction.data.corrections import Corrections
+from ssh_abduction.data.corrections_file import (
+    FILE,
+    direction,
+    load_corrections,
+    save_corrections,
+)
+from ssh_abduction.data.drives import Drive, step_name, step_of
+from ssh_abduction.data.errors import MapError, TraceError, brief, named
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.rivals.listing import Listing
+
+MAPS = "maps.json"  # the name of the file of maps in a folder
+# Directions on the map as it is drawn, in degrees counterclockwise from east.
+COMPASS = {"east": 0.0, "north": 90.0, "west": 180.0, "south": 270.0}
+_THING = re.compile(r"(?P<kind>p|place|path|region) ?(?P<number>\d{1,9})")
+_KINDS = {"p": "place"}
+
+
+@dataclass(frozen=True)
+class Standing:
+    """A map and the drives that it was made of.
+
+    Attributes:
+        map: The map.
+        drives: Its drives.
+        file: The file of maps.
+        corrections: What a person said about it.
+        in_quarters: Whether its stars have four directions.
+    """
+
+    map: SSHMap
+    drives: tuple[Drive, ...]
+    file: Path
+    corrections: Corrections
+    in_quarters: bool
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], number: int | str = 1) -> Standing:
+        """Read a map, and the corrections beside it.
+
+        Args:
+            path: The file of maps; or a folder with a file `maps.json`.
+            number: The number of the map, from 1, or its id.
+
+        Raises:
+            MapError: A file cannot be read; the maps do not say of which drives they are; or the
+                corrections are of another map.
+        """
+        file = Path(path) / MAPS if Path(path).is_dir() else Path(path)
+        data = read_maps(str(file), "give a file that solve -o wrote")
+        listing = Listing.from_dict(data, named(file))
+        known = {drive.name: drive.fingerprint for drive in listing.drives}
+        if not known or None in known.values():
+            raise MapError(
+                f"{named(file)}: drives: expected the drives that were mapped, each with its "
+                "fingerprint, got none; solve again, with -o"
+            )
+        theory = data.get("theory") if isinstance(data, dict) else None
+        beside = file.parent / FILE
+        said = load_corrections(beside) if beside.is_file() else Corrections()
+        said.check_drives(known)
+        drives = {**said.drives, **{name: str(mark) for name, mark in known.items()}}
+        return cls(
+            listing.maps[listing.number(str(number))],
+            listing.drives,
+            file,
+            replace(said, drives=drives),
+            isinstance(theory, dict) and theory.get("star") == "frame",
+        )
+
+    def save(self, corrections: Corrections) -> Path:
+        """Write the corrections beside the map, after a check. Returns their file."""
+        corrections.known_in(self.drives)
+        file = self.file.parent / FILE
+        save_corrections(corrections, file)
+        return file
+
+    def thing(self, text: str) -> tuple[str, str]:
+        """Find what a person names.
+
+        Args:
+            text: A place, path or region by its number, such as "p4" or "path 2"; or a step such
+                as "monday:12", for the place where the robot was.
+
+        Returns:
+            Its kind, and the first step at it.
+
+        Raises:
+            MapError: The map has no such thing.
+        """
+        found = _THING.fullmatch(text)
+        if found is None:
+            return "place", self.step(text)
+        kind, number = _KINDS.get(found["kind"], found["kind"]), int(found["number"])
+        if kind == "region":
+            raise MapError(
+                f"{text}: expected a place or a path by number, got a region; name it by a step in "
+                "it, in the file"
+            )
+        here = (t for t, s in enumerate(self.map.labels) if self._of(kind, s) == number)
+        first = next(here, None)
+        if first is None:
+            raise MapError(
+                f"{text}: expected a {kind} of the map, got {brief(text)}, which is none; "
+                "ssh-abduction show lists them"
+            )
+        return kind, step_name(self.drives, first)
+
+    def step(self, text: str) -> str:
+        """Return the name of a step, such as "monday:12". Raise MapError if there is none."""
+        try:
+            return step_name(self.drives, step_of(self.drives, text))
+        except TraceError as error:
+            raise MapError(f"{error}; or a place such as p4") from None
+
+    def gateway(self, text: str) -> tuple[tuple[str, float], ...]:
+        """Find the steps at which the robot faced a gateway.
+
+        Args:
+            text: A place and a direction on the drawn map, such as "p4 north"; or a step and a
+                direction from the robot, such as "monday:12 left" or "monday:12 135".
+
+        Returns:
+            For each step at the place: the step, and the direction in degrees clockwise from ahead.
+
+        Raises:
+            MapError: The map has no such place or step, or no headings there.
+        """
+        where, _, way = text.strip().rpartition(" ")
+        kind, step = self.thing(where.strip()) if where else ("", "")
+        if kind != "place":
+            raise MapError(
+                f"gateway: expected a place and a direction such as 'p4 north' or "
+                f"'monday:12 left', got {brief(text)}"
+            )
+        label = self.map.labels[step_of(self.drives, step)]
+        if way not in COMPASS:
+            return self._seen_from(label, self._rounded(direction(way), text))
+        drawn = self._drawn(self.map.dstates[label].place)
+        # In a drawing that is not at right angles, start at the dstate that is drawn best.
+        off = {s: (heading - COMPASS[way]) % 90 for s, heading in drawn.items()}
+        best = min(off, key=lambda s: min(off[s], 90 - off[s]), default=None)
+        if best is None:
+            raise MapError(
+                f"gateway: expected a place with known headings for {brief(text)}; say it by a "
+                "step, such as 'monday:12 left'"
+            )
+        return self._seen_from(best, self._rounded(drawn[best] - COMPASS[way], text))
+
+    def _seen_from(self, label: int, way: float) -> tuple[tuple[str, float], ...]:
+        """List the steps at the place of a dstate, each with the direction of a gateway.
+
+        Without headings, only the steps at the dstate itself are listed.
+
+        Args:
+            label: The dstate.
+            way: The direction of the gateway from this dstate, in degrees clockwise from ahead.
+        """
+        here = self.map.dstates[label]
+        unit = 90 if self.in_quarters else 1
+        ways = {
+            s.id: (way + unit * (here.heading - s.heading)) % 360
+            for s in self.map.dstates
+            if s.place == here.place and s.heading is not None and here.heading is not None
+        } or {label: way}
+        return tuple(
+            (step_name(self.drives, t), ways[s]) for t, s in enumerate(self.map.labels) if s in ways
+        )
+
+    def _drawn(self, place: int | None) -> dict[int, float]:
+        """The drawn headings of the dstates at a place, in degrees counterclockwise from east."""
+        from ssh_abduction.output.layout import layout  # loads scipy
+
+        drawn = layout(self.map).dstates
+        return {
+            s.id: math.degrees(heading)
+            for s in self.map.dstates
+            if s.place == place and place is not None and (heading := drawn[s.id][2]) is not None
+        }
+
+    def _rounded(self, degrees: float, text: str) -> float:
+        """Round a direction to degrees or, if stars have four directions, to the nearest one."""
+        if not self.in_quarters:
+            return round(degrees) % 360.0
+        quarter = round(degrees / 90)
+        if abs(degrees - 90 * quarter) > 30:
+            raise MapError(
+                f"gateway: expected a direction ahead, right, back or left of the robot, got "
+                f"{brief(text)}, which is between two; say it by a step, such as 'monday:12 left'"
+            )
+        return 90.0 * (quarter % 4)
+
+    def _of(self, kind: str, label: int) -> int | None:
+        dstate = self.map.dstates[label]
+        return dstate.place if kind == "place" else dstate.path
+
+
+def told(corrections: Corrections) -> Iterator[str]:
+    """Yield the sentences of some corrections in words."""
+    yield from map(str, (*corrections.names, *corrections.pairs, *corrections.gateways))

@@ -1,0 +1,389 @@
+"""Names and corrections: what a person says about the drives of a map.
+
+They stand in a file `corrections.yaml` beside the map. Each sentence names steps, not places: a
+place is "where the robot was at step 12 of Monday", written `monday:12`. So a sentence keeps its
+meaning when the map is solved again, and when drives are added.
+
+>>> from ssh_abduction import Trace
+>>> monday = Trace.from_steps("aba", ["travel", "around"], name="monday")
+>>> said = Corrections.for_drives(monday).with_name("kitchen", "place", "monday:1")
+>>> [str(naming) for naming in said.names]
+["name 'kitchen' of the place of monday:1"]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+from ssh_abduction.data.checks import (
+    a_flag,
+    a_list,
+    a_number,
+    a_text,
+    all_instances,
+    an_instance,
+    an_object,
+    one_of,
+)
+from ssh_abduction.data.drives import SEEN, Drive, drives_of, fingerprints_of, step_of
+from ssh_abduction.data.errors import MapError, TraceError, brief, is_writable
+from ssh_abduction.data.map_parts import NAMED, Name
+from ssh_abduction.data.maps import SSHMap, checked_map
+from ssh_abduction.data.star import star_to_json, with_gateway
+from ssh_abduction.data.trace import Trace, checked_trace
+
+FORMAT, VERSION = "ssh-corrections", 1
+# The kinds of pairs of steps, which are fields of a theory.
+PAIRS = ("same", "different", "elsewhere")
+# The directions of gateways by name, in degrees clockwise from ahead.
+DIRECTIONS = {"ahead": 0.0, "right": 90.0, "back": 180.0, "left": 270.0}
+
+
+@dataclass(frozen=True, slots=True)
+class Naming:
+    """A name for the place, path or region of a step.
+
+    Attributes:
+        name: The name.
+        kind: "place", "path" or "region".
+        step: The step, such as "monday:12".
+        note: A remark of the person; it has no effect.
+    """
+
+    name: str
+    kind: str
+    step: str
+    note: str | None = None
+
+    def __str__(self) -> str:
+        return f"name {brief(self.name)} of the {self.kind} of {self.step}"
+
+
+@dataclass(frozen=True, slots=True)
+class Said:
+    """Two steps that a person says are one dstate, different dstates, or at different places.
+
+    Attributes:
+        kind: "same", "different" or "elsewhere".
+        steps: The two steps, such as ("monday:12", "tuesday:3").
+        note: A remark of the person; it has no effect.
+    """
+
+    kind: str
+    steps: tuple[str, str]
+    note: str | None = None
+
+    def __str__(self) -> str:
+        return f"{self.kind}: {self.steps[0]}, {self.steps[1]}"
+
+
+@dataclass(frozen=True, slots=True)
+class Passage:
+    """A gateway that a person says is open or closed.
+
+    Attributes:
+        is_open: Whether it is open.
+        seen: For each step at which the robot faced it: the step, and the direction of the
+            gateway in degrees clockwise from ahead.
+        note: A remark of the person; it has no effect.
+    """
+
+    is_open: bool
+    seen: tuple[tuple[str, float], ...]
+    note: str | None = None
+
+    def __str__(self) -> str:
+        told = ", ".join(f"{told_direction(way)} at {step}" for step, way in self.seen)
+        return f"{'open' if self.is_open else 'closed'}: {told}"
+
+
+@dataclass(frozen=True)
+class Corrections:
+    """Names and corrections of a person, with the drives that they are about.
+
+    A value is immutable. `solve` obeys it.
+
+    Attributes:
+        drives: The fingerprint of each drive, by its name.
+        names: The names.
+        pairs: Pairs of steps.
+        gateways: Gateways that are open or closed.
+        source: The file that it was read from.
+    """
+
+    drives: Mapping[str, str] = field(default_factory=dict)
+    names: tuple[Naming, ...] = ()
+    pairs: tuple[Said, ...] = ()
+    gateways: tuple[Passage, ...] = ()
+    source: str | None = field(default=None, compare=False)
+
+    def __post_init__(self) -> None:
+        self._check_names()
+
+    def __bool__(self) -> bool:
+        """Whether anything is said."""
+        return bool(self.names or self.pairs or self.gateways)
+
+    @classmethod
+    def for_drives(cls, trace: Trace) -> Corrections:
+        """Return corrections for the drives of a trace that say nothing yet."""
+        return cls(fingerprints_of(checked_trace(trace)))
+
+    def with_name(self, name: str, kind: str, step: str) -> Corrections:
+        """Name the place, path or region of a step. An earlier name for this step is replaced.
+
+        Args:
+            name: The name.
+            kind: "place", "path" or "region".
+            step: The step, such as "monday:12".
+
+        Raises:
+            MapError: Another place, path or region has this name, or an argument is wrong.
+        """
+        one_of("kind", kind, NAMED, MapError)
+        kept = [n for n in self.names if (n.kind, n.step) != (kind, step)]
+        return replace(self, names=(*kept, Naming(_a_name(name), kind, _a_step("step", step))))
+
+    def with_pair(self, kind: str, first: str, second: str) -> Corrections:
+        """Say that two steps are one dstate, different dstates, or at different places.
+
+        Args:
+            kind: "same", "different" or "elsewhere".
+            first: A step, such as "monday:12".
+            second: Another step.
+
+        Raises:
+            MapError: An argument is wrong.
+        """
+        one_of("kind", kind, PAIRS, MapError)
+        said = Said(kind, (_a_step("first", first), _a_step("second", second)))
+        if said.steps[0] == said.steps[1]:
+            raise MapError(f"second: expected another step than {first}, got it again; name two")
+        return self if said in self.pairs else replace(self, pairs=(*self.pairs, said))
+
+    def with_gateway(self, is_open: bool, seen: Iterable[tuple[str, float]]) -> Corrections:
+        """Say that a gateway is open or closed. What was said about it before is replaced.
+
+        Args:
+            is_open: Whether it is open.
+            seen: The steps at its place, each with the direction of the gateway in degrees
+                clockwise from ahead.
+
+        Raises:
+            MapError: An argument is wrong.
+        """
+        a_flag("is_open", is_open, MapError)
+        ways = []
+        for i, at in enumerate(a_list("seen", seen, MapError)):
+            if not isinstance(at, tuple) or len(at) != 2:
+                raise MapError(
+                    f"seen[{i}]: expected a step and degrees, such as ('monday:12', 90.0), got "
+                    f"{brief(at)}; give both"
+                )
+            way = a_number(f"seen[{i}]", at[1], MapError)
+            ways.append((_a_step(f"seen[{i}]", at[0]), way % 360))
+        passage = Passage(is_open, tuple(ways))
+        kept = [said for said in self.gateways if not set(said.seen) & set(passage.seen)]
+        return replace(self, gateways=(*kept, passage))
+
+    def check_drives(self, known: Mapping[str, str | None]) -> None:
+        """Check that these corrections are about some of these drives.
+
+        Args:
+            known: The fingerprint of each drive, by its name; None if it is unknown.
+
+        Raises:
+            MapError: No drive is known, or a drive of a known name has other steps.
+        """
+        an_object("known", known, MapError)
+        where = self.source or "corrections"
+        other = [d for d, mark in known.items() if self.drives.get(d, mark) not in (mark, None)]
+        other = [d for d in other if known[d] is not None]
+        if other or (self.drives and not set(self.drives) & set(known)):
+            told = f"other steps of {other[0]}" if other else f"{', '.join(known)}"
+            raise MapError(
+                f"{where}: drives: expected the drives {', '.join(self.drives)} that it was "
+                f"written for, got {told}; it belongs to another map: name another file, or "
+                "remove it"
+            )
+
+    def known_in(self, drives: Sequence[Drive]) -> Corrections:
+        """Return only the sentences whose steps are all of these drives.
+
+        Raises:
+            MapError: A sentence names a drive that these corrections do not list, or a step that
+                its drive does not have.
+        """
+        mend = "take drives_of(trace), or those of a solution"
+        drives = all_instances("drives", drives, Drive, MapError, mend=mend)
+        names = {drive.name for drive in drives}
+
+        def is_known(step: str) -> bool:
+            drive = step.rpartition(":")[0]
+            if drive in names:
+                self._number(drives, step)
+            elif drive not in self.drives:
+                raise MapError(
+                    f"{self.source or 'corrections'}: expected a step such as "
+                    f"{drives[0].name}:0, of {', '.join({**self.drives, **dict.fromkeys(names)})}, "
+                    f"got {brief(step)}; name the drive and the step"
+                )
+            return drive in names
+
+        return replace(
+            self,
+            names=tuple(n for n in self.names if is_known(n.step)),
+            pairs=tuple(p for p in self.pairs if all(map(is_known, p.steps))),
+            gateways=tuple(
+                replace(g, seen=seen)
+                for g in self.gateways
+                if (seen := tuple(at for at in g.seen if is_known(at[0])))
+            ),
+        )
+
+    def assertions(self, trace: Trace) -> dict[str, tuple[tuple[int, int], ...]]:
+        """Return the pairs of steps as fields of a theory for a trace.
+
+        Returns:
+            For same, different and elsewhere: the pairs, by the numbers of the steps.
+
+        Raises:
+            MapError: The trace has no drive, or no step, that is named.
+        """
+        drives = drives_of(checked_trace(trace))
+        return {
+            kind: tuple(
+                (self._number(drives, said.steps[0]), self._number(drives, said.steps[1]))
+                for said in self.known_in(drives).pairs
+                if said.kind == kind
+            )
+            for kind in PAIRS
+        }
+
+    def corrected(self, trace: Trace) -> Trace:
+        """Return a trace whose stars have the gateways that a person said are open or closed.
+
+        A changed step keeps what the robot saw in its field `star_seen`.
+
+        Raises:
+            MapError: A sentence contradicts the trace: the robot passed a gateway that is said to
+                be closed, or saw no star there.
+        """
+        drives = drives_of(checked_trace(trace))
+        steps = list(trace.steps)
+        for said in self.known_in(drives).gateways:
+            for name, way in said.seen:
+                t = self._number(drives, name)
+                self._check_passable(trace, said, name, t, way)
+                step = steps[t]
+                star = step.star
+                if star is None:
+                    raise self._contradicted(said, f"{name} has no star; leave it out")
+                changed = with_gateway(star, way, is_open=said.is_open)
+                if changed != star:
+                    extra = {SEEN: star_to_json(star), **step.extra}
+                    steps[t] = replace(step, star=changed, extra=extra)
+        return replace(trace, steps=tuple(steps))
+
+    def named(self, ssh_map: SSHMap, drives: Sequence[Drive]) -> SSHMap:
+        """Return a map with the names that a person gave.
+
+        If two names are of one place of this map, the first one counts.
+
+        Args:
+            ssh_map: The map.
+            drives: The drives of its trace.
+        """
+        checked_map(ssh_map)
+        found: dict[tuple[str, int], str] = {}
+        for naming in self.known_in(drives).names:
+            dstate = ssh_map.dstates[ssh_map.labels[self._number(drives, naming.step)]]
+            number = {"place": dstate.place, "path": dstate.path}.get(naming.kind)
+            if number is not None:
+                found.setdefault((naming.kind, number), naming.name)
+        names = (Name(kind, number, text) for (kind, number), text in sorted(found.items()))
+        return replace(ssh_map, names=tuple(names))
+
+    def without(self, sentence: Said | Passage) -> Corrections:
+        """Return the same corrections without one sentence, of `pairs` or `gateways`.
+
+        Raises:
+            MapError: The sentence is none.
+        """
+        if not isinstance(sentence, Said | Passage):
+            raise MapError(
+                f"sentence: expected one of pairs or gateways, got {brief(sentence)}; take one"
+            )
+        return replace(
+            self,
+            pairs=tuple(said for said in self.pairs if said != sentence),
+            gateways=tuple(said for said in self.gateways if said != sentence),
+        )
+
+    def _check_names(self) -> None:
+        """Raise MapError if two sentences give one name, or name one thing twice."""
+        where = self.source or "corrections"
+        first: dict[tuple[str, ...], int] = {}
+        for i, naming in enumerate(self.names):
+            for key, what in (
+                ((naming.kind, naming.name), f"another name than {brief(naming.name)}"),
+                ((naming.kind, naming.step, ""), f"one name for the {naming.kind}"),
+            ):
+                if key in first:
+                    raise MapError(
+                        f"{where}: names[{i}]: expected {what}, which names[{first[key]}] has at "
+                        f"{self.names[first[key]].step}, got {naming}; rename one of them"
+                    )
+                first[key] = i
+
+    def _number(self, drives: Sequence[Drive], step: str) -> int:
+        """Return the number of a step. Raise MapError if there is none."""
+        try:
+            return step_of(drives, step)
+        except TraceError as error:
+            raise MapError(f"{self.source or 'corrections'}: {error}") from None
+
+    def _contradicted(self, said: object, why: str) -> MapError:
+        return MapError(f"{self.source or 'corrections'}: {said}: it contradicts the trace: {why}")
+
+    def _check_passable(self, trace: Trace, said: Passage, name: str, t: int, way: float) -> None:
+        """Raise MapError if the robot passed a gateway that is said to be closed."""
+        if said.is_open:
+            return
+        action, before = trace.steps[t].action, trace.steps[t - 1].action if t else None
+        if way == 0 and action is not None and action.kind == "travel":
+            raise self._contradicted(said, f"the robot left {name} through it; say it is open")
+        if way == 180 and before is not None and before.kind == "travel":
+            raise self._contradicted(said, f"the robot came to {name} through it; say it is open")
+
+
+def told_direction(way: float) -> str:
+    """Say a direction: ahead, right, back, left, or degrees clockwise from ahead."""
+    names = {degrees: name for name, degrees in DIRECTIONS.items()}
+    return names.get(way, f"{way:g}")
+
+
+def checked_corrections(value: object) -> Corrections:
+    """Return a value if it is Corrections, or raise MapError."""
+    mend = "read them with load_corrections, or make them with Corrections.for_drives"
+    return an_instance("corrections", value, Corrections, MapError, mend=mend)
+
+
+def _a_step(field: str, step: object) -> str:
+    """Return the name of a step, such as "monday:12". Raise MapError if it is none."""
+    text = a_text(field, step, MapError, mend="name a step, such as monday:12")
+    drive, _, number = text.rpartition(":")
+    if not (drive and number.isascii() and number.isdecimal() and is_writable(text)):
+        raise MapError(
+            f"{field}: expected a drive, a colon and a step, such as monday:12, got {brief(text)}; "
+            "name one"
+        )
+    return text
+
+
+def _a_name(name: object) -> str:
+    text = a_text("name", name, MapError, mend="give a name such as kitchen").strip()
+    if not text or not text.isprintable():
+        raise MapError(f"name: expected a name such as kitchen, got {brief(name)}; give one")
+    return text

@@ -1,0 +1,317 @@
+"""Read and write files of names and corrections, in YAML. See docs/reference/formats.md."""
+
+from __future__ import annotations
+
+import math
+import os
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, TypeVar
+
+from ssh_abduction.data.checks import a_path
+from ssh_abduction.data.corrections import (
+    DIRECTIONS,
+    FORMAT,
+    PAIRS,
+    VERSION,
+    Corrections,
+    Naming,
+    Passage,
+    Said,
+    checked_corrections,
+    told_direction,
+)
+from ssh_abduction.data.drives import Drive
+from ssh_abduction.data.errors import MapError, brief, named
+from ssh_abduction.data.files import read_at_most, write_file
+from ssh_abduction.data.map_parts import NAMED
+from ssh_abduction.data.maps import SSHMap
+
+FILE = "corrections.yaml"  # the name of the file beside a map
+LARGEST = 2**24  # bytes
+HEAD = """\
+# Names and corrections of a person. You can edit this file, or use `ssh-abduction name` and
+# `ssh-abduction correct`, which write it anew: they keep each `note:`, but not comments like this.
+"""
+T = TypeVar("T")
+
+
+def load_corrections(path: str | os.PathLike[str]) -> Corrections:
+    """Read a file of names and corrections.
+
+    Args:
+        path: The file; or a folder, for the file `corrections.yaml` in it.
+
+    Raises:
+        MapError: The file cannot be read or is malformed. The error names the field.
+    """
+    file = file_in(path)
+    try:
+        text = read_at_most(file, LARGEST).decode()
+    except (OSError, ValueError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise MapError(
+            f"{named(file)}: expected a file of corrections: {why}; check the path"
+        ) from None
+    return from_yaml(text, str(file))
+
+
+def save_corrections(corrections: Corrections, path: str | os.PathLike[str]) -> None:
+    """Write names and corrections into a file.
+
+    Args:
+        corrections: The names and corrections.
+        path: The file; or a folder, for the file `corrections.yaml` in it.
+
+    Raises:
+        MapError: The file cannot be written.
+    """
+    file = file_in(path)
+    try:
+        write_file(str(file), (HEAD + to_yaml(checked_corrections(corrections))).encode())
+    except (OSError, ValueError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise MapError(
+            f"{named(file)}: cannot write the corrections: {why}; check the folder"
+        ) from None
+
+
+def file_in(path: str | os.PathLike[str]) -> Path:
+    """Return the file of corrections that a path names: itself, or the one in a folder."""
+    file = Path(a_path("path", path, MapError) or FILE)
+    return file / FILE if file.is_dir() else file
+
+
+def beside(maps: str | os.PathLike[str] | None) -> Path | None:
+    """Return the file of corrections beside a file of maps; None if there is none."""
+    if maps is None or str(maps) == "-":
+        return None
+    file = Path(a_path("maps", maps, MapError)).parent / FILE
+    return file if file.is_file() else None
+
+
+def named_beside(
+    maps: Iterable[SSHMap], drives: Sequence[Drive], path: str | os.PathLike[str] | None
+) -> tuple[SSHMap, ...]:
+    """Return maps with the names in the file of corrections beside their file, if there is one.
+
+    If that file is of other drives, a warning says so.
+
+    Args:
+        maps: The maps.
+        drives: The drives of their trace, with fingerprints; empty if they are unknown.
+        path: The file of the maps; None or "-" if there is none.
+
+    Raises:
+        MapError: The file of corrections is malformed.
+    """
+    file = beside(path)
+    if file is None or not drives:
+        return tuple(maps)
+    said = load_corrections(file)
+    try:
+        said.check_drives({drive.name: drive.fingerprint for drive in drives})
+    except MapError as error:
+        warnings.warn(f"{error}; its names are not used", stacklevel=3)
+        return tuple(maps)
+    return tuple(said.named(ssh_map, drives) for ssh_map in maps)
+
+
+def to_yaml(corrections: Corrections) -> str:
+    """Write names and corrections as YAML. `from_yaml` reads them."""
+    import yaml  # loads slowly
+
+    data: dict[str, Any] = {
+        "format": FORMAT,
+        "version": VERSION,
+        "drives": dict(corrections.drives),
+        "names": [{"name": n.name, n.kind: n.step, **_note(n)} for n in corrections.names],
+    }
+    for kind in PAIRS:
+        pairs = [said for said in corrections.pairs if said.kind == kind]
+        data[kind] = [
+            {"steps": [*said.steps], "note": said.note} if said.note else [*said.steps]
+            for said in pairs
+        ]
+    data["gateways"] = [
+        {
+            ("open" if said.is_open else "closed"): {
+                step: told_direction(way) for step, way in said.seen
+            },
+            **_note(said),
+        }
+        for said in corrections.gateways
+    ]
+    kept = {name: value for name, value in data.items() if value or name == "drives"}
+    text: str = yaml.safe_dump(
+        kept, sort_keys=False, allow_unicode=True, default_flow_style=None, width=100
+    )
+    return text
+
+
+def _note(said: Naming | Passage) -> dict[str, str]:
+    return {"note": said.note} if said.note else {}
+
+
+def from_yaml(text: str, source: str = "corrections") -> Corrections:
+    """Read names and corrections from YAML.
+
+    Args:
+        text: The text of the file.
+        source: The name of the file, for messages.
+
+    Raises:
+        MapError: The text is malformed. The error names the field.
+    """
+    import yaml  # loads slowly
+
+    try:
+        # This loader makes a text of each scalar: a step such as 1:30 is no number of seconds.
+        _check_keys(yaml.compose(text, Loader=yaml.BaseLoader))
+        data = yaml.load(text, Loader=yaml.BaseLoader)
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        told = " ".join(str(error).split())
+        raise MapError(f"{source}: expected YAML, got {told}; mend it there") from None
+    return _Reader(source).corrections(data)
+
+
+def _check_keys(node: Any) -> None:
+    """Raise ValueError if an object has a field twice, of which YAML would keep the last one."""
+    if isinstance(getattr(node, "value", None), list):
+        for child in node.value:
+            pair = child if isinstance(child, tuple) else (child,)
+            for part in pair:
+                _check_keys(part)
+        keys = [child[0].value for child in node.value if isinstance(child, tuple)]
+        for child in node.value:
+            if isinstance(child, tuple) and keys.count(child[0].value) > 1:
+                raise ValueError(
+                    f"{brief(child[0].value)} twice, first in line {child[0].start_mark.line + 1}"
+                )
+
+
+class _Reader:
+    """Checks the fields of a file of corrections. Errors name the file and the field."""
+
+    def __init__(self, source: str) -> None:
+        self._source = source
+
+    def corrections(self, data: object) -> Corrections:
+        """Convert the data of a file."""
+        fields = ("format", "version", "drives", "names", *PAIRS, "gateways")
+        record = self._object(data, "file", fields)
+        if record.get("format") != FORMAT:
+            raise self._wrong("format", f'"{FORMAT}"', record.get("format"))
+        if record.get("version") != str(VERSION):
+            told = f"{VERSION} (another one is of another ssh-abduction)"
+            raise self._wrong("version", told, record.get("version"))
+        drives = self._object(record.get("drives") or {}, "drives")
+        return Corrections(
+            {name: self._text(mark, f"drives.{name}") for name, mark in drives.items()},
+            self._each(record, "names", self._naming),
+            tuple(
+                self._said(kind, value, where)
+                for kind in PAIRS
+                for value, where in self._each(record, kind, lambda value, where: (value, where))
+            ),
+            self._each(record, "gateways", self._passage),
+            self._source,
+        )
+
+    def _naming(self, value: object, where: str) -> Naming:
+        record = self._object(value, where, ("name", *NAMED, "note"))
+        kinds = [kind for kind in NAMED if kind in record]
+        if len(kinds) != 1:
+            raise self._wrong(where, f"one of {', '.join(NAMED)}", value)
+        name = self._text(record.get("name"), f"{where}.name").strip()
+        step = self._step(record[kinds[0]], f"{where}.{kinds[0]}")
+        return Naming(name, kinds[0], step, self._note(record, where))
+
+    def _said(self, kind: str, value: object, where: str) -> Said:
+        note, steps = None, value
+        if isinstance(value, Mapping):
+            record = self._object(value, where, ("steps", "note"))
+            note, steps = self._note(record, where), record.get("steps")
+        if not isinstance(steps, list) or len(steps) != 2:
+            raise self._wrong(where, "two steps, such as [monday:12, tuesday:3]", value)
+        first, second = (self._step(step, f"{where}[{i}]") for i, step in enumerate(steps))
+        if first == second:
+            raise self._wrong(where, "two different steps", value)
+        return Said(kind, (first, second), note)
+
+    def _passage(self, value: object, where: str) -> Passage:
+        record = self._object(value, where, ("open", "closed", "note"))
+        if ("open" in record) == ("closed" in record):
+            raise self._wrong(where, "one of open, closed", value)
+        is_open = "open" in record
+        field = f"{where}.{'open' if is_open else 'closed'}"
+        seen = self._object(record["open" if is_open else "closed"], field)
+        return Passage(
+            is_open,
+            tuple((self._step(s, field), self._way(w, f"{field}.{s}")) for s, w in seen.items()),
+            self._note(record, where),
+        )
+
+    def _way(self, value: object, where: str) -> float:
+        text = self._text(value, where)
+        try:
+            return direction(text)
+        except MapError:
+            raise self._wrong(where, f"{', '.join(DIRECTIONS)}, or degrees", value) from None
+
+    def _step(self, value: object, where: str) -> str:
+        text = self._text(value, where)
+        drive, colon, number = text.rpartition(":")
+        if not (drive and colon and number.isascii() and number.isdecimal()):
+            raise self._wrong(where, "a drive, a colon and a step, such as monday:12", value)
+        return f"{drive}:{int(number)}"
+
+    def _note(self, record: Mapping[str, object], where: str) -> str | None:
+        return self._text(record["note"], f"{where}.note") if record.get("note") else None
+
+    def _text(self, value: object, where: str) -> str:
+        if not isinstance(value, str) or not value.strip() or not value.isprintable():
+            raise self._wrong(where, "a text on one line", value)
+        return value
+
+    def _object(
+        self, value: object, where: str, fields: Sequence[str] | None = None
+    ) -> Mapping[str, Any]:
+        if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
+            told = "fields such as name: kitchen" if fields is None else ", ".join(fields)
+            raise self._wrong(where, told, value)
+        if fields is not None and (unknown := set(value) - set(fields)):
+            raise self._wrong(where, f"only {', '.join(fields)}", min(unknown))
+        return value
+
+    def _each(
+        self, record: Mapping[str, Any], name: str, read: Callable[[object, str], T]
+    ) -> tuple[T, ...]:
+        listed = record.get(name) or []
+        if not isinstance(listed, list):
+            raise self._wrong(name, "a list, each entry after a dash", listed)
+        return tuple(read(value, f"{name}[{i}]") for i, value in enumerate(listed))
+
+    def _wrong(self, where: str, expected: str, value: object) -> MapError:
+        return MapError(
+            f"{named(self._source)}: {where}: expected {expected}, got {brief(value)}; mend it "
+            "there"
+        )
+
+
+def direction(text: str) -> float:
+    """Read a direction: ahead, right, back, left, or degrees clockwise from ahead.
+
+    Raises:
+        MapError: The text is none.
+    """
+    with suppress(ValueError):
+        degrees = DIRECTIONS[text] if text in DIRECTIONS else float(text)
+        if math.isfinite(degrees):
+            return degrees % 360
+    raise MapError(
+        f"direction: expected {', '.join(DIRECTIONS)}, or degrees clockwise from ahead, got "
+        f"{brief(text)}; take one"
+    )

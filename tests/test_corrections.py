@@ -1,0 +1,315 @@
+"""Names and corrections of a person: the file, what solve does with it, and where names stand."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from ssh_abduction import Theory, Trace, export_map, route, solve
+from ssh_abduction.cli import main
+from ssh_abduction.data import (
+    Corrections,
+    MapError,
+    SSHMap,
+    drives_of,
+    load_corrections,
+    save_corrections,
+    together,
+)
+from ssh_abduction.data.corrections_file import from_yaml, to_yaml
+from ssh_abduction.data.drives import fingerprints_of
+from ssh_abduction.data.star import Gateway, with_gateway
+from ssh_abduction.output import to_dot, to_networkx, to_svg
+from ssh_abduction.output.cards import map_card
+from ssh_abduction.page.content import content_of
+
+MONDAY = Trace.from_steps("abcd", ["travel", "around", "travel"], name="monday")
+TUESDAY = Trace.from_steps("bcd", ["around", "travel"], name="tuesday")
+# Three corners of a triangle, as the robot sees them: it turns right at each.
+CORNER, TURNED = (0, 1, 1, 0), (1, 1, 0, 0)
+ROUND = Trace.from_steps(
+    "ccccccc",
+    ["travel", "right"] * 3,
+    stars=[TURNED, CORNER, TURNED, CORNER, TURNED, CORNER, TURNED],
+    name="round",
+)
+JOINT = together([MONDAY, TUESDAY])
+MARKS = fingerprints_of(JOINT)
+HEAD = f"format: ssh-corrections\nversion: 1\ndrives: {json.dumps(MARKS)}\n"
+
+
+def read(text: str) -> Corrections:
+    return from_yaml(HEAD + text, "c.yaml")
+
+
+@pytest.fixture
+def folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
+    """A folder with traces and their joint map, in which the b of Tuesday is that of Monday."""
+    for trace in (MONDAY, TUESDAY, ROUND):
+        trace.save(tmp_path / f"{trace.name}.jsonl")
+    (tmp_path / "building").mkdir()
+    assert main(solving(tmp_path)) == 0
+    capsys.readouterr()
+    return tmp_path
+
+
+def solving(folder: Path, *names: str) -> list[str]:
+    files = [str(folder / f"{name}.jsonl") for name in names or ("monday", "tuesday")]
+    return ["solve", *files, "--together", "-o", str(folder / "building" / "maps.json")]
+
+
+def test_a_file_says_what_was_written(tmp_path: Path) -> None:
+    said = (
+        Corrections(MARKS)
+        .with_name("Küche: 2", "place", "monday:1")
+        .with_pair("same", "monday:3", "tuesday:2")
+        .with_pair("different", "monday:1", "tuesday:0")
+        .with_gateway(False, [("monday:1", 90.0), ("monday:2", 135.0)])
+    )
+    save_corrections(said, tmp_path)
+    assert load_corrections(tmp_path / "corrections.yaml") == said == from_yaml(to_yaml(said))
+    noted = read("same:\n- steps: [monday:3, tuesday:2]\n  note: I saw it\n")
+    assert noted.pairs[0].note == "I saw it"
+    assert from_yaml(to_yaml(noted)) == noted
+
+
+def test_a_name_is_moved_and_a_gateway_changes_its_mind() -> None:
+    said = Corrections(MARKS).with_name("hall", "place", "monday:1")
+    assert [n.name for n in said.with_name("kitchen", "place", "monday:1").names] == ["kitchen"]
+    with pytest.raises(
+        MapError, match=r"another name than 'hall', which names\[0\] has at monday:1"
+    ):
+        said.with_name("hall", "place", "monday:3")
+    assert len(said.with_name("hall", "path", "monday:3").names) == 2
+    closed = said.with_gateway(False, [("monday:1", 90.0)])
+    assert [g.is_open for g in closed.with_gateway(True, [("monday:1", 90.0)]).gateways] == [True]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", None),
+        ("names:\n- {name: a, place: monday:1}\n- {name: a, place: tuesday:1}\n", "another name"),
+        ("names:\n- {name: a, place: monday:1}\n- {name: b, place: monday:1}\n", "one name for"),
+        ("names:\n- {name: a}\n", r"names\[0\]: expected one of place, path, region"),
+        ("names:\n- {name: a, place: p4}\n", r"names\[0\].place: expected a drive, a colon"),
+        ("names: kitchen\n", "names: expected a list"),
+        ("names:\n- {name: a, place: monday:1}\nnames: []\n", "'names' twice, first in line"),
+        ("same:\n- [monday:1]\n", r"same\[0\]: expected two steps"),
+        ("same:\n- [monday:1, monday:01]\n", r"same\[0\]: expected two different steps"),
+        ("gateways:\n- {closed: {monday:1: up}}\n", "expected ahead, right, back, left, or degr"),
+        ("gateways:\n- {monday:1: left}\n", "expected only open, closed, note, got 'monday:1'"),
+        ("rooms: []\n", "file: expected only format, version"),
+        ("same: [\n", "expected YAML, got"),
+    ],
+)
+def test_a_wrong_file_is_refused(text: str, said: str | None) -> None:
+    if said is None:
+        assert not read(text)
+        return
+    with pytest.raises(MapError, match=said) as error:
+        read(text)
+    assert str(error.value).startswith("c.yaml: ")
+
+
+def test_a_file_of_another_version_is_refused(tmp_path: Path) -> None:
+    for wrong in ("version: 2", "version: true"):
+        with pytest.raises(MapError, match=r"version: expected 1 .*, got"):
+            from_yaml(HEAD.replace("version: 1", wrong))
+    with pytest.raises(MapError, match='format: expected "ssh-corrections", got None'):
+        from_yaml("version: 1")
+    with pytest.raises(MapError, match="expected a file of corrections"):
+        load_corrections(tmp_path)
+
+
+def test_a_file_of_another_map_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    said = Corrections(MARKS).with_name("kitchen", "place", "monday:1")
+    with pytest.raises(MapError, match=r"expected the drives monday, tuesday .* got round"):
+        solve(ROUND, corrections=said)
+    with pytest.raises(MapError, match="got other steps of monday; it belongs to another map"):
+        solve(replace(TUESDAY, name="monday"), corrections=said)
+    save_corrections(said, folder / "building")
+    assert main(solving(folder, "round")) == 1
+    assert "it belongs to another map" in capsys.readouterr().err
+    for unknown in ("sunday:1", "monday:9"):
+        with pytest.raises(MapError, match=r"sunday:1|from 0 to 3"):
+            solve(JOINT, corrections=said.with_name("den", "place", unknown))
+
+
+@pytest.mark.filterwarnings("always")
+def test_names_of_another_map_are_not_shown(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_corrections(
+        Corrections(fingerprints_of(ROUND)).with_name("kitchen", "place", "round:1"),
+        folder / "building",
+    )
+    assert main(["show", str(folder / "building" / "maps.json")]) == 0
+    told = capsys.readouterr()
+    assert "its names are not used" in told.err
+    assert "kitchen" not in told.out
+
+
+def test_what_a_person_says_is_obeyed_at_each_later_solve(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    building = str(folder / "building")
+    assert main(["name", building, "p1", "kitchen"]) == 0
+    assert main(["correct", building, "--different", "monday:1,tuesday:0"]) == 0
+    assert main(["correct", building]) == 0
+    assert capsys.readouterr().out.splitlines()[-2:] == [
+        "name 'kitchen' of the place of monday:1",
+        "different: monday:1, tuesday:0",
+    ]
+    assert main(solving(folder)) == 0
+    told = capsys.readouterr()
+    assert "obeying 2 sentences of" in told.err
+    assert "optimal: 6 dstates" in told.out
+    assert "(kitchen)" in told.out
+    # With a third drive, all stays. Without Tuesday, what was said about Tuesday has no effect.
+    replace(TUESDAY, name="again").save(folder / "again.jsonl")
+    assert main([*solving(folder, "monday", "tuesday", "again")]) == 0
+    assert "obeying 2 sentences of" in capsys.readouterr().err
+    assert main(solving(folder, "monday")) == 0
+    assert "obeying 1 sentence of" in (told := capsys.readouterr()).err
+    assert "1 are of drives that are not solved" in told.err
+    elsewhere = ["solve", *solving(folder)[1:4], "--corrections", building, "--json"]
+    assert main(elsewhere) == 0
+    assert json.loads(capsys.readouterr().out)["theory"]["different"] == [[1, 4]]
+
+
+def test_a_name_stays_at_its_steps_when_places_get_other_numbers() -> None:
+    """Solved after Tuesday, the place that Monday first sees has another number."""
+    said = Corrections(MARKS).with_name("start", "place", "monday:0")
+    (first,) = solve(JOINT, corrections=said)
+    (second,) = solve([TUESDAY, MONDAY], corrections=said)
+    assert first.name_of("place", first.place_of(0)) == "start"
+    assert second.name_of("place", second.place_of(3)) == "start"
+    assert first.names[0].id != second.names[0].id
+    both = said.with_name("end", "place", "monday:3")  # in this map, both are one place
+    (third,) = solve(JOINT, corrections=both)
+    assert [n.text for n in third.names] == ["start"]
+
+
+def test_sentences_that_contradict_a_trace_are_reported(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    building = str(folder / "building")
+    assert main(["correct", building, "--same", "monday:1,tuesday:1"]) == 0
+    assert main(["correct", building, "--same", "monday:2,tuesday:1"]) == 0
+    assert main(solving(folder)) == 20
+    told = capsys.readouterr().out
+    assert (
+        "same: monday:1, tuesday:1: it contradicts the trace (monday:1 shows b, tuesday:1 shows c)"
+        in told
+    )
+    assert "monday:2" not in told
+    assert main([*solving(folder), "--json"]) == 20
+    assert "tuesday:1" in json.loads(capsys.readouterr().out)["corrections"][0]
+
+
+def test_gateways_are_opened_and_closed(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The gateway is seen from two steps at its place, in two directions."""
+    assert main(solving(folder, "round")) == 0
+    maps = str(folder / "building" / "maps.json")
+    assert main(["correct", maps, "--open", "round:1 ahead"]) == 0
+    file = folder / "building" / "corrections.yaml"
+    (said,) = load_corrections(file).gateways
+    assert said.seen == (("round:1", 0.0), ("round:2", 270.0))
+    corrected = load_corrections(file).corrected(ROUND)
+    assert corrected.steps[1].star == (1, 1, 1, 0)
+    assert corrected.steps[2].star == (1, 1, 0, 1)
+    assert corrected.steps[2].extra == {"star_seen": [1, 1, 0, 0]}
+    assert fingerprints_of(corrected) == fingerprints_of(ROUND)
+    assert main(solving(folder, "round")) == 0
+    capsys.readouterr()
+    # The robot came to the corner from behind: that gateway is open.
+    for way in ("round:1 back", "round:2 ahead"):
+        file.unlink()
+        assert main(["correct", maps, "--closed", way]) == 0
+        assert main(solving(folder, "round")) == 1
+        assert "it contradicts the trace: the robot" in capsys.readouterr().err
+
+
+def test_directions_on_the_map_are_those_of_its_drawing(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(solving(folder, "round")) == 0
+    maps = str(folder / "building" / "maps.json")
+    place = SSHMap.place_of(solve(ROUND)[0], 1)
+    assert main(["correct", maps, "--closed", f"p{place} north", "--open", "p0 south"]) == 0
+    drawn = {}
+    for said in load_corrections(folder / "building").gateways:
+        drawn.update(said.seen)
+    # The robot first faces east; north is on its left. After a right turn, it is behind.
+    assert drawn["round:1"] == 270.0
+    assert drawn["round:2"] == 180.0
+    for wrong, told in (
+        ("p0", "expected a place and a direction"),
+        ("p9 north", "expected a place of the map"),
+        ("p0 up", "expected ahead, right, back, left"),
+    ):
+        assert main(["correct", maps, "--open", wrong]) == 1
+        assert told in capsys.readouterr().err
+
+
+def test_a_star_without_a_gateway() -> None:
+    assert with_gateway((1, None, 0, 0), 90.0, is_open=True) == (1, 1, 0, 0)
+    bearings = (0.0, Gateway(120.0, opposite=2), Gateway(240.0, opposite=1))
+    assert with_gateway(bearings, 3.0, is_open=False) == (
+        Gateway(120.0, opposite=1),
+        Gateway(240.0, opposite=0),
+    )
+    assert with_gateway(bearings, 118.0, is_open=False) == (0.0, Gateway(240.0))
+    assert with_gateway((0.0,), 90.0, is_open=True) == (0.0, 90.0)
+    assert with_gateway((0.0,), 90.0, is_open=False) == (0.0,)
+    unknown = (0.0, Gateway(90.0, open=None))
+    assert with_gateway(unknown, 91.0, is_open=True) == (0.0, Gateway(90.0))
+
+
+def named_map() -> SSHMap:
+    said = (
+        Corrections(fingerprints_of(ROUND))
+        .with_name("kitchen", "place", "round:1")
+        .with_name("hall", "path", "round:0")
+    )
+    (ssh_map,) = solve(ROUND, corrections=said)
+    return ssh_map
+
+
+def test_names_stand_in_all_that_is_made_of_a_map(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ssh_map = named_map()
+    assert ssh_map.called("place", 1) == "place 1 (kitchen)"
+    assert ssh_map.renumbered().names == ssh_map.names
+    assert SSHMap.from_dict(ssh_map.to_dict()).names == ssh_map.names
+    for to in ("nav2", "tmap2", "graphml", "dot", "svg", "networkx-json"):
+        text = export_map(ssh_map, to)
+        assert "kitchen" in text, to
+        assert "hall" in text, to
+    assert 'label="place 1 (kitchen)"' in to_dot(ssh_map)
+    assert "kitchen" in to_svg(ssh_map)
+    assert "1 (kitchen)" in map_card(ssh_map)
+    assert to_networkx(ssh_map, "places").nodes[1]["name"] == "kitchen"
+    assert to_networkx(ssh_map, "topological").nodes["path", 0]["name"] == "hall"
+    assert content_of([ssh_map])["maps"][0]["names"] == {"path 0": "hall", "place 1": "kitchen"}
+    assert route(ssh_map, 0, "kitchen").goal == "place 1 (kitchen)"
+    with pytest.raises(MapError, match="or a place as p0, or kitchen, got 'den'"):
+        route(ssh_map, 0, "den")
+    ssh_map.save(folder / "map.json")
+    for verb in (["show"], ["route", "--to", "kitchen"], ["view", "-o", str(folder / "p.html")]):
+        assert main([verb[0], str(folder / "map.json"), *verb[1:]]) == 0
+    assert capsys.readouterr().out.count("(kitchen)") > 3
+
+
+def test_pairs_of_steps_are_those_of_a_theory() -> None:
+    """There is one mechanism: the fields of a theory."""
+    said = Corrections(MARKS).with_pair("elsewhere", "tuesday:1", "monday:0")
+    assert solve(JOINT, corrections=said).theory.elsewhere == ((0, 5),)
+    twice = solve(JOINT, Theory(elsewhere=[(0, 5)]), corrections=said)
+    assert twice.theory.elsewhere == ((0, 5),)
+    assert drives_of(JOINT)[1].fingerprint is None
