@@ -97,8 +97,11 @@ def ending(solution: Solution, count: int, backbone: Backbone | None) -> dict[st
         },
     }
     end["summary"] = summary_of(solution, count, backbone)
-    trace = solution.trace
-    if drives := solution.drives if trace is None else with_fingerprints(trace):
+    recorded = solution.support.recorded
+    drives = () if recorded is None else recorded.drives
+    if recorded is None and solution.trace is not None:
+        drives = with_fingerprints(solution.trace)
+    if drives:
         end["drives"] = [drive.to_dict() for drive in drives]
     # Leave out fields that would say nothing.
     if backbone and not (solution.minimal_listed and count == 1):
@@ -107,7 +110,6 @@ def ending(solution: Solution, count: int, backbone: Backbone | None) -> dict[st
         end["levels"] = [level.to_dict() for level in solution.levels]
         if solution.minimal_listed and not solution.complete:
             end["minimal_listed"] = True
-    recorded = solution.support.recorded
     if recorded is not None and recorded.written_certificate is not None:
         end["certificate"] = dict(recorded.written_certificate)
     elif solution.certificate:
