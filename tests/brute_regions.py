@@ -88,11 +88,12 @@ def moves(ssh_map: SSHMap, trace: Trace) -> Iterator[tuple]:
 def parts(ssh_map: SSHMap, trace: Trace, axioms: Collection[str]) -> dict[frozenset[int], int]:
     """The sets of places that one place cuts off, each with this place."""
     place = {s.id: s.place for s in ssh_map.dstates}
-    on = {(s.place, s.path) for s in ssh_map.dstates if s.path is not None}
+    on = {(s.place, (s.path, s.floor)) for s in ssh_map.dstates if s.path is not None}
     pathless = {s.id for s in ssh_map.dstates if s.path is None}
     near = {(p, q) for p, h in on for q, g in on if h == g and "path_holds_together" in axioms}
     for s, action, x in moves(ssh_map, trace):
-        if action.kind == "travel" and s in pathless and "travel_links" in axioms:
+        leads = (action.kind == "travel" and s in pathless) or action.kind in ("lift", "stairs")
+        if leads and place[s] != place[x] and "travel_links" in axioms:
             near |= {(place[s], place[x]), (place[x], place[s])}
 
     def hold(places: frozenset[int]) -> bool:

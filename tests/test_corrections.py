@@ -291,7 +291,7 @@ def test_names_stand_in_all_that_is_made_of_a_map(
         text = export_map(ssh_map, to)
         assert "kitchen" in text, to
         assert "hall" in text, to
-    assert 'label="place 1 (kitchen)"' in to_dot(ssh_map)
+    assert 'label="place 1 (kitchen)' in to_dot(ssh_map)
     assert "kitchen" in to_svg(ssh_map)
     assert "1 (kitchen)" in map_card(ssh_map)
     assert to_networkx(ssh_map, "places").nodes[1]["name"] == "kitchen"

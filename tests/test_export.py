@@ -6,11 +6,13 @@ import io
 import json
 import math
 import re
+from dataclasses import replace
 from typing import Any
 
 import networkx as nx
 import pytest
 import yaml
+from test_regions import LOG, TOUR, trace_of
 from worlds import rectangle
 
 from ssh_abduction import SSHMap, Theory, Trace, export_map, solve
@@ -18,6 +20,7 @@ from ssh_abduction.cli import export as verb
 from ssh_abduction.cli import main
 from ssh_abduction.data import MapError
 from ssh_abduction.data.maps import DState
+from ssh_abduction.output import to_networkx
 from ssh_abduction.output.export import formats
 from ssh_abduction.output.export.roads import TURN, Road, Roads, Stop
 from ssh_abduction.output.export.tmap2 import tmap2
@@ -359,3 +362,29 @@ def test_the_command_writes_what_python_makes(
     assert "positions are of a layout" in printed.err
     assert main(["export", file, "--to", "nav2", "--map", "3"]) == 1
     assert "1 to 1" in capsys.readouterr().err
+
+
+def test_exports_have_regions() -> None:
+    (ssh_map,) = solve(Trace.from_steps("abcdef", ["travel", "right", "travel", "left", "travel"]))
+    regions = [region.to_dict() for region in ssh_map.regions or ()]
+    graph = to_networkx(ssh_map)
+    assert graph.graph["regions"] == regions
+    assert graph.nodes[0]["regions"] == (0,)
+    assert "regions" not in to_networkx(replace(ssh_map, regions=None)).graph
+    places = nx.parse_graphml(export_map(ssh_map, "graphml", level="places"))
+    assert places.nodes["3"]["regions"] == "3"
+    assert json.loads(places.graph["regions"]) == regions
+    nodes = json.loads(export_map(ssh_map, "nav2"))["features"]
+    assert nodes[0]["properties"]["metadata"]["regions"] == "0"
+    (first, *_) = yaml.safe_load(export_map(ssh_map, "tmap2"))["nodes"]
+    assert first["node"]["properties"]["regions"] == "0"
+
+
+def test_dot_nests_regions_behind_a_place() -> None:
+    trace = trace_of(TOUR)
+    text = export_map(solve(trace, LOG, max_maps=1)[0], "dot")
+    outer, inner = text.index("cluster_region_0 "), text.index('label="region 3, behind place 0"')
+    assert outer < inner < text.index("subgraph cluster_1 ") < text.index("cluster_region_1 ")
+    assert text.count("{") == text.count("}")
+    corner = solve(Trace.from_steps("abcd", ["travel", "right", "travel"]))[0]
+    assert 'label="place 2\\nright of path 0+"' in export_map(corner, "dot")

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from test_regions import LOG, TOUR, trace_of
 from worlds import TOURS, drive
 
 from ssh_abduction import SSHMap, Theory, Trace, solve
@@ -75,7 +76,10 @@ def dots(picture: str) -> dict[str, tuple[float, float]]:
         if group.find(f"{SVG}circle") is not None
     ]
     return {
-        str(group.findtext(f"{SVG}title")): (float(circle.attrib["cx"]), float(circle.attrib["cy"]))
+        str(group.findtext(f"{SVG}title")).partition(",")[0]: (
+            float(circle.attrib["cx"]),
+            float(circle.attrib["cy"]),
+        )
         for group in groups
         if (circle := group.find(f"{SVG}circle")) is not None
     }
@@ -239,3 +243,24 @@ def test_the_file_is_written_where_it_is_asked_for(
     assert "place 3" in written
     assert main([*export, "-o", str(tmp_path / "no" / "map.svg")]) == 1
     assert "cannot write the map" in capsys.readouterr().err
+
+
+def test_bands_of_regions_lie_behind_a_place() -> None:
+    ssh_map = solve(trace_of(TOUR), LOG, max_maps=1)[0]
+    root = ET.fromstring(to_svg(ssh_map))
+    groups = [g for g in root.iter(f"{SVG}g") if g.get("class") == "region"]
+    told = [g.findtext(f"{SVG}title") for g in groups]
+    assert told == [str(region) for region in ssh_map.regions or () if region.door is not None]
+    paths = [g.find(f"{SVG}path") for g in groups]
+    widths = [float(path.get("stroke-width", 0)) for path in paths if path is not None]
+    assert widths[:3] == [widths[0]] * 3 > widths[3:] == [widths[3]] * 3
+    names = [node.text for node in root.iter(f"{SVG}text")]
+    assert {f"region {i}" for i in range(6)} <= {*names}
+    assert "region" not in to_svg(replace(ssh_map, regions=None))
+
+
+def test_titles_of_places_name_their_sides() -> None:
+    corner = solve(Trace.from_steps("abcd", ["travel", "right", "travel"]))[0]
+    titles = [node.text for node in ET.fromstring(to_svg(corner)).iter(f"{SVG}title")]
+    assert "place 2, right of path 0+, in region 1" in titles
+    assert "place 1" in titles

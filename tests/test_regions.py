@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from worlds import written
 
 from ssh_abduction import SSHMap, Theory, Trace, check, solve
-from ssh_abduction.data import MapError
+from ssh_abduction.data import Action, MapError
 from ssh_abduction.data.regions import Region, right_of
 from ssh_abduction.robot_logs.log_maps import BARE
 from ssh_abduction.solver import find_regions, with_regions
@@ -220,6 +220,18 @@ def test_encoding_checker_and_brute_force_agree_on_rooms(rooms: list[str], seed:
     theory = settle(trace, LOG).theory
     ssh_map = first_map(trace, theory)
     assert not check(trace, ssh_map, theory)
+    assert as_set(ssh_map) == brute_regions.regions(ssh_map, trace, axioms_for_regions(theory))
+
+
+def test_a_floor_lies_behind_its_lift() -> None:
+    up = Action("up", "lift")
+    trace = Trace.from_steps(
+        ["a", "b", "c", "lift", "up", "hall"], ["travel", "travel", "travel", up, "travel"]
+    )
+    theory = settle(trace, PLAIN).theory
+    ssh_map = first_map(trace, theory)
+    assert not check(trace, ssh_map, theory)
+    assert "4,5 behind3" in told(ssh_map.regions or ()).split("/")
     assert as_set(ssh_map) == brute_regions.regions(ssh_map, trace, axioms_for_regions(theory))
 
 

@@ -15,7 +15,8 @@ from ssh_abduction.checker.sides import Branch, right_of
 from ssh_abduction.data.regions import Region, listed
 
 _Places: TypeAlias = frozenset[int]
-_Node: TypeAlias = tuple[str, int]  # ("place", its id) or ("path", its id)
+# ("place", its id), or ("path", its id, its floor); paths are links on one floor only.
+_Node: TypeAlias = tuple[str, int] | tuple[str, int, int | None]
 
 
 def known_sides(m: Reading) -> Mapping[Course, Mapping[int, Branch]]:
@@ -79,16 +80,18 @@ def _behind(m: Reading) -> dict[_Places, int]:
 
 
 def _links(m: Reading) -> dict[_Node, set[_Node]]:
-    """Link each place with its paths, and with the places that travels along no path reach."""
+    """Link each place with its paths, and with what lifts and travels along no path reach."""
     links: dict[_Node, set[_Node]] = defaultdict(set)
-    pairs = [
-        (("place", s.place), ("path", course[0]))
+    pairs: list[tuple[_Node, _Node]] = [
+        (("place", s.place), ("path", course[0], s.floor))
         for s in m.states.values()
         if s.place is not None and (course := course_of(s))
     ]
-    for move in m.travels:
+    leading = [move for move in m.travels if course_of(move.source) is None]
+    leading += [move for move in m.moves if move.action.kind in ("lift", "stairs")]
+    for move in leading:
         p, q = move.source.place, move.target.place
-        if p is not None and q is not None and p != q and course_of(move.source) is None:
+        if p is not None and q is not None and p != q:
             pairs.append((("place", p), ("place", q)))
     for one, other in pairs:
         links[one].add(other)
@@ -108,7 +111,7 @@ def _reached(links: Mapping[_Node, set[_Node]], start: _Node, closed: _Node) -> 
 
 
 def _places(nodes: Iterable[_Node]) -> _Places:
-    return frozenset(number for sort, number in nodes if sort == "place")
+    return frozenset(node[1] for node in nodes if node[0] == "place")
 
 
 def _bounds(m: Reading, places: _Places) -> set[Course]:

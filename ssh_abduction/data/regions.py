@@ -123,6 +123,11 @@ def regions_at(regions: Iterable[Region], place: int) -> tuple[Region, ...]:
     return tuple(region for region in regions if place in region.places)
 
 
+def ids_at(regions: Iterable[Region] | None, place: int | None) -> tuple[int, ...]:
+    """Find the ids of the regions that contain a place."""
+    return tuple(region.id for region in regions or () if place in region.places)
+
+
 def renumbered(
     regions: Iterable[Region],
     place: Mapping[int | None, int],

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from ssh_abduction.data.errors import printable
 from ssh_abduction.data.maps import DState, SSHMap, checked_map
+from ssh_abduction.data.regions import course_named, listed
 
 
 def to_dot(ssh_map: SSHMap) -> str:
     """Write the dstates and links of a map as DOT text.
 
     Each dstate (distinctive state: a place and a direction) is a node, each link an edge, and each
-    place a cluster of nodes.
+    place a cluster of nodes. A region behind one place is a cluster of places.
 
     Raises:
         MapError: `ssh_map` is not a map.
@@ -18,16 +19,44 @@ def to_dot(ssh_map: SSHMap) -> str:
     checked_map(ssh_map)
     lines = ["digraph map {", "  node [shape=box, style=rounded];"]
     lines += [f"  {_node(s, ssh_map)}" for s in ssh_map.dstates if s.place is None]
-    for p in ssh_map.places:
-        inside = " ".join(_node(s, ssh_map) for s in ssh_map.dstates if s.place == p)
-        lines.append(
-            f"  subgraph cluster_{p} {{ label={_quoted(ssh_map.called('place', p))}; {inside} }}"
-        )
+    lines += _clusters(ssh_map, {*ssh_map.places}, 0)
     lines += [
         f"  {source} -> {target} [label={_quoted(action)}];"
         for source, action, target in ssh_map.links
     ]
     return "\n".join([*lines, "}"])
+
+
+def _clusters(ssh_map: SSHMap, places: set[int], after: int, indent: str = "  ") -> list[str]:
+    """Write clusters for places, and around them for the regions behind one place.
+
+    Two such regions lie in each other or are apart. The largest come first.
+
+    Args:
+        ssh_map: The map.
+        places: The places to write.
+        after: The id of the first region to write.
+        indent: The spaces before each line.
+    """
+    lines, left = [], set(places)
+    for region in (ssh_map.regions or ())[after:]:
+        if region.door is not None and left >= {*region.places}:
+            label = _quoted(f"region {region.id}, behind place {region.door}")
+            lines.append(f"{indent}subgraph cluster_region_{region.id} {{ label={label};")
+            lines += _clusters(ssh_map, {*region.places}, region.id + 1, f"{indent}  ")
+            lines.append(f"{indent}}}")
+            left -= {*region.places}
+    for p in (p for p in ssh_map.places if p in left):
+        inside = " ".join(_node(s, ssh_map) for s in ssh_map.dstates if s.place == p)
+        label = _quoted(ssh_map.called("place", p) + _beside(ssh_map, p))
+        lines.append(f"{indent}subgraph cluster_{p} {{ label={label}; {inside} }}")
+    return lines
+
+
+def _beside(ssh_map: SSHMap, place: int) -> str:
+    """Say which directed paths a place is known to lie right of."""
+    bounds = {c for r in ssh_map.regions or () if place in r.places for c in r.bounds}
+    return f"\nright of {listed(map(course_named, sorted(bounds)))}" if bounds else ""
 
 
 def _node(s: DState, ssh_map: SSHMap) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from itertools import pairwise
 from typing import Any, Literal
@@ -11,6 +12,7 @@ import networkx as nx
 from ssh_abduction.data.checks import one_of
 from ssh_abduction.data.errors import MapError, xml_text
 from ssh_abduction.data.maps import SSHMap, checked_map
+from ssh_abduction.data.regions import ids_at
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.output.turns import Turns, degrees_of
 
@@ -30,7 +32,8 @@ def to_networkx(
             "causal" is a MultiDiGraph. Each dstate (distinctive state: a place and a direction) is
             a node with the attributes view, place, path, direction, heading, floor, place_name and
             path_name. Each link is an edge with the attribute action. Unknown attributes are left
-            out.
+            out. If the map lists regions, nodes have their ids as the attribute regions, and
+            `graph["regions"]` has the regions as dicts; so in all graphs.
             "topological" is a bipartite Graph with the nodes ("place", p) and ("path", h). Each
             place on a path gives an edge with the attribute index, its position in the order of
             the path.
@@ -49,9 +52,23 @@ def to_networkx(
     checked_map(ssh_map)
     one_of("level", level, LEVELS, MapError)
     degrees_of(turns)
+    graph: nx.Graph[Any]
+    place_of: dict[Any, int | None]
     if level == "causal":
-        return _causal(ssh_map)
-    return _places(ssh_map, turns) if level == "places" else _topological(ssh_map)
+        graph = _causal(ssh_map)
+        place_of = {s.id: s.place for s in ssh_map.dstates}
+    elif level == "places":
+        graph = _places(ssh_map, turns)
+        place_of = {p: p for p in ssh_map.places}
+    else:
+        graph = _topological(ssh_map)
+        place_of = {("place", p): p for p in ssh_map.places}
+    if ssh_map.regions is not None:
+        graph.graph["regions"] = [region.to_dict() for region in ssh_map.regions]
+        for node, place in place_of.items():
+            if found := ids_at(ssh_map.regions, place):
+                graph.nodes[node]["regions"] = found
+    return graph
 
 
 def to_graphml(ssh_map: SSHMap) -> str:
@@ -60,8 +77,8 @@ def to_graphml(ssh_map: SSHMap) -> str:
     Raises:
         MapError: `ssh_map` is not a map.
     """
-    graph: nx.MultiDiGraph[Any] = nx.MultiDiGraph()
-    causal = to_networkx(ssh_map)
+    causal = in_text(to_networkx(ssh_map))
+    graph: nx.MultiDiGraph[Any] = nx.MultiDiGraph(**causal.graph)
     for s, data in causal.nodes(data=True):
         texts = {
             name: xml_text(str(data[name]))
@@ -75,6 +92,16 @@ def to_graphml(ssh_map: SSHMap) -> str:
             key = f"{name} ({graph.number_of_edges(source, target)})"
         graph.add_edge(source, target, key=key, action=name)
     return "\n".join(nx.generate_graphml(graph))
+
+
+def in_text(graph: nx.Graph[Any]) -> nx.Graph[Any]:
+    """Return a graph whose regions are texts, as files have no lists: JSON, and ids of a node."""
+    if "regions" in graph.graph:
+        graph.graph["regions"] = json.dumps(graph.graph["regions"])
+    for _, data in graph.nodes(data=True):
+        if "regions" in data:
+            data["regions"] = " ".join(map(str, data["regions"]))
+    return graph
 
 
 def _causal(ssh_map: SSHMap) -> nx.MultiDiGraph[Any]:

@@ -30,6 +30,7 @@ from ssh_abduction.output.drawing import (
     titled,
 )
 from ssh_abduction.output.layout import travelled
+from ssh_abduction.output.region_marks import place_title, region_marks
 
 # In units of the page. NEAREST is the distance of the two nearest places, if the limits allow it.
 # APART limits the median distance of a place from the nearest one, LARGEST the size of the map.
@@ -94,6 +95,8 @@ class _Picture:
         ]
         arrows = [self.arrow(s) for s in self.map.dstates]
         lines = self.paths(spots) if self.map.places else self.links()
+        bands, around = region_marks(self.map, spots, 2 * END * self.unit)
+        self.points += around
         # Draw the first place last, on top of the others.
         first = _site(self.map.dstates[self.map.labels[0]])
         dots = [
@@ -108,7 +111,17 @@ class _Picture:
             for s, said in faults_of(self.map).items()
         ]
         return page(
-            [*lines, *ellipses, *arrows, *dots, *labels, *floors, *faults, *self.scale_bar()],
+            [
+                *bands,
+                *lines,
+                *ellipses,
+                *arrows,
+                *dots,
+                *labels,
+                *floors,
+                *faults,
+                *self.scale_bar(),
+            ],
             self.points,
             MARGIN,
         )
@@ -147,9 +160,8 @@ class _Picture:
             stroke="#222",
             stroke_width=f"{1.8 * self.unit:.1f}",
         )
-        return titled(
-            self.map.called("place", site) if site >= 0 else f"dstate {-1 - site}", circle
-        )
+        title = place_title(self.map, site) if site >= 0 else f"dstate {-1 - site}"
+        return titled(title, circle)
 
     def ellipse(self, spot: Point, spread: tuple[float, float, float]) -> list[str]:
         """Draw an ellipse of two standard deviations around a point of the page.

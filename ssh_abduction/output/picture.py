@@ -29,6 +29,7 @@ from ssh_abduction.output.drawing import (
 )
 from ssh_abduction.output.layout import Layout, layout, located, travelled
 from ssh_abduction.output.metric_picture import metric_svg
+from ssh_abduction.output.region_marks import place_title, region_marks
 from ssh_abduction.output.turns import Turns, degrees_of
 
 # Distances in units of the page. SPACING is between neighbouring places, DSTATE from the centre of
@@ -75,12 +76,13 @@ def _topological(ssh_map: SSHMap, found: Layout) -> tuple[list[str], list[Point]
         lines += _path(ssh_map, path, spots)
         marks += _path_name(ssh_map, path, spots)
     for place, (x, y) in spots.items():
-        marks.append(_circle(x, y, "#222"))
-        marks.append(text(x, y, str(place), "#222", size=15, weight="bold"))
+        number = text(x, y, str(place), "#222", size=15, weight="bold")
+        marks.append(titled(place_title(ssh_map, place), _circle(x, y, "#222"), number))
         if (name := ssh_map.name_of("place", place)) is not None:
             marks.append(text(x, y + NAME, name, "#222", size=12, weight="bold"))
         marks += _dstates(ssh_map, place, (x, y), found)
-    return lines + marks, list(spots.values())
+    bands, points = region_marks(ssh_map, spots, 3 * RADIUS)
+    return bands + lines + marks, [*spots.values(), *points]
 
 
 def _circle(x: float, y: float, colour: str) -> str:

@@ -23,7 +23,7 @@ from ssh_abduction.output.dot import to_dot
 from ssh_abduction.output.export.nav2 import nav2
 from ssh_abduction.output.export.roads import Roads
 from ssh_abduction.output.export.tmap2 import tmap2
-from ssh_abduction.output.graphs import to_graphml, to_networkx
+from ssh_abduction.output.graphs import in_text, to_graphml, to_networkx
 from ssh_abduction.output.picture import to_svg
 from ssh_abduction.output.turns import Turns, degrees_of
 
@@ -102,7 +102,7 @@ def _graph_of_places(ssh_map: SSHMap, to: str, turns: Trace | Turns | None) -> n
             "level: expected dstates, got places: DOT has a node a dstate, and a cluster a place; "
             "leave the level out"
         )
-    graph = to_networkx(ssh_map, "places", turns)
+    graph = in_text(to_networkx(ssh_map, "places", turns))
     for _, data in graph.nodes(data=True):
         data["x"], data["y"] = (round(float(number), 4) for number in data.pop("pos"))
         data["dstates"] = " ".join(map(str, data["dstates"]))

@@ -45,7 +45,7 @@ def _node(stop: Stop, roads: Roads, frame: str) -> dict[str, Any]:
     metadata = {
         "level": roads.level,
         "metric": roads.metric,
-        "views": " ".join(map(str, stop.views)),
+        **stop.properties,
         "heading": round(stop.heading, DIGITS),
         **({} if stop.floor is None else {"floor": stop.floor}),
         **({} if stop.name is None else {"name": stop.name}),

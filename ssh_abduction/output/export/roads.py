@@ -9,6 +9,7 @@ from typing import TypeAlias
 
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.regions import ids_at
 from ssh_abduction.data.trace import Trace, View
 from ssh_abduction.output.layout import Layout, layout, travelled
 from ssh_abduction.output.turns import Turns
@@ -33,6 +34,7 @@ class Stop:
         views: The views of its dstates, in their order.
         floor: The number of its floor; None if the map has no floors.
         name: The name that a person gave to its place; None if it has none.
+        regions: The ids of the regions that contain it.
     """
 
     id: int
@@ -42,6 +44,13 @@ class Stop:
     views: tuple[View, ...]
     floor: int | None = None
     name: str | None = None
+    regions: tuple[int, ...] = ()
+
+    @property
+    def properties(self) -> dict[str, str]:
+        """Its views, and its regions if there are any, as texts for files."""
+        regions = {"regions": " ".join(map(str, self.regions))} if self.regions else {}
+        return {"views": " ".join(map(str, self.views)), **regions}
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +130,7 @@ class Roads:
                     () if s.view is None else (s.view,),
                     s.floor,
                     ssh_map.name_of("place", s.place),
+                    ids_at(ssh_map.regions, s.place),
                 )
                 for s, (x, y, heading) in zip(ssh_map.dstates, drawn.dstates, strict=True)
             )
@@ -178,8 +188,8 @@ def _places(ssh_map: SSHMap, drawn: Layout) -> tuple[Stop, ...]:
         heading = next((h for h in headings if h is not None), 0.0)
         views = tuple(s.view for s in members if s.view is not None)
         floor = members[0].floor if members else None
-        name = ssh_map.name_of("place", p)
-        stops.append(Stop(p, *drawn.places[p], heading, views, floor, name))
+        name, regions = ssh_map.name_of("place", p), ids_at(ssh_map.regions, p)
+        stops.append(Stop(p, *drawn.places[p], heading, views, floor, name, regions))
     return tuple(stops)
 
 

@@ -107,7 +107,7 @@ def _node(
             "properties": {
                 "xy_goal_tolerance": NEAR,
                 "yaw_goal_tolerance": facing,
-                "views": " ".join(map(str, stop.views)),
+                **stop.properties,
                 **({} if stop.name is None else {"place_name": stop.name}),
             },
             "restrictions_planning": "True",

@@ -26,13 +26,15 @@ def region_facts(ssh_map: SSHMap, trace: Trace, axioms: Collection[str]) -> str:
     facts = [f"axiom({name})." for name in sorted(axioms)]
     for s in ssh_map.dstates:
         if s.place is not None:
-            facts.append(f"at({s.id},{s.place}).")
+            facts.append(f"at({s.id},{s.place}). floor({s.id},{s.floor or 0}).")
         if s.path is not None and s.direction is not None:
             facts.append(f"along({s.id},{s.path},{_DIRECTION[s.direction]}).")
     for source, name, target in ssh_map.links:
         action = actions.get(name)
         if action is not None and action.kind == "travel":
             facts.append(f"travelled({source},{target}).")
+        elif action is not None and action.kind in ("lift", "stairs"):
+            facts.append(f"lifted({source},{target}).")
         elif action is not None and action.turn in ("right", "left"):
             facts.append(f"turned({source},{action.turn},{target}).")
     facts += [f"excused({h},{g})." for h, g in ssh_map.excused]

@@ -1,0 +1,99 @@
+"""Draw the regions of a map: bands along the streets of a region behind one place, and titles.
+
+Regions beside paths overlap each other. They are told in the titles of places, which browsers show
+under the pointer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.regions import Region, course_named, ids_at, listed
+from ssh_abduction.output.drawing import Point, element, line, text, titled
+
+# The colour and the opacity of bands. WIDER is by how many times the width of the innermost band a
+# band around another one is wider.
+BAND, OPACITY, WIDER = "#8a6d00", 0.13, 0.5
+
+
+def region_marks(
+    ssh_map: SSHMap, spots: Mapping[int, Point], width: float
+) -> tuple[list[str], list[Point]]:
+    """Draw a band around the places of each region behind one place, with its name beside it.
+
+    Args:
+        ssh_map: The map.
+        spots: The point of each place on the page.
+        width: The width of the innermost bands, in units of the page.
+
+    Returns:
+        The marks, and the points that the page has to include.
+    """
+    bands: list[str] = []
+    names: list[str] = []
+    points: list[Point] = []
+    regions = [r for r in ssh_map.regions or () if r.door is not None]
+    for region in regions:
+        broad = width * (1 + WIDER * _depth(region, regions))
+        inside = [spots[p] for p in region.places]
+        ways = [line(p, p) for p in inside]
+        ways += [line(spots[p], spots[q]) for p, q in streets_in(ssh_map, region)]
+        bands.append(band(region, ways, broad))
+        points += [(x + k * broad / 2, y + k * broad / 2) for x, y in inside for k in (-1, 1)]
+        # The name is at the lowest place that is in no inner region. Dstates are rarely named on
+        # its lower left.
+        own = {*region.places}.difference(*(r.places for r in _within(region, regions)))
+        x, y = max((spots[p] for p in own or region.places), key=lambda spot: (spot[1], -spot[0]))
+        beside = x - 0.6 * broad, y + 0.5 * broad + 4
+        names.append(text(*beside, f"region {region.id}", BAND, 11, halo=True))
+        points.append((beside[0] - 30, beside[1]))
+    return [*bands, *names], points
+
+
+def band(region: Region, ways: Sequence[str], width: float) -> str:
+    """Draw one band along these ways (data of SVG paths), with the region as its title."""
+    mark = element(
+        "path",
+        d=" ".join(ways),
+        fill="none",
+        stroke=BAND,
+        stroke_width=f"{width:.1f}",
+        stroke_linecap="round",
+        stroke_linejoin="round",
+    )
+    return titled(str(region), mark, class_="region", opacity=OPACITY)
+
+
+def streets_in(ssh_map: SSHMap, region: Region) -> list[tuple[int, int]]:
+    """Find the pairs of neighbouring places of a region: by links, and along paths."""
+    place = [s.place for s in ssh_map.dstates]
+    pairs = [(place[s], place[x]) for s, _, x in ssh_map.links]
+    pairs += [ends for path in ssh_map.paths for ends in pairwise(path.order)]
+    inside = {
+        (min(p, q), max(p, q))
+        for p, q in pairs
+        if p in region.places and q in region.places and p is not None and q is not None and p != q
+    }
+    return sorted(inside)
+
+
+def place_title(ssh_map: SSHMap, place: int) -> str:
+    """Say where a place lies: "place 2, right of path 0+, in regions 1 and 3"."""
+    regions = [r for r in ssh_map.regions or () if place in r.places]
+    bounds = sorted({course for region in regions for course in region.bounds})
+    beside = f", right of {listed(map(course_named, bounds))}" if bounds else ""
+    ids = ids_at(ssh_map.regions, place)
+    within = f", in region{'' if len(ids) == 1 else 's'} {listed(ids)}" if ids else ""
+    return f"{ssh_map.called('place', place)}{beside}{within}"
+
+
+def _depth(region: Region, regions: Sequence[Region]) -> int:
+    """How many regions lie in each other within this one."""
+    inner = _within(region, regions)
+    return 1 + max(_depth(r, regions) for r in inner) if inner else 0
+
+
+def _within(region: Region, regions: Sequence[Region]) -> list[Region]:
+    return [r for r in regions if {*r.places} < {*region.places}]
