@@ -219,6 +219,7 @@ def choices_of(field: str, trace: Trace) -> st.SearchStrategy[Any]:
         "misread": st.just(0.0),  # tests/test_faults.py has tests of its own
         "slipped": st.just(0.0),
         "jumped": st.just(0.0),
+        "changed": st.just(0.0),  # tests/test_changes.py has tests of its own
         "weigh": st.just("auto"),  # tests/test_weighing.py has tests of its own
         "prices": st.just(PRICES),
         "unknown_views": st.just(False),  # the trace says it

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ssh_abduction.checker.reading import Found, Reading
+from ssh_abduction.checker.stars import changes
 from ssh_abduction.data.maps import Fault
 
 
@@ -12,12 +13,12 @@ def faults_are_allowed(m: Reading) -> Found:
     A fault must be listed once, with the view or action that the trace shows at its step, and with
     the cost that the theory sets.
     """
-    steps, named = m.trace.steps, set[tuple[str, int]]()
+    steps, named = m.trace.steps, set[tuple[str, int, int | None]]()
     for fault in m.map.faults:
         i, kind = fault.step, fault.kind
         if what := _what_is_wrong(m, fault):
             yield [i] if 0 <= i < len(steps) else [], what
-        elif (kind, i) in named:
+        elif (kind, i, fault.gateway) in named:
             yield [i], f"The map names the fault of step {i} ({kind}) twice."
         if _is_allowed(m, kind) and 0 <= i < len(steps):
             price = m.theory.fault_tenths(kind, steps[i])
@@ -27,7 +28,13 @@ def faults_are_allowed(m: Reading) -> Found:
                     f"The fault of step {i} ({kind}) costs {fault.cost:g} dstates in the map, and "
                     f"{price / 10:g} by the theory.",
                 )
-        named.add((kind, i))
+        named.add((kind, i, fault.gateway))
+    if m.theory.changed:
+        told = {(f.place, f.gateway, f.step, f.expected, f.seen) for f in m.map.faults}
+        for change in changes(m):
+            if change not in told:
+                p, slot, i, was, now = change
+                yield [i], f"Gateway {slot} of place {p} was {was} and {now}: the map hides it."
 
 
 def _is_allowed(m: Reading, kind: str) -> bool:
@@ -37,6 +44,7 @@ def _is_allowed(m: Reading, kind: str) -> bool:
         "misseen": m.theory.misread,
         "slipped": m.theory.slipped,
         "jumped": m.theory.jumped,
+        "changed": m.theory.changed,
     }
     return bool(prices.get(kind))
 
@@ -66,6 +74,13 @@ def _what_is_wrong(m: Reading, fault: Fault) -> str | None:
                 f"The map says that {fault}, but the trace has {seen!r} there, and the dstate "
                 f"{s.view if s else None!r}."
             )
+    if kind == "changed":
+        told = (fault.place, fault.gateway, i, fault.expected, fault.seen)
+        return (
+            None
+            if told in list(changes(m))
+            else f"The map says that {fault}, but no drives show it."
+        )
     if kind == "slipped" and step.action and fault.seen != step.action.name:
         return f"The map says that {fault}, but the trace has another action there."
     return None

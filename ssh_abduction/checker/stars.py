@@ -6,17 +6,27 @@ place, numbered 0 to 3 clockwise. A turn right adds 1 to the heading.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 from ssh_abduction.checker.moves import Course, along, course_of, heading_of, opposite
 from ssh_abduction.checker.planarity import QUARTERS
 from ssh_abduction.checker.reading import Check, Found, Reading
+from ssh_abduction.data.drives import ALONE
 from ssh_abduction.data.maps import DState
 from ssh_abduction.data.star import Openings
 
 
 def star_pattern(m: Reading) -> Found:
-    """Check that all stars seen at a place are rotations of one star."""
+    """Check that all stars seen at a place are rotations of one star.
+
+    If gateways may change between drives, this holds within each drive.
+    """
+    if m.theory.changed:
+        for p, _, seen in gateways_by_drive(m):
+            yield from _alike(
+                p, [(min(_rotated(star, k) for k in range(4)), i) for star, i in seen]
+            )
+        return
     yield from _one_star(
         ((s, min(_rotated(star, k) for k in range(4)), i) for s, star, i in stars_of(m)),
         "however turned",
@@ -24,13 +34,67 @@ def star_pattern(m: Reading) -> Found:
 
 
 def star_frame(m: Reading) -> Found:
-    """Check that the stars seen at a place agree when each is turned by its heading."""
+    """Check that the stars seen at a place agree when each is turned by its heading.
+
+    If gateways may change between drives, this holds within each drive.
+    """
+    if m.theory.changed:
+        for p, _, seen in gateways_by_drive(m):
+            yield from _alike(p, seen)
+        return
     framed = (
         (s, _rotated(star, heading), i)
         for s, star, i in stars_of(m)
         if (heading := heading_of(s)) is not None
     )
     yield from _one_star(framed, "turned by their headings")
+
+
+def _alike(place: int, seen: Sequence[tuple[Openings, int]]) -> Found:
+    """Check that one drive saw the same at a place at all its steps there."""
+    first, at = seen[0]
+    for star, i in seen[1:]:
+        if star != first:
+            yield (at, i), f"The stars seen at place {place} at steps {at} and {i} differ."
+
+
+def gateways_by_drive(m: Reading) -> Iterator[tuple[int, str, list[tuple[Openings, int]]]]:
+    """Yield each place, each drive that was there in order, and what it saw there.
+
+    A drive is given by its name, and what it saw by the openings in the frame of the place and the
+    step.
+    """
+    seen: dict[tuple[int, int], list[tuple[Openings, int]]] = {}
+    names = [m.trace.drive or m.trace.name or ALONE]
+    for i, (label, step) in enumerate(zip(m.map.labels, m.trace.steps, strict=False)):
+        s = m.states.get(label)
+        if s and s.place is not None and step.openings and (k := heading_of(s)) is not None:
+            here = seen.setdefault((s.place, len(names)), [])
+            here.append((_rotated(step.openings, k), i))
+        if step.action and step.action.kind == "start":
+            names.append(step.action.name)
+    for (place, drive), found in sorted(seen.items()):
+        yield place, names[drive - 1], found
+
+
+def changes(m: Reading) -> Iterator[tuple[int, int, int, str, str]]:
+    """Yield each gateway that differs between a drive and the one before at its place.
+
+    Each is a place, a slot, the first step of the later drive there, and what the earlier and the
+    later drive saw, in words.
+    """
+    last: dict[int, tuple[str, Openings]] = {}
+    for p, name, seen in gateways_by_drive(m):
+        star, i = seen[0]
+        before, known = last.get(p, (name, star))
+        for slot in range(4):
+            if star[slot] != known[slot]:
+                said = [
+                    f"{'open' if is_open else 'closed'} on {drive}"
+                    for drive, is_open in ((before, known[slot]), (name, star[slot]))
+                ]
+                yield p, slot, i, said[0], said[1]
+        last[p] = name, star
 
 
 def stars_of(m: Reading) -> Iterator[tuple[DState, Openings, int]]:

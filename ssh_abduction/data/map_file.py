@@ -274,7 +274,15 @@ def _fault(read: FieldReader, value: Any, steps: int, name: str) -> Fault:
         for part in ("seen", "expected")
     )
     cost = read.number(record.get("cost", 0), f"{name}.cost")
-    return Fault(step, record["kind"], seen, expected, cost)
+    place, gateway = (
+        read.optional(record.get(part), f"{name}.{part}") for part in ("place", "gateway")
+    )
+    if record["kind"] == "changed" and (place is None or gateway not in (0, 1, 2, 3)):
+        raise read.wrong(f"{name}.gateway", "a slot, 0 to 3, and a place, for a change", gateway)
+    towards = record.get("towards")
+    if not isinstance(towards, str | None):
+        raise read.wrong(f"{name}.towards", "a text", towards)
+    return Fault(step, record["kind"], seen, expected, cost, place, gateway, towards)
 
 
 def _regions(

@@ -7,9 +7,11 @@ from typing import Literal
 
 from ssh_abduction.data.observation import View
 
-FAULTS = ("misread", "misseen", "slipped", "jumped")
 # What a person can name.
 NAMED = ("place", "path", "region")
+FAULTS = ("misread", "misseen", "slipped", "jumped", "changed")
+# The slots of the frame of a place, in words: the first dstate there faces slot 0.
+SLOTS = ("ahead", "right", "behind", "left")
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,19 +82,33 @@ class Fault:
         kind: "misread": the view of the step is not that of its dstate. "misseen": the star (the
             gateways seen) is not that of its dstate. "slipped": the action did not do what its
             name says, so no link joins this step and the next one. "jumped": the displacement
-            from the step before is wrong.
-        seen: The view, the name of the action, or the displacement in words; None for a star.
-        expected: The view of the dstate if the view is misread, else None.
+            from the step before is wrong. "changed": a gateway was open on one drive and closed
+            on another. The step is the first of the later drive at the place.
+        seen: The view, the name of the action, or the displacement in words; None for a star. For a
+            change, such as "closed on tuesday".
+        expected: The view of the dstate if the view is misread. For a change, what an earlier drive
+            saw, such as "open on monday".
         cost: The cost of the fault, in dstates.
+        place: For a change, the number of the place.
+        gateway: For a change, the slot of the gateway at the place. Slots are numbered 0 to 3,
+            clockwise from the heading of the first dstate there.
+        towards: For a change in a map with poses, where the gateway is: north is up in pictures.
     """
 
     step: int
-    kind: Literal["misread", "misseen", "slipped", "jumped"]
+    kind: Literal["misread", "misseen", "slipped", "jumped", "changed"]
     seen: View | None = None
     expected: View | None = None
     cost: float = field(default=0.0, compare=False)
+    place: int | None = None
+    gateway: int | None = None
+    towards: str | None = field(default=None, compare=False)
 
     def __str__(self) -> str:
+        if self.kind == "changed":
+            way = self.towards or SLOTS[self.gateway or 0]
+            of = "of" if self.towards else "at the first dstate of"
+            return f"the gateway {way} {of} place {self.place} was {self.expected} and {self.seen}"
         if self.kind == "misread":
             return f"the view at step {self.step} is misread: {self.seen}, expected {self.expected}"
         if self.kind == "misseen":

@@ -110,7 +110,10 @@ class SSHMap:
         """
         whole = self.renumbered()
         dstates = [(s.view, s.place, s.path, s.direction) for s in whole.dstates]
-        faults = [(fault.step, fault.kind, fault.seen, fault.expected) for fault in whole.faults]
+        faults = [
+            (fault.step, fault.kind, fault.seen, fault.expected, *_changed(fault))
+            for fault in whole.faults
+        ]
         compared = [whole.labels, dstates, whole.links, whole.places, faults]
         text = json.dumps(compared, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()[:ID_LENGTH]
@@ -287,7 +290,7 @@ class SSHMap:
             paths=tuple(paths),
             excused=tuple((path.get(h, h), path.get(g, g)) for h, g in self.excused),
             fit=fit,
-            faults=self.faults,
+            faults=tuple(replace(fault, place=place.get(fault.place)) for fault in self.faults),
             regions=None
             if self.regions is None
             else renumbered(self.regions, place, path, {h for h, d in faced.items() if d == -1}),
@@ -373,6 +376,11 @@ class SSHMap:
             raise MapError(f"{named(path)}: expected one map, got a solution; take Solution.load")
         (ssh_map,) = maps_of(data, named(path))
         return ssh_map
+
+
+def _changed(fault: Fault) -> tuple[int | None, ...]:
+    """What tells two changes at one step apart; empty for other faults."""
+    return (fault.place, fault.gateway) if fault.kind == "changed" else ()
 
 
 def _numbered(ids: Iterable[int | None]) -> dict[int | None, int]:

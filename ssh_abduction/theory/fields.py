@@ -52,12 +52,13 @@ EXCUSED = {
         "turn_rotates",
     },
     "jumped": {"one_pose"},
+    "changed": {"star_pattern", "star_frame"},
 }
 DEAREST = 1000.0  # the most dstates that a fault may cost
 MOST_JOINT = 2  # the most returns that may be tested together
 MOST_STEPS = 2**31  # the numbers of steps are below this: clingo's numbers have 32 bits
 ASSERTIONS = ("same", "different", "elsewhere")
-FAULTS = ("misread", "misseen", "slipped", "jumped")
+FAULTS = ("misread", "misseen", "slipped", "jumped", "changed")
 CAUSAL = "Theory.causal() (--theory causal)"  # for error messages
 
 
@@ -159,6 +160,12 @@ def _check_faults(theory: Theory) -> None:
         raise TheoryError(
             "jumped: expected displacements to be used, which may be wrong, got "
             f"displacement=none; leave it out, or take {choice('displacement', 'auto')}"
+        )
+    others = [kind for kind in EXCUSED if kind != "changed" and getattr(theory, kind)]
+    if theory.changed and (others or theory.level == "causal"):
+        raise TheoryError(
+            "changed: expected a topological theory without other faults, as gateways of places "
+            f"change, got {', '.join(others) or 'level=causal'}; leave one out"
         )
     if theory.planar:
         raise TheoryError(

@@ -150,8 +150,8 @@ def _any_theory(theory: Theory) -> bool:
 
 
 def _knows_views(theory: Theory) -> bool:
-    """Whether the views of all steps are known."""
-    return not theory.unknown_views
+    """Whether the observations of all steps are known, and tell dstates apart."""
+    return not theory.unknown_views and not theory.changed
 
 
 def _keeps_headings(theory: Theory) -> bool:
@@ -330,6 +330,7 @@ TABLE = (
             (theory.level == "topological" or theory.jumped > 0)
             and theory.has_faults
             and not theory.without
+            and not theory.changed
         ),
         NOTHING,
         lambda: (

@@ -61,7 +61,6 @@ SPOKEN_FOR = {
     "reject",
     "joint",
     "returns",
-    # Engines find the fewest dstates in any case. Maps are weighed above them.
     "weigh",
     "prices",
     *ASSERTIONS,
@@ -106,6 +105,7 @@ class Theory:
         slipped: Cost in dstates of an action that did not do what its name says; 0 forbids it.
         jumped: Cost in dstates of ignoring a displacement, for example because the robot was
             carried; 0 forbids it.
+        changed: Cost in dstates of a gateway that differs between two drives; 0 forbids it.
         planar: Whether paths meet only at places. Then the map can be drawn in the plane without a
             crossing, with right turns to the right.
         prefer: What to minimise, most important first, out of dstates, paths, places and excuses.
@@ -147,6 +147,7 @@ class Theory:
     misread: float = 0.0
     slipped: float = 0.0
     jumped: float = 0.0
+    changed: float = 0.0
     unknown_views: bool = False
     several_drives: bool = False
     lifts: bool = False
@@ -240,14 +241,14 @@ class Theory:
 
         Args:
             kind: misread (the view is wrong), misseen (the star), slipped (the action done there),
-                or jumped (the displacement that led there).
+                jumped (the displacement that led there), or changed (one gateway).
             step: The step.
         """
-        if not isinstance(kind, str) or kind not in FAULTS:
-            one_of("kind", kind, FAULTS, TheoryError)
+        one_of("kind", kind, FAULTS, TheoryError)
         _checked_step(step)
-        price = 10 * (getattr(self, kind) if kind in ("slipped", "jumped") else self.misread)
-        if not price or kind in ("slipped", "jumped") or step.confidence is None:
+        is_seen = kind in ("misread", "misseen")
+        price = 10 * (self.misread if is_seen else getattr(self, kind))
+        if not price or not is_seen or step.confidence is None:
             return round(price)
         c = min(step.confidence, 1 - 1e-12)
         odds = math.log(c / (1 - c)) / math.log(99) if c > 0 else 0.0

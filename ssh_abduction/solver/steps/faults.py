@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
+from ssh_abduction.data.drives import drives_of, starts_of
 from ssh_abduction.data.maps import Fault, SSHMap
 from ssh_abduction.data.odometry import in_words
 from ssh_abduction.data.trace import Trace, View
@@ -68,6 +70,57 @@ def view_at(trace: Trace, step: int) -> str | int:
     view = trace.steps[step].view
     assert view is not None
     return view
+
+
+def with_changes(ssh_map: SSHMap, trace: Trace, theory: Theory) -> SSHMap | None:
+    """Return a map with the gateways that differ between drives as its faults.
+
+    Args:
+        ssh_map: A map of the first steps of the trace, with the heading of each dstate as a slot.
+        trace: The trace.
+        theory: The theory. If it allows no changes, the map is returned as it is.
+
+    Returns:
+        The map; None if a gateway differs within a drive.
+    """
+    if not theory.changed:
+        return ssh_map
+    begins = starts_of(trace)
+    names = [drive.name for drive in drives_of(trace)]
+    last: dict[int | None, tuple[int, tuple[bool, ...]]] = {}  # what was last seen at each place
+    faults = []
+    for t, label in enumerate(ssh_map.labels):
+        drive, s = bisect_right(begins, t), ssh_map.dstates[label]
+        seen = turned_to_frame(trace.steps[t].openings or (), s.heading or 0)
+        before, known = last.setdefault(s.place, (drive, seen))
+        if seen != known and before == drive:
+            return None
+        for slot, (was, is_open) in enumerate(zip(known, seen, strict=True)):
+            if was != is_open:
+                said = [
+                    f"{'open' if x else 'closed'} on {names[n]}"
+                    for x, n in ((was, before), (is_open, drive))
+                ]
+                cost = theory.fault_tenths("changed", trace.steps[t]) / 10
+                faults.append(Fault(t, "changed", said[1], said[0], cost, s.place, slot))
+        last[s.place] = drive, seen
+    return replace(ssh_map, faults=tuple(faults))
+
+
+def without_changes(ssh_map: SSHMap, trace: Trace) -> Trace:
+    """Return the trace as if no gateway had changed: each place has the star first seen there."""
+    first: dict[int | None, tuple[bool, ...]] = {}
+    steps = list(trace.steps)
+    for t, label in enumerate(ssh_map.labels):
+        s, openings = ssh_map.dstates[label], trace.steps[t].openings or ()
+        star = first.setdefault(s.place, turned_to_frame(openings, s.heading or 0))
+        steps[t] = replace(steps[t], star=turned_to_frame(star, -(s.heading or 0)))
+    return replace(trace, steps=tuple(steps))
+
+
+def turned_to_frame(openings: tuple[bool, ...], heading: int) -> tuple[bool, ...]:
+    """Turn openings seen ahead, right, back and left into slots, for a robot that faces one."""
+    return tuple(openings[(slot - heading) % 4] for slot in range(len(openings)))
 
 
 def with_faults(ssh_map: SSHMap, trace: Trace, mended: Trace, theory: Theory) -> SSHMap:

@@ -10,7 +10,7 @@ from ssh_abduction.data.maps import FAULTS, DState, MapPath, SSHMap
 from ssh_abduction.data.trace import Trace, View
 from ssh_abduction.solver.asp.facts.atoms import read_atom
 from ssh_abduction.solver.steps import frames
-from ssh_abduction.solver.steps.faults import faults_of, links_of, view_at
+from ssh_abduction.solver.steps.faults import faults_of, links_of, view_at, with_changes
 from ssh_abduction.theory.theory import Theory
 
 
@@ -53,7 +53,8 @@ def read_map(model: Model, trace: Trace, theory: Theory) -> SSHMap:
             t: frames.heading(found[shape[p]], found[shape[t]], heading[t])
             for t, p in place.items()
         }
-    return _map(trace, is_at, place, course, heading, before, excused, faults, theory)
+    read = _map(trace, is_at, place, course, heading, before, excused, faults, theory)
+    return with_changes(read, trace, theory) or read
 
 
 def read_steps(model: Model) -> tuple[tuple[int, ...], tuple[int | None, ...]]:

@@ -5,11 +5,13 @@ Facts and rules are text in the language of clingo.
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Iterator
 from itertools import product
 
 from clingo import Function, Symbol
 
+from ssh_abduction.data.drives import starts_of
 from ssh_abduction.data.trace import Action, Trace
 from ssh_abduction.solver.asp.facts.atoms import constant, numbers
 from ssh_abduction.solver.steps import frames
@@ -103,6 +105,12 @@ def trace_facts(problem: Problem, start: int, stop: int) -> str:
         facts += [
             f"moved({t}). price(jumped,{t},{theory.fault_tenths('jumped', trace.steps[t])})."
             for t in moved
+        ]
+    if theory.changed:
+        starts, price = starts_of(trace), round(10 * theory.changed)
+        facts += [
+            f"drive({t},{bisect_right(starts, t)}). price(changed,{t},{price})."
+            for t in range(start, stop)
         ]
     if theory.slipped:
         facts += [

@@ -1,0 +1,195 @@
+"""Gateways that change between drives, against a brute force and the checker."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+from brute_force import (
+    Key,
+    Labels,
+    _goes_straight,
+    _headings,
+    consistent_maps,
+    key,
+)
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import STARS, traces
+
+from ssh_abduction import SSHMap, Theory, Trace, solve
+from ssh_abduction.checker.checker import check
+from ssh_abduction.cli import main
+from ssh_abduction.data import Action, Fault, MapError, TheoryError, drives_of, together
+from ssh_abduction.theory.settle import settle
+
+MONDAY = Trace.from_steps(
+    "abcd",
+    ["travel", "around", "travel"],
+    stars=[(1, 1, 0, 0), (0, 0, 1, 0), (1, 0, 0, 0), (0, 0, 1, 1)],
+    name="monday",
+)
+TUESDAY = Trace.from_steps(
+    "abcd",
+    ["travel", "around", "travel"],
+    stars=[(1, 0, 0, 0), (0, 0, 1, 0), (1, 0, 0, 0), (0, 0, 1, 0)],
+    name="tuesday",
+)
+SAID = "the gateway right at the first dstate of place 0 was open on monday and closed on tuesday"
+
+
+@st.composite
+def drives_with_stars(draw: st.DrawFn) -> Trace:
+    """Tiny traces of two or three drives, with stars and few actions."""
+    trace = draw(traces(max_steps=6).filter(lambda trace: len(trace) > 2))
+    last = len(trace) - 1
+    starts = draw(st.sets(st.integers(1, last), min_size=1, max_size=2))
+    some = draw(st.lists(st.sampled_from(STARS), min_size=1, max_size=3))
+    steps = list(trace.without_displacements().steps)
+    for t in range(len(steps)):
+        star = draw(st.sampled_from(some))
+        k = draw(st.integers(0, 3))
+        steps[t] = replace(steps[t], star=star[k:] + star[:k])
+    for t in starts:
+        steps[t - 1] = replace(steps[t - 1], action=Action(f"start at {t}", "start"))
+    return Trace(tuple(steps))
+
+
+def fewest_changes(trace: Trace, theory: Theory, found: Key) -> int | None:
+    """The fewest changes of a map, over all headings that it may have; None if it has none."""
+    labels, places, courses = found
+    at: Labels = tuple(p for p in places if p is not None)
+    on = frozenset(theory.axioms) - {"star_frame", "star_pattern"}
+    stars = tuple(step.openings for step in trace)
+    counts = [
+        count
+        for headings in _headings(labels, at, trace.actions, stars, on)
+        if _goes_straight(labels, at, courses, headings, on)
+        for count in _changes(trace, [at[label] for label in labels], headings)
+    ]
+    return min(counts, default=None)
+
+
+def _changes(trace: Trace, at: list[int], headings: tuple[int, ...]) -> Iterator[int]:
+    """Yield the number of changes; nothing if a gateway differs within a drive."""
+    count = 0
+    for place in set(at):
+        seen = []
+        for drive in drives_of(trace):
+            states = {
+                tuple(
+                    bool((trace.steps[t].openings or ())[(k - headings[t]) % 4]) for k in range(4)
+                )
+                for t in range(drive.first, drive.stop)
+                if at[t] == place
+            }
+            if len(states) > 1:
+                return
+            seen += states
+        count += sum(
+            a != b for one, other in pairwise(seen) for a, b in zip(one, other, strict=True)
+        )
+    yield count
+
+
+@settings(max_examples=25)
+@given(st.data())
+def test_the_solver_lists_the_maps_with_changes_of_the_brute_force(data: st.DataObject) -> None:
+    trace = data.draw(drives_with_stars(), label="trace")
+    price = data.draw(st.sampled_from([0.5, 1.0, 2.0]), label="price")
+    boundary: Any = data.draw(st.sampled_from(["none", "strict"]), label="boundary")
+    theory = Theory(changed=price, boundary=boundary, star="frame")
+    bare = theory.replace(changed=0.0, without=("star_frame", "star_pattern"))
+    costs: dict[Key, tuple[float, ...]] = {}
+    for found, counts in consistent_maps(trace, bare):
+        changes = fewest_changes(trace, settle(trace, theory).theory, found)
+        if changes is not None:
+            tenths = 10 * counts.dstates + round(10 * price) * changes
+            costs[found] = (tenths, counts.paths, counts.places)
+    least = min(costs.values(), default=(0.0,))
+    solution = solve(trace, theory, max_maps=None, time_limit=100)
+    assert solution.complete
+    assert {key(m) for m in solution.maps} == {k for k, cost in costs.items() if cost == least}
+    for ssh_map in solution.maps:
+        assert check(trace, ssh_map, theory) == ()
+        assert 10 * len(ssh_map.dstates) + sum(10 * f.cost for f in ssh_map.faults) == least[0]
+
+
+def test_a_change_has_a_name_and_a_place(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    solution = solve([MONDAY, TUESDAY], Theory(changed=1.5))
+    (ssh_map,) = solution.maps
+    assert ssh_map.labels == (0, 1, 2, 3, 0, 1, 2, 3)
+    (fault,) = ssh_map.faults
+    assert str(fault) == SAID
+    assert (fault.step, fault.place, fault.gateway, fault.cost) == (4, 0, 1, 1.5)
+    for trace in (MONDAY, TUESDAY):
+        trace.save(tmp_path / f"{trace.name}.jsonl")
+    files = [str(tmp_path / f"{name}.jsonl") for name in ("monday", "tuesday")]
+    maps = str(tmp_path / "maps.json")
+    assert main(["solve", *files, "--together", "--set", "changed=1.5", "-o", maps]) == 0
+    assert SAID in capsys.readouterr().out
+    data = json.loads(Path(maps).read_text())["maps"][0]
+    assert data["faults"][0]["gateway"] == 1
+    assert SSHMap.from_dict(data) == ssh_map
+    data["faults"][0]["gateway"] = 4
+    with pytest.raises(MapError, match="gateway: expected a slot, 0 to 3"):
+        SSHMap.from_dict(data)
+
+
+def test_without_a_price_nothing_changes() -> None:
+    (ssh_map, *_) = solve([MONDAY, TUESDAY]).maps
+    assert len(ssh_map.dstates) == 8
+    (ssh_map,) = solve([MONDAY, TUESDAY[:1]], Theory(changed=1.5)).maps[:1]
+    assert [fault.kind for fault in ssh_map.faults] in ([], ["changed"])
+
+
+def test_nothing_changes_within_a_drive() -> None:
+    """The place of step 0 has a way to the right, and that of step 3 has none."""
+    trace = replace(MONDAY, steps=(*MONDAY.steps[:3], replace(MONDAY.steps[3], star=(0, 0, 1, 0))))
+    for changed in (0.0, 1.5):
+        (ssh_map, *_) = solve(trace, Theory(changed=changed, star="frame")).maps
+        assert ssh_map.place_of(0) != ssh_map.place_of(3)
+        assert ssh_map.faults == ()
+
+
+@pytest.mark.parametrize(
+    ("faults", "said"),
+    [
+        ((), "the map hides it"),
+        ((Fault(4, "changed", "closed on tuesday", "open on monday", 1.5, 0, 2),), "no drives"),
+        ((Fault(5, "changed", "closed on tuesday", "open on monday", 1.5, 0, 1),), "no drives"),
+        ((Fault(4, "changed", "closed on tuesday", "open on monday", 2.5, 0, 1),), "by the theory"),
+        ((Fault(4, "changed", "closed on tuesday", "open on monday", 1.5, 0, 1),) * 2, "twice"),
+    ],
+)
+def test_the_checker_judges_changes(faults: tuple[Fault, ...], said: str) -> None:
+    theory = Theory(changed=1.5)
+    (ssh_map,) = solve([MONDAY, TUESDAY], theory).maps
+    trace = together([MONDAY, TUESDAY])
+    assert check(trace, ssh_map, theory) == ()
+    wrong = replace(ssh_map, faults=faults)
+    assert any(said in v.message for v in check(trace, wrong, theory))
+    # A theory without changes does not allow them.
+    assert {"star_frame", "star_pattern"} <= {v.axiom for v in check(trace, ssh_map, Theory())}
+
+
+@pytest.mark.parametrize(
+    ("theory", "said"),
+    [
+        ({"changed": 1.5, "misread": 1.5}, "without other faults, .* got misread"),
+        ({"changed": -1}, "changed: expected a number of dstates"),
+        ({"changed": 1.5, "star": "none"}, "read by star=frame, got star=none"),
+    ],
+)
+def test_theories_that_know_no_gateways_are_refused(theory: dict[str, Any], said: str) -> None:
+    with pytest.raises(TheoryError, match=said):
+        solve([MONDAY, TUESDAY], Theory(**theory))
+    with pytest.raises(TheoryError, match="got level=causal"):
+        Theory.causal().replace(changed=1.5)
