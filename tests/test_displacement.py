@@ -13,6 +13,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from instances import maze
 from scipy.optimize import approx_fprime
+from scipy.sparse import csr_array
 from strategies import theories, traces
 from test_property import agree
 
@@ -21,6 +22,7 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.data import DState, Odometry, TheoryError
 from ssh_abduction.solver.asp.facts.answer_maps import causal_map
 from ssh_abduction.solver.fit import Poses, fit
+from ssh_abduction.solver.linear import as_dense, least_squares, solved
 from ssh_abduction.solver.ranking import noise_warning, units_warning
 from ssh_abduction.theory.evidence import pairs_of
 from ssh_abduction.theory.evidence.displacement import Displacement
@@ -194,7 +196,20 @@ def test_the_jacobian_of_a_fit_is_right(data: st.DataObject) -> None:
     rng = np.random.default_rng(0)
     unknown = problem._begun() + 0.01 * rng.normal(size=problem._size)
     numeric = approx_fprime(unknown, problem._residuals, 1e-7)
-    assert problem._jacobian(unknown).toarray() == pytest.approx(numeric, abs=2e-3)
+    assert as_dense(problem._jacobian(unknown)) == pytest.approx(numeric, abs=2e-3)
+
+
+def test_dense_and_sparse_systems_have_one_solution() -> None:
+    rng = np.random.default_rng(0)
+    some, values, weights = rng.normal(size=(12, 5)), rng.normal(size=12), rng.uniform(1, 2, 12)
+    some[:, 4] = some[:, 3]  # of several solutions, the smallest
+    dense = least_squares(some, values, weights)
+    assert dense == pytest.approx(least_squares(csr_array(some), values, weights), abs=1e-6)
+    assert dense[3] == pytest.approx(dense[4])
+    square, added = some.T @ some, np.full(5, 0.1)
+    right = square @ np.arange(5.0) + 0.1 * np.arange(5.0)
+    for matrix in (square, csr_array(square)):
+        assert solved(matrix, added, right) == pytest.approx(np.arange(5.0))
 
 
 def test_fits_of_true_maps_are_as_likely_as_they_say() -> None:

@@ -23,21 +23,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Sequence
-from contextlib import suppress
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
-from scipy.sparse import coo_array, csr_array, diags_array
+from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
-from scipy.sparse.linalg import lsqr, splu
 from scipy.special import gammaincc
 
 from ssh_abduction.data.maps import Fit, Pose, SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.equations import Equations
+from ssh_abduction.solver.linear import as_dense, inverse, least_squares, matrix, solved, weighted
 from ssh_abduction.theory.evidence.loops import turned
 
 Array: TypeAlias = NDArray[np.float64]
@@ -52,8 +50,6 @@ SWEEPS, HELD = 20, 1e-2
 # poses that nothing is known of.
 LEAST_DAMPING, MOST_DAMPING, ROUNDS, STILL, NEARLY = 1e-9, 1e8, 100, 1e-13, 1e-4
 HELD_STILL = 1e-9
-# With at most so many unknowns, covariances come from a dense matrix. That is faster.
-DENSE = 3000
 
 
 def fit(trace: Trace, ssh_map: SSHMap) -> Fit:
@@ -146,11 +142,10 @@ class Poses:
         damping = LEAST_DAMPING
         for _ in range(ROUNDS):
             jacobian = self._jacobian(unknown)
-            normal, gradient = (jacobian.T @ jacobian).tocsc(), jacobian.T @ off
+            normal, gradient = jacobian.T @ jacobian, jacobian.T @ off
             scale = normal.diagonal() + HELD_STILL
             while True:
-                damped = (normal + diags_array(damping * scale)).tocsc()
-                step = splu(damped).solve(-gradient)
+                step = solved(normal, damping * scale, -gradient)
                 better = self._residuals(unknown + step)
                 gain = float(off @ off - better @ better)
                 if gain >= 0 or damping > MOST_DAMPING:
@@ -184,7 +179,7 @@ class Poses:
         reckoned = self._reckoned()
         off = self._moved[:, 2] + reckoned[self._from] - reckoned[self._to]
         off -= math.tau * np.round(off / math.tau)
-        heading[:] = reckoned + _least(
+        heading[:] = reckoned + least_squares(
             self._differences(self._from, self._to, self._headings),
             off / self._sigmas(2),
             1 / self._sigmas(2),
@@ -194,7 +189,7 @@ class Poses:
             heading += self._rotations(turned(self._moved[:, :2], heading[self._from]))[self._group]
         onward = turned(self._moved[:, :2], heading[self._from])
         for axis in range(2):
-            at[:, axis] = _least(differences, onward[:, axis] * weights, weights)
+            at[:, axis] = least_squares(differences, onward[:, axis] * weights, weights)
         return unknown
 
     def _reckoned(self) -> Array:
@@ -250,21 +245,17 @@ class Poses:
         weights = 1 / self._sigmas(0)
         vectors = weights * (onward[:, 0] + 1j * onward[:, 1])
         columns = np.arange(len(vectors)), self._group[self._from]
-        turns = coo_array(
-            (vectors, columns), shape=(len(vectors), int(self._group.max()) + 1)
-        ).tocsr()
-        moves = csr_array(self._moves().multiply(weights[:, None]))
-        mixed = (moves.T @ turns).toarray()
+        turns = matrix((vectors, columns), (len(vectors), int(self._group.max()) + 1))
+        moves = weighted(self._moves(), weights)
+        mixed = as_dense(moves.T @ turns)
         square = moves.T @ moves
         held = 1e-9 * max(float(square.diagonal().max()), 1.0)
-        solved = splu((square + held * _identity(self._positions)).tocsc().astype(complex)).solve(
-            mixed
-        )
-        form: NDArray[np.complex128] = (turns.conj().T @ turns).toarray() - mixed.conj().T @ solved
+        best = solved(square, np.full(self._positions, held), mixed)
+        form: NDArray[np.complex128] = as_dense(turns.conj().T @ turns) - mixed.conj().T @ best
         return form
 
-    def _moves(self) -> csr_array:
-        """The sparse matrix that maps one coordinate of all positions to that of displacements."""
+    def _moves(self) -> Any:
+        """The matrix that maps one coordinate of all positions to that of displacements."""
         return self._differences(self._place[self._from], self._place[self._to], self._positions)
 
     def _graph(self, first: NDArray[np.int_], second: NDArray[np.int_], size: int) -> csr_array:
@@ -275,10 +266,8 @@ class Poses:
         sigmas: Array = 1 / np.sqrt((self._whitening[:, :, axis] ** 2).sum(1))
         return sigmas
 
-    def _differences(
-        self, first: NDArray[np.int_], second: NDArray[np.int_], size: int
-    ) -> csr_array:
-        """The sparse matrix that maps a vector to differences of its entries: second minus first.
+    def _differences(self, first: NDArray[np.int_], second: NDArray[np.int_], size: int) -> Any:
+        """The matrix that maps a vector to differences of its entries: second minus first.
 
         Args:
             first: The index of the entry to subtract, for each difference.
@@ -291,7 +280,7 @@ class Poses:
             np.concatenate([ones, -ones]),
             (np.concatenate([rows, rows]), np.concatenate([second, first])),
         )
-        return coo_array(entries, shape=(len(first), size)).tocsr()
+        return matrix(entries, (len(first), size))
 
     def _predicted(self, unknown: Array) -> tuple[Array, Array, Array]:
         """Predict the displacements from the unknowns.
@@ -320,7 +309,7 @@ class Poses:
         off[:, 2] -= math.tau * np.round(off[:, 2] / math.tau)
         return np.concatenate([np.einsum("nij,nj->ni", self._whitening, off).ravel(), unknown[-2:]])
 
-    def _jacobian(self, unknown: Array) -> csr_array:
+    def _jacobian(self, unknown: Array) -> Any:
         predicted, cos, sin = self._predicted(unknown)
         scale = 1 + unknown[-2] * self._sigma[0] * self._scaled
         m, heading = len(self._moved), 2 * self._positions
@@ -364,7 +353,7 @@ class Poses:
                 ),
             ),
         )
-        return coo_array(entries, shape=(3 * m + 2, self._size)).tocsr()
+        return matrix(entries, (3 * m + 2, self._size))
 
     def _parts(self) -> NDArray[np.int_]:
         """The number of the part of the map of each position. No displacement joins two parts."""
@@ -388,7 +377,7 @@ class Poses:
         parts = len(np.unique(self._parts()[used]))
         exact = (1 / np.sqrt((self._whitening**2).sum(1)) < EXACT).ravel()
         settled = (
-            int(np.linalg.matrix_rank(self._jacobian(unknown)[: len(exact)][exact].toarray()))
+            int(np.linalg.matrix_rank(as_dense(self._jacobian(unknown)[: len(exact)][exact])))
             if exact.any()
             else 0
         )
@@ -470,48 +459,10 @@ class Poses:
         look_at_clock()
         jacobian = self._jacobian(unknown)
         free = np.setdiff1d(np.arange(self._size), fixed)
-        information: Any = (jacobian.T @ jacobian)[free][:, free]
+        information = (jacobian.T @ jacobian)[free][:, free]
         held = 1e-12 * max(float(information.diagonal().max()), 1.0) if len(free) else 0.0
-        information = (information + held * _identity(len(free))).tocsc()
         is_free = ~np.isin(wanted, fixed)
         rows = np.searchsorted(free, np.asarray(wanted)[is_free])
         covariance: Array = np.zeros((len(wanted), len(wanted)))
-        covariance[np.ix_(is_free, is_free)] = _inverse(information, rows)
+        covariance[np.ix_(is_free, is_free)] = inverse(information, np.full(len(free), held), rows)
         return covariance
-
-
-def _inverse(matrix: Any, rows: NDArray[np.intp]) -> Array:
-    """Some rows, and the same columns, of the inverse of a symmetric sparse matrix."""
-    if matrix.shape[0] <= DENSE:
-        # With these rows last, the end of the Cholesky factor is the factor of what is wanted.
-        order = np.concatenate([np.setdiff1d(np.arange(matrix.shape[0]), rows), rows])
-        with suppress(np.linalg.LinAlgError):
-            factor = np.linalg.cholesky(matrix.toarray()[np.ix_(order, order)])
-            first = len(order) - len(rows)
-            root = solve_triangular(factor[first:, first:], np.identity(len(rows)), lower=True)
-            inverse: Array = root.T @ root
-            return inverse
-    columns = np.zeros((matrix.shape[0], len(rows)))
-    columns[rows, np.arange(len(rows))] = 1.0
-    solved: Array = splu(matrix).solve(columns)[rows]
-    return solved
-
-
-def _identity(size: int) -> csr_array:
-    numbers = np.arange(size)
-    return coo_array((np.ones(size), (numbers, numbers)), shape=(size, size)).tocsr()
-
-
-def _least(differences: csr_array, values: Array, weights: Array) -> Array:
-    """Solve a sparse linear system by weighted least squares.
-
-    Args:
-        differences: The matrix of the system.
-        values: The right-hand side, already multiplied by the weights.
-        weights: The weight of each equation.
-    """
-    weighted = csr_array(differences.multiply(weights[:, None]))
-    solved: Array = lsqr(
-        weighted, values, atol=1e-10, btol=1e-10, iter_lim=4 * differences.shape[1] + 100
-    )[0]
-    return solved

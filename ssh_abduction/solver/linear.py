@@ -1,0 +1,101 @@
+"""Matrices and linear systems of the fit of poses: dense if they are small, else sparse."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+from scipy.sparse import coo_array, csr_array, diags_array
+from scipy.sparse.linalg import lsqr, splu
+
+Array: TypeAlias = NDArray[np.float64]
+
+# Matrices with at most this many columns are dense. Up to there, numpy takes less time for all
+# numbers than scipy does for those that are not zero.
+DENSE = 60
+# With at most this many unknowns, an inverse comes from a dense matrix.
+DENSE_INVERSE = 3000
+
+
+def matrix(entries: tuple[Any, tuple[Any, Any]], shape: tuple[int, int]) -> Any:
+    """Make a matrix of its entries. Entries at one position are added up.
+
+    Args:
+        entries: The values, and their rows and columns.
+        shape: The numbers of rows and columns.
+
+    Returns:
+        A `csr_array`; an array of numpy if there are few columns.
+    """
+    made = coo_array(entries, shape=shape)
+    return made.toarray() if shape[1] <= DENSE else made.tocsr()
+
+
+def as_dense(some: Any) -> Any:
+    """The same matrix as an array of numpy."""
+    return some if isinstance(some, np.ndarray) else some.toarray()
+
+
+def weighted(some: Any, weights: Array) -> Any:
+    """The matrix with each row multiplied by its weight."""
+    if isinstance(some, np.ndarray):
+        return some * weights[:, None]
+    return csr_array(some.multiply(weights[:, None]))
+
+
+def solved(square: Any, added: Array, right: Any) -> Any:
+    """Solve a system of linear equations.
+
+    Args:
+        square: The n x n matrix, dense or sparse.
+        added: The n numbers to add to its diagonal.
+        right: The right-hand side, with n rows.
+    """
+    if isinstance(square, np.ndarray):
+        return np.linalg.solve(square + np.diag(added), right)
+    whole = (square + diags_array(added)).tocsc()
+    return splu(whole.astype(right.dtype)).solve(right)
+
+
+def least_squares(some: Any, values: Array, weights: Array) -> Array:
+    """Solve a system by weighted least squares. Of several solutions, return the smallest.
+
+    Args:
+        some: The matrix of the system.
+        values: The right-hand side, already multiplied by the weights.
+        weights: The weight of each equation.
+    """
+    system = weighted(some, weights)
+    if isinstance(system, np.ndarray):
+        return np.linalg.lstsq(system, values, rcond=1e-12)[0].astype(float)
+    found: Array = lsqr(system, values, atol=1e-10, btol=1e-10, iter_lim=4 * system.shape[1] + 100)[
+        0
+    ]
+    return found
+
+
+def inverse(square: Any, added: Array, rows: NDArray[np.intp]) -> Array:
+    """Compute some rows, and the same columns, of the inverse of a symmetric matrix.
+
+    Args:
+        square: The n x n matrix, dense or sparse.
+        added: The n numbers to add to its diagonal.
+        rows: The numbers of the wanted rows.
+    """
+    if square.shape[0] <= DENSE_INVERSE:
+        # With these rows last, the end of the Cholesky factor is the factor of what is wanted.
+        order = np.concatenate([np.setdiff1d(np.arange(len(added)), rows), rows])
+        with suppress(np.linalg.LinAlgError):
+            whole = as_dense(square) + np.diag(added)
+            factor = np.linalg.cholesky(whole[np.ix_(order, order)])
+            first = len(order) - len(rows)
+            root = solve_triangular(factor[first:, first:], np.identity(len(rows)), lower=True)
+            part: Array = root.T @ root
+            return part
+    columns = np.zeros((len(added), len(rows)))
+    columns[rows, np.arange(len(rows))] = 1.0
+    found: Array = solved(square, added, columns)[rows]
+    return found
