@@ -14,13 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from perception.places.local_map import Patch
-from perception.places.matching import MOST, Match, Scene, match
+from perception.places.matching import MOST, Match, Scene, Turned, match
 from perception.places.track import Array, Track, wrapped
 from perception.places.visits import Visit
 
-# A match is reliable with at least this score and share of area that both maps observed, and with
-# less than this spread in metres.
-SCORE, MUTUAL, SPREAD = 0.7, 0.5, 0.6
+# A match is reliable with at least this score and share of area that both maps observed.
+SCORE, MUTUAL = 0.75, 0.5
 # Standard deviations of a reliable match, in metres and radians (docs/measurements/logs.md).
 NOISE = (0.1, 0.1, math.radians(1))
 # The covariance of the track is multiplied by INFLATED. The drifts are multiples of BEND up to
@@ -29,7 +28,7 @@ NOISE = (0.1, 0.1, math.radians(1))
 INFLATED, BEND, BENDS, GATE = 10.0, 2e-4, 10, 20.0
 # Rotations are tried in steps of TURN radians, from the least to the largest that the track allows
 # within SIGMAS standard deviations.
-TURN, SIGMAS = math.radians(3), 3.0
+TURN, SIGMAS = math.radians(6), 3.0
 # Each visit has at most this many closures with earlier ones: those with the best scores.
 KEPT = 2
 
@@ -65,21 +64,35 @@ def find_closures(
     found: list[Closing] = []
     for last, gates in enumerate(_gates(track, visits)):
         way = track.way[visits[last].scan] - apart
-        here = [
-            Closing(first, last, matched)
-            for first, gate in gates
-            if track.way[visits[first].scan] < way
-            and (matched := match(scenes[first], scenes[last], gate.turns)) is not None
-            and _is_reliable(matched)
-            and gate.allows(matched)
-        ]
-        scenes[last].forget()
-        found += sorted(here, key=lambda closing: -closing.match.score)[:KEPT]
+        asked = [(first, gate) for first, gate in gates if track.way[visits[first].scan] < way]
+        here = sorted(_closings(scenes, asked, last), key=lambda closing: -closing.match.score)
+        found += here[:KEPT]
     return found
 
 
+def _closings(
+    scenes: Sequence[Scene], asked: Sequence[tuple[int, _Gate]], last: int
+) -> Iterator[Closing]:
+    """Match a visit with earlier ones.
+
+    Args:
+        scenes: The local map of each visit.
+        asked: The earlier visits to try, each with what the track says.
+        last: Index of the visit.
+    """
+    turns = [gate.turns for _, gate in asked]
+    begin = min((some.start for some in turns), default=0)
+    end = max((some.stop for some in turns), default=0)
+    # The visit is rotated once, for all the earlier visits.
+    turned = Turned.of(scenes[last], [k * TURN for k in range(begin, end)])
+    for (first, gate), some in zip(asked, turns, strict=True):
+        found = match(scenes[first], turned.part(some.start - begin, some.stop - begin))
+        if found is not None and _is_reliable(found) and gate.allows(found):
+            yield Closing(first, last, found)
+
+
 def _is_reliable(found: Match) -> bool:
-    return found.score >= SCORE and found.mutual >= MUTUAL and found.spread < SPREAD
+    return found.score >= SCORE and found.mutual >= MUTUAL
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,14 +109,14 @@ class _Gate:
     covariance: Array
 
     @property
-    def turns(self) -> list[float]:
-        """Rotations to try in radians: those that the track allows, in steps of TURN."""
+    def turns(self) -> range:
+        """Rotations to try, those that the track allows: k for k times TURN."""
         margin = SIGMAS * math.sqrt(self.covariance[2, 2])
         least, most = self.poses[:, 2].min() - margin, self.poses[:, 2].max() + margin
         first, last = math.floor(least / TURN), math.ceil(most / TURN)
         if last - first >= math.tau / TURN:
             first, last = 0, round(math.tau / TURN) - 1
-        return [k * TURN for k in range(first, last + 1)]
+        return range(first, last + 1)
 
     def allows(self, found: Match) -> bool:
         """Whether a match agrees with the track for some drift."""

@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,32 +27,40 @@ from perception.places.track import Array, points_turned
 REACH, MOST = 7.0, 5.0
 # Side of a coarse cell in metres, cells a side, and the size of the transforms. It is at least the
 # number of cells plus that of the largest shift.
-COARSE, SIDE, SIZE = 0.2, 80, 108
+COARSE, SIDE, SIZE = 0.4, 40, 54
 # Standard deviations in metres of the distance from a wall point to its wall: in the coarse search,
 # and in the refinement.
-BLURRED, SHARP = 0.25, 0.15
+BLURRED, SHARP = 0.3, 0.15
 # A wall point counts -CLASH in free space at least CLEAR metres from all walls.
 CLASH, CLEAR = 0.5, 0.3
 # A score is divided by the number of wall points that the other map observed, but at least by this
 # share of all wall points. So maps that hardly overlap do not match.
 OVERLAP = 0.3
-# If the best coarse score is less than this, the match is not refined.
-HOPELESS = 0.45
+# A match is refined only if its coarse score is at least HOPELESS, and if the standard deviation of
+# its shift is less than SPREAD metres. Otherwise quite other shifts match as well.
+HOPELESS, SPREAD = 0.7, 0.9
 # Scores differ by 1 / SHARPNESS where a shift is e times as probable.
 SHARPNESS = 20.0
 # Steps of the refinement, in radians and metres; each is repeated at most TRIES times.
 STEPS = tuple(
-    (math.radians(degrees), metres) for degrees, metres in ((2, 0.1), (1, 0.05), (0.5, 0.025))
+    (math.radians(degrees), metres)
+    for degrees, metres in ((4, 0.2), (2, 0.1), (1, 0.05), (0.5, 0.025))
 )
 TRIES = 6
 
-_Spectra = tuple[NDArray[np.complex64], NDArray[np.complex64], NDArray[np.complex64]]
 _MOST = int(MOST / COARSE)
 _SHIFTS = np.arange(-_MOST, _MOST + 1)
 _X, _Y = (grid * COARSE for grid in np.meshgrid(_SHIFTS, _SHIFTS, indexing="ij"))
 _WITHIN = np.hypot(_X, _Y) <= MOST
 _AXIS = (np.arange(SIDE) - SIDE // 2) * COARSE
 _CENTRES = np.stack([grid.ravel() for grid in np.meshgrid(_AXIS, _AXIS, indexing="ij")], axis=1)
+# Steps of the refinement in x, y and rotation. Walls across both axes need the diagonal shifts.
+_MOVES = np.array(
+    [(x, y, 0) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y] + [(0, 0, -1), (0, 0, 1)]
+)
+
+_Spectra = NDArray[np.complex64]
+_Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,7 +83,7 @@ class Match:
     spread: float
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class Scene:
     """The local map around the middle of a place, prepared for matching.
 
@@ -84,10 +93,9 @@ class Scene:
 
     walls: Array
     _observed: Bools
-    _sharp: Array
-    _blurred: Array
+    _sharp: _Floats
+    _blurred: _Floats
     _shift: Array
-    _known: dict[int, _Spectra] = field(default_factory=dict)
 
     @staticmethod
     def of(patch: Patch, middle: Array) -> Scene:
@@ -100,49 +108,31 @@ class Scene:
             np.asarray(ndimage.distance_transform_edt(~walls)) * CELL if walls.any() else near * 9.0
         )
         clash = CLASH * (free & (far > CLEAR))
-        sharp = np.where(free | walls, np.exp(-(far**2) / (2 * SHARP**2)), 0.0) - clash
-        blurred = (
-            np.where(free | walls | (far <= CLEAR), np.exp(-(far**2) / (2 * BLURRED**2)), 0.0)
-            - clash
+        observed = free | walls
+        sharp, blurred = (
+            (np.where(seen, np.exp(-(far**2) / (2 * sigma**2)), 0.0) - clash).astype(np.float32)
+            for seen, sigma in ((observed, SHARP), (observed | (far <= CLEAR), BLURRED))
         )
         shift = np.asarray(middle) - (patch.corner + size // 2 * CELL)
         points = (np.argwhere(walls) - size // 2) * CELL - shift
-        return Scene(points, free | walls, sharp, blurred, shift)
+        return Scene(points, observed, sharp, blurred, shift)
 
-    def spectra(self, turn: float) -> _Spectra:
-        """The transforms of the wall points, the blurred walls, and the observed cells.
+    @cached_property
+    def spectra(self) -> _Spectra:
+        """The complex conjugates of the transforms without rotation, as in `Turned`."""
+        return np.asarray(Turned.of(self, [0.0]).spectra[:, 0].conj())
 
-        Args:
-            turn: Rotation of the map in radians, rounded to thousandths.
-        """
-        key = round(turn * 1000)
-        if key not in self._known:
-            cells = np.rint(points_turned(turn, self.walls) / COARSE).astype(int) + SIDE // 2
-            cells = cells[((cells >= 0) & (cells < SIDE)).all(axis=1)]
-            points = np.zeros((SIDE, SIDE), np.float32)
-            np.add.at(points, (cells[:, 0], cells[:, 1]), 1.0)
-            centres = points_turned(-turn, _CENTRES)
-            grids = [points] + [
-                self._at(values, centres).reshape(SIDE, SIDE).astype(np.float32)
-                for values in (self._blurred, self._observed)
-            ]
-            one, other, third = (fft.rfft2(grid, (SIZE, SIZE)) for grid in grids)
-            self._known[key] = one, other, third
-        return self._known[key]
-
-    def forget(self) -> None:
-        """Forget the transforms of all rotations but 0, which saves memory."""
-        self._known = {key: known for key, known in self._known.items() if key == 0}
-
-    def agreement(self, points: Array) -> tuple[float, int]:
+    def agreement(self, points: Array) -> tuple[Array, Array]:
         """The sum of the agreements of points with the walls, and how many were observed here.
 
         Args:
-            points: (m, 2) metres, relative to the middle.
+            points: (n, 2, m) x and y in metres, relative to the middle, of m points with n poses.
+
+        Returns:
+            (n,) and (n,).
         """
-        return float(self._at(self._sharp, points).sum()), int(
-            self._at(self._observed, points).sum()
-        )
+        cells = self.cells(points)
+        return self._sharp.ravel()[cells].sum(axis=1), self._observed.ravel()[cells].sum(axis=1)
 
     def mutual(self, other: Scene, turn: float, shift: Array) -> float:
         """The area that both scenes observed, as a share of the smaller one.
@@ -153,72 +143,152 @@ class Scene:
             shift: (x, y) of its middle in metres.
         """
         here = (np.argwhere(self._observed) - len(self._observed) // 2) * CELL - self._shift
-        seen = other._at(other._observed, points_turned(-turn, here - shift)).sum()
+        there = points_turned(-turn, here - shift)
+        seen = other._observed.ravel()[other.cells(there.T)].sum()
         return float(seen / max(min(self._observed.sum(), other._observed.sum()), 1))
 
-    def _at(self, values: NDArray[np.generic], points: Array) -> NDArray[np.generic]:
-        """The values of the cells of points, 0 outside of the map."""
-        cells = np.rint((points + self._shift) / CELL).astype(int) + len(values) // 2
-        inside = ((cells >= 0) & (cells < len(values))).all(axis=1)
-        cells = np.clip(cells, 0, len(values) - 1)
-        return np.where(inside, values[cells[:, 0], cells[:, 1]], 0)
+    def cells(self, points: Array) -> NDArray[np.intp]:
+        """The numbers of the cells of points, (..., 2, m); a border cell for those outside.
+
+        Border cells are farther than REACH from the middle. So nothing was observed there.
+        """
+        size = len(self._observed)
+        at = (points + self._shift[:, None]) / CELL + (size // 2 + 0.5)
+        rows, columns = np.moveaxis(np.clip(at, 0, size - 1).astype(np.intp), -2, 0)
+        return np.asarray(rows * size + columns)
+
+    def sampled(self, points: Array) -> _Floats:
+        """The blurred walls, and whether there was an observation, at points (2, m): (2, m)."""
+        cells = self.cells(points)
+        return np.stack([self._blurred.ravel()[cells], self._observed.ravel()[cells]])
 
 
-def match(first: Scene, second: Scene, turns: Sequence[float]) -> Match | None:
+@dataclass(frozen=True, eq=False)
+class Turned:
+    """A scene in several rotations.
+
+    Attributes:
+        scene: The scene.
+        turns: The rotations in radians, n.
+        spectra: The transforms of the wall points, the blurred walls and the observed cells:
+            (3, n, SIZE, SIZE // 2 + 1).
+    """
+
+    scene: Scene
+    turns: Sequence[float]
+    spectra: _Spectra
+
+    @staticmethod
+    def of(scene: Scene, turns: Sequence[float]) -> Turned:
+        """Rotate a scene."""
+        grids = np.zeros((3, len(turns), SIDE, SIDE), np.float32)
+        for k, turn in enumerate(turns):
+            grids[0, k] = _spread_out(points_turned(turn, scene.walls) / COARSE + SIDE // 2)
+            seen = scene.sampled(points_turned(-turn, _CENTRES).T)
+            grids[1:, k] = seen.reshape(2, SIDE, SIDE)
+        return Turned(scene, turns, np.asarray(fft.rfft2(grids, (SIZE, SIZE))))
+
+    def part(self, begin: int, end: int) -> Turned:
+        """The scene in the rotations begin … end - 1 only."""
+        return Turned(self.scene, self.turns[begin:end], self.spectra[:, begin:end])
+
+
+def _spread_out(at: Array) -> Array:
+    """Distribute points over the four cells around each, by their distances.
+
+    Args:
+        at: (n, 2) rows and columns of the points.
+    """
+    corner = np.floor(at)
+    rest = at - corner
+    cells = corner.astype(np.intp)
+    found = np.zeros(SIDE * SIDE)
+    for x, y in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        rows, columns = np.clip(cells + np.array([x, y]), 0, SIDE - 1).T
+        share = np.abs(1 - x - rest[:, 0]) * np.abs(1 - y - rest[:, 1])
+        found += np.bincount(rows * SIDE + columns, share, SIDE * SIDE)
+    return found.reshape(SIDE, SIDE)
+
+
+def match(first: Scene, second: Turned) -> Match | None:
     """Find the rotation and shift with which the maps of two places agree best.
 
     Args:
         first: The first place.
-        second: The second place.
-        turns: Rotations to try, in radians.
+        second: The second place, in the rotations to try.
 
     Returns:
-        None if the maps agree nowhere.
+        None if the maps agree nowhere, or agree as well with quite other shifts.
     """
-    least = OVERLAP * (len(first.walls) + len(second.walls))
+    scene = second.scene
+    least = OVERLAP * (len(first.walls) + len(scene.walls))
     if not least:
         return None
-    walls, blurred, observed = first.spectra(0.0)
-    scores = np.empty((len(turns), len(_SHIFTS), len(_SHIFTS)), np.float32)
-    for k, turn in enumerate(turns):
-        points, soft, seen = (spectrum.conj() for spectrum in second.spectra(turn))
-        agree = fft.irfft2(points * blurred + soft * walls, (SIZE, SIZE))
-        count = fft.irfft2(points * observed + seen * walls, (SIZE, SIZE))
-        inside = np.ix_(_SHIFTS % SIZE, _SHIFTS % SIZE)
-        scores[k] = np.where(_WITHIN, agree[inside] / np.maximum(count[inside], least), -np.inf)
+    scores = _scores(first.spectra, second.spectra, least)
     best = np.unravel_index(int(scores.argmax()), scores.shape)
-    if scores[best] < HOPELESS:
+    if scores[best] < HOPELESS or (spread := _spread(scores - scores[best])) >= SPREAD:
         return None
     shift = np.array([_X[best[1:]], _Y[best[1:]]])
-    score, turn, shift = _refined(first, second, float(turns[int(best[0])]), shift)
-    weights = np.exp(SHARPNESS * (scores - scores[best]))
+    score, turn, shift = _refined(first, scene, float(second.turns[int(best[0])]), shift)
+    return Match(score, turn, shift, first.mutual(scene, turn, shift), spread)
+
+
+def _scores(first: _Spectra, second: _Spectra, least: float) -> Array:
+    """The coarse score of each rotation and shift: (n, shifts, shifts).
+
+    Args:
+        first: The spectra of the first place, conjugated.
+        second: The spectra of the second place.
+        least: The score is divided by this number of observed points at least.
+    """
+    walls, blurred, observed = first
+    points, soft, seen = second
+    agree, count = (
+        _correlated(points * field + turned * walls)
+        for field, turned in ((blurred, soft), (observed, seen))
+    )
+    return np.where(_WITHIN, agree / np.maximum(count, least), -np.inf)
+
+
+def _correlated(products: _Spectra) -> _Floats:
+    """Transform products of spectra back, for the shifts of `_SHIFTS` only."""
+    rows = fft.ifft(products, axis=-2)[..., -_SHIFTS % SIZE, :]
+    return np.asarray(fft.irfft(rows, SIZE, axis=-1)[..., -_SHIFTS % SIZE])
+
+
+def _spread(less: Array) -> float:
+    """The standard deviation of the shift in metres.
+
+    Args:
+        less: (n, shifts, shifts) scores minus the best one.
+    """
+    weights = np.exp(SHARPNESS * less).sum(axis=0)
     weights /= weights.sum()
     x, y = (float((weights * grid).sum()) for grid in (_X, _Y))
-    spread = math.sqrt(float((weights * ((_X - x) ** 2 + (_Y - y) ** 2)).sum()))
-    return Match(score, turn, shift, first.mutual(second, turn, shift), spread)
+    return math.sqrt(float((weights * ((_X - x) ** 2 + (_Y - y) ** 2)).sum()))
 
 
 def _refined(first: Scene, second: Scene, turn: float, shift: Array) -> tuple[float, float, Array]:
     """Improve a rotation and a shift step by step; return the score, too."""
+    least = OVERLAP * (len(first.walls) + len(second.walls))
 
-    def score_of(turn: float, shift: Array) -> float:
-        there, seen = first.agreement(points_turned(turn, second.walls) + shift)
-        back, seen_back = second.agreement(points_turned(-turn, first.walls - shift))
-        return (there + back) / max(
-            seen + seen_back, OVERLAP * (len(first.walls) + len(second.walls))
-        )
+    def scores_of(poses: Array) -> Array:
+        cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+        turned = np.moveaxis(np.array([[cos, -sin], [sin, cos]]), 2, 0)
+        shifts = poses[:, :2, None]
+        # The points of each place are moved to the map of the other place.
+        there, seen = first.agreement(turned @ second.walls.T + shifts)
+        back, seen_back = second.agreement(turned.transpose(0, 2, 1) @ (first.walls.T - shifts))
+        return np.asarray((there + back) / np.maximum(seen + seen_back, least))
 
-    score = score_of(turn, shift)
+    pose = np.array([*shift, turn])
+    score = float(scores_of(pose[None])[0])
     for angle, metres in STEPS:
-        moves = [(sign * angle, 0.0, 0.0) for sign in (1, -1)]
-        moves += [(0.0, sign * metres, 0.0) for sign in (1, -1)]
-        moves += [(0.0, 0.0, sign * metres) for sign in (1, -1)]
+        steps = _MOVES * (metres, metres, angle)
         for _ in range(TRIES):
-            found = [(turn + a, shift + np.array([x, y])) for a, x, y in moves]
-            better = max(
-                ((score_of(*there), k) for k, there in enumerate(found)), default=(score, 0)
-            )
-            if better[0] <= score:
+            tried = pose + steps
+            found = scores_of(tried)
+            if found.max() <= score:
                 break
-            score, (turn, shift) = better[0], found[better[1]]
-    return score, turn, shift
+            score, pose = float(found.max()), tried[found.argmax()]
+    return score, float(pose[2]), pose[:2]
