@@ -144,6 +144,34 @@ def test_traces_that_do_not_fit_are_refused(parts: Any, names: Any, said: str) -
         together(parts, names)
 
 
+def test_drives_keep_the_noise_of_their_own_odometry() -> None:
+    precise = replace(MOVED, odometry=Odometry(along=0.001))
+    joint = together([MOVED, precise], names=["monday", "tuesday"])
+    assert joint.covariance(1) == MOVED.covariance(1)
+    assert joint.covariance(3) == precise.covariance(1) != MOVED.covariance(1)
+    assert joint.covariance(2) is None
+    assert joint.odometry == precise.odometry
+
+
+def test_drives_keep_what_all_headers_say() -> None:
+    one = replace(MONDAY, extra={"site": "a", "beams": {"first": -90, "step": 1}})
+    other = replace(TUESDAY, extra={"site": "b", "beams": {"first": -90, "step": 1}})
+    assert together([one, other]).extra == {"beams": {"first": -90, "step": 1}}
+    seen = [replace(t, steps=(replace(t[0], image=(1.0, 2.0)), *t.steps[1:])) for t in (one, other)]
+    seen[1] = replace(seen[1], extra={"beams": {"first": 0, "step": 1}})
+    with pytest.raises(TraceError, match="beams: expected the same in all traces"):
+        together(seen)
+
+
+def test_actions_that_slipped_are_numbered_over_all_drives() -> None:
+    slipped = replace(
+        MONDAY, steps=(replace(MONDAY[0], action=Action.that_slipped(0)), *MONDAY.steps[1:])
+    )
+    again = slipped.with_views("dcba")
+    joint = together([slipped, again], names=["one", "two"])
+    assert [t for t, a in enumerate(joint.actions) if a == Action.that_slipped(t)] == [0, 4]
+
+
 def test_a_trace_given_twice_is_noticed() -> None:
     with pytest.warns(UserWarning, match="traces 1 and 2 have the same steps"):
         together([MONDAY, MONDAY], names=["monday", "again"])

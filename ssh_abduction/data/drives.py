@@ -210,7 +210,8 @@ def together(traces: Iterable[Trace], names: Iterable[str] | None = None) -> Tra
 
     Raises:
         TraceError: There is no trace; two drives have one name; or the traces differ in what they
-            record, such as stars, displacements, the odometry, or the kind of an action.
+            record, such as stars, displacements, the systematic errors of the odometry, or the
+            kind of an action.
     """
     parts = all_instances(
         "traces", traces, Trace, TraceError, mend="make one with Trace.load or Trace.from_steps"
@@ -219,6 +220,8 @@ def together(traces: Iterable[Trace], names: Iterable[str] | None = None) -> Tra
         raise TraceError("traces: expected at least one trace, got none; give the traces to join")
     called = _names(parts, names)
     _check_alike(parts, called)
+    if len({told for trace in parts if (told := _odometry(trace))}) > 1:
+        parts = tuple(map(_with_covariances, parts))
     drives = [trace.steps[d.first : d.stop] for trace in parts for d in drives_of(trace)]
     if len(drives) == 1:
         return parts[0]
@@ -334,8 +337,22 @@ def _displacements(trace: Trace) -> str | None:
     return "displacements" if trace.has_displacements else "no displacements"
 
 
+def _systematic(trace: Trace) -> dict[str, float] | None:
+    """The errors of the odometry that are not those of single displacements, by name."""
+    told = _odometry(trace)
+    if told is None:
+        return None
+    return {name: getattr(told, name) for name in ("scale", "bend", "offset", "facing")}
+
+
 def _odometry(trace: Trace) -> Odometry | None:
     return trace.odometry or (Odometry() if trace.has_displacements else None)
+
+
+def _with_covariances(trace: Trace) -> Trace:
+    """Copy a trace, with the covariance of each displacement at its step."""
+    steps = (replace(step, covariance=trace.covariance(t)) for t, step in enumerate(trace.steps))
+    return replace(trace, steps=tuple(steps))
 
 
 def _header(name: str) -> Callable[[Trace], object]:
@@ -358,7 +375,7 @@ def _sidecar(trace: Trace) -> str | None:
 _RECORDED: tuple[tuple[str, Callable[[Trace], object], str], ...] = (
     ("star", _stars, "record stars in one way, or leave them out (Trace.without_stars)"),
     ("displacement", _displacements, "add them, or leave them out (Trace.without_displacements)"),
-    ("odometry", _odometry, "give all traces one odometry"),
+    ("odometry", _systematic, "give all traces one odometry"),
     ("images", _sidecar, "put the images of all traces into one file"),
     ("beams", _header("beams"), "take images of one laser"),
     ("panorama", _header("panorama"), "take images of one camera"),

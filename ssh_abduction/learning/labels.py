@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sklearn.neighbors import NearestNeighbors
 
 from perception.confidence import NOISE
-from perception.recognition import recogniser
+from ssh_abduction.data.drives import Drive, drives_of, joined_drives, sentence_of
 from ssh_abduction.data.errors import AbductionError, brief, is_whole
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
@@ -31,8 +31,8 @@ class LearnerError(AbductionError, ValueError):
 class AmbiguousMapWarning(UserWarning):
     """The labels may be wrong or incomplete.
 
-    The reason is one of these: several minimal maps remain, the map is not proven minimal, or
-    another trace cannot be placed on the map.
+    The reason is one of these: several minimal maps remain, the map is not proven minimal, or it
+    is in pieces that share no place.
     """
 
 
@@ -97,60 +97,61 @@ def labels_of(
     return np.where(agreed, labels, -1)
 
 
-def map_of(solution: Solution, choose: int | None = None) -> tuple[SSHMap, NDArray[np.intp]]:
+def map_of(
+    solution: Solution, vectors: NDArray[np.float64], choose: int | None = None
+) -> tuple[SSHMap, NDArray[np.intp]]:
     """Return the map to learn from, and the labels of its n steps, (n,), by `labels_of`.
 
     Args:
         solution: The minimal maps.
+        vectors: (n, d) the vector of each image. Views say little of how drives lie to each other.
+            So of several joint maps those are kept that fit the images best.
         choose: Index of the map, from 0; None takes the first map, and labels only the steps on
             which all maps agree.
     """
-    labels = labels_of(solution.maps, choose, solution.complete, solution.status is Status.OPTIMAL)
-    return solution.maps[choose or 0], labels
+    maps: Sequence[SSHMap] = solution.maps
+    if choose is None and len(maps) > 1 and len(solution.drives) > 1:
+        maps = fitting_best(maps, solution.drives, vectors)
+    labels = labels_of(maps, choose, solution.complete, solution.status is Status.OPTIMAL)
+    return maps[choose or 0], labels
 
 
-def labels_of_all(
-    ssh_map: SSHMap,
-    labels: NDArray[np.intp],
-    traces: Traces,
-    views: NDArray[np.intp],
-    features: Any = None,
-) -> NDArray[np.intp]:
-    """Label each step of several traces with the id of its dstate, (n,); -1 if it is unknown.
+def fitting_best(
+    maps: Sequence[SSHMap], drives: Sequence[Drive], vectors: NDArray[np.float64]
+) -> list[SSHMap]:
+    """Find the joint maps by which most images are at the dstate of the most similar image.
 
-    The map was made for the longest trace, so this trace keeps `labels`. Each other trace is
-    followed on the map. If a trace cannot be placed there, issue an AmbiguousMapWarning.
+    Only the images of other drives are compared with an image.
 
     Args:
-        ssh_map: The map of the longest trace.
-        labels: The label of each step of the longest trace.
-        traces: Traces with n steps in all.
-        views: The number of the view of each step, (n,); -1 if its image has none. Such a step gets
-            no label.
-        features: The transformer that makes vectors of images, as in `recogniser`.
+        maps: Joint maps of n steps.
+        drives: The drives.
+        vectors: (n, d) the vector of each image.
     """
-    if len(traces.each) == 1:
-        return np.where(views == NOISE, -1, labels)
-    # A recogniser trained on the longest trace says which dstate each other image looks like.
-    own = traces.parts(traces.images)[traces.longest]
-    looks = (
-        recogniser(features=features)
-        .fit(own[labels >= 0], labels[labels >= 0])
-        .predict(traces.images)
-    )
-    found = labels_on(ssh_map, traces, views, looks)
-    for i, part in enumerate(traces.parts(found)):
-        if i == traces.longest:
-            part[:] = labels
-        elif (part < 0).all():
-            warnings.warn(
-                f"trace {i}: the map of the longest trace does not tell where any of its "
-                f"{len(part)} steps is: it is not learnt from; "
-                "drive it longer, or where the longest one was",
-                AmbiguousMapWarning,
-                stacklevel=3,
-            )
-    return np.where(views == NOISE, -1, found)
+    nearest = np.zeros(len(vectors), np.intp)
+    steps = np.arange(len(vectors))
+    for drive in drives:
+        own = (steps >= drive.first) & (steps < drive.stop)
+        found = NearestNeighbors(n_neighbors=1).fit(vectors[~own]).kneighbors(vectors[own])[1]
+        nearest[own] = steps[~own][found[:, 0]]
+    labels = np.array([ssh_map.labels for ssh_map in maps])
+    fits = (labels == labels[:, nearest]).sum(axis=1)
+    return [ssh_map for ssh_map, count in zip(maps, fits, strict=True) if count == fits.max()]
+
+
+def warn_of_pieces(trace: Trace, ssh_map: SSHMap) -> None:
+    """Issue an AmbiguousMapWarning if a map leaves drives of a trace in pieces.
+
+    Then one dstate may have two labels: one in each piece.
+    """
+    drives = drives_of(trace)
+    if len(joined_drives(drives, ssh_map)) > 1:
+        warnings.warn(
+            f"{sentence_of(drives, ssh_map)}: a dstate that several pieces have gets several "
+            "labels; drive where another drive was",
+            AmbiguousMapWarning,
+            stacklevel=3,
+        )
 
 
 def labels_on(

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator
 
-from perception.confidence import warn_of_doubts
+from perception.confidence import NOISE, warn_of_doubts
 from perception.recognition import cloned, recogniser
 from perception.views import ISOLATED, ViewClusterer, as_view_clusterer
 from ssh_abduction.data.trace import Trace
@@ -29,9 +29,9 @@ from ssh_abduction.learning.labels import (
     AmbiguousMapWarning,
     LearnerError,
     labels_of,
-    labels_of_all,
     labels_on,
     map_of,
+    warn_of_pieces,
 )
 from ssh_abduction.learning.runner_up import RunnerUpWarning, warn_of_second_map
 from ssh_abduction.learning.traces import Traces
@@ -54,8 +54,10 @@ _log = log_of(__name__)
 class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
     """A scikit-learn estimator that learns to recognise dstates from images and actions.
 
-    It needs no place names. Given several traces, it clusters the images of all traces into views,
-    makes a map of the longest trace, and follows the other traces on this map.
+    It needs no place names. Given several traces of one building, it clusters the images of all
+    traces into views, and labels them all by the joint map of the traces. Of several minimal joint
+    maps, it takes those by which most images are at the dstate of the most similar image of another
+    trace.
 
     Args:
         theory: The axioms; Theory.topological() by default.
@@ -75,12 +77,12 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
         views_: The number of the view of each step, (n,); -1 for an image without a view. n counts
             the steps of all traces, one after the other.
         confidence_: The confidence in each view, (n,), from 0 to 1.
-        solution_: The minimal maps of the longest trace.
+        solution_: The minimal maps; for several traces, their joint maps.
         map_: The map that the labels come from.
         second_map_: A SecondMap, if another number of views separates the images about as well and
             gives another map; else None.
-        labels_: The id of the dstate of each step, (n,); -1 if it is unknown: the maps disagree,
-            the image has no view, or the trace cannot be followed.
+        labels_: The id of the dstate of each step, (n,); -1 if it is unknown: the maps disagree, or
+            the image has no view.
         recogniser_: The recogniser, trained on images with a label. Images that the map treats as
             misread are left out.
 
@@ -110,7 +112,8 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
         Raises:
             LearnerError: There is no map, or no label is left to learn from.
             PerceptionError: The images cannot be clustered.
-            TraceError: A trace lacks what the theory needs.
+            TraceError: A trace lacks what the theory needs, or the traces differ in what they
+                record, such as stars.
         """
         traces, theory = Traces.of(X), checked_theory(self.theory)
 
@@ -122,22 +125,22 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
         warn_of_doubts(self.views_, self.confidence_, self.clusterer_.quality_[self.clusterer_.k_])
         _log.info("%d images, %d views", len(traces.images), self.clusterer_.k_)
 
-        # 2. Map: find the minimal maps of the longest trace.
+        # 2. Map: find the minimal maps of the trace, or the joint maps of the traces.
         second_views = self.clusterer_.runner_up_labels_
-        seen = traces.with_views(vectors, self.views_, second_views, self.confidence_)
-        longest = seen.each[seen.longest]
-        self.solution_ = solve(longest, theory, time_limit=self.time_limit)
-        self.map_, own_labels = map_of(self.solution_, self.choose)
-        self.second_map_ = warn_of_second_map(longest, self.solution_.maps, theory, self.time_limit)
+        seen = traces.with_views(vectors, self.views_, second_views, self.confidence_).joint
+        self.solution_ = solve(seen, theory, time_limit=self.time_limit)
+        self.map_, labels = map_of(self.solution_, vectors, self.choose)
+        warn_of_pieces(seen, self.map_)
+        self.second_map_ = warn_of_second_map(seen, self.solution_.maps, theory, self.time_limit)
         _log.info("a map of %d dstates", len(self.map_.dstates))
 
-        # 3. Labels: the map gives the dstate of each image.
-        self.labels_ = labels_of_all(self.map_, own_labels, seen, self.views_, self.features_)
+        # 3. Labels: the map gives the dstate of each image that has a view.
+        self.labels_ = np.where(self.views_ == NOISE, -1, labels)
 
         # 4. Recogniser: learn from the images whose label is sure.
         misread = [fault.step for fault in self.map_.faults if fault.kind == "misread"]
         is_sure = self.labels_ >= 0
-        is_sure[traces.at_longest(misread)] = False
+        is_sure[np.asarray(misread, np.intp)] = False
         self.recogniser_ = recogniser(features=self.features_).fit(
             traces.images[is_sure], self.labels_[is_sure]
         )

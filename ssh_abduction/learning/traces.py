@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -14,6 +15,7 @@ from perception.appearance import features_of
 from perception.confidence import nearest_views
 from perception.errors import PerceptionError
 from perception.images import images_of
+from ssh_abduction.data.drives import together
 from ssh_abduction.data.errors import TraceError, brief
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.learning.runner_up import with_runner_up
@@ -88,14 +90,21 @@ class Traces:
         return kinds[0]
 
     @property
-    def longest(self) -> int:
-        """The index of the longest trace; the first one if several are equally long."""
-        return max(range(len(self.each)), key=lambda i: (len(self.each[i]), -i))
+    def joint(self) -> Trace:
+        """The traces as drives of one joint trace, without images; or the only trace.
 
-    def at_longest(self, steps: Sequence[int]) -> Integers:
-        """Convert step numbers of the longest trace to indices among all n steps."""
-        before = sum(len(trace) for trace in self.each[: self.longest])
-        return before + np.asarray(steps, np.intp)
+        Raises:
+            TraceError: The traces differ in what they record.
+        """
+        if len(self.each) == 1:
+            return self.each[0]
+        names = [trace.name or "" for trace in self.each]
+        if "" in names or len(set(names)) < len(names):
+            names = [f"trace {i}" for i in range(len(names))]
+        with warnings.catch_warnings():
+            # Drives that differ only in their images are no repeats.
+            warnings.filterwarnings("ignore", ".* have the same steps", UserWarning)
+            return together(map(_without_images, self.each), names)
 
     def parts(self, of_all: NDArray[Any]) -> list[NDArray[Any]]:
         """Split an array with one row for each step, (n, …), into one array for each trace."""
@@ -132,3 +141,10 @@ class Traces:
         return Traces(
             tuple(with_runner_up(t, other) for t, other in zip(seen, others, strict=True))
         )
+
+
+def _without_images(trace: Trace) -> Trace:
+    """Copy a trace without its images, which may be in files of their own."""
+    return replace(
+        trace, steps=tuple(replace(step, image=None) for step in trace.steps), images=None
+    )
