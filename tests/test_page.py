@@ -577,3 +577,38 @@ def test_assuming_and_explaining_in_the_browser(browser: Any, server: PageServer
     page.browser.execute_script("why(); $('stop').click()")
     assert page["answer"].text == "Given up."
     assert page.complaints == []
+
+
+def test_content_has_the_regions_of_maps(content: dict[str, Any], rivals: Solution) -> None:
+    for told, ssh_map in zip(content["maps"], rivals.maps, strict=True):
+        regions = content["regions"][told["regions"]]
+        assert [(list(p), d) for p, _, d in regions] == [
+            (list(r.places), r.door) for r in ssh_map.regions or ()
+        ]
+    blind = content_of([replace(m, regions=None) for m in rivals])
+    assert blind["regions"] == []
+    assert "regions" not in blind["maps"][0]
+
+
+def test_regions_in_the_browser(browser: Any, tmp_path: Path) -> None:
+    trace = Trace.from_steps("abcdef", ["travel", "right", "travel", "left", "travel"])
+    (tmp_path / "page.html").write_text(view_page(solve(trace), trace).html)
+    page = Shown(browser, (tmp_path / "page.html").as_uri())
+    told = page.browser.execute_script(
+        "return [...document.querySelectorAll('#regions button')].map((b) => b.textContent)"
+    )
+    assert told == [
+        "path 0 – right: 2",
+        "path 1 – right: 0; left: 3",
+        "path 2 – left: 1",
+        "region 0: place 0, behind place 1",
+        "region 3: place 3, behind place 2",
+    ]
+    script = "document.querySelectorAll('#regions button')[1].click()"
+    page.browser.execute_script(script)
+    count = "return ['.band', '.beside.right', '.beside.left'].map((c) => {0}.length)"
+    rings = count.replace("{0}", "document.querySelectorAll('#drawings ' + c)")
+    assert page.browser.execute_script(rings) == [2, 1, 1]
+    page.browser.execute_script(script)
+    assert page.browser.execute_script(rings) == [2, 0, 0]
+    assert page.complaints == []

@@ -71,6 +71,7 @@ def content_of(
     maps = [ssh_map.renumbered() for ssh_map in listing.maps]
     # List what maps share once, and let each map refer to it by number.
     labelings, places, orders, faults = _Pool(), _Pool(), _Pool(), _Pool()
+    regions = _Pool()
     told: list[dict[str, Any]] = []
     for ssh_map, name in zip(maps, found.ids, strict=True):
         one: dict[str, Any] = {
@@ -81,6 +82,10 @@ def content_of(
             "places": places.number(tuple((s.place, s.path, s.direction) for s in ssh_map.dstates)),
             "orders": orders.number(tuple((path.id, path.order) for path in ssh_map.paths)),
         }
+        if ssh_map.regions:
+            one["regions"] = regions.number(
+                tuple((r.places, r.bounds, r.door) for r in ssh_map.regions)
+            )
         if ssh_map.names:
             one["names"] = {f"{n.kind} {n.id}": n.text for n in ssh_map.names}
         if ssh_map.fit:
@@ -109,6 +114,7 @@ def content_of(
         "places": _differences(places.items),
         "orders": orders.items,
         "faults": faults.items,
+        "regions": regions.items,
         "layouts": drawings,
         "spots": [
             [round(x, 3), round(y, 3), None if h is None else round(h, 3)] for x, y, h in spots

@@ -28,6 +28,7 @@ SCRIPTS = (
     "maps",
     "camera",
     "figures",
+    "regions",
     "paint",
     "choosing",
     "replay",

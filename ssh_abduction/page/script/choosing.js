@@ -27,6 +27,7 @@ function draw(keep = true) {
   $("labels").disabled = nextMap((one, now) => one.labeling !== now.labeling) === null;
   $("paths").disabled = nextMap((one, now) => one.labeling === now.labeling) === null;
   about();
+  tellRegions();
   legend();
   tellBelief();
 }
@@ -55,6 +56,15 @@ function legend() {
   if (!replay().other) rows.push(["here", "", "where the robot is at this step"]);
   if (replay().beliefs)
     rows.push(["believed", "", "where it is believed to be: the larger, the more probable"]);
+  if (figures.some((figure) => figure.bands?.length))
+    rows.push(["band", "", "a region: all known ways to it lead through one place"]);
+  if (state.region && state.mode === "one")
+    for (const side of Object.keys(state.region.sides))
+      rows.push([
+        "beside",
+        side,
+        side === "within" ? `in ${state.region.name}` : `${side} of ${state.region.name}`,
+      ]);
   if (figures.some((figure) => figure.layout?.ellipses?.length))
     rows.push(["ellipse", "", "two standard deviations of a position"]);
   if (data.faults.length)
@@ -90,6 +100,8 @@ function legend() {
         null,
         svg,
       );
+    else if (shape === "band")
+      element("svg:path", { d: "M10,8 H28", class: shape, "stroke-width": 14 }, null, svg);
     else if (shape === "ellipse")
       element("svg:ellipse", { cx: 19, cy: 8, rx: 14, ry: 6, class: shape }, null, svg);
     else if (shape === "fault") {
@@ -134,6 +146,7 @@ function go(i) {
     return;
   }
   state.map = i;
+  state.region = null;
   if (state.mode === "overview") state.mode = "one";
   draw();
 }

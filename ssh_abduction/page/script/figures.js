@@ -88,6 +88,7 @@ function mapFigure(i, rival) {
           : "";
   figure.nodes = [...ssh.places].map(([p, at]) => ({
     at,
+    place: p,
     name: `${p}`,
     own: ssh.names[`place ${p}`],
     kind: kindOf(`p${ssh.ofPlace.get(p) ?? []}`),
@@ -140,6 +141,7 @@ function mapFigure(i, rival) {
     ...ssh.places.values(),
     ...ssh.dstates.filter((s) => s.place === null).map((s) => s.at),
   ];
+  figure.bands = bandsOf(ssh);
   figure.layout = ssh.layout;
   figure.labels = ssh.labels;
   return figure;

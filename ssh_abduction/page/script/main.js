@@ -1,6 +1,7 @@
 // Filling the page, and listening to the user.
 
 function load(judging = true) {
+  state.region = null;
   $("sentence").textContent = data.sentence + (theory() ? ` — assumed:${theory()}` : "");
   document.title = data.sentence;
   $("first").max = $("later").max = labelsOf(0).length - 1;

@@ -105,6 +105,12 @@ function mapOf(i) {
       return name === undefined ? `${kind} ${number}` : `${kind} ${number} (${name})`;
     },
     names: told.names ?? {},
+    regions: (data.regions[told.regions] ?? []).map(([places, bounds, door], number) => ({
+      id: number,
+      places: new Set(places),
+      bounds,
+      door,
+    })),
     id: told.id,
   };
   if (decoded.size > 40) decoded.delete(decoded.keys().next().value);

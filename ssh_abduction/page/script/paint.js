@@ -21,6 +21,7 @@ function paintFigure(figure) {
     radiusAt = (at) => radii.get(`${at}`) ?? r;
   const see = (at) => onScreen(figure, at);
   const spots = figure.nodes.map((node) => see(node.at));
+  paintBands(figure, see, r);
   for (const street of figure.streets)
     paintStreet(figure, street, see(street.a), see(street.b), spots, r);
   paintEllipses(figure, see);
@@ -338,6 +339,7 @@ function paintScale(figure) {
 function paintOver(figure) {
   figure.under.replaceChildren();
   figure.over.replaceChildren();
+  paintChosen(figure);
   const beliefs = replay().beliefs,
     labeling = figure.map === null ? Object.keys(beliefs ?? {})[0] : data.maps[figure.map].labeling,
     belief = beliefs?.[labeling]?.[state.step];
