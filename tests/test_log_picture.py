@@ -108,3 +108,14 @@ def test_doubtful_joins_show_their_probability(
     assert picture.count("<title>a join at place") == len(joined) > 0
     page = report(house.log, house.imported, house.solution, (), house.to_dict())
     assert "<h2>Doubtful joins</h2><table>" in page
+
+
+def test_rooms_and_wings_have_bands(house: LogMap) -> None:
+    regions = house.solution.maps[0].regions or ()
+    picture = figure(house.log, house.imported, house.solution)
+    assert regions
+    assert picture.count('class="region"') == len(regions)
+    for region in regions:
+        assert region.door is not None
+        assert not region.bounds  # nothing in a log says which travels are one path
+        assert f"<title>{region}</title>" in picture

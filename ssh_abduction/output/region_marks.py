@@ -34,9 +34,7 @@ def region_marks(
     bands: list[str] = []
     names: list[str] = []
     points: list[Point] = []
-    regions = [r for r in ssh_map.regions or () if r.door is not None]
-    for region in regions:
-        broad = width * (1 + WIDER * _depth(region, regions))
+    for region, broad in (pairs := banded(ssh_map, width)):
         inside = [spots[p] for p in region.places]
         ways = [line(p, p) for p in inside]
         ways += [line(spots[p], spots[q]) for p, q in streets_in(ssh_map, region)]
@@ -44,12 +42,24 @@ def region_marks(
         points += [(x + k * broad / 2, y + k * broad / 2) for x, y in inside for k in (-1, 1)]
         # The name is at the lowest place that is in no inner region. Dstates are rarely named on
         # its lower left.
-        own = {*region.places}.difference(*(r.places for r in _within(region, regions)))
+        inner = _within(region, [r for r, _ in pairs])
+        own = {*region.places}.difference(*(r.places for r in inner))
         x, y = max((spots[p] for p in own or region.places), key=lambda spot: (spot[1], -spot[0]))
         beside = x - 0.6 * broad, y + 0.5 * broad + 4
         names.append(text(*beside, f"region {region.id}", BAND, 11, halo=True))
         points.append((beside[0] - 30, beside[1]))
     return [*bands, *names], points
+
+
+def banded(ssh_map: SSHMap, width: float) -> list[tuple[Region, float]]:
+    """List the regions behind one place, the largest first, each with the width of its band.
+
+    Args:
+        ssh_map: The map.
+        width: The width of the innermost bands.
+    """
+    regions = [r for r in ssh_map.regions or () if r.door is not None]
+    return [(r, width * (1 + WIDER * _depth(r, regions))) for r in regions]
 
 
 def band(region: Region, ways: Sequence[str], width: float) -> str:

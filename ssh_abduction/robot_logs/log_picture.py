@@ -24,6 +24,7 @@ from ssh_abduction.data.drives import Drive, drives_of, starts_of
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import between, moved
 from ssh_abduction.output.drawing import ALARM, COLOURS, escaped, page, text, titled
+from ssh_abduction.output.region_marks import band, banded
 from ssh_abduction.robot_logs.drive_frames import laid_over
 from ssh_abduction.solver import Solution
 
@@ -40,6 +41,8 @@ DRAWN = 12.0
 BESIDE = 1.5
 # Nearer than this many metres to the middle of a place, an edge leads straight to it.
 MIDDLE = 1.0
+# The innermost bands of regions are this many metres wide.
+BROAD = 2.0
 # A join with a smaller probability is doubtful.
 SURE = 0.95
 # The colour of edges that belong to no meaningful path, of walls, and of the robot's way.
@@ -81,7 +84,8 @@ def figure(log: RobotLog, imported: Imported, solution: Solution) -> str:
         caption = (
             f"The first map over the scans, at {poses}. Numbers are places, ticks their gateways, "
             f"and lines the edges along the robot's course. {colours}Dots are places at which the "
-            "robot only passed through. Red shows the probability of a doubtful join."
+            "robot only passed through. Bands are regions that all known ways enter through one "
+            "place. Red shows the probability of a doubtful join."
         )
     return f"<figure>{picture}<figcaption>{caption}</figcaption></figure>"
 
@@ -230,7 +234,9 @@ def _map_marks(sheet: _Sheet, imported: Imported, solution: Solution) -> Iterato
     shown = {place: middle for place, middle in middles.items() if place not in hidden}
     path_of = {state.id: state.path for state in ssh_map.dstates}
     colourful = paths_mean_something(solution)
-    for step, course in _edges(sheet, imported, places, visit_of, shown):
+    edges = list(_edges(sheet, imported, places, visit_of, shown))
+    yield from _bands(sheet, ssh_map, middles, [(places[t], places[t + 1], c) for t, c in edges])
+    for step, course in edges:
         path = path_of[ssh_map.labels[step]] or 0
         colour = COLOURS[path % len(COLOURS)] if colourful else EDGE
         if len(sheet.bounds) > 2:
@@ -246,6 +252,31 @@ def _map_marks(sheet: _Sheet, imported: Imported, solution: Solution) -> Iterato
         else:
             yield from _place(sheet, imported, at, seen)
             yield from _number(at, str(place), doubts.get(place))
+
+
+def _bands(
+    sheet: _Sheet,
+    ssh_map: SSHMap,
+    middles: Mapping[int, Array],
+    edges: Sequence[tuple[int | None, int | None, Array]],
+) -> Iterator[str]:
+    """Draw a band for each region behind one place, along the courses between its places.
+
+    Args:
+        sheet: The poses.
+        ssh_map: The map.
+        middles: (2,) the middle of each place.
+        edges: The two places and the course, (n, 2) metres, of each edge.
+    """
+    for region, width in banded(ssh_map, BROAD * sheet.unit):
+        here = [middles[p].tolist() for p in region.places if p in middles]
+        ways = [_line([sheet.on_page(middle)] * 2) for middle in here]
+        ways += [
+            _line(map(sheet.on_page, course))
+            for first, last, course in edges
+            if {first, last} <= {*region.places}
+        ]
+        yield band(region, ways, width)
 
 
 def _edges(
