@@ -124,9 +124,9 @@ class Trace:
                     f"got {brief(action.name)}; remove it, or add the step that it led to"
                 )
             if action.starts:
-                self._check_start(i, action.name, types)
+                _check_start(self, i, action.name, types)
             if action.breaks_frame:
-                self._check_frame(i, action)
+                _check_frame(self, i, action)
             first, known = types.setdefault(action.name, (i, action))
             if known != action:
                 raise TraceError(
@@ -134,23 +134,6 @@ class Trace:
                     f"turn {action.turn} here but kind {known.kind}, turn {known.turn} "
                     f"on {self.at(first)}; give the two different names, or the same kind"
                 )
-
-    def _check_start(self, i: int, name: str, known: Collection[str]) -> None:
-        """Check the start of the drive `name` after step i. `known` has earlier names."""
-        if name in known or name == self.drive:
-            raise TraceError(
-                f"{self.at(i)}: action: expected a new name for this drive, got {brief(name)}, the "
-                "name of an earlier drive or action; rename it"
-            )
-
-    def _check_frame(self, i: int, action: Action) -> None:
-        """Check that no displacement leads from step i to a step with a frame of its own."""
-        if (moved := self.steps[i + 1].displacement) is not None:
-            where = "the first step of a drive" if action.starts else "the first step of a floor"
-            raise TraceError(
-                f"{self.at(i + 1)}: displacement: expected none on {where}, got "
-                f"{brief(moved)}; leave it out"
-            )
 
     def __len__(self) -> int:
         """The number of steps, which is one more than the number of actions."""
@@ -470,6 +453,25 @@ class Trace:
         yield _dump({**{k: v for k, v in header.items() if v is not None}, **more, **self.extra})
         for step in self.steps:
             yield _dump(step.to_json())
+
+
+def _check_start(trace: Trace, i: int, name: str, known: Collection[str]) -> None:
+    """Check the start of the drive `name` after step i. `known` has earlier names."""
+    if name in known or name == trace.drive:
+        raise TraceError(
+            f"{trace.at(i)}: action: expected a new name for this drive, got {brief(name)}, the "
+            "name of an earlier drive or action; rename it"
+        )
+
+
+def _check_frame(trace: Trace, i: int, action: Action) -> None:
+    """Check that no displacement leads from step i to a step with a frame of its own."""
+    if (moved := trace.steps[i + 1].displacement) is not None:
+        where = "the first step of a drive" if action.starts else "the first step of a floor"
+        raise TraceError(
+            f"{trace.at(i + 1)}: displacement: expected none on {where}, got "
+            f"{brief(moved)}; leave it out"
+        )
 
 
 def checked_trace(value: object) -> Trace:

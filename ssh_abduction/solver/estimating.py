@@ -1,4 +1,6 @@
-"""Estimate rivals of the best map: some visits to a place may be visits to a new place.
+"""Estimate rivals of the best map, and the fewest places that any map has.
+
+In a rival, some visits to a place of the best map may be visits to a new place.
 
 The search for maps of least cost (`weighing.py`) finds few rivals of a long trace. So these are
 added. They fit the displacements, and may break axioms.
@@ -12,6 +14,7 @@ from typing import TypeAlias
 
 from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.solver.weighed import Rival
+from ssh_abduction.theory.settle import Problem
 
 # The dstate and the place of each step, numbered by first visit.
 Course: TypeAlias = tuple[tuple[int, ...], tuple[int, ...]]
@@ -80,3 +83,21 @@ def _begins(at: Sequence[int], visit: Sequence[int]) -> list[int]:
         is_first = not step or at[step - 1] != name or visit[step] == step
         begins.append(step if is_first else begins[-1])
     return begins
+
+
+def least_places(problem: Problem) -> int:
+    """The size of a large set of visits that are pairwise at different places by the evidence."""
+    if problem.theory.level == "causal":
+        return 0
+    import numpy as np
+
+    from ssh_abduction.solver.steps.apart import large_clique
+
+    elsewhere = problem.pairs.elsewhere
+    steps = sorted({0, *elsewhere, *(i for others in elsewhere.values() for i in others)})
+    number = {step: i for i, step in enumerate(steps)}
+    apart = np.zeros((len(steps), len(steps)), dtype=bool)
+    for j, others in elsewhere.items():
+        for i in others:
+            apart[number[i], number[j]] = apart[number[j], number[i]] = True
+    return len(large_clique(apart))

@@ -38,7 +38,7 @@ from ssh_abduction.solver.choosing import FEW_STEPS, READABLE, new_engine, takes
 from ssh_abduction.solver.engines.base import Engine, Found, Task
 from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.equations import spreads_of
-from ssh_abduction.solver.estimating import CostOf, Course, estimated
+from ssh_abduction.solver.estimating import CostOf, Course, estimated, least_places
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
 from ssh_abduction.solver.map_list import Priced
@@ -181,7 +181,7 @@ class Weighing:
         parts.watch.use_reserve()
         if parts.known.best is not None:
             self.add(parts.known.best)
-        self._least = {"places": _least_places(parts.task.problem)}
+        self._least = {"places": least_places(parts.task.problem)}
         may_be_wrong = range(1, len(parts.task.trace)) if parts.task.theory.jumped else ()
         self._base = self._misfit.of_returns([], may_be_wrong) / 2  # of every map
         task = replace(parts.task, speedups=replace(parts.task.speedups, prefixes=False))
@@ -484,21 +484,3 @@ def _engine(task: Task, parts: Parts) -> Engine:
 
         return FramelessEngine(task, best.labels)
     return engine
-
-
-def _least_places(problem: Problem) -> int:
-    """The size of a large set of visits that are pairwise at different places by the evidence."""
-    if problem.theory.level == "causal":
-        return 0
-    import numpy as np
-
-    from ssh_abduction.solver.steps.apart import large_clique
-
-    elsewhere = problem.pairs.elsewhere
-    steps = sorted({0, *elsewhere, *(i for others in elsewhere.values() for i in others)})
-    number = {step: i for i, step in enumerate(steps)}
-    apart = np.zeros((len(steps), len(steps)), dtype=bool)
-    for j, others in elsewhere.items():
-        for i in others:
-            apart[number[i], number[j]] = apart[number[j], number[i]] = True
-    return len(large_clique(apart))

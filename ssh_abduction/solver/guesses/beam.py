@@ -103,15 +103,14 @@ class Beam:
         self._has_places = theory.level == "topological"
         self._stays = self._has_places and "turn_stays" in theory.hard
         self._leaves = self._has_places and "travel_leaves" in theory.hard
-        self._price, self._price_of_place = theory.prices[:2]
-        if not self._has_places:
-            self._price_of_place = 0.0
+        # The prices of a dstate and of a place.
+        self._prices = theory.prices[0], theory.prices[1] if self._has_places else 0.0
         self._reckoning, self._frames = Reckoning(trace), frames_of(trace)
         self.nats, self.refuses = math.inf, False
         self._sights = [self._sight(step) for step in trace.steps]
         # For each kind of fault, what it costs at each step in nats.
         self._fault = {
-            kind: [self._price * theory.fault_tenths(kind, step) / 10 for step in trace.steps]
+            kind: [self._prices[0] * theory.fault_tenths(kind, step) / 10 for step in trace.steps]
             for kind in ("misread", "slipped", "jumped")
             if getattr(theory, kind)
         }
@@ -206,7 +205,7 @@ class Beam:
 
     def _price_of(self, found: Hypothesis) -> float:
         """The price of the dstates, places and faults of a hypothesis, in nats."""
-        price = self._price * len(found.places) + self._price_of_place * len(found.position)
+        price = self._prices[0] * len(found.places) + self._prices[1] * len(found.position)
         price += sum(self._fault[kind][t] for t, kind in found.faults)
         if "misread" in self._fault:
             price += sum(map(_nats_of_misread, found.seen))
@@ -229,7 +228,7 @@ class Beam:
 
     def _first(self) -> Hypothesis:
         mean, covariance = first_pose()
-        nowhere = Hypothesis([], [], [], {}, [], [], [], mean, covariance, self._price)
+        nowhere = Hypothesis([], [], [], {}, [], [], [], mean, covariance, self._prices[0])
         n, met = len(mean) - 3, self._reckoning.met(nowhere, 0, None, None)
         return replace(
             nowhere,
@@ -348,7 +347,7 @@ class Beam:
                 for place, sight in enumerate(moved.sights)
                 if (place != there or not leaves) and (misreads or _agree(sight, self._sights[t]))
             ]
-        dstate, new_place = (self._price, self._price_of_place) if joins else (0.0, 0.0)
+        dstate, new_place = self._prices if joins else (0.0, 0.0)
         options = []
         if not stays:
             nats = moved.nats + dstate + new_place
