@@ -24,7 +24,7 @@ from ssh_abduction import Localiser, Solution, SSHMap, Theory, Trace, solve, vie
 from ssh_abduction.cli import main
 from ssh_abduction.cli.options import add_theory, flags_of, theory_of
 from ssh_abduction.cli.parsing import Parser
-from ssh_abduction.data import Action, DState, MapError, Step, TraceError
+from ssh_abduction.data import Action, DState, MapError, Step, TraceError, together
 from ssh_abduction.data.maps import Fault, Fit, MapPath, Pose
 from ssh_abduction.explain.pairs import explain_pair
 from ssh_abduction.page import html
@@ -190,9 +190,9 @@ def test_colours_can_be_told_apart_by_the_colour_blind_and_from_the_paper() -> N
             > 3
         )
         assert max(bright["ink"] / bright["paper"], bright["paper"] / bright["ink"]) > 12
-        for together in (["few", "half", "most", "soft"], [f"path{k}" for k in range(6)]):
+        for beside in (["few", "half", "most", "soft"], [f"path{k}" for k in range(6)]):
             for seen in DEFICIENT.values():
-                labs = [cielab(np.array(seen) @ found[name]) for name in together]
+                labs = [cielab(np.array(seen) @ found[name]) for name in beside]
                 assert min(np.linalg.norm(a - b) for a, b in combinations(labs, 2)) > 20
 
 
@@ -611,4 +611,29 @@ def test_regions_in_the_browser(browser: Any, tmp_path: Path) -> None:
     assert page.browser.execute_script(rings) == [2, 1, 1]
     page.browser.execute_script(script)
     assert page.browser.execute_script(rings) == [2, 0, 0]
+    assert page.complaints == []
+
+
+def test_the_page_of_a_joint_map_shows_its_drives(browser: Any, tmp_path: Path) -> None:
+    monday = Trace.from_steps("abc", ["travel", "travel"], name="monday")
+    tuesday = Trace.from_steps("cd", ["travel"], name="<b>tuesday</b>")
+    joint = together([monday, tuesday])
+    solution = solve(joint, Theory.causal())
+    content = content_of(solution, joint)
+    assert content["joined"] == "the map joins all 2 drives: monday, <b>tuesday</b>"
+    assert [joined["joins"] for joined in content["between"]] == [[(2, 3, 1.0)]]
+    Page(content).save(tmp_path / "page.html")
+    page = Shown(browser, (tmp_path / "page.html").as_uri())
+    assert page["joined"].text == content["joined"]
+    trails = browser.find_elements("css selector", "#drawings .trail")
+    assert len({trail.get_attribute("class") for trail in trails}) == 2
+    # A button leads to the first step of its drive, and playing ends with the drive.
+    for k, (at, last) in enumerate([("monday:0 of 2", (0, 2)), ("<b>tuesday</b>:0 of 1", (3, 4))]):
+        page["starts"].find_elements("tag name", "button")[k].click()
+        assert page["at"].text.startswith(at)
+        assert browser.execute_script("return endsOf(state.step)") == [*last]
+    browser.execute_script("setStep(2)")
+    assert page["seen"].text.endswith("this drive ends")
+    page["between"].find_element("tag name", "button").click()
+    assert page["verdict"].text.startswith("Steps monday:2 and <b>tuesday</b>:0: one dstate")
     assert page.complaints == []

@@ -12,17 +12,20 @@ import math
 import time
 from collections import Counter
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from statistics import median
 from typing import Any
 
+from ssh_abduction.data.drives import sentence_of
 from ssh_abduction.data.maps import SSHMap, check_of_trace
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.data.words import counted
 from ssh_abduction.output.layout import Layout, layout
 from ssh_abduction.output.metric_picture import axes
 from ssh_abduction.page.overview import Spot, overview
 from ssh_abduction.page.replays import Run, replays
 from ssh_abduction.rivals.comparison import compare
+from ssh_abduction.rivals.drive_joins import DrivePair, joins_of_drives
 from ssh_abduction.rivals.listing import Listing, Maps
 
 DRAWING = 3.0  # processor seconds for the drawings of all maps except the first
@@ -101,6 +104,7 @@ def content_of(
         "sentence": found.sentence,
         "sureness": listing.sureness,
         "joins": _joins(listing),
+        **_drives(listing),
         "file": called.maps,
         "trace": called.trace,
         "flags": called.flags,
@@ -144,6 +148,40 @@ def _joins(listing: Listing) -> list[tuple[int, int, float | None]]:
         return [(join.first, join.second, None) for join in listing.by_minimality[:JOINS]]
     doubted = [join for join in listing.weighed.joins if join[2] < DOUBTED]
     return [(first, second, round(share, 2)) for first, second, share in doubted[:JOINS]]
+
+
+def _drives(listing: Listing) -> dict[str, Any]:
+    """The drives of a joint trace, which of them the first map joins, and the joins between them.
+
+    Each join is two steps and its probability, or the share of the maps that have it.
+    """
+    first = {drive.name: drive.first for drive in listing.drives}
+    return {
+        "drives": [asdict(drive) for drive in listing.drives] if len(listing.drives) > 1 else [],
+        "joined": sentence_of(listing.drives, listing.maps[0]),
+        "between": [
+            {
+                "sentence": f"{pair.first} and {pair.second}: {_shared_by(pair)}",
+                "joins": [
+                    (first[pair.first] + j.first, first[pair.second] + j.second, round(j.share, 2))
+                    for j in (*pair.forced, *pair.possible)[:JOINS]
+                ],
+            }
+            for pair in joins_of_drives(listing)
+        ],
+    }
+
+
+def _shared_by(pair: DrivePair) -> str:
+    """Say how many places two drives share."""
+    if not pair.forced and not pair.possible:
+        return f"no {pair.of} in common in any map"
+    told = [
+        f"{counted(len(joins), f'{pair.of}s')} in common in {where}"
+        for joins, where in ((pair.forced, "all maps"), (pair.possible, "some maps"))
+        if joins
+    ]
+    return ", ".join(told)
 
 
 class _Pool:

@@ -30,6 +30,7 @@ SCRIPTS = (
     "figures",
     "regions",
     "paint",
+    "drives",
     "choosing",
     "replay",
     "pairs",

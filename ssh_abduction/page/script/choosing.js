@@ -53,6 +53,7 @@ function legend() {
     rows.push(["street", "order", "nobody travelled there: the order of the path says so"]);
   if (data.places[0].some(([place]) => place !== null))
     rows.push(["node", "", "a place"], ["dstate", "", "a dstate, headed as it faces"]);
+  data.drives.forEach(({ name }, k) => rows.push(["trail", colourOf(k), `the way of ${name}`]));
   if (!replay().other) rows.push(["here", "", "where the robot is at this step"]);
   if (replay().beliefs)
     rows.push(["believed", "", "where it is believed to be: the larger, the more probable"]);
@@ -82,7 +83,9 @@ function legend() {
   for (const [shape, kind, text] of rows) {
     const row = element("p", { class: "key" }, null, $("legend")),
       svg = element("svg:svg", { viewBox: "0 0 38 16", "aria-hidden": "true" }, null, row);
-    if (shape === "street")
+    if (shape === "trail")
+      element("svg:path", { d: "M2,8 H36", class: classes("trail", kind) }, null, svg);
+    else if (shape === "street")
       element(
         "svg:path",
         {

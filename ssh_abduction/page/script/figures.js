@@ -101,7 +101,7 @@ function mapFigure(i, rival) {
       at: s.at,
       heading: s.heading,
       kind,
-      colour: !other && s.path !== null ? s.path % COLOURS : null,
+      colour: other ? null : colourAt(s.steps, s.path),
       title: `dstate ${s.id}, ${s.view}: ${stretches(s.steps)}${path}`,
       steps: s.steps,
       name: `x${s.id}`,
@@ -115,7 +115,7 @@ function mapFigure(i, rival) {
       a: ssh.places.get(from),
       b: ssh.places.get(to),
       kind: `${kindOf(key, path)}${travelled ? "" : " order"}`.trim(),
-      colour: other ? null : path % COLOURS,
+      colour: other || data.drives.length ? null : path % COLOURS,
       path,
       called: ssh.called("path", path),
       title:
@@ -145,6 +145,13 @@ function mapFigure(i, rival) {
   figure.layout = ssh.layout;
   figure.labels = ssh.labels;
   return figure;
+}
+
+// The colour of a dstate: that of its path. In a joint map it is that of the only drive there.
+function colourAt(steps, path) {
+  if (!data.drives.length) return path === null ? null : path % COLOURS;
+  const drives = new Set(steps.map(driveOf));
+  return drives.size === 1 ? [...drives][0] % COLOURS : null;
 }
 
 // The distance of each point from the nearest other one, in units of the map.

@@ -9,6 +9,7 @@ function load(judging = true) {
   data.replays.forEach(({ name }, k) => element("option", { value: k }, name, $("which")));
   $("replay").hidden = data.replays.length < 2;
   tellDoubts();
+  tellDrives();
   $("choices").replaceChildren();
   for (const choice of data.choices.slice(0, 20)) {
     const item = element("li", {}, null, $("choices"));
@@ -66,7 +67,7 @@ function tellDoubts() {
     ? "The best map joins these steps. Their probability, by the maps that are known:"
     : "These joins of map 1 rest on minimality alone. The others follow from them:";
   for (const [a, b, probability] of data.joins) {
-    const text = `steps ${a} and ${b}${weighed ? `: ${probability.toFixed(2)}` : ""}`;
+    const text = `steps ${called(a)} and ${called(b)}${weighed ? `: ${probability.toFixed(2)}` : ""}`;
     const item = element("li", {}, null, $("joins"));
     element("button", {}, text, item).addEventListener("click", () => {
       state.picked = [a, b];

@@ -24,6 +24,7 @@ function paintFigure(figure) {
   paintBands(figure, see, r);
   for (const street of figure.streets)
     paintStreet(figure, street, see(street.a), see(street.b), spots, r);
+  paintTrails(figure, see);
   paintEllipses(figure, see);
   figure.nodes.forEach((node, k) => {
     const [x, y] = spots[k],

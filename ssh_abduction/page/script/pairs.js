@@ -19,7 +19,7 @@ function judge() {
   $("ask").hidden = b === undefined && !theory();
   for (const id of ["why", "same", "different"]) $(id).hidden = b === undefined;
   if (b === undefined)
-    $("verdict").textContent = a === undefined ? "" : `Step ${a} is chosen; choose another one.`;
+    $("verdict").textContent = a === undefined ? "" : `Step ${called(a)} is chosen; choose another one.`;
   else {
     tellVerdict(a, b);
     if (served) why();
@@ -68,7 +68,7 @@ function tellVerdict(a, b) {
   const places = data.places[0].some(([place]) => place !== null)
     ? `; at one place in ${count.place}, along one path in ${count.path} of ${minimal}`
     : "";
-  $("verdict").textContent = `Steps ${a} and ${b}: ${verdict}${places}.`;
+  $("verdict").textContent = `Steps ${called(a)} and ${called(b)}: ${verdict}${places}.`;
   const least = Math.min(best.same, best.different),
     cost = {};
   for (const side of ["same", "different"]) {

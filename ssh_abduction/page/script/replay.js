@@ -7,7 +7,11 @@ function setStep(t) {
   const step = steps[t],
     parts = [];
   $("slider").value = t;
-  $("at").textContent = `${t} of ${steps.length - 1}`;
+  const [first, last] = endsOf(t);
+  $("at").textContent =
+    replay().other || !data.drives.length
+      ? `${t} of ${last}`
+      : `${called(t)} of ${last - first} (step ${t})`;
   parts.push(`view ${step.view}`);
   if (step.confidence !== undefined) parts[0] += ` (confidence ${step.confidence})`;
   if (step.moved && t > 0) {
@@ -20,10 +24,12 @@ function setStep(t) {
     parts.push(moved.join(", "));
   }
   parts.push(
-    step.action === null
+    step.action === null || t === last
       ? t === steps.length - 1
         ? "the trace ends"
-        : "then an action that the maps do not tell"
+        : t === last
+          ? "this drive ends"
+          : "then an action that the maps do not tell"
       : `then ${step.action}`,
   );
   $("seen").textContent = parts.join("; ");
@@ -222,8 +228,8 @@ function play(on) {
   $("play").setAttribute("aria-pressed", on);
   $("play").textContent = on ? "Pause" : "Play";
   if (!on) return;
-  const last = replay().steps.length - 1;
-  if (state.step === last) setStep(0);
+  const [first, last] = endsOf(state.step);
+  if (state.step === last) setStep(first);
   player = setInterval(() => {
     setStep(state.step + 1);
     if (state.step >= last) play(false);

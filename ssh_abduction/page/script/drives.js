@@ -1,0 +1,77 @@
+// The drives of a joint trace: their names, their colours, their trails, and the joins between them.
+
+// The index of the drive of a step; -1 for the only drive of a trace.
+function driveOf(t) {
+  return data.drives.findIndex(({ first, stop }) => first <= t && t < stop);
+}
+
+function called(t) {
+  const drive = data.drives[driveOf(t)];
+  return drive ? `${drive.name}:${t - drive.first}` : `${t}`;
+}
+
+function colourOf(k) {
+  return `coloured path${k % COLOURS}`;
+}
+
+// The first and the last step of the drive of a step, or of the replay of another trace.
+function endsOf(t) {
+  const drive = replay().other ? undefined : data.drives[driveOf(t)];
+  return drive ? [drive.first, drive.stop - 1] : [0, replay().steps.length - 1];
+}
+
+function tellDrives() {
+  $("drives").hidden = $("joins_of_drives").hidden = !data.drives.length;
+  $("joined").textContent = data.joined;
+  $("starts").replaceChildren();
+  $("between").replaceChildren();
+  data.drives.forEach(({ name, first }, k) => {
+    const button = element("button", { title: "go to its first step" }, null, $("starts"));
+    const svg = element("svg:svg", { viewBox: "0 0 22 12", "aria-hidden": "true" }, null, button);
+    element("svg:path", { d: "M2,6 H20", class: classes("trail", colourOf(k)) }, null, svg);
+    element("span", {}, name, button);
+    button.addEventListener("click", () => {
+      chooseReplay(data.replays.length - 1);
+      setStep(first);
+    });
+  });
+  for (const { sentence, joins } of data.between) {
+    const item = element("li", {}, sentence, $("between"));
+    for (const [a, b, share] of joins)
+      element(
+        "button",
+        { title: "choose these two steps" },
+        `${called(a)} = ${called(b)}: ${share.toFixed(2)}`,
+        item,
+      ).addEventListener("click", () => {
+        state.picked = [a, b];
+        judge();
+      });
+  }
+}
+
+// Paint the way of each drive through the places, the ways of several drives side by side.
+function paintTrails(figure, see) {
+  const states = figure.map === null ? null : mapOf(figure.map).dstates;
+  const at = (t) => see(states ? states[figure.labels[t]].at : data.spots[t]);
+  data.drives.forEach(({ name, first, stop }, k) => {
+    const lane = (k - (data.drives.length - 1) / 2) * 4,
+      parts = [];
+    for (let t = first + 1; t < stop; t++) {
+      const [a, b] = [at(t - 1), at(t)],
+        far = Math.hypot(b[0] - a[0], b[1] - a[1]);
+      if (far < 1) continue;
+      // Both directions of an edge have the same lane.
+      const side = Math.sign(b[0] - a[0] || b[1] - a[1]),
+        [nx, ny] = [(-side * lane * (b[1] - a[1])) / far, (side * lane * (b[0] - a[0])) / far];
+      parts.push(`M${point([a[0] + nx, a[1] + ny])} L${point([b[0] + nx, b[1] + ny])}`);
+    }
+    const trail = element(
+      "svg:path",
+      { d: parts.join(" ") || "M0,0", class: classes("trail", colourOf(k)) },
+      null,
+      figure.base,
+    );
+    element("svg:title", {}, `the way of ${name}`, trail);
+  });
+}
