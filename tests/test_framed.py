@@ -27,19 +27,17 @@ from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.engines import base as engine
 from ssh_abduction.solver.engines import (
     framed,
-    framed_guess,
     framed_paths,
     transitive,
     visit_program,
 )
 from ssh_abduction.solver.engines import paths as paths_module
 from ssh_abduction.solver.engines import visit_labels as same
-from ssh_abduction.solver.engines.base import Found
 from ssh_abduction.solver.engines.framed import FramedEngine
 from ssh_abduction.solver.engines.framed_paths import FramedPaths
 from ssh_abduction.solver.engines.sides import FramedSides
 from ssh_abduction.solver.engines.visit_labels import VisitLabels
-from ssh_abduction.solver.engines.visit_program import OPEN, VisitProgram
+from ssh_abduction.solver.engines.visit_program import VisitProgram
 from ssh_abduction.solver.guesses import annealing, sampling
 from ssh_abduction.solver.guesses.annealing import Guess, attempts
 from ssh_abduction.solver.guesses.merging import kept, merged_near
@@ -123,8 +121,6 @@ def test_lists_the_maps_of_the_plain_encoding(
         "FIRST_PAIRS": data.draw(
             st.sampled_from([0, 2, 10, same.FIRST_PAIRS]), label="first pairs"
         ),
-        "TRY_CONFLICTS": data.draw(st.sampled_from([0, same.TRY_CONFLICTS]), label="tries"),
-        "FAILED_TRIES": data.draw(st.sampled_from([1, same.FAILED_TRIES]), label="failed tries"),
     }
     fitted = {
         "BETTERING": data.draw(st.sampled_from([0, framed_paths.BETTERING]), label="bettering"),
@@ -132,13 +128,6 @@ def test_lists_the_maps_of_the_plain_encoding(
         "MANY_DSTATES": data.draw(st.sampled_from([0, framed_paths.MANY_DSTATES]), label="many"),
     }
     many_pairs = data.draw(st.sampled_from([5, framed.MANY_PAIRS]), label="many pairs")
-    soon = data.draw(st.sampled_from([-1.0, framed.SOON]), label="soon")
-    guessed = {
-        "GUESSES": data.draw(st.sampled_from([1, framed_guess.GUESSES]), label="guesses"),
-        "GUESS_FIRST": data.draw(
-            st.sampled_from([-1.0, framed_guess.GUESS_FIRST]), label="patience"
-        ),
-    }
     off = off - {"names"}
     charted = data.draw(st.sampled_from([FramedEngine._charted, plainly_charted]), label="charted")
     prefixes = patch.object(engine, "FIRST_PREFIXES", first)
@@ -148,8 +137,7 @@ def test_lists_the_maps_of_the_plain_encoding(
         patch.multiple(same, **cores),
         patch.object(transitive, "AT_A_TIME", at_a_time),
         patch.multiple(framed_paths, **fitted),
-        patch.multiple(framed_guess, **guessed),
-        patch.multiple(framed, MANY_PAIRS=many_pairs, SOON=soon),
+        patch.multiple(framed, MANY_PAIRS=many_pairs),
         patch.object(paths_module, "SECONDS", 0.0),
         patch.object(
             annealing, "ANNEALED", ((0.5, data.draw(st.integers(1, 20), label="sweeps")),)
@@ -802,56 +790,6 @@ def test_places_that_a_guess_has_for_one_are_told_apart(size: int, steps: int, s
         assert len(set(labels)) <= len(set(truth))
 
 
-@pytest.mark.parametrize(
-    ("limit", "waited", "begins"),
-    [
-        (None, 11.9, False),
-        (None, 12.1, True),
-        (24, 5.9, False),
-        (24, 6.1, True),
-        (10, 4.9, False),
-        (10, 5.1, True),
-        (0.5, 0.4, False),
-    ],
-)
-def test_a_guess_begins_if_the_search_takes_long(
-    limit: float | None, waited: float, begins: bool
-) -> None:
-    """Later if clingo lacks visits, as here; at the latest after a quarter of the time limit."""
-    asked = framed_engine(maze(2, 2, steps=20, seed=0, stars=True).trace, Theory.topological())
-    if limit is not None:
-        asked.asker.watch.shorten(limit)
-    with patch.object(Watch, "elapsed", lambda _: waited):
-        assert asked._soon_maps.should_interrupt() == begins
-
-
-def test_labels_that_take_too_long_to_try_are_left() -> None:
-    """Where no separate paths fit them, and there is no time to ground all; the search goes on."""
-    walk = maze(3, 3, steps=200, seed=0, stars=True)
-    asked = framed_engine(walk.trace, Theory.topological())
-    labels = node_labels(solve(walk.trace, Theory.topological(), max_maps=1).maps[0], asked._chart)
-
-    def known() -> tuple[list[Found], bool | None]:
-        found = []
-        tries = asked._soon_maps.known_if_it_has_paths(labels)
-        while True:
-            try:
-                found.append(next(tries))
-            except StopIteration as end:
-                return found, end.value
-
-    asked._visits.known = None
-    asked.asker.watch.shorten(50.0)
-    with patch.object(FramedPaths, "found_soon", lambda *_: None):
-        with patch.object(FramedPaths, "preparing", 100.0):
-            assert known() == ([], None)
-        assert asked._visits.known is None
-        found, fits = known()
-    assert fits
-    assert len(found) == 1
-    assert check(walk.trace, found[0].map, Theory.topological()) == ()
-
-
 @pytest.mark.parametrize(("loops", "most"), [(0.1, 1.1), (0.3, 1.2)])
 def test_a_guess_with_wrong_travels_leads_to_a_map_with_streets(loops: float, most: float) -> None:
     """Annealing ends early, so some travels do not lead where they should."""
@@ -874,27 +812,3 @@ def test_a_guess_with_wrong_travels_leads_to_a_map_with_streets(loops: float, mo
     assert failed[0] > 0
     assert asked._fitting.paths.has_separate(chart, labels)
     assert len(set(labels)) < most * len(set(walk.truth))
-
-
-def test_a_guess_leaves_a_small_map_when_time_is_over() -> None:
-    """The robot was in 88 dstates; the sketch that there is without the guess has 1,529."""
-    walk = maze(5, 5, steps=1600, seed=1, stars=True)
-    fewest, is_open = VisitLabels.fewest, []
-
-    def interrupted(self: VisitLabels, until: Callable[[], bool]) -> object:
-        if is_open:
-            raise KeyboardInterrupt
-        is_open.append(fewest(self, until) is OPEN)
-        return OPEN
-
-    with (
-        patch.object(framed, "SOON", -1.0),
-        patch.object(framed_guess, "GUESS_FIRST", -1.0),
-        patch.object(VisitLabels, "fewest", interrupted),
-    ):
-        solution = solve(walk.trace, Theory.topological())
-    assert solution.status is Status.FEASIBLE
-    assert solution.cost
-    assert solution.bound.dstates
-    assert solution.bound.dstates <= solution.cost.dstates <= len(set(walk.truth))
-    assert check(walk.trace, solution.maps[0], Theory.topological()) == ()

@@ -274,7 +274,6 @@ class Asker:
         assumed: Sequence[int],
         conflicts: int = -1,
         mode: str = "ignore",
-        until: Callable[[], bool] = lambda: False,
     ) -> tuple[Answer | None, list[int] | None]:
         """Find an answer in which some literals are true, or an unsat core of these literals.
 
@@ -283,18 +282,16 @@ class Asker:
             assumed: The literals.
             conflicts: The number of conflicts after which the search ends; -1 for no limit.
             mode: The value of clingo's option --opt-mode.
-            until: Called now and then; the search ends once it returns True.
 
         Returns:
             The value and None; or None and the core, a list of literals that cannot all be true.
-            Both are None if `conflicts` or `until` ended the search.
+            Both are None if `conflicts` ended the search.
 
         Raises:
             LimitError: A limit is reached.
         """
         with self._solving(self.control, assumed, mode, 1, "no", conflicts) as handle:
-            if not self._has_come(handle, until):
-                return None, None
+            self._has_come(handle, lambda: False)
             model = handle.model()
             if model is not None:
                 return read(model), None

@@ -21,9 +21,6 @@ contradicted, or there are too many visits. Then paths_framed.lp is asked which 
 clash is a minimal set of nodes whose labels no paths fit. visits.lp gets a rule that forbids it.
 Every map of the topological theory satisfies these rules, so the bounds still hold.
 
-*A guess.* If that takes long, a map is guessed, and smaller maps are looked for near the guess
-(`engines/framed_guess.py`).
-
 *Why only some paths.* In a half explored world the causal axioms allow fewer dstates than order and
 sides do, in too many ways to forbid them one by one. The axioms of order and sides of one path need
 a rule for each pair of visits that may be at one place. So they are added only for paths that an
@@ -32,19 +29,17 @@ answer contradicts.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Generator, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain, islice
 
 from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.engines.base import Found, Task, next_charted_size
 from ssh_abduction.solver.engines.doubts import Settled
-from ssh_abduction.solver.engines.framed_guess import SoonMaps
 from ssh_abduction.solver.engines.framed_paths import Fitted, FramedPaths, Naming
-from ssh_abduction.solver.engines.refusing import all_accepted, first_accepted_of
+from ssh_abduction.solver.engines.refusing import all_accepted, first_accepted
 from ssh_abduction.solver.engines.sides import FramedSides
 from ssh_abduction.solver.engines.visit_labels import VisitLabels
-from ssh_abduction.solver.engines.visit_program import OPEN
 from ssh_abduction.solver.guesses.merging import kept
 from ssh_abduction.solver.steps.chart import Chart, FramedChart
 from ssh_abduction.theory.evidence import Equality
@@ -55,9 +50,6 @@ MANY_PAIRS = 20_000
 # Keep at most this many controls for minimal labels until their maps are listed. A control takes
 # some megabytes, and making it again takes seconds.
 KEPT = 10
-# If the fewest dstates are not found after this many seconds, also look for a map near a guess.
-# Most traces are solved by then.
-SOON = 3.0
 
 
 class FramedEngine:
@@ -70,7 +62,6 @@ class FramedEngine:
         self,
         task: Task,
         around: Mapping[int, Sequence[int]] | None = None,
-        soon: float | None = None,
     ) -> None:
         """Begin with an empty prefix.
 
@@ -78,14 +69,11 @@ class FramedEngine:
             task: The problem, the limits and the speed-ups.
             around: For each observation, the ones seen ahead, right, back and left of it, as in
                 `Chart.framed`. None if the steps have stars, the gateways seen there.
-            soon: If the fewest dstates are not found after this many seconds, guess a map. None
-                for the default `SOON`.
         """
         self.asker = Asker(task.watch)
         self.intact = True
         self.paths = len(task.trace)  # names for paths are never short
         self._task, self._around = task, around
-        self._soon = SOON if soon is None else soon
         self._sides = FramedSides(task.theory, self.asker)
         self._fitting = FramedPaths(task, self.asker)
         self._visits = VisitLabels(task, self.asker, self._charted, self._sides)
@@ -93,13 +81,6 @@ class FramedEngine:
         self._framed = True  # whether the visits fit their frames
         # The minimal cost, and all labels with maps of that cost.
         self._best: tuple[tuple[int, ...], list[Naming]] | None = None
-        self._soon_maps = self._new_soon_maps()
-
-    def _new_soon_maps(self) -> SoonMaps:
-        """Make the search for maps near a guess, for a new prefix."""
-        return SoonMaps(
-            self._fitting, self._visits, self.asker, soon=self._soon, refuse=self._refuse
-        )
 
     @property
     def size(self) -> int:
@@ -117,7 +98,7 @@ class FramedEngine:
 
     def with_paths(self, paths: int) -> FramedEngine:
         """Make a new engine. `paths` changes nothing, as there are always enough names here."""
-        return FramedEngine(self._task, self._around, self._soon)
+        return FramedEngine(self._task, self._around)
 
     def over(self, task: Task) -> FramedEngine:
         """Go on with a longer trace, and return this engine itself.
@@ -145,7 +126,6 @@ class FramedEngine:
         if size != self.size:
             self._best = None
             self._fitting.forget_time()
-            self._soon_maps = self._new_soon_maps()
         self._framed = self._visits.grow(size)
         self._unframed_size = size
 
@@ -153,7 +133,7 @@ class FramedEngine:
         """Yield maps of the prefix, each cheaper than the one before; the last is minimal."""
         if not self._framed:
             return
-        first = yield from self._first_with_paths()
+        first = self._first_with_paths()
         if first is None:
             return
         best = first.found
@@ -172,29 +152,16 @@ class FramedEngine:
                 namings.append(naming if len(namings) < KEPT else replace(naming, control=None))
         self._best = best.cost, namings
 
-    def _first_with_paths(self) -> Generator[Found, None, Fitted | None]:
-        """Find labels with the fewest dstates that paths fit.
-
-        Yields:
-            Maps near a guess, if the search takes long.
-
-        Returns:
-            The labels with a map; None if the prefix has no map.
-        """
+    def _first_with_paths(self) -> Fitted | None:
+        """Find labels with the fewest dstates that paths fit; None if the prefix has no map."""
         fitted: list[Fitted] = []
-
-        def ask() -> Generator[Found, None, list[int] | None]:
-            soon = self._soon_maps
-            while (labels := self._visits.fewest(soon.should_interrupt)) is OPEN:
-                yield from soon.found()
-            return labels
 
         def why_not(labels: list[int]) -> list[int] | None:
             found = self._fitting.some(self._chart, labels)
             fitted.extend([found] if found else [])
             return None if found else labels
 
-        yield from first_accepted_of(ask, why_not, self._refuse)
+        first_accepted(self._visits.fewest, why_not, self._refuse)
         return fitted[0] if fitted else None
 
     def map_of_guess(self) -> Found | None:

@@ -32,7 +32,11 @@ def maps_with_frames(problem: Problem, watch: Watch, speedups: Speedups) -> Iter
         places have frames.
     """
     task = Task.of(problem.changed(theory=problem.theory.with_frames()), watch, speedups)
-    engine = FramedEngine(task, soon=0.0)
+    engine = FramedEngine(task)
+    guess = engine.map_of_guess() if task.speedups.annealed else None
+    if guess is not None:
+        yield guess.map.without_headings()
     engine.grow(len(problem.trace))
     for found in engine.improving_maps():
-        yield found.map.without_headings()
+        if guess is None or found.cost < guess.cost:
+            yield found.map.without_headings()

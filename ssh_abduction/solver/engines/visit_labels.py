@@ -28,42 +28,33 @@ relaxation, and an answer that locates all visits is an answer for all of them.
 
 *From below.* Unsat cores raise the bound (`Cores`). Clasp has this built in, but starts again with
 each call, and each answer that is not transitive needs another call.
-
-*Near a guess.* If the search takes long, clingo is asked for answers near a guessed map.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
-from functools import partial
-from itertools import combinations, islice
+from collections.abc import Callable, Collection, Generator, Iterable, Sequence
+from itertools import combinations
 
 import clingo
 
 from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.facts import visits_lp
 from ssh_abduction.solver.engines.base import Task
-from ssh_abduction.solver.engines.refusing import first_accepted, smaller
+from ssh_abduction.solver.engines.refusing import first_accepted
 from ssh_abduction.solver.engines.visit_program import (
-    OPEN,
     Answer,
-    Open,
     Refusal,
     Sides,
     VisitProgram,
     fits_in_time,
 )
 from ssh_abduction.solver.steps.apart import clique
-from ssh_abduction.solver.steps.chart import FramedChart, numbered
-from ssh_abduction.solver.steps.localising import Located, states_of
+from ssh_abduction.solver.steps.chart import FramedChart
+from ssh_abduction.solver.steps.localising import Located
 
 # At first, give clingo the first visits up to where this many pairs of them may be at one place. It
 # gets other visits if answers need them.
 FIRST_PAIRS = 10_000
-# To shrink a set of places that clash, ask whether fewer of them still clash. Give up each question
-# after this many conflicts, and the shrinking after FAILED_TRIES failed questions.
-TRY_CONFLICTS = 100
-FAILED_TRIES = 20
 # If the number of nodes has grown by this factor, make a new control, as the order of choice was
 # made for the first nodes.
 GROWN = 1.1
@@ -81,8 +72,6 @@ class VisitLabels:
         size: The number of these steps.
         bound: A proven lower bound on the number of dstates; None if none is known.
         clique: Nodes that are pairwise distinct.
-        known: The labels of the best known map, which the engine sets; None if there is none.
-        has_forbidden: Whether `forbid_together` was called, as evidence contradicted a map.
     """
 
     def __init__(
@@ -103,8 +92,6 @@ class VisitLabels:
         """
         self.bound: int | None = None
         self.clique: list[int] = []
-        self.known: tuple[int, ...] | None = None
-        self.has_forbidden = False
         self.size = 0
         self._task, self._asker, self._charted, self._sides = task, asker, charted, sides
         self._program: VisitProgram | None = None
@@ -152,7 +139,6 @@ class VisitLabels:
                 self._give(chart, self._first_visits(chart), order, anew=True)
             self.size = size
             self._found = []
-            self.known = None
             return True
 
     def _order_of_choice(self, chart: FramedChart) -> list[int]:
@@ -209,32 +195,14 @@ class VisitLabels:
     def _raise_bound(self) -> None:
         self.bound = max(self.bound or 0, self.program.cores.least)
 
-    def fewest(self, until: Callable[[], bool] = lambda: False) -> list[int] | Open | None:
-        """Find labels of all nodes with the fewest dstates.
-
-        Args:
-            until: Called now and then; the search stops when it returns True.
-
-        Returns:
-            The dstate of each node; None if no labels satisfy all constraints; OPEN if the search
-            was stopped.
-        """
-        while not self._found:
-            if self.known and self._knows_fewest():
-                self._found.append(self.known)
-                break
-            best = partial(self._best_answer, lambda: self._knows_fewest() or until())
-            answer = first_accepted(best, self.program.why_not, self._tell_why)
+    def fewest(self) -> list[int] | None:
+        """Find labels of all nodes with the fewest dstates; None if no labels satisfy all rules."""
+        if not self._found:
+            answer = first_accepted(self._best_answer, self.program.why_not, self._tell_why)
             if answer is None:
                 return None
-            if answer.is_open and not self._knows_fewest():
-                return OPEN
-            self._found += [] if answer.is_open else [self.program.labels(answer.located)]
+            self._found.append(self.program.labels(answer.located))
         return list(self._found[0])
-
-    def _knows_fewest(self) -> bool:
-        """Whether the known labels have as few dstates as the bound."""
-        return bool(self.known) and len(set(self.known or ())) == self.bound
 
     def _tell_why(self, reason: Refusal) -> None:
         """Give clingo what it lacked when it found a rejected answer: rules or visits."""
@@ -243,10 +211,10 @@ class VisitLabels:
         else:
             self._give_more(reason.missed)
 
-    def _best_answer(self, until: Callable[[], bool]) -> Answer | None:
-        """Find an answer with the fewest lone nodes, which is open if `until` stops the search.
+    def _best_answer(self) -> Answer | None:
+        """Find an answer with the fewest lone nodes; None if there is no answer.
 
-        None if there is no answer. Cores that clingo returns meanwhile raise the bound.
+        Cores that clingo returns meanwhile raise the bound.
         """
         program = self.program
         if not self._task.speedups.core_guided:
@@ -258,86 +226,14 @@ class VisitLabels:
             self._raise_bound()
             return Answer(pairs)
         while True:
-            if until():
-                return Answer(is_open=True)
             avoided = list(program.cores.avoided)
-            pairs_found, core = self._asker.verdict(program.read, avoided, until=until)
+            pairs_found, core = self._asker.verdict(program.read, avoided)
             if core is None:
-                return Answer(pairs_found or (), is_open=pairs_found is None)
+                return Answer(pairs_found or ())
             if not core:
                 return None
             program.cores.relax(core)
             self._raise_bound()
-
-    def near(self, guess: Sequence[int]) -> Iterator[tuple[int, ...]]:
-        """Yield the labels of a guess, and then better and better labels near it.
-
-        At first clingo is asked for labels that put two visits at one place exactly if the guess
-        does. If some places of the guess contradict each other, their visits become free. Once the
-        caller has set `known` to labels with a map, clingo is asked for an answer without lone
-        nodes. If a core shows that one of its nodes is lone, one of them is allowed to be.
-
-        Args:
-            guess: The dstate of each node.
-        """
-        program = self.program
-        yield tuple(numbered(guess))
-        states = states_of(self.chart, guess)
-        # For each literal that two visits are at one place: their place in the guess.
-        place_of: dict[int, int] = {}
-        freed: set[int] = set()
-        avoided: set[int] = set()
-        patient, pairs, batch = False, 0, -1
-        while True:
-            if batch < program.batch:
-                batch = program.batch
-                literals = program.read_literals()
-                for (i, j, r), literal in islice(literals.items(), pairs, None):
-                    if states[i] // 4 != states[j] // 4 or (states[i] - states[j]) % 4 != r:
-                        avoided |= set() if patient else {-literal}
-                    elif states[i] // 4 not in freed:
-                        place_of[literal] = states[i] // 4
-                pairs = len(literals)
-                patient = False
-            if self.known and not patient:
-                patient, avoided = True, set(program.cores.avoided)
-            pairs_found, core = self._asker.verdict(program.read, [*place_of, *avoided])
-            if core is not None:
-                if fewer := [literal for literal in core if literal in avoided]:
-                    avoided.difference_update(fewer[-1:] if patient else fewer)
-                elif core:
-                    freed.update(
-                        self._together_impossible(
-                            sorted({place_of[literal] for literal in core}), place_of
-                        )
-                    )
-                    place_of = {
-                        literal: place for literal, place in place_of.items() if place not in freed
-                    }
-                else:
-                    return
-            elif (reason := self.program.why_not(answer := Answer(pairs_found or []))) is not None:
-                self._tell_why(reason)
-            else:
-                yield program.labels(answer.located)
-
-    def _together_impossible(self, places: list[int], place_of: Mapping[int, int]) -> list[int]:
-        """Reduce a set of places that cannot all be as guessed to a small one.
-
-        Args:
-            places: Numbers of places of the guess.
-            place_of: For each literal that two visits are at one place, their place in the guess.
-        """
-
-        def impossible(some: list[int]) -> list[int] | None:
-            core = self._asker.verdict(
-                lambda _: None,
-                [literal for literal, place in place_of.items() if place in some],
-                TRY_CONFLICTS,
-            )[1]
-            return None if core is None else sorted({place_of[literal] for literal in core})
-
-        return smaller(places, impossible, FAILED_TRIES)
 
     def all_of(self, dstates: int) -> Generator[list[int], None, None]:
         """Yield all labels with this many dstates, each once.
@@ -474,7 +370,6 @@ class VisitLabels:
             pairs: Pairs of nodes.
             places: Pairs of nodes.
         """
-        self.has_forbidden = True
         program, facing = self.program, self.chart.facing
         apart = [(a, b) for a, b in pairs if a != b]
         away = [(a, b) for a, b in places if facing[a][0] != facing[b][0]]
@@ -497,4 +392,3 @@ class VisitLabels:
 
         self._excluded = sum(map(is_left, self._found[: self._excluded]))
         self._found = [labels for labels in self._found if is_left(labels)]
-        self.known = self.known if self.known and is_left(self.known) else None

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
-from enum import Enum
-from typing import Final, Protocol
+from typing import Protocol
 
 import clingo
 
@@ -25,15 +24,6 @@ from ssh_abduction.solver.steps.localising import Located, State, faced, located
 # Clingo takes about this many seconds to ground one pair of visits that may be at one place. It
 # cannot be stopped meanwhile.
 SECONDS_A_PAIR = 3e-5
-
-
-class Open(Enum):
-    """The result of a search that was interrupted before it had an answer."""
-
-    OPEN = "open"
-
-
-OPEN: Final = Open.OPEN
 
 
 class Sides(Protocol):
@@ -115,17 +105,15 @@ class Cores:
 
 @dataclass
 class Answer:
-    """An answer of clingo, or the result that it has not answered.
+    """An answer of clingo.
 
     Attributes:
         pairs: The pairs of visits that are at one place.
         everywhere: The places of all visits; None until the pairs are known to be transitive.
-        is_open: Whether the search was interrupted, so that there is no answer.
     """
 
     pairs: Sequence[Pair] = ()
     everywhere: Located | None = None
-    is_open: bool = False
 
     @property
     def located(self) -> Located:
@@ -354,9 +342,7 @@ class VisitProgram:
         )
 
     def why_not(self, answer: Answer) -> Refusal | None:
-        """Return the reason to reject an answer; None if it is accepted, or open."""
-        if answer.is_open:
-            return None
+        """Return the reason to reject an answer; None if it is accepted."""
         threes = self.intransitive(answer.pairs)
         if not threes:
             answer.everywhere = self.located(answer.pairs)
