@@ -364,6 +364,39 @@ def test_the_command_writes_what_python_makes(
     assert "1 to 1" in capsys.readouterr().err
 
 
+def test_undecided_places_are_hidden_and_their_roads_joined(
+    square: SSHMap, tmp_path: object, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The robot drove once around the square. It began and ended at place 0."""
+    nodes, edges = nav2_graph(export_map(square, "nav2", hide_undecided=True))
+    assert sorted(nodes) == [0, 2, 3]  # one road less, and the loop would be none
+    costs = {(start, end): cost for start, end, cost in edges.values()}
+    assert set(costs) == {(0, 2), (2, 0), (2, 3), (3, 2), (3, 0), (0, 3)}
+    assert costs[0, 2] == costs[2, 0] == pytest.approx(20, abs=0.1)
+    assert costs[2, 3] == pytest.approx(10, abs=0.1)
+    square.save(file := f"{tmp_path}/map.json")
+    assert main(["export", file, "--to", "tmap2", "--hide-undecided"]) == 0
+    assert len(checked_tmap2(capsys.readouterr().out)["nodes"]) == 3
+    assert main(["export", file, "--to", "svg", "--hide-undecided"]) == 1
+    assert "expected nav2 or tmap2 with places, got svg" in capsys.readouterr().err
+    assert len(square.places) == 4
+
+
+def test_a_road_past_a_hidden_place_is_that_of_the_robot() -> None:
+    """There and back along a corridor of four places, of which two are undecided."""
+    moves = [(5, 0, 0), (7, 0, 0), (5, 0, 0), (0, 0, math.pi)]
+    moves += moves[:3]
+    trace = Trace.from_steps(
+        "abcdefgh", [*["travel"] * 3, "around", *["travel"] * 3], displacements=moves
+    )
+    ssh_map = solve(trace).maps[0]
+    roads = Roads.of(ssh_map, "places").without({1, 2})
+    assert [(road.start, road.end) for road in roads.roads] == [(0, 3), (3, 0)]
+    assert [road.action for road in roads.roads] == ["travel", "travel"]
+    assert [road.length for road in roads.roads] == pytest.approx([17, 17], abs=0.1)
+    assert [stop.id for stop in roads.stops] == [0, 3]
+
+
 def test_exports_have_regions() -> None:
     (ssh_map,) = solve(Trace.from_steps("abcdef", ["travel", "right", "travel", "left", "travel"]))
     regions = [region.to_dict() for region in ssh_map.regions or ()]

@@ -15,9 +15,10 @@ from ssh_abduction import solve
 from ssh_abduction.cli.simulate import scans_of
 from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.output.drawing import ALARM
+from ssh_abduction.output.undecided import place_of_steps, undecided_places
 from ssh_abduction.robot_logs import log_picture
 from ssh_abduction.robot_logs.log_maps import LogMap, map_log
-from ssh_abduction.robot_logs.log_picture import EDGE, figure, place_of_steps, undecided_places
+from ssh_abduction.robot_logs.log_picture import EDGE, figure
 from ssh_abduction.robot_logs.log_report import report
 
 

@@ -46,6 +46,14 @@ def add_parser(verbs: Verbs) -> None:
         help=("the trace that was mapped; its turns give a better layout of a map without poses"),
     )
     parser.add_argument(
+        "--hide-undecided",
+        action="store_true",
+        help=(
+            "leave out the places where the robot always went on, between the same two neighbours "
+            "(nav2 and tmap2 only)"
+        ),
+    )
+    parser.add_argument(
         "-o",
         "--output",
         default="-",
@@ -86,6 +94,7 @@ def run(options: argparse.Namespace) -> int:
             name=options.name,
             frame=options.frame,
             turns=turns,
+            hide_undecided=options.hide_undecided,
         )
     except MapError as error:
         raise MapError(f"{listing.source}: {error}") from None
@@ -93,6 +102,12 @@ def run(options: argparse.Namespace) -> int:
         print(text.removesuffix("\n"))
     else:
         write_map(options.output, text.removesuffix("\n"), "map", "--output")
-    for doubt in doubts(chosen, options.to, level=options.level, turns=turns):
+    for doubt in doubts(
+        chosen,
+        options.to,
+        level=options.level,
+        turns=turns,
+        hide_undecided=options.hide_undecided,
+    ):
         print(f"ssh-abduction: warning: {doubt}", file=sys.stderr)
     return 0

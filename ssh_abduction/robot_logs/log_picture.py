@@ -12,7 +12,7 @@ from bisect import bisect
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby, pairwise
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +20,12 @@ from scipy.spatial import cKDTree
 
 from perception.places.importing import Imported
 from perception.readers.scans import Pose, RobotLog
-from ssh_abduction.data.drives import Drive, drives_of, starts_of
+from ssh_abduction.data.drives import Drive, drives_of
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import between, moved
 from ssh_abduction.output.drawing import ALARM, COLOURS, escaped, page, text, titled
 from ssh_abduction.output.region_marks import band, banded
+from ssh_abduction.output.undecided import place_of_steps, undecided_places
 from ssh_abduction.robot_logs.drive_frames import laid_over
 from ssh_abduction.solver import Solution
 
@@ -109,12 +110,6 @@ def paths_mean_something(solution: Solution) -> bool:
     return theory.star != "none" or theory.boundary != "none" or bool(theory.planar)
 
 
-def place_of_steps(ssh_map: SSHMap) -> list[int | None]:
-    """Return the place of each step of a map."""
-    place = {state.id: state.place for state in ssh_map.dstates}
-    return [place[label] for label in ssh_map.labels]
-
-
 def doubtful_joins(solution: Solution) -> list[tuple[int, int, float]]:
     """List the joins of the first map whose probability is less than SURE, least first.
 
@@ -123,32 +118,6 @@ def doubtful_joins(solution: Solution) -> list[tuple[int, int, float]]:
     """
     joins = solution.weighed.joins if solution.weighed else ()
     return sorted((join for join in joins if join[2] < SURE), key=lambda join: join[2])
-
-
-def undecided_places(ssh_map: SSHMap, starts: Sequence[int] = ()) -> frozenset[int]:
-    """Find the places at which nothing was ever decided.
-
-    The robot came from one of two neighbours and went on to the other, at every visit. It neither
-    turned around there, nor began or ended a drive.
-
-    Args:
-        ssh_map: The map.
-        starts: The steps, besides step 0, at which a drive starts.
-    """
-    places = place_of_steps(ssh_map)
-    through = defaultdict[int, set[frozenset[int]]](set)
-    ends: set[int] = set()
-    for first, stop in pairwise([0, *starts, len(places)]):
-        drive = [place for place in places[first:stop] if place is not None]
-        stays = [place for place, _ in groupby(drive)]
-        for before, place, after in zip(stays, stays[1:], stays[2:], strict=False):
-            through[place].add(frozenset((before, after)))
-        ends.update(stays[:1], stays[-1:])
-    return frozenset(
-        place
-        for place, pairs in through.items()
-        if place not in ends and len(pairs) == 1 and len(next(iter(pairs))) == 2
-    )
 
 
 @dataclass(frozen=True)
@@ -230,7 +199,7 @@ def _map_marks(sheet: _Sheet, imported: Imported, solution: Solution) -> Iterato
     doubts: dict[int | None, float] = {}
     for _, second, probability in doubtful_joins(solution):
         doubts.setdefault(places[second], probability)
-    hidden = undecided_places(ssh_map, starts_of(imported.trace)) - doubts.keys()
+    hidden = undecided_places(ssh_map) - doubts.keys()
     shown = {place: middle for place, middle in middles.items() if place not in hidden}
     path_of = {state.id: state.path for state in ssh_map.dstates}
     colourful = paths_mean_something(solution)

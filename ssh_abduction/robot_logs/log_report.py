@@ -19,6 +19,7 @@ from ssh_abduction.data.drives import sentence_of as sentence_of_drives
 from ssh_abduction.data.words import counted
 from ssh_abduction.evaluation.ladder import Rung
 from ssh_abduction.output.drawing import escaped
+from ssh_abduction.output.undecided import place_of_steps
 from ssh_abduction.rivals.drive_joins import joins_of_drives
 from ssh_abduction.rivals.listing import Listing
 from ssh_abduction.robot_logs.log_picture import (
@@ -26,7 +27,6 @@ from ssh_abduction.robot_logs.log_picture import (
     doubtful_joins,
     figure,
     paths_mean_something,
-    place_of_steps,
 )
 from ssh_abduction.solver import Solution, Status
 

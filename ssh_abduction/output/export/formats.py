@@ -14,7 +14,7 @@ from typing import Any
 
 import networkx as nx
 
-from ssh_abduction.data.checks import one_of
+from ssh_abduction.data.checks import a_flag, one_of
 from ssh_abduction.data.errors import MapError, brief, is_writable
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.maps import SSHMap, checked_map
@@ -26,6 +26,7 @@ from ssh_abduction.output.export.tmap2 import tmap2
 from ssh_abduction.output.graphs import in_text, to_graphml, to_networkx
 from ssh_abduction.output.picture import to_svg
 from ssh_abduction.output.turns import Turns, degrees_of
+from ssh_abduction.output.undecided import undecided_places
 
 FORMATS = ("nav2", "tmap2", "graphml", "dot", "svg", "networkx-json")
 FOR_NAVIGATION = ("nav2", "tmap2")  # these need positions
@@ -40,6 +41,7 @@ def export_map(
     name: str = "ssh-abduction",
     frame: str = "map",
     turns: Trace | Turns | None = None,
+    hide_undecided: bool = False,
 ) -> str:
     """Export a map as the text of a file for another program.
 
@@ -57,6 +59,9 @@ def export_map(
         name: The name of the map in nav2 and tmap2 files. In tmap2 it also names the pointset.
         frame: The name of the coordinate frame of the positions, in nav2 and tmap2 files.
         turns: How actions turn, as in `to_svg`. The layout of a map without poses uses it.
+        hide_undecided: Whether nav2 and tmap2 files leave out the places at which nothing was ever
+            decided. There the robot always went on, between the same two neighbours. One road leads
+            past them.
 
     Raises:
         MapError: An argument is wrong, or the map has no such level or no roads.
@@ -64,6 +69,12 @@ def export_map(
     checked_map(ssh_map)
     degrees_of(turns)
     one_of("to", to, FORMATS, MapError)
+    hidden = a_flag("hide_undecided", hide_undecided, MapError)
+    if hidden and (to not in FOR_NAVIGATION or _level(ssh_map, to, level) != "places"):
+        raise MapError(
+            f"hide_undecided: expected nav2 or tmap2 with places, got {to} with "
+            f"{_level(ssh_map, to, level)}; export places for navigation, or show all"
+        )
     if to == "svg":
         if level is not None:
             raise MapError(
@@ -75,7 +86,7 @@ def export_map(
         if not isinstance(text, str) or not text or not is_writable(text):
             raise MapError(f"{field}: expected a text, got {brief(text)}; name it")
     if to in FOR_NAVIGATION:
-        roads = Roads.of(ssh_map, level, turns)
+        roads = _roads(ssh_map, level, turns, hide_undecided)
         return nav2(roads, name, frame) if to == "nav2" else tmap2(roads, name, frame)
     if level == "places":
         graph = _graph_of_places(ssh_map, to, turns)
@@ -86,6 +97,12 @@ def export_map(
     if to == "networkx-json":
         return json_line(nx.node_link_data(graph, edges="edges"))
     return "\n".join(nx.generate_graphml(graph))
+
+
+def _roads(ssh_map: SSHMap, level: str, turns: Trace | Turns | None, hide_undecided: bool) -> Roads:
+    """Make the stops and roads of a map, without undecided places if these are hidden."""
+    roads = Roads.of(ssh_map, level, turns)
+    return roads.without(undecided_places(ssh_map)) if hide_undecided else roads
 
 
 def _graph_of_places(ssh_map: SSHMap, to: str, turns: Trace | Turns | None) -> nx.Graph[Any]:
@@ -110,7 +127,12 @@ def _graph_of_places(ssh_map: SSHMap, to: str, turns: Trace | Turns | None) -> n
 
 
 def doubts(
-    ssh_map: SSHMap, to: str, *, level: str | None = None, turns: Trace | Turns | None = None
+    ssh_map: SSHMap,
+    to: str,
+    *,
+    level: str | None = None,
+    turns: Trace | Turns | None = None,
+    hide_undecided: bool = False,
 ) -> tuple[str, ...]:
     """Find reasons why a program may navigate wrongly by an exported map.
 
@@ -119,6 +141,7 @@ def doubts(
         to: The format, as in `export_map`.
         level: What a node is, as in `export_map`.
         turns: How actions turn, as in `export_map`.
+        hide_undecided: Whether undecided places are left out, as in `export_map`.
 
     Returns:
         A sentence for each reason. Empty for formats other than nav2 and tmap2.
@@ -126,7 +149,7 @@ def doubts(
     if to not in FOR_NAVIGATION:
         return ()
     level = _level(ssh_map, to, level)
-    roads = Roads.of(ssh_map, level, turns)
+    roads = _roads(ssh_map, level, turns, hide_undecided)
     found = []
     if not roads.metric:
         found.append(

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from itertools import product
 from typing import TypeAlias
 
 from ssh_abduction.data.errors import MapError
@@ -60,7 +62,8 @@ class Road:
     Attributes:
         start: The id of the stop where it begins.
         end: The id of the stop where it ends.
-        length: The straight distance in metres, or in units of the layout.
+        length: The straight distance in metres, or in units of the layout; by way of hidden stops,
+            if there are any.
         action: The name of the robot's action; None if the robot travelled only the other way.
         path: The path that the road is along; None if there is none.
         direction: The direction along this path, +1 or -1; None if there is none.
@@ -161,11 +164,48 @@ class Roads:
             )
         return cls(level, drawn.metric, stops, roads)
 
+    def without(self, hidden: Collection[int]) -> Roads:
+        """Hide stops, and join the roads that lead through them.
+
+        A stop stays if its roads do not lead to exactly two others, or if there is another road
+        between these two.
+
+        Args:
+            hidden: The ids of stops.
+        """
+        stops, roads = {stop.id: stop for stop in self.stops}, list(self.roads)
+        for stop in sorted(hidden):
+            here = [road for road in roads if stop in (road.start, road.end)]
+            beside = {end for road in here for end in (road.start, road.end)} - {stop}
+            if len(beside) == 2 and not any({r.start, r.end} == beside for r in roads):
+                del stops[stop]
+                roads = [road for road in roads if road not in here] + [
+                    _joined(before, after)
+                    for before, after in product(here, here)
+                    if before.end == after.start == stop and before.start != after.end
+                ]
+        order = sorted(roads, key=lambda road: (road.start, road.end))
+        return replace(self, stops=tuple(stops.values()), roads=tuple(order))
+
     @property
     def together(self) -> int:
         """The number of stops that share their position (to 1 cm) with another stop."""
         counts = Counter((round(stop.x, 2), round(stop.y, 2)) for stop in self.stops)
         return sum(count for count in counts.values() if count > 1)
+
+
+def _joined(before: Road, after: Road) -> Road:
+    """Join a road and the next one, without the stop between them."""
+    path, name = (before.path, before.name) if before.path == after.path else (None, None)
+    return Road(
+        before.start,
+        after.end,
+        before.length + after.length,
+        None if after.action is None else before.action,
+        path,
+        before.direction if before.direction == after.direction and path is not None else None,
+        name=name,
+    )
 
 
 def _is_turn(here: int | None, there: int | None, length: float) -> bool:

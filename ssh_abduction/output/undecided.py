@@ -1,0 +1,39 @@
+"""Find the places of a map at which nothing was ever decided, such as corners of a corridor."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from itertools import groupby, pairwise
+
+from ssh_abduction.data.maps import SSHMap
+
+
+def place_of_steps(ssh_map: SSHMap) -> list[int | None]:
+    """Return the place of each step of a map."""
+    place = {state.id: state.place for state in ssh_map.dstates}
+    return [place[label] for label in ssh_map.labels]
+
+
+def undecided_places(ssh_map: SSHMap) -> frozenset[int]:
+    """Find the places at which nothing was ever decided.
+
+    The robot came from one of two neighbours and went on to the other, at every visit. It neither
+    turned around there, nor began or ended a drive.
+    """
+    places, labels = place_of_steps(ssh_map), ssh_map.labels
+    # A drive starts where no action leads from the step before.
+    linked = {(s, x) for s, _, x in ssh_map.links}
+    starts = [t for t, pair in enumerate(pairwise(labels), 1) if pair not in linked]
+    through = defaultdict[int, set[frozenset[int]]](set)
+    ends: set[int] = set()
+    for first, stop in pairwise([0, *starts, len(places)]):
+        drive = [place for place in places[first:stop] if place is not None]
+        stays = [place for place, _ in groupby(drive)]
+        for before, place, after in zip(stays, stays[1:], stays[2:], strict=False):
+            through[place].add(frozenset((before, after)))
+        ends.update(stays[:1], stays[-1:])
+    return frozenset(
+        place
+        for place, pairs in through.items()
+        if place not in ends and len(pairs) == 1 and len(next(iter(pairs))) == 2
+    )
