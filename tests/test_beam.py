@@ -18,6 +18,8 @@ from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data import Odometry
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.explain.no_map import explain
+from ssh_abduction.solver import Status
 from ssh_abduction.solver.guesses.beam import Beam
 from ssh_abduction.solver.guesses.completing import completed
 from ssh_abduction.solver.steps.log import Log
@@ -131,3 +133,22 @@ def test_a_path_is_no_circle() -> None:
     theory = settle(trace, Theory(boundary="none", star="none")).theory
     assert completed(trace, theory, [0, 1, 2, 0], [0, 1, 2], [0.0] * 3) is None
     assert completed(trace, theory, [0, 1, 2, 3], [0, 1, 2, 3], [0.0] * 4) is not None
+
+
+def test_two_steps_that_clash_end_the_search_at_once() -> None:
+    """After the turn at step 1, the place has other openings."""
+    cross, three = [0.0, 90.0, 180.0, 270.0], [0.0, 120.0, 240.0]
+    go, left = (5.0, 0.0, 0.0), (0.0, 0.0, math.pi / 2)
+    trace = Trace.from_steps(
+        "aabb",
+        ["travel", "left", "travel"],
+        stars=[cross, cross, three, cross],
+        displacements=[go, left, go],
+    )
+    theory = Theory.topological().replace(star="gateways")
+    solution = solve(trace, theory)
+    assert solution.status is Status.UNSATISFIABLE
+    assert solution.effort.prefix == 0  # clingo was not given any prefix
+    explanation = explain(trace, theory)
+    assert explanation is not None
+    assert (explanation.first, explanation.last) == (1, 2)

@@ -298,7 +298,9 @@ class Search:
         watch = self._parts.watch
         # The matrices are small: threads of BLAS would mostly wait for each other.
         with threadpool_limits(1, user_api="blas"):
-            weighing.guess()
+            if not weighing.guess(self._two_steps_clash):
+                self._parts.known.status = Status.UNSATISFIABLE
+                return
         if watch.left() < math.inf:
             watch.end_stage_after(watch.elapsed() + COUNTING_SHARE * watch.left())
         with suppress(StageTimeError):
@@ -307,6 +309,21 @@ class Search:
         if self._parts.known.status is not Status.UNSATISFIABLE:
             most = self.limits.most
             weighing.search(lambda trace, theory, s: self._solve_mended(trace, theory, most, s))
+
+    def _two_steps_clash(self) -> bool:
+        """Whether some step and the next one have no map by themselves. Then the trace has none."""
+        if self.theory.has_faults:
+            return False
+        bare = self.theory.replace(weigh="count", displacement="none")
+        for t, action in enumerate(self.trace.actions):
+            steps = self.trace.steps[t], replace(self.trace.steps[t + 1], action=None)
+            two = Trace(steps, odometry=self.trace.odometry)
+            if action.starts:
+                continue
+            maps, proven = self._solve_mended(two, bare.of_steps(t, 2), 1, self._parts.watch.left())
+            if proven and not maps:
+                return True
+        return False
 
     def _solve_mended(
         self, mended: Trace, theory: Theory, most: int, seconds: float

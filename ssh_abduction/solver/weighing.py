@@ -129,8 +129,16 @@ class Weighing:
         least = self.candidates[0].nats + EQUAL if self.candidates else 0.0
         return [candidate for candidate in self.candidates if candidate.nats <= least]
 
-    def guess(self) -> None:
-        """Find some maps of little cost without clingo, in a share of the time."""
+    def guess(self, clashes: Callable[[], bool]) -> bool:
+        """Find some maps of little cost without clingo, in a share of the time.
+
+        Args:
+            clashes: Says whether it is plain that the trace has no map. It is asked if the first
+                beam finds none.
+
+        Returns:
+            Whether the trace may have a map.
+        """
         parts, watch = self._parts, self._parts.watch
         begun, left = watch.elapsed(), watch.left()
         is_long = len(parts.task.trace) > FEW_STEPS
@@ -156,6 +164,9 @@ class Weighing:
                     self._broken = -math.inf if beam.refuses else 0.0
                 self.keep_best()
                 parts.report()
+            if narrow == math.inf and parts.known.best is None and clashes():
+                watch.end_stage_after(math.inf)
+                return False
             narrow = min(narrow, watch.elapsed() - began)
         watch.end_stage_after(begun + BREAKING * left)
         with suppress(StageTimeError):
@@ -163,6 +174,7 @@ class Weighing:
             if is_open and (beam := parts.candidates.beam(widest)):
                 self._broken = self._searched[1] - beam.nats_without_axioms()
         watch.end_stage_after(math.inf)
+        return True
 
     def search(self, of_labels: OfLabels) -> None:
         """Find the maps of least cost and their rivals, and prove that there are no others.
