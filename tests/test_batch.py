@@ -104,6 +104,7 @@ def cluster() -> Iterator[str]:
             {
                 "distributed.scheduler.allowed-failures": 0,
                 "distributed.deploy.lost-worker-timeout": "600s",
+                "distributed.worker.profile.enabled": False,  # it takes time all the while
             }
         ),
         LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as cluster,

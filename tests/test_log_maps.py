@@ -396,7 +396,9 @@ def test_options_of_the_old_detector_have_no_effect_and_say_so(
 def test_the_rooms_of_a_building_are_told_apart(tmp_path: Path) -> None:
     """A robot drives around four rooms in a ring, and the map has a place in each of them."""
     middles = {room: middle for room, middle in MIDDLES.items() if room != "closet"}
-    drive = record_plan(plan_of(tmp_path, xml(DOORS[:4], middles=middles)), seed=1, metres=36)
+    drive = record_plan(
+        plan_of(tmp_path, xml(DOORS[:4], middles=middles)), seed=1, metres=36, every=0.5
+    )
     log = RobotLog(tuple(scans_of(drive)), source="ring")
     done = map_log(log, max_maps=1, time_limit=60, with_ladder=False)
     (judged,) = evaluate_visits(done.solution.maps[:1], done.imported.trace).maps

@@ -31,8 +31,6 @@ from ssh_abduction.solver.asp.facts import answer_maps, names_lp
 from ssh_abduction.solver.asp.limits import LimitError
 from ssh_abduction.solver.engines import base as engine
 from ssh_abduction.solver.engines import (
-    framed,
-    framed_guess,
     name_program,
     name_search,
     pinned,
@@ -168,8 +166,6 @@ def hurried() -> Iterator[None]:
     with (
         patch.multiple(choosing, FEW_STEPS=0, STEPWISE=-1.0),
         patch.multiple(name_search, PATIENCE=0, CORES=0),
-        patch.object(framed, "SOON", -1.0),
-        patch.object(framed_guess, "GUESS_FIRST", -1.0),
         patch.object(annealing, "ANNEALED", ((0.5, 50),)),
     ):
         yield
