@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -64,6 +64,7 @@ def displaced(
 
 
 Cell = tuple[int, int]
+Door = tuple[Cell, Cell]
 
 
 def doors_of(
@@ -111,6 +112,7 @@ def maze(
     scale: float = 0.0,
     bend: float = 0.0,
     drive: int | None = None,
+    doors: Collection[Door] | None = None,
 ) -> Walk:
     """Make a random walk in a maze of corridors.
 
@@ -134,9 +136,11 @@ def maze(
         scale: Share by which reported distances are too long.
         bend: Radians a metre by which the reported heading drifts to the left.
         drive: The number of the walk, for several walks in one maze; None for a single one.
+        doors: The pairs of cells between which the way is open; None to draw them by the seed.
     """
     chance = random.Random(seed)
-    doors = doors_of(width, height, chance, loops)
+    if doors is None:
+        doors = doors_of(width, height, chance, loops)
     if drive is not None:
         chance = random.Random(f"{seed}, {drive}")
         seed = chance.randrange(2**32)

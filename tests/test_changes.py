@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
@@ -25,7 +26,15 @@ from strategies import STARS, traces
 from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main
-from ssh_abduction.data import Action, Fault, MapError, TheoryError, drives_of, together
+from ssh_abduction.data import (
+    Action,
+    Fault,
+    MapError,
+    Odometry,
+    TheoryError,
+    drives_of,
+    together,
+)
 from ssh_abduction.theory.settle import settle
 
 MONDAY = Trace.from_steps(
@@ -193,3 +202,33 @@ def test_theories_that_know_no_gateways_are_refused(theory: dict[str, Any], said
         solve([MONDAY, TUESDAY], Theory(**theory))
     with pytest.raises(TheoryError, match="got level=causal"):
         Theory.causal().replace(changed=1.5)
+
+
+def test_the_beam_finds_changes_of_drives_with_displacements() -> None:
+    """On Tuesday there is no way to the right at the first end of a corridor.
+
+    The beam is the only engine: the trace is longer than the readable encodings take.
+    """
+    travels = ["travel", "travel", "around", "travel", "travel", "around"]
+    moved = [(5.0, 0.0, 0.0)] * 2 + [(0.0, 0.0, math.pi)]
+    looks = ["a", "b", "c", "d", "e", "f"]
+    stars = [[1, 1, 0, 0], [1, 0, 1, 0], [0, 0, 1, 0], [1, 0, 0, 0], [1, 0, 1, 0], [0, 0, 1, 1]]
+    closed = [[1, 0, 0, 0], *stars[1:5], [0, 0, 1, 0]]
+    monday, tuesday = (
+        Trace.from_steps(
+            looks * 6,
+            (travels * 6)[:-1],
+            stars=seen * 6,
+            displacements=(moved * 12)[:-1],
+            odometry=Odometry(along=0.05, heading=0.01),
+            name=name,
+        )
+        for name, seen in (("monday", stars), ("tuesday", closed))
+    )
+    solution = solve([monday, tuesday], Theory(changed=0.5))
+    ssh_map = solution.maps[0]
+    assert ssh_map.labels == tuple(range(6)) * 12
+    (fault,) = ssh_map.faults
+    assert str(fault) == "the gateway south of place 0 was open on monday and closed on tuesday"
+    assert solution.trace is not None
+    assert check(solution.trace, ssh_map, Theory(changed=0.5)) == ()

@@ -16,6 +16,7 @@ from ssh_abduction.data.maps import Fit, SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import heeding, look_at_clock
 from ssh_abduction.solver.asp.limits import LimitError, Watch
+from ssh_abduction.solver.steps.faults import with_compass
 from ssh_abduction.theory.evidence.displacement import jumped
 
 # Rank at most this many maps, so that memory stays constant. Later maps keep their order.
@@ -52,7 +53,7 @@ class Ranking:
         key = ssh_map.labels, tuple(s.place for s in ssh_map.dstates), jumped(ssh_map)
         if key not in self._known:
             self._known[key] = fit(self._trace.without_displacements_at(jumped(ssh_map)), ssh_map)
-        return replace(ssh_map, fit=self._known[key])
+        return with_compass(replace(ssh_map, fit=self._known[key]))
 
     def ranked(self, maps: Iterator[SSHMap], over: Callable[[], bool]) -> Iterator[SSHMap]:
         """Yield the same maps with their fit, the one with the least chi-square first.

@@ -61,6 +61,7 @@ class Stages:
         engine, steps = parts.prefixes.engine, len(task.trace)
         if row("mending").holds_for(task.theory) and may_name(task) and self._mend():
             return
+        self.mends |= bool(task.theory.changed)  # no other engine than the readable one knows it
         if self.mends and steps > choosing.READABLE:
             raise LimitError("no proof")
         if parts.known.status is Status.OPTIMAL:  # another search proved a map minimal

@@ -29,16 +29,12 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from itertools import product
 
 from ssh_abduction.checker.checker import violations
 from ssh_abduction.data.action import Action
 from ssh_abduction.data.drives import frames_of
-from ssh_abduction.data.gateways import rotations
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.star import Star
-from ssh_abduction.data.trace import Step, Trace
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.guesses.completing import completed
 from ssh_abduction.solver.guesses.pieces import fitted
@@ -47,7 +43,8 @@ from ssh_abduction.solver.guesses.reckoning import (
     Reckoning,
     first_pose,
 )
-from ssh_abduction.solver.steps.faults import with_faults
+from ssh_abduction.solver.guesses.sights import Sights
+from ssh_abduction.solver.steps.faults import with_changes, with_faults
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import Problem
 
@@ -99,7 +96,9 @@ class Beam:
         """
         trace, theory = problem.trace, problem.theory
         self._trace, self._log, self._width, self._problem = trace, log, width, problem
-        self._bare = theory.without_faults().replace(displacement="none", weigh="count")
+        self._bare = theory.without_faults().replace(
+            displacement="none", weigh="count", changed=theory.changed
+        )
         self._has_places = theory.level == "topological"
         self._stays = self._has_places and "turn_stays" in theory.hard
         self._leaves = self._has_places and "travel_leaves" in theory.hard
@@ -107,7 +106,7 @@ class Beam:
         self._prices = theory.prices[0], theory.prices[1] if self._has_places else 0.0
         self._reckoning, self._frames = Reckoning(trace), frames_of(trace)
         self.nats, self.refuses = math.inf, False
-        self._sights = [self._sight(step) for step in trace.steps]
+        self._sights = Sights(trace, self._bare, log, misreads=theory.misread > 0)
         # For each kind of fault, what it costs at each step in nats.
         self._fault = {
             kind: [self._prices[0] * theory.fault_tenths(kind, step) / 10 for step in trace.steps]
@@ -177,13 +176,6 @@ class Beam:
                 count[pieces.joins] += 1
                 yield hypothesis
 
-    def _sight(self, step: Step) -> Star | tuple[bool, ...] | None:
-        """What a step shows of its place, in any direction: its star, or nothing."""
-        if self._bare.star == "gateways":
-            return step.gateways or Star(())
-        star = step.openings if self._bare.star in ("pattern", "frame") else None
-        return None if star is None else min(star[k:] + star[:k] for k in range(4))
-
     def _extended(self, beam: list[Hypothesis], end: int) -> list[Hypothesis]:
         """Extend a beam to a number of steps, and check it then."""
         begun = len(beam[0].labels)
@@ -228,14 +220,15 @@ class Beam:
 
     def _first(self) -> Hypothesis:
         mean, covariance = first_pose()
-        nowhere = Hypothesis([], [], [], {}, [], [], [], mean, covariance, self._prices[0])
+        nowhere = Hypothesis([], [], [], {}, [], [], [], [], mean, covariance, self._prices[0])
         n, met = len(mean) - 3, self._reckoning.met(nowhere, 0, None, None)
         return replace(
             nowhere,
             labels=[0],
             places=[0],
-            seen=[{self._log.seen[0]: self._doubt(0)}],
-            sights=self._sights[:1],
+            seen=[{self._sights.seen[0]: self._doubt(0)}],
+            drives=[0],
+            sights=self._sights.shown[:1],
             position=[n],
             heading=[n + 2],
             mean=met[0],
@@ -254,6 +247,8 @@ class Beam:
         trace, theory = self._mended(found), self._bare.of_steps(0, steps)
         facing: list[float] = found.mean[found.heading].tolist()
         ssh_map = completed(trace, theory, found.labels, found.places, facing)
+        if ssh_map is not None:
+            ssh_map = with_changes(ssh_map, trace, theory)
         if (
             ssh_map is None
             or next(violations(trace, ssh_map, theory), None) is not None
@@ -277,7 +272,7 @@ class Beam:
         if not self._fault:
             return trace
         steps = list(trace.steps)
-        first = {number: t for t, number in reversed([*enumerate(self._log.seen)])}
+        first = {number: t for t, number in reversed([*enumerate(self._sights.seen)])}
         for t, label in enumerate(found.labels):
             right = self._trace.steps[first[_shown(found.seen[label])]]
             steps[t] = replace(steps[t], view=right.view)
@@ -294,7 +289,7 @@ class Beam:
 
     def _misread(self, found: Hypothesis, dstate: int, t: int) -> float:
         """What faults of views cost more, in nats, if the last step is at a dstate."""
-        seen, number, doubt = found.seen[dstate], self._log.seen[t], self._doubt(t)
+        seen, number, doubt = found.seen[dstate], self._sights.seen[t], self._doubt(t)
         if math.isinf(doubt):
             return 0.0 if number in seen else math.inf
         after = {**seen, number: seen.get(number, 0.0) + doubt}
@@ -331,21 +326,23 @@ class Beam:
         if known is not None:
             place = moved.places[known]
             moved = fitted(moved, place, known)
-            nats = moved.nats + self._misread(moved, known, t)
+            nats = (
+                moved.nats + self._misread(moved, known, t) + self._sights.changes(moved, place, t)
+            )
             nats += float(self._reckoning.squares(moved, t, [place], known)[0]) / 2
             option = _Extension(nats, place, known, moved)
             return [option] if nats < math.inf and self._is_allowed(option, t) else []
         stays = self._stays and self._trace.actions[t - 1].kind == "turn" and not slips
         there = moved.places[here]
         leaves = self._leaves and not slips and t not in self._frames
-        misreads = "misread" in self._fault
         if stays:
             places = [there]
         else:
             places = [
                 place
-                for place, sight in enumerate(moved.sights)
-                if (place != there or not leaves) and (misreads or _agree(sight, self._sights[t]))
+                for place in range(len(moved.sights))
+                if (place != there or not leaves)
+                and self._sights.changes(moved, place, t) < math.inf
             ]
         dstate, new_place = self._prices if joins else (0.0, 0.0)
         options = []
@@ -355,13 +352,16 @@ class Beam:
         for place, square, near in self._near(moved, t, places):
             if square / 2 > DEAREST and not stays:
                 continue
+            changes = 0.0 if stays else self._sights.changes(moved, place, t)
             if self._has_places:
-                options.append(_Extension(moved.nats + dstate + square / 2, place, None, near))
+                nats = moved.nats + changes + dstate + square / 2
+                options.append(_Extension(nats, place, None, near))
             for s, p in enumerate(moved.places):
                 if p == place and (misread := self._misread(moved, s, t)) < math.inf:
                     facing = fitted(moved, place, s)
                     both = float(self._reckoning.squares(facing, t, [place], s)[0])
-                    options.append(_Extension(moved.nats + misread + both / 2, place, s, facing))
+                    nats = moved.nats + changes + misread + both / 2
+                    options.append(_Extension(nats, place, s, facing))
         least = min(option.nats for option in options)
         return [
             option
@@ -399,6 +399,7 @@ class Beam:
         n = len(moved.mean) - 3
         position, heading, places, seen = moved.position, moved.heading, moved.places, moved.seen
         place, there, sights = option.place, option.dstate, moved.sights
+        drives = moved.drives
         pose = self._reckoning.met(
             moved,
             t,
@@ -407,12 +408,19 @@ class Beam:
         )
         if place is None:
             place = len(position)
-            position, sights = [*position, n], [*sights, self._sights[t]]
+            position, sights = [*position, n], [*sights, self._sights.shown[t]]
+            drives = [*drives, self._sights.drive[t]]
+        elif drives[place] != self._sights.drive[t]:
+            sights = [*sights[:place], self._sights.shown[t], *sights[place + 1 :]]
+            drives = [*drives[:place], self._sights.drive[t], *drives[place + 1 :]]
         if there is None:
             there = len(places)
             places, seen = [*places, place], [*seen, {}]
             heading = [*heading, len(pose[0]) - 4]
-        number, (dstate, action) = self._log.seen[t], (moved.labels[-1], self._log.actions[t - 1])
+        number, (dstate, action) = (
+            self._sights.seen[t],
+            (moved.labels[-1], self._log.actions[t - 1]),
+        )
         links = moved.links
         if not _slips(moved, t):
             links = {**links, (dstate, action): there}
@@ -425,6 +433,7 @@ class Beam:
             seen,
             links,
             sights,
+            drives,
             position,
             heading,
             *pose,
@@ -447,20 +456,3 @@ def _nats_of_misread(seen: dict[int, float]) -> float:
 def _shown(seen: dict[int, float]) -> int:
     """The observation that a dstate shows: the one that is dearest to treat as misread."""
     return max(seen, key=lambda number: seen[number])
-
-
-def _agree(first: Star | tuple[bool, ...] | None, second: Star | tuple[bool, ...] | None) -> bool:
-    """Whether two sights may be of one place."""
-    if isinstance(first, Star) and isinstance(second, Star):
-        return _may_fit(first, second)
-    return first == second
-
-
-@lru_cache(maxsize=2**14)
-def _may_fit(first: Star, second: Star) -> bool:
-    """Whether two stars agree with some shift of their gateways."""
-    return any(
-        rotations(frame, other, shift)
-        for frame, other in product(first.frames, second.frames)
-        for shift in range(max(frame.slots, 1))
-    )

@@ -45,7 +45,9 @@ class Hypothesis:
         places: The place of each dstate.
         seen: For each dstate, what it costs to treat each observation there as misread.
         links: For each dstate and action, the dstate that it leads to.
-        sights: For each place, what its first step shows of it.
+        sights: For each place, what its first step shows of it: of the last drive there, if
+            gateways may change between drives.
+        drives: For each place, the drive of this step.
         position: For each place, the index of its x in the means; y is the next one.
         heading: For each dstate, the index of its heading in the means.
         mean: The means in metres, radians and standard deviations. The last three are the pose of
@@ -61,6 +63,7 @@ class Hypothesis:
     seen: list[dict[int, float]]
     links: dict[tuple[int, int], int]
     sights: list[Star | tuple[bool, ...] | None]
+    drives: list[int]
     position: list[int]
     heading: list[int]
     mean: Array

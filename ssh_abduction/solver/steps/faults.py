@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -13,6 +14,8 @@ from ssh_abduction.data.maps import Fault, SSHMap
 from ssh_abduction.data.odometry import in_words
 from ssh_abduction.data.trace import Trace, View
 from ssh_abduction.theory.theory import Theory
+
+COMPASS = ("east", "north", "west", "south")  # counterclockwise; in pictures east is to the right
 
 
 def faults_of(
@@ -107,15 +110,21 @@ def with_changes(ssh_map: SSHMap, trace: Trace, theory: Theory) -> SSHMap | None
     return replace(ssh_map, faults=tuple(faults))
 
 
-def without_changes(ssh_map: SSHMap, trace: Trace) -> Trace:
-    """Return the trace as if no gateway had changed: each place has the star first seen there."""
-    first: dict[int | None, tuple[bool, ...]] = {}
-    steps = list(trace.steps)
-    for t, label in enumerate(ssh_map.labels):
-        s, openings = ssh_map.dstates[label], trace.steps[t].openings or ()
-        star = first.setdefault(s.place, turned_to_frame(openings, s.heading or 0))
-        steps[t] = replace(steps[t], star=turned_to_frame(star, -(s.heading or 0)))
-    return replace(trace, steps=tuple(steps))
+def with_compass(ssh_map: SSHMap) -> SSHMap:
+    """Say of each change of a map with poses in which direction the gateway is. North is up."""
+    if not any(fault.kind == "changed" for fault in ssh_map.faults) or len(ssh_map.pieces) > 1:
+        return ssh_map
+    poses = ssh_map.fit.poses if ssh_map.fit else ()
+    first = {s.place: s for s in reversed(ssh_map.dstates) if poses}
+    faults = []
+    for fault in ssh_map.faults:
+        towards = None
+        if fault.kind == "changed" and (s := first.get(fault.place)) is not None:
+            clockwise = (fault.gateway or 0) - (s.heading or 0)
+            quarters = round(poses[s.id].heading / (math.pi / 2)) - clockwise
+            towards = COMPASS[quarters % 4]
+        faults.append(replace(fault, towards=towards))
+    return replace(ssh_map, faults=tuple(faults))
 
 
 def turned_to_frame(openings: tuple[bool, ...], heading: int) -> tuple[bool, ...]:

@@ -1,0 +1,85 @@
+"""What steps show of their dstates and places, and what it costs that gateways changed."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from functools import lru_cache
+from itertools import product
+
+from ssh_abduction.data.drives import starts_of
+from ssh_abduction.data.gateways import rotations
+from ssh_abduction.data.star import Star
+from ssh_abduction.data.trace import Step, Trace
+from ssh_abduction.solver.guesses.reckoning import Hypothesis
+from ssh_abduction.solver.steps.chart import numbered
+from ssh_abduction.solver.steps.log import Log
+from ssh_abduction.theory.theory import Theory
+
+
+class Sights:
+    """What each step of a trace shows.
+
+    Attributes:
+        seen: What each step shows of its dstate, as a number. If gateways may change between
+            drives, this is its view only.
+        shown: What each step shows of its place in any direction: its star, or nothing.
+        drive: The number of the drive of each step.
+    """
+
+    def __init__(self, trace: Trace, theory: Theory, log: Log, *, misreads: bool) -> None:
+        """Look at each step once.
+
+        Args:
+            trace: The trace.
+            theory: The theory. Its field `changed` is the price of a change in dstates.
+            log: The trace as integers.
+            misreads: Whether a star may be wrong. Then all places agree with all steps.
+        """
+        starts = starts_of(trace)
+        self.seen = numbered(trace.views) if theory.changed else log.seen
+        self.shown = [_shown(step, theory.star) for step in trace.steps]
+        self.drive = [bisect_right(starts, t) for t in range(len(trace))]
+        self._misreads, self._price = misreads, theory.prices[0] * theory.changed
+
+    def changes(self, found: Hypothesis, place: int, t: int) -> float:
+        """What the gateways that changed cost, in nats, if step t is at a place; inf for never."""
+        sight, own = found.sights[place], self.shown[t]
+        if self._misreads or _agree(sight, own):
+            return 0.0
+        is_one_drive = found.drives[place] == self.drive[t]
+        if not self._price or is_one_drive or not isinstance(sight, tuple):
+            return math.inf
+        return self._price * _fewest_changes(sight, own)
+
+
+def _shown(step: Step, star: str) -> Star | tuple[bool, ...] | None:
+    if star == "gateways":
+        return step.gateways or Star(())
+    seen = step.openings if star in ("pattern", "frame") else None
+    return None if seen is None else min(seen[k:] + seen[:k] for k in range(4))
+
+
+def _agree(first: Star | tuple[bool, ...] | None, second: Star | tuple[bool, ...] | None) -> bool:
+    """Whether two sights may be of one place."""
+    if isinstance(first, Star) and isinstance(second, Star):
+        return _may_fit(first, second)
+    return first == second
+
+
+@lru_cache(maxsize=2**14)
+def _fewest_changes(first: tuple[bool, ...], second: tuple[bool, ...]) -> int:
+    """The fewest gateways that differ between two stars of four openings, however turned."""
+    return min(
+        sum(a != b for a, b in zip(first, second[k:] + second[:k], strict=True)) for k in range(4)
+    )
+
+
+@lru_cache(maxsize=2**14)
+def _may_fit(first: Star, second: Star) -> bool:
+    """Whether two stars agree with some shift of their gateways."""
+    return any(
+        rotations(frame, other, shift)
+        for frame, other in product(first.frames, second.frames)
+        for shift in range(max(frame.slots, 1))
+    )
