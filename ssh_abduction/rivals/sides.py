@@ -24,7 +24,7 @@ from ssh_abduction.data.regions import right_of
 from ssh_abduction.data.words import counted
 from ssh_abduction.rivals.listing import Listing
 
-SHOWN = 6  # a sentence names at most this many sides
+SHOWN = 2  # a sentence names at most this many sides
 
 _Side: TypeAlias = Literal["right", "left"]
 
