@@ -3,8 +3,9 @@
     python benchmarks/recognition.py FIRST SECOND [--halves] [--time-limit S]
 
 The first log is mapped, and a recogniser learns its dstates from parts of its images. Images of the
-second log at dstates of the map are recognised. Corrected poses decide what is right. With
---halves, FIRST is cut in two, and SECOND is left out.
+second log at dstates of the map are recognised. Then the localiser follows the robot through the
+second log. True or corrected poses decide what is right. With --halves, FIRST is cut in two, and
+SECOND is left out.
 """
 
 from __future__ import annotations
@@ -16,14 +17,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from logs import sidecar
 from numpy.typing import NDArray
+from visited import truth_of
 
 from perception.places.importing import import_log
 from perception.readers.logs import read_log
 from perception.readers.scans import RobotLog
 from perception.recognition import recogniser
+from ssh_abduction import Localiser
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.robot_logs.log_maps import FLOOR, map_log
+from ssh_abduction.online.belief import Verdict
+from ssh_abduction.robot_logs.log_maps import FLOOR, LogMap, map_log
 
 # A dstate is within NEAR metres and TURNED radians of an image that shows it.
 NEAR, TURNED = 2.0, math.radians(45)
@@ -61,6 +66,32 @@ def recognised(
     return counts
 
 
+def localised(done: LogMap, asked: Trace) -> dict[str, int]:
+    """Count the steps of another drive where a localiser is sure, and where it is right."""
+    ssh_map, trace = done.solution.maps[0], done.imported.trace
+    labels, poses, others = np.array(ssh_map.labels), poses_of(trace), poses_of(asked)
+    localiser = Localiser(ssh_map, done.recogniser(), trace=trace)
+    counts = dict.fromkeys(("steps", "located", "located and right"), 0)
+    for belief, pose in zip(localiser.beliefs(asked), others, strict=True):
+        located = belief.verdict is Verdict.LOCATED
+        counts["steps"] += 1
+        counts["located"] += located
+        counts["located and right"] += located and bool(
+            is_near(pose, poses[labels == belief.likeliest]).any()
+        )
+    return counts
+
+
+def read(log: Path) -> RobotLog:
+    """Read a log. Its poses by the simulator become the corrected ones."""
+    found, truth = read_log(log), sidecar(log)
+    if truth is None:
+        return found
+    poses = truth_of(log, truth).poses.tolist()
+    scans = [replace(s, corrected=tuple(p)) for s, p in zip(found.scans, poses, strict=True)]
+    return replace(found, scans=tuple(scans))
+
+
 def halves(log: RobotLog) -> tuple[RobotLog, RobotLog]:
     middle = len(log) // 2
     return replace(log, scans=log.scans[:middle]), replace(log, scans=log.scans[middle:])
@@ -73,11 +104,11 @@ def main() -> None:
     parser.add_argument("--halves", action="store_true")
     parser.add_argument("--time-limit", type=float, default=30.0)
     options: Any = parser.parse_args()
-    first = read_log(options.first)
+    first = read(options.first)
     if options.halves:
         first, second = halves(first)
     else:
-        second = read_log(options.second)
+        second = read(options.second)
     done = map_log(first, time_limit=options.time_limit, with_ladder=False)
     labels = np.array(done.solution.maps[0].labels)
     cost = done.solution.cost
@@ -88,6 +119,7 @@ def main() -> None:
         done.imported.trace, labels, asked, np.random.default_rng(0)
     ):
         print(f"| {learnt} | {known} of {len(asked)} | {right} ({right / max(known, 1):.2f}) |")
+    print(", ".join(f"{count} {what}" for what, count in localised(done, asked).items()))
 
 
 if __name__ == "__main__":

@@ -24,8 +24,8 @@ from perception.recognition import PlaceRecogniser, recogniser
 from perception.store import save
 from ssh_abduction import Localiser, SSHMap, Theory, Trace, solve
 from ssh_abduction.cli import main
-from ssh_abduction.data import LocaliserError, MapError, Step, TraceError
-from ssh_abduction.data.maps import DState
+from ssh_abduction.data import Action, LocaliserError, MapError, Step, TraceError
+from ssh_abduction.data.map_parts import DState, Fit, Pose
 from ssh_abduction.online import Belief, Chances
 from ssh_abduction.online.belief import COLLAPSED, Verdict
 
@@ -357,6 +357,27 @@ def _walk_of_moore(seed: int) -> tuple[Sequence[object], Trace]:
 
 
 # beliefs as values
+
+
+@pytest.mark.parametrize(("degrees", "expected"), [(93.0, 2), (-86.0, 1), (180.0, None)])
+def test_turns_of_another_drive_are_compared_by_angle(degrees: float, expected: int | None) -> None:
+    """Both sides of a hall have a door. No two drives have turns with the same names."""
+    ssh_map = SSHMap(
+        (0, 1, 0, 2),
+        tuple(DState(i, view, place=0) for i, view in enumerate(["hall", "door", "door"])),
+        ((0, "turn 270.5", 1), (0, "turn 88.7", 2)),
+        fit=Fit(0.0, 1, 1.0, poses=tuple(Pose(0.0, 0.0, a) for a in (0.0, 1.6, -1.5))),
+    )
+    turn = Action(f"turn {degrees:g}", "turn", "right")
+    other = Trace.from_steps(
+        ["hall", "door"], [turn], displacements=[(0.0, 0.0, -math.radians(degrees))]
+    )
+    localiser = Localiser(ssh_map)
+    *_, belief = localiser.beliefs(other)
+    assert belief.dstate == expected if expected else belief.probabilities[1:].max() < 0.6
+    if expected:
+        turned = Action(turn.name, "turn", bearing=degrees)
+        assert localiser.update(localiser.start("hall"), turned, "door").dstate == expected
 
 
 def test_a_belief_is_a_frozen_value_that_says_what_it_comes_to() -> None:

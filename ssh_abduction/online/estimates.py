@@ -1,20 +1,37 @@
 """Estimate what dstates show and where actions lead: equations 3 and 4 of `localiser.py`.
 
 A dstate (distinctive state) is a place and the direction that the robot faces there.
+
+If the map has poses, and turns with names of their own such as "turn 91.3", then no two drives have
+the same turns. So turns are compared by their angles: a turn leads to the dstates of its place that
+face the direction after the turn.
 """
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from ssh_abduction.data.action import STANDARD_ACTIONS
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.trace import Trace, View
+from ssh_abduction.data.star import SPREAD
+from ssh_abduction.data.trace import Action, Trace, View
 from ssh_abduction.online.belief import Observation
+
+# A move of the robot: the name of an action, or a turn by whole degrees clockwise.
+Move: TypeAlias = str | int
+
+# Degrees of the turns that have standard names.
+STANDARD_TURNS = {"right": 90, "around": 180, "left": 270}
+# A turn leads to dstates that face within FACING standard deviations of the direction after it.
+FACING = 3.0
 
 
 @dataclass(frozen=True)
@@ -29,6 +46,98 @@ class Links:
 
     leads: sparse.csr_array
     missing: NDArray[np.float64]
+
+
+class Moves:
+    """Where the moves of a robot lead from each of the N dstates of a map.
+
+    Args:
+        ssh_map: The map.
+        trace: The trace that was mapped, to estimate probabilities by counting; None takes all
+            links from the map.
+    """
+
+    def __init__(self, ssh_map: SSHMap, trace: Trace | None) -> None:
+        """Count where the actions lead."""
+        self._map = ssh_map
+        self._links: dict[Move, Links] = {}
+        self._links.update(transitions(ssh_map, trace).items())
+        self._by_angle = _has_turns_of_its_own(ssh_map)
+
+    def move(self, action: Action, turned: float | None = None) -> Move:
+        """The move of an action.
+
+        Args:
+            action: The action.
+            turned: The angle in radians counterclockwise by which the robot turned, by odometry;
+                None takes it from the action.
+        """
+        if not self._by_angle or action.kind != "turn":
+            return action.name
+        if turned is not None:
+            return round(-math.degrees(turned)) % 360
+        angle = STANDARD_TURNS.get(action.name) if action.bearing is None else action.bearing
+        return action.name if angle is None else round(angle) % 360
+
+    def links(self, move: Move) -> Links | None:
+        """Where a move leads; None if the map has no such action."""
+        if isinstance(move, int) and move not in self._links:
+            self._links[move] = self._turn(move)
+        return self._links.get(move)
+
+    def _turn(self, degrees: int) -> Links:
+        """Where a turn by an angle leads: to dstates at the same place that face that way."""
+        sources, targets, angles = self._pairs
+        off = (angles - degrees + 180) % 360 - 180
+        near = np.abs(off) <= FACING * SPREAD
+        return _links_of(
+            sources[near],
+            targets[near],
+            np.exp(-((off[near] / SPREAD) ** 2) / 2),
+            len(self._map.dstates),
+        )
+
+    @cached_property
+    def _pairs(self) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]]:
+        """Pairs of dstates at one place, and the degrees clockwise from one to the other."""
+        assert self._map.fit is not None
+        places = np.array([-1 if s.place is None else s.place for s in self._map.dstates])
+        sources, targets = np.nonzero((places[:, None] == places) & (places >= 0))
+        headings = np.degrees([pose.heading for pose in self._map.fit.poses])
+        return sources, targets, headings[sources] - headings[targets]
+
+
+def _has_turns_of_its_own(ssh_map: SSHMap) -> bool:
+    """Whether a map has poses, and links within places whose actions have no standard names."""
+    place = {s.id: s.place for s in ssh_map.dstates}
+    return (
+        ssh_map.fit is not None
+        and len(ssh_map.fit.poses) == len(ssh_map.dstates)
+        and any(
+            place[x] is not None and place[x] == place[y] and x != y
+            for x, action, y in ssh_map.links
+            if action not in STANDARD_ACTIONS
+        )
+    )
+
+
+def _links_of(
+    sources: NDArray[np.intp], targets: NDArray[np.intp], weights: NDArray[np.float64], number: int
+) -> Links:
+    """Make the links of one action from weights of pairs of dstates.
+
+    Args:
+        sources: Where the action begins, n.
+        targets: Where it ends, n.
+        weights: How likely each pair is, relative to the others with the same source, n.
+        number: The number of dstates.
+    """
+    totals = np.bincount(sources, weights, number)
+    missing = np.where(totals > 0, 0.0, 1.0)
+    return Links(
+        sparse.csr_array((weights / totals[sources], (targets, sources)), shape=(number, number)),
+        missing,
+    )
 
 
 def view_ratios(ssh_map: SSHMap, trace: Trace | None) -> dict[View, Observation]:
@@ -91,20 +200,11 @@ def transitions(ssh_map: SSHMap, trace: Trace | None) -> dict[str, Links]:
         )
     tried = {(x, action) for x, action, _ in counts}
     counts.update({link for link in ssh_map.links if link[:2] not in tried})
-    trials = Counter[tuple[int, str]]()
-    for (x, action, _), n in counts.items():
-        trials[x, action] += n
-    entries: dict[str, list[tuple[int, int, float]]] = {}
+    entries: dict[str, list[tuple[int, int, int]]] = {}
     for (x, action, y), n in counts.items():
-        entries.setdefault(action, []).append((x, y, n / trials[x, action]))
-    number = len(ssh_map.dstates)
+        entries.setdefault(action, []).append((x, y, n))
     links: dict[str, Links] = {}
     for action, listed in entries.items():
-        sources, targets, p = (np.array(column) for column in zip(*listed, strict=True))
-        missing = np.ones(number)
-        missing[sources] = 0.0
-        links[action] = Links(
-            sparse.csr_array((p, (targets, sources)), shape=(number, number)),
-            missing,
-        )
+        sources, targets, tries = np.array(listed).T
+        links[action] = _links_of(sources, targets, tries, len(ssh_map.dstates))
     return links

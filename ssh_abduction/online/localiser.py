@@ -67,7 +67,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Action, Step, Trace, View, checked_trace
 from ssh_abduction.online.belief import AKIN, NOVEL, TINY, Belief, Observation
 from ssh_abduction.online.chances import Chances
-from ssh_abduction.online.estimates import transitions, view_ratios
+from ssh_abduction.online.estimates import Move, Moves, view_ratios
 
 if TYPE_CHECKING:
     from perception.likelihood import ImageLikelihood
@@ -116,9 +116,9 @@ class Localiser:
                 f"{len(ssh_map.labels)}; take the trace that the map was found for"
             )
         self._shown = view_ratios(ssh_map, trace)
-        self._links = transitions(ssh_map, trace)
+        self._moves = Moves(ssh_map, trace)
         # Results of _alike for views, which recur.
-        self._followed: dict[tuple[Observation, str, Observation], float] = {}
+        self._followed: dict[tuple[Observation, Move, Observation], float] = {}
         self._seen = None if recogniser is None else self._likelihood(recogniser)
 
     def __repr__(self) -> str:
@@ -161,7 +161,8 @@ class Localiser:
 
         Args:
             belief: The belief before the action.
-            action: The action, or its name.
+            action: The action, or its name. If the map has turns that are compared by their
+                angles (`estimates.py`), a turn needs a bearing.
             view: The view after it, for a localiser without a recogniser.
             image: The image after it, (d,), for a localiser with a recogniser: laser ranges in
                 metres, or whatever it was trained on.
@@ -176,7 +177,8 @@ class Localiser:
                 f"belief: expected one over {self._number} dstates, got {brief(belief)}; "
                 "begin with start()"
             )
-        return self._after(belief, Action.of(action).name, self._observation(view, image))
+        move = self._moves.move(Action.of(action))
+        return self._after(belief, move, self._observation(view, image))
 
     def beliefs(self, trace: Trace) -> Iterator[Belief]:
         """Yield the belief after each step of another trace.
@@ -191,11 +193,12 @@ class Localiser:
         observed = self._observed(checked_trace(trace))
         belief = self._weighed(self.prior, next(observed))
         yield belief
-        for action, seen in zip(trace.actions, observed, strict=True):
+        for step, action, seen in zip(trace.steps[1:], trace.actions, observed, strict=True):
+            turned = None if step.displacement is None else step.displacement[2]
             belief = (
                 self._weighed(self.prior, seen)
                 if action.starts
-                else self._after(belief, action.name, seen)
+                else self._after(belief, self._moves.move(action, turned), seen)
             )
             yield belief
 
@@ -245,20 +248,18 @@ class Localiser:
             slice(None), spread, max(0.0, 1 - float(ratios.sum()) / (len(ratios) + 1))
         )
 
-    def _after(self, belief: Belief, action: str, seen: Observation | None) -> Belief:
+    def _after(self, belief: Belief, move: Move, seen: Observation | None) -> Belief:
         """Compute the belief after an action and an observation, and whether the robot is lost."""
-        found = self._weighed(
-            self._moved(belief, action), seen, self._alike(belief.seen, action, seen)
-        )
+        found = self._weighed(self._moved(belief, move), seen, self._alike(belief.seen, move, seen))
         sure = belief.entropy if belief.sure is None and found.collapsed else belief.sure
         if sure is None or (not found.collapsed and found.found_again(sure)):
             return found
         return replace(found, sure=sure)
 
-    def _moved(self, belief: Belief, action: str) -> Belief:
+    def _moved(self, belief: Belief, move: Move) -> Belief:
         """Compute the belief after an action and before the observation: the sum in equation 2."""
         chances, p = self.chances, belief.probabilities
-        links = self._links.get(action)
+        links = self._moves.links(move)
         # `anywhere` is the probability that the robot was in the map, and that no link leads to
         # where it is now: the action slipped, or has no link.
         if links is None:
@@ -278,18 +279,18 @@ class Localiser:
         )
         return Belief(moved, entered + stayed, akin=akin)
 
-    def _alike(self, before: Observation | None, action: str, seen: Observation | None) -> float:
+    def _alike(self, before: Observation | None, move: Move, seen: Observation | None) -> float:
         """Compute p(o'|akin) / q(o') for two observations with an action between them.
 
         Args:
             before: The observation o before the action; None if there was none.
-            action: The name of the action.
+            move: The action, as a move.
             seen: The observation o' after it; None if there was none.
         """
-        links = self._links.get(action)
+        links = self._moves.links(move)
         if before is None or seen is None or links is None:
             return 1.0
-        key = (before, action, seen)
+        key = (before, move, seen)
         if (known := self._followed.get(key)) is not None:
             return known
         alike = 1.0
