@@ -10,7 +10,7 @@ import pytest
 from test_regions import BLOCK, CORNER, LOG, TOUR, trace_of
 from worlds import written
 
-from ssh_abduction import Theory, Trace, solve
+from ssh_abduction import SSHMap, Theory, Trace, export_map, solve
 from ssh_abduction.cli import main
 from ssh_abduction.data import MapError
 from ssh_abduction.explain import explain_place
@@ -178,3 +178,25 @@ def test_compare_two_files_that_differ_in_sides_only(
     out = capsys.readouterr().out
     assert "the map is the same in both" in out
     assert "the first maps of both differ in what follows from them:" in out
+
+
+def test_a_name_of_a_region_stands_everywhere(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    written(CORNER).save("corner.jsonl")
+    assert main(["solve", "corner.jsonl", "-o", "maps.json"]) == 0
+    assert main(["name", "maps.json", "region3", "east ward"]) == 0
+    assert main(["solve", "corner.jsonl", "-o", "maps.json"]) == 0
+    ssh_map = SSHMap.from_dict(json.loads(Path("maps.json").read_text())["maps"][0])
+    assert ssh_map.name_of("region", 3) == "east ward"
+    assert ssh_map.renumbered().names == ssh_map.names
+    capsys.readouterr()
+    assert main(["show", "maps.json"]) == 0
+    assert "  region 3 (east ward): place 3, right of path 1-" in capsys.readouterr().out
+    assert main(["route", "maps.json", "--from", "p0", "--to", "p3", "--by", "places"]) == 0
+    assert "enter region 3 (east ward) through place 2" in capsys.readouterr().out
+    for to in ("svg", "dot"):
+        assert "region 3 (east ward)" in export_map(ssh_map, to)
+    assert main(["name", "maps.json", "region9", "nowhere"]) == 1
+    assert "expected a region of the map" in capsys.readouterr().err

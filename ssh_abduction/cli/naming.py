@@ -1,4 +1,4 @@
-"""ssh-abduction name MAPS WHAT NAME: name a place or a path of a standing map."""
+"""ssh-abduction name MAPS WHAT NAME: name a place, path or region of a standing map."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ from ssh_abduction.data.errors import named, printable
 
 def add_parser(verbs: Verbs) -> None:
     text = (
-        "Name a place or a path of a map. The name is written to corrections.yaml beside the map, "
-        "by a step of a drive: so it stays where it belongs when the map is solved again."
+        "Name a place, a path or a region of a map. The name is written to corrections.yaml beside "
+        "the map, by a step of a drive: so it stays where it belongs when the map is solved again."
     )
-    parser = verbs.add_parser("name", help="name a place or a path", description=text)
+    parser = verbs.add_parser("name", help="name a place, path or region", description=text)
     parser.add_argument("maps", help="file that solve -o wrote, or a folder with maps.json")
     parser.add_argument(
         "what",
-        help="a place such as p4, a path such as path2, or a step such as monday:12, for its place",
+        help="a place such as p4, a path such as path2, a region such as region3, or a step such "
+        "as monday:12, for its place",
     )
     parser.add_argument("name", help='the name, such as "kitchen"')
     parser.add_argument(

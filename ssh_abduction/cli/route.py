@@ -85,7 +85,9 @@ def run(options: argparse.Namespace) -> int:
         return 0
     print(printable(found.sentence))
     if found.legs:
-        print(f"by regions: {'; '.join(map(str, found.legs))}")
+        called = listing.maps[found.map - 1].called
+        told = "; ".join(leg.told(called) for leg in found.legs)
+        print(printable(f"by regions: {told}"))
     if found.moves:
         chosen = listing.maps[found.map - 1]
         rows = [

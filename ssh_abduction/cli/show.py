@@ -47,5 +47,5 @@ def run(options: argparse.Namespace) -> int:
 
 def _with_regions(ssh_map: SSHMap) -> str:
     """Describe a map and its regions: sets of places beside paths, or behind one place."""
-    regions = [f"  {region}" for region in ssh_map.regions or ()]
+    regions = [f"  {region.told(ssh_map.called)}" for region in ssh_map.regions or ()]
     return "\n".join([describe(ssh_map), *regions])

@@ -20,6 +20,7 @@ from ssh_abduction.data.corrections_file import (
 from ssh_abduction.data.drives import Drive, step_name, step_of
 from ssh_abduction.data.errors import MapError, TraceError, brief, named
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.regions import region_of
 from ssh_abduction.rivals.listing import Listing
 
 MAPS = "maps.json"  # the name of the file of maps in a folder
@@ -105,16 +106,13 @@ class Standing:
         if found is None:
             return "place", self.step(text)
         kind, number = _KINDS.get(found["kind"], found["kind"]), int(found["number"])
-        if kind == "region":
-            raise MapError(
-                f"{text}: expected a place or a path by number, got a region; name it by a step in "
-                "it, in the file"
-            )
         here = (t for t, s in enumerate(self.map.labels) if self._of(kind, s) == number)
         first = next(here, None)
         if first is None:
             raise MapError(
-                f"{text}: expected a {kind} of the map, got {brief(text)}, which is none; "
+                f"{text}: expected a {kind} of the map, got {brief(text)}, which is none"
+                + ", or has no place of its own" * (kind == "region")
+                + "; "
                 "ssh-abduction show lists them"
             )
         return kind, step_name(self.drives, first)
@@ -205,6 +203,8 @@ class Standing:
 
     def _of(self, kind: str, label: int) -> int | None:
         dstate = self.map.dstates[label]
+        if kind == "region":
+            return region_of(self.map.regions, dstate.place)
         return dstate.place if kind == "place" else dstate.path
 
 

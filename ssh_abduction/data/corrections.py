@@ -30,6 +30,7 @@ from ssh_abduction.data.drives import SEEN, Drive, drives_of, fingerprints_of, s
 from ssh_abduction.data.errors import MapError, TraceError, brief, is_writable
 from ssh_abduction.data.map_parts import NAMED, Name
 from ssh_abduction.data.maps import SSHMap, checked_map
+from ssh_abduction.data.regions import region_of
 from ssh_abduction.data.star import star_to_json, with_gateway
 from ssh_abduction.data.trace import Trace, checked_trace
 
@@ -299,7 +300,8 @@ class Corrections:
         found: dict[tuple[str, int], str] = {}
         for naming in self.known_in(drives).names:
             dstate = ssh_map.dstates[ssh_map.labels[self._number(drives, naming.step)]]
-            number = {"place": dstate.place, "path": dstate.path}.get(naming.kind)
+            region = region_of(ssh_map.regions, dstate.place)
+            number = {"place": dstate.place, "path": dstate.path, "region": region}[naming.kind]
             if number is not None:
                 found.setdefault((naming.kind, number), naming.name)
         names = (Name(kind, number, text) for (kind, number), text in sorted(found.items()))

@@ -282,6 +282,9 @@ class SSHMap:
         fit = self.fit
         if fit and fit.poses:
             fit = replace(fit, poses=tuple(fit.poses[s.id] for s in visited))
+        flipped = {h for h, d in faced.items() if d == -1}
+        regions, region = renumbered(self.regions or (), place, path, flipped)
+        new = {"place": place, "path": path, "region": region}
         return SSHMap(
             labels=tuple(number[s] for s in self.labels),
             dstates=dstates,
@@ -291,13 +294,8 @@ class SSHMap:
             excused=tuple((path.get(h, h), path.get(g, g)) for h, g in self.excused),
             fit=fit,
             faults=tuple(replace(fault, place=place.get(fault.place)) for fault in self.faults),
-            regions=None
-            if self.regions is None
-            else renumbered(self.regions, place, path, {h for h, d in faced.items() if d == -1}),
-            names=tuple(
-                replace(n, id={"place": place, "path": path}.get(n.kind, {}).get(n.id, n.id))
-                for n in self.names
-            ),
+            regions=None if self.regions is None else regions,
+            names=tuple(replace(n, id=new[n.kind].get(n.id, n.id)) for n in self.names),
         )
 
     def to_dict(self) -> dict[str, Any]:

@@ -13,7 +13,7 @@ through this place, as far as the robot knows.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
@@ -42,12 +42,20 @@ class Region:
     inside: tuple[int, ...] = ()
 
     def __str__(self) -> str:
+        return self.told(numbered)
+
+    def told(self, called: Callable[[str, int], str]) -> str:
+        """Say what the region is.
+
+        Args:
+            called: Returns words for a kind ("place", "region") and a number, as `SSHMap.called`.
+        """
         places = f"place{'' if len(self.places) == 1 else 's'} {listed(self.places)}"
-        told = [f"region {self.id}: {places}"]
+        told = [f"{called('region', self.id)}: {places}"]
         if self.bounds:
             told.append(f"right of {listed(map(course_named, self.bounds))}")
         if self.door is not None:
-            told.append(f"behind place {self.door}")
+            told.append(f"behind {called('place', self.door)}")
         if self.inside:
             plural = "" if len(self.inside) == 1 else "s"
             told.append(f"in region{plural} {listed(self.inside)}")
@@ -128,13 +136,25 @@ def ids_at(regions: Iterable[Region] | None, place: int | None) -> tuple[int, ..
     return tuple(region.id for region in regions or () if place in region.places)
 
 
+def region_of(regions: Iterable[Region] | None, place: int | None) -> int | None:
+    """Find the region that a person means by a place in it: the smallest one behind one place.
+
+    Returns:
+        Its id. If no region behind one place holds the place, the id of the smallest region; None
+        if no region holds it.
+    """
+    around = [region for region in regions or () if place in region.places]
+    behind = [region for region in around if region.door is not None]
+    return (behind or around)[-1].id if around else None
+
+
 def renumbered(
     regions: Iterable[Region],
     place: Mapping[int | None, int],
     path: Mapping[int | None, int],
     flipped: Collection[int | None],
-) -> tuple[Region, ...]:
-    """Return the same regions with other numbers of places and paths.
+) -> tuple[tuple[Region, ...], dict[int | None, int]]:
+    """Return the same regions with other numbers of places and paths, and their new numbers.
 
     Args:
         regions: The regions.
@@ -152,11 +172,17 @@ def renumbered(
         for region in regions
     ]
     new.sort(key=lambda region: (-len(region.places), region.places))
-    number = {region.id: i for i, region in enumerate(new)}
-    return tuple(
+    number: dict[int | None, int] = {region.id: i for i, region in enumerate(new)}
+    found = tuple(
         replace(region, id=i, inside=tuple(sorted(number[k] for k in region.inside)))
         for i, region in enumerate(new)
     )
+    return found, number
+
+
+def numbered(kind: str, number: int) -> str:
+    """Name a thing by its number: "place 4"."""
+    return f"{kind} {number}"
 
 
 def course_named(course: tuple[int, int]) -> str:

@@ -14,11 +14,12 @@ leave region 0 through place 1; pass from right to left of path 1+; enter region
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.regions import Region, course_named, right_of
+from ssh_abduction.data.regions import Region, course_named, numbered, right_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,8 +41,19 @@ class Leg:
     starts: Literal["right", "left"] | None = None
 
     def __str__(self) -> str:
-        if self.path is None:
-            return f"{self.move} region {self.region} through place {self.door}"
+        return self.told(numbered)
+
+    def told(self, called: Callable[[str, int], str]) -> str:
+        """Say what to do.
+
+        Args:
+            called: Returns words for a kind ("place", "region") and a number, as `SSHMap.called`.
+        """
+        if self.region is not None and self.door is not None:
+            return (
+                f"{self.move} {called('region', self.region)} through {called('place', self.door)}"
+            )
+        assert self.path is not None
         ends = "left" if self.starts == "right" else "right"
         return f"pass from {self.starts} to {ends} of {course_named((self.path, 1))}"
 

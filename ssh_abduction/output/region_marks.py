@@ -46,7 +46,7 @@ def region_marks(
         own = {*region.places}.difference(*(r.places for r in inner))
         x, y = max((spots[p] for p in own or region.places), key=lambda spot: (spot[1], -spot[0]))
         beside = x - 0.6 * broad, y + 0.5 * broad + 4
-        names.append(text(*beside, f"region {region.id}", BAND, 11, halo=True))
+        names.append(text(*beside, ssh_map.called("region", region.id), BAND, 11, halo=True))
         points.append((beside[0] - 30, beside[1]))
     return [*bands, *names], points
 
