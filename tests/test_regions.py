@@ -329,6 +329,6 @@ def test_a_causal_map_has_no_regions() -> None:
 def test_many_maps_share_the_time_for_regions(monkeypatch: pytest.MonkeyPatch) -> None:
     trace = Trace.load(Path(__file__).parent.parent / "examples" / "aces3-route.jsonl")
     assert all(m.regions for m in solve(trace))
-    monkeypatch.setattr("ssh_abduction.solver.regions.UNITS", 2 * UNITS // 100)
+    monkeypatch.setattr("ssh_abduction.solver.regions.UNITS", UNITS // 20)
     have = [m.regions is not None for m in solve(trace)]
     assert 0 < sum(have) < len(have) == 4

@@ -28,9 +28,9 @@ from ssh_abduction.theory import encodings
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory
 
-# A search derives the regions of its first maps, as far as this takes about a third of a second. To
-# derive those of n dstates takes about STARTING + n² units of 3.5 microseconds.
-UNITS, STARTING = 100_000, 1000
+# To derive the regions of a map of n dstates takes about STARTING + n² units of 3.5 microseconds.
+# A search spends at most FIRST units on its first map, and UNITS on all its other maps.
+STARTING, FIRST, UNITS = 1000, 100_000, 30_000
 
 _Key: TypeAlias = tuple[tuple[object, ...], ...]
 
@@ -100,8 +100,9 @@ class Deriving:
         )
         if key not in self._known:
             units = STARTING + len(ssh_map.dstates) ** 2
-            if units > self._left or not ssh_map.places:
+            is_first = not self._known
+            if units > (FIRST if is_first else self._left) or not ssh_map.places:
                 return ssh_map
-            self._left -= units
+            self._left -= 0 if is_first else units
             self._known[key] = derived(ssh_map, self._trace, self._axioms)
         return replace(ssh_map, regions=self._known[key])
