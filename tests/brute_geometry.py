@@ -144,6 +144,13 @@ class Geometry:
             for loop, (*_, f) in zip(loops, returns, strict=True):
                 covariance[at : at + f, at : at + f] += loop[2][:f, :f]
                 at += f
+            if len(returns) == 2:
+                # At a step where both loops begin or end, the robot is off its dstate once.
+                (i, j, f), (k, m, g) = returns
+                spreads = [self.odometry.offset, self.odometry.offset, self.odometry.facing]
+                ends = np.diag(np.square(spreads)) * ((i == k) + (j == m))
+                covariance[:f, f:] += ends[:f, :g]
+                covariance[f:, :f] += ends[:g, :f]
             least = min(least, float(off @ np.linalg.solve(covariance, off)) + unlikely)
         return bool(least > most)
 

@@ -19,6 +19,8 @@ from test_property import agree
 
 from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
+from ssh_abduction.checker.dead_reckoning import ErrorFilter
+from ssh_abduction.checker.geometry import _square_together
 from ssh_abduction.data import DState, Odometry, TheoryError
 from ssh_abduction.solver.asp.facts.answer_maps import causal_map
 from ssh_abduction.solver.fit import Poses, fit
@@ -28,6 +30,7 @@ from ssh_abduction.theory.evidence import pairs_of
 from ssh_abduction.theory.evidence.displacement import Displacement
 from ssh_abduction.theory.evidence.loops import Loops
 from ssh_abduction.theory.evidence.returns import Returns
+from ssh_abduction.theory.evidence.together import joint_squares
 from ssh_abduction.theory.settle import settle
 
 ROOM = 10.0  # metres from corner to corner
@@ -396,3 +399,26 @@ def test_fits_of_true_maps_are_as_likely_where_displacements_are_missing(kept: s
         squares, freedom, above = squares + found.chi2, freedom + found.dof, above + (found.p > 0.5)
     assert squares == pytest.approx(freedom, rel=0.25)
     assert 4 <= above <= 16
+
+
+@pytest.mark.parametrize(("offset", "facing"), [(0.0, 0.0), (0.3, 0.0), (0.3, 0.1)])
+@pytest.mark.parametrize("rows", [[(0, 2), (0, 4)], [(0, 4), (2, 4)]])
+def test_two_returns_with_a_common_end_fit_as_badly_as_their_map(
+    offset: float, facing: float, rows: list[tuple[int, int]]
+) -> None:
+    """The robot comes to one place three times. Evidence, checker and misfit judge it alike."""
+    still = 1e-8
+    noise = ((0.04, 0.0, 0.0), (0.0, 0.04, 0.0), (0.0, 0.0, still))
+    moves = [(2.0, 0.0, 0.0), (-1.3, 0.4, 0.0), (0.0, 2.0, 0.0), (0.2, -2.9, 0.0)]
+    trace = Trace.from_steps("abcde", ["travel"] * 4, displacements=moves)
+    odometry = Odometry(scale=0.0, bend=0.0, offset=offset, facing=facing)
+    steps = [replace(step, covariance=noise) if i else step for i, step in enumerate(trace.steps)]
+    trace = replace(trace, steps=tuple(steps), odometry=odometry)
+    misfit = Poses(trace, range(5), [0, 1, 0, 2, 0]).misfit()
+    first, second = (np.array([[*row, 0]]) for row in rows)
+    (square,) = joint_squares(Loops.of(trace), first, second)
+    assert square == pytest.approx(misfit, rel=1e-3)
+    both = np.array([[*row, 2] for row in rows])
+    judged = ErrorFilter(trace, odometry, 0.0, 0.0)
+    (square,) = _square_together(judged, both, np.array([1]), np.array([0]))
+    assert square == pytest.approx(misfit, rel=1e-3)

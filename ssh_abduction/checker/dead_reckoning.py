@@ -59,7 +59,7 @@ class ErrorFilter:
         self.sigma = np.array([odometry.scale, drift])
         # at both ends of a loop the robot may be off the pose of the dstate
         ends = np.diag([odometry.offset, odometry.offset, odometry.facing])
-        self.at_ends = 2 * ends**2
+        self.at_end = ends**2
         for t in range(1, size):
             if t % FEW == 0:
                 look_at_clock()
@@ -136,7 +136,7 @@ class ErrorFilter:
         added = (
             bent[..., None, None] * np.diag([1.0, 1.0, 0.0])
             + ROUNDED**2 * np.diag([0.0, 0.0, 1.0])
-            + self.at_ends
+            + 2 * self.at_end
         )
         total: Array = white + repeated @ repeated.swapaxes(-1, -2) + added
         return total

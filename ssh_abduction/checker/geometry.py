@@ -345,23 +345,34 @@ def _unsafe(
         np.searchsorted(rows[:, 1], rows[later, 0].min(), side="right"), later[-1] + 1
     )
     first, stop = rows[later, 0], rows[earlier, 1, None]
-    new = filtered.new_until(end)
+    new, at_end = filtered.new_until(end), filtered.at_end.ravel()
     table = new @ alone.inverse[later].T
     begin = np.maximum(rows[earlier, 0, None], first)
     trace = (
         table[rows[earlier, 1]]
         - np.take_along_axis(table, begin, axis=0)
         + (alone.inverse[later] * alone.repeated[later]).sum(1)
+        + _common_ends(rows, earlier[:, None], later) * (alone.inverse[later] @ at_end)
     )
     squares = alone.square[earlier, None] + alone.square[later]
     others, these = np.nonzero(
         ~_is_safe(trace, squares, most) & (stop > first) & (earlier[:, None] < later)
     )
     share = new[rows[earlier[others], 1]] - new[begin[others, these]] + alone.repeated[later[these]]
+    share += _common_ends(rows, earlier[others], later[these])[:, None] * at_end
     share = alone.inverse[later[these]].reshape(-1, 3, 3) @ share.reshape(-1, 3, 3)
     norm = np.sqrt(np.maximum(np.einsum("mij,mji->m", share, share), 0.0))
     left = ~_is_safe(norm, squares[others, these], most)
     return earlier[others[left]], later[these[left]]
+
+
+def _common_ends(rows: Steps, here: Steps, others: Steps) -> Steps:
+    """Count the ends that the loops of two returns have in common.
+
+    At such an end the robot is off its dstate by one error, which both returns share.
+    """
+    same: Steps = (rows[here, :2] == rows[others, :2]).sum(-1)
+    return same
 
 
 def _is_safe(share: Array, squares: Array, most: float) -> NDArray[np.bool_]:
@@ -400,6 +411,7 @@ def _square_together(filtered: ErrorFilter, rows: Steps, here: Steps, others: St
     mixed += filtered.repeated_since(rows[here, 0], rows[here, 1]) @ filtered.repeated_since(
         rows[others, 0], rows[others, 1]
     ).swapaxes(1, 2)
+    mixed += _common_ends(rows, here, others)[:, None, None] * filtered.at_end
     joint, off = np.zeros((m, 6, 6)), np.zeros((m, 6))
     for k, which in enumerate((here, others)):
         part = slice(3 * k, 3 * k + 3)

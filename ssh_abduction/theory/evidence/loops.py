@@ -123,12 +123,11 @@ class Loops:
         covariance = self.noise(i, j) + self.repeated(i, j)
         lost = self._heading_variance(i, j)
         moved_by_heading = self._moved_by_heading(i, j)
-        bent = (
-            (SIGMAS / 2) ** 2 * lost * moved_by_heading + ROUNDED**2 + 2 * self.odometry.offset**2
-        )
+        bent = (SIGMAS / 2) ** 2 * lost * moved_by_heading + ROUNDED**2
+        covariance += 2 * self.at_end
         covariance[:, 0, 0] += bent
         covariance[:, 1, 1] += bent
-        covariance[:, 2, 2] += ROUNDED**2 + 2 * self.odometry.facing**2
+        covariance[:, 2, 2] += ROUNDED**2
         return closing, covariance
 
     def shared(
@@ -151,6 +150,12 @@ class Loops:
         begin, end = np.maximum(i, k), np.minimum(j, m)
         covariance = self._white(begin, np.maximum(begin, end), j, m)
         return covariance + self._repeated((i, j), (k, m))
+
+    @property
+    def at_end(self) -> Array:
+        """The covariance of the pose of the robot relative to its dstate, 3 x 3."""
+        odometry = self.odometry
+        return np.diag([odometry.offset**2, odometry.offset**2, odometry.facing**2])
 
     def _white(self, i: Steps, j: Steps, end: Steps, other_end: Steps) -> Array:
         """Return the covariances, between closings, that the noise of some displacements causes.

@@ -166,7 +166,8 @@ class Together:
         alone, rows = self._of_each(self._number), self.rows
         first = rows[later, 0]
         inverse = alone.inverse[later]
-        gathered = self._loops(self._number).of_ends(end) @ inverse.T
+        loops = self._loops(self._number)
+        gathered = loops.of_ends(end) @ inverse.T
         before = np.arange(end + 1)[:, None] < first
         # Steps before the beginning of a loop do not count.
         gathered = np.where(before, gathered[first, np.arange(len(later))], gathered)
@@ -174,6 +175,7 @@ class Together:
             gathered[rows[earlier, 1]]
             - gathered[rows[earlier, 0]]
             + (inverse * alone.repeated[later]).sum(1)
+            + _common_ends(rows[earlier, None], rows[later]) * (inverse @ loops.at_end.ravel())
         )
         unsafe = ~self._is_safe(
             share, alone.square[earlier, None] + alone.square[later], self._number
@@ -236,12 +238,13 @@ class Together:
             rows[earlier, 1],
         )
         gathered = loops.of_ends(end)
-        share = self._largest_share(alone, later, gathered[stop] - gathered[begin])
+        ends = np.outer(_common_ends(rows[earlier], rows[later]), loops.at_end)
+        share = self._largest_share(alone, later, gathered[stop] - gathered[begin] + ends)
         excess = np.zeros(len(later))
         left = np.flatnonzero(~self._is_safe(share, squares, number))
         if not len(left):
             return excess
-        noise = loops.noise(begin[left], stop[left]).reshape(-1, 9)
+        noise = loops.noise(begin[left], stop[left]).reshape(-1, 9) + ends[left]
         share = np.minimum(share[left], 1.0) * np.minimum(
             self._largest_share(alone, earlier[left], noise), 1.0
         )
@@ -332,11 +335,24 @@ def joint_squares(loops: Loops, these: Steps, others: Steps) -> Array:
         _cut_off_headings(closing, covariance, rows[:, 2])
         off[:, at], joint[:, at, at] = closing, covariance
     shared = loops.shared((these[:, 0], these[:, 1]), (others[:, 0], others[:, 1]))
+    shared += _common_ends(these, others)[:, None, None] * loops.at_end
     shared[these[:, 2] == 0, 2, :] = 0.0
     shared[others[:, 2] == 0, :, 2] = 0.0
     joint[:, :3, 3:], joint[:, 3:, :3] = shared, shared.transpose(0, 2, 1)
     squares: Array = np.einsum("mi,mi->m", off, np.linalg.solve(joint, off[:, :, None])[:, :, 0])
     return squares
+
+
+def _common_ends(these: Steps, others: Steps) -> Steps:
+    """Count the ends that the loops of two returns share: the beginning, the end, or both.
+
+    There the robot is off its dstate by one error, which is in both loops.
+
+    Args:
+        these: Rows of returns, as in `Together.rows`.
+        others: The same for the other returns.
+    """
+    return np.asarray((these[..., :2] == others[..., :2]).sum(-1))
 
 
 def _alone(closing: Array, covariance: Array, repeated: Array, one_dstate: Steps) -> _Alone:
