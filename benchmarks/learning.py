@@ -60,7 +60,7 @@ def shares(learnt: Sequence[Trace], asked: Trace, theory: Theory) -> tuple[float
     by_truth = recogniser().fit(np.concatenate([images_of(t) for t in learnt]), names)
     upper = float(np.mean(by_truth.predict(images) == true))
     try:
-        learner = BootstrapLearner(theory, time_limit=20).fit(learnt)
+        learner = BootstrapLearner(theory).fit(learnt)
     except LearnerError:
         return 0.0, upper, 0
     meaning = {

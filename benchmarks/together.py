@@ -3,28 +3,48 @@
     python benchmarks/together.py --family aces3 [--seeds 10] [--stars]
     python benchmarks/together.py --family mazes [--cells 4] [--steps 60] [--seeds 10] [--stars]
     python benchmarks/together.py --family plans --folder ../shared/data/plans [--steps 100]
+    python benchmarks/together.py --family worlds --folder FOLDER --causal [--stars]
 
 The script prints a table in Markdown with a row for each joint trace, and a summary below, as
 benchmarks/truth.py does. ACES3 is one drive, cut into three that overlap by two places. In mazes
 and plans, three robots start at random. Nothing is known of where a drive starts. The noise is that
-of benchmarks/truth.py.
+of benchmarks/truth.py. A trace of a world has several drives, which an action "jump…" joins.
+
+With --beam, only the beam searches, with this width and without a time limit. So the load of the
+machine does not matter. Its cheapest map is judged.
 """
 
 from __future__ import annotations
 
 import argparse
+import time
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 
-from truth import NOISE, ROOT, Known, Noise, aces3, random_walk, report, told
+from truth import (
+    NOISE,
+    ROOT,
+    Known,
+    Noise,
+    aces3,
+    is_true,
+    random_walk,
+    report,
+    told,
+    worlds,
+)
 
 from simulator.plan_tours import tour
 from simulator.plans import Plan
 from ssh_abduction import Theory
 from ssh_abduction.data import Odometry, together
+from ssh_abduction.solver.guesses.beam import Beam
+from ssh_abduction.solver.steps.log import Log
+from ssh_abduction.theory.settle import settle
 
 DRIVES = 3
+JUMP = "jump"  # how the name of an action begins that leads from one drive to the next
 
 
 def joined(name: str, drives: Sequence[Known]) -> Known:
@@ -59,11 +79,46 @@ def cut(known: Known, drives: int = DRIVES, overlap: int = 2) -> Known:
     return joined(known.name, parts)
 
 
-def of_mazes(cells: int, steps: int, seeds: Sequence[int], noise: Noise) -> Iterator[Known]:
+def of_mazes(
+    cells: int, steps: int, seeds: Sequence[int], noise: Noise, drives: int = DRIVES
+) -> Iterator[Known]:
     """Yield joint traces of random walks in mazes, one for each seed."""
     for seed in seeds:
-        walks = [random_walk(cells, steps, seed, noise, drive) for drive in range(DRIVES)]
+        walks = [random_walk(cells, steps, seed, noise, drive) for drive in range(drives)]
         yield joined(walks[0].name, walks)
+
+
+def of_worlds(folder: Path) -> Iterator[Known]:
+    """Yield joint traces of worlds, one for each file, cut where the robot jumped."""
+    for known in worlds(folder):
+        actions = [action.name for action in known.trace.actions]
+        starts = [t for t, name in enumerate(actions, 1) if name.startswith(JUMP)]
+        bounds = pairwise([0, *starts, len(known.trace)])
+        parts = [
+            Known("", known.trace[a:b], known.dstates[a:b], known.places[a:b]) for a, b in bounds
+        ]
+        yield joined(known.name, parts)
+
+
+def report_of_beams(traces: Iterator[Known], theory: Theory, width: int) -> str:
+    """Print a row for the cheapest map of the beam for each trace, and return how many are true."""
+    head = ("trace", "steps", "true dstates", "dstates", "cheapest map", "CPU s")
+    print(f"| {' | '.join(head)} |\n|{'---|' * len(head)}")
+    right = count = 0
+    for known in traces:
+        begin, problem = time.process_time(), settle(known.trace, theory)
+        beam = Beam(problem, Log(known.trace, problem.theory, problem.pairs), width)
+        found = next(beam.maps(), None)
+        true = found is not None and is_true(found, known)
+        count, right = count + 1, right + true
+        print(
+            f"| {known.name} | {len(known.trace)} | {len(set(known.dstates))} "
+            f"| {len(found.dstates) if found else '–'} "
+            f"| {'true' if true else 'false' if found else 'none'} "
+            f"| {time.process_time() - begin:.1f} |",
+            flush=True,
+        )
+    return f"the cheapest map is true: {right} of {count}"
 
 
 def of_plans(folder: Path, steps: int, seeds: Sequence[int], noise: Noise) -> Iterator[Known]:
@@ -78,7 +133,7 @@ def of_plans(folder: Path, steps: int, seeds: Sequence[int], noise: Noise) -> It
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--family", choices=("aces3", "mazes", "plans"), required=True)
+    parser.add_argument("--family", choices=("aces3", "mazes", "plans", "worlds"), required=True)
     parser.add_argument("--seeds", type=int, metavar="N", help="seeds (default 10; plans 1)")
     parser.add_argument("--first", type=int, default=0, metavar="SEED", help="the first seed")
     parser.add_argument("--cells", type=int, default=4, metavar="N", help="mazes of N x N cells")
@@ -89,6 +144,9 @@ def main() -> None:
         "--folder", type=Path, default=ROOT.parent / "shared" / "data" / "plans", metavar="FOLDER"
     )
     parser.add_argument("--limit", type=float, default=60, metavar="S", help="seconds for each")
+    parser.add_argument("--drives", type=int, default=DRIVES, metavar="N", help="drives of a maze")
+    parser.add_argument("--causal", action="store_true", help="solve by the causal theory")
+    parser.add_argument("--beam", type=int, metavar="WIDTH", help="search by a beam alone")
     parser.add_argument("--stars", action="store_true", help="give the solver stars, too")
     parser.add_argument(
         "--displacement", choices=("auto", "none"), default="auto", help="none ignores odometry"
@@ -100,15 +158,23 @@ def main() -> None:
     seeds = range(options.first, options.first + count)
     families = {
         "aces3": lambda: map(cut, aces3(seeds, noise)),
-        "mazes": lambda: of_mazes(options.cells, options.steps or 60, seeds, noise),
+        "mazes": lambda: of_mazes(options.cells, options.steps or 60, seeds, noise, options.drives),
         "plans": lambda: of_plans(options.folder, options.steps or 100, seeds, noise),
+        "worlds": lambda: of_worlds(options.folder),
     }
     theory = Theory(
         displacement=options.displacement,
         star="auto" if options.stars else "none",
         boundary=options.boundary,
     )
-    print(f"\n{report(families[options.family](), theory, options.limit)}")
+    if options.causal:
+        star = "alike" if options.stars else "none"
+        theory = Theory.causal().replace(displacement=options.displacement, star=star)
+    traces = families[options.family]()
+    if options.beam is None:
+        print(f"\n{report(traces, theory, options.limit)}")
+    else:
+        print(f"\n{report_of_beams(traces, theory, options.beam)}")
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ import pytest
 from coarse import every_second_beam
 
 from perception.errors import LogError
+from perception.places.between import closures_between, scenes_of
 from perception.places.importing import Imported, import_log
 from perception.places.joining import join_logs
 from perception.readers.scans import RobotLog
@@ -78,6 +79,30 @@ def test_joint_logs_number_scans_and_visits_over_all_drives(
         np.testing.assert_allclose(
             moved(tuple(robot), step.extra["seen"])[:2], visit.middle, atol=1e-3
         )
+
+
+def test_closures_between_drives_are_right(
+    joint: tuple[RobotLog, Imported, list[Imported]], halves: tuple[RobotLog, RobotLog]
+) -> None:
+    # Furniture makes the places of this world differ. Each drive is a tour.
+    scans = every_second_beam(scans_of(record(World.named("cluttered"), 2, every=1.0)))
+    middle = len(scans) // 2
+    drives = [RobotLog(scans[:middle], source="a"), RobotLog(scans[middle:], source="b")]
+    parts = [import_log(drive, name=drive.source) for drive in drives]
+    trace = join_logs(drives, parts)[1].trace
+    (start,) = starts_of(trace)
+    found = [c for c in trace.closures if c.first < start <= c.last]
+    assert len(found) >= 3
+    for closure in found:
+        true = [trace[t].truth["pose"] for t in (closure.first, closure.last)]
+        off = between(between(*true), closure.displacement)
+        assert math.hypot(*off[:2]) < 0.5
+        assert abs(off[2]) < math.radians(5)
+    # The rooms of the house look alike, so that two relations of its halves are possible.
+    assert len(joint[1].trace.closures) == sum(len(part.trace.closures) for part in joint[2])
+    # Another building has no visits that agree.
+    scenes = scenes_of(drives[0], parts[0]), scenes_of(halves[0], joint[2][0])
+    assert closures_between(parts[0], joint[2][0], *scenes) == []
 
 
 def test_a_single_log_stays_as_it_is(halves: tuple[RobotLog, RobotLog]) -> None:

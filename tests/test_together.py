@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import theories, traces
 from test_property import agree, checker_rejects_foreign_maps
-from together import of_mazes
+from together import of_mazes, of_worlds, report_of_beams
 
 from ssh_abduction import Localiser, OnlineMapper, Solution, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
@@ -32,6 +32,7 @@ from ssh_abduction.data import (
     drives_of,
     together,
 )
+from ssh_abduction.data.closure import Closure
 from ssh_abduction.data.drives import fingerprints_of, sentence_of
 from ssh_abduction.rivals import Listing, joins_of_drives
 from ssh_abduction.solver import choosing, prefixes
@@ -43,9 +44,9 @@ from ssh_abduction.theory.settle import settle
 
 
 @st.composite
-def joint_traces(draw: st.DrawFn) -> Trace:
-    """Tiny traces of two or three drives."""
-    trace = draw(traces().filter(lambda trace: len(trace) > 1))
+def joint_traces(draw: st.DrawFn, closures: bool = False) -> Trace:
+    """Tiny traces of two or three drives; with `closures`, also between drives."""
+    trace = draw(traces(closures=closures).filter(lambda trace: len(trace) > 1))
     last = len(trace) - 1
     starts = draw(st.sets(st.integers(1, last), min_size=1, max_size=min(2, last)))
     steps = list(trace.steps)
@@ -74,7 +75,8 @@ def test_the_solver_lists_the_joint_maps_of_the_brute_force(data: st.DataObject)
 @settings(max_examples=5)
 @given(st.data())
 def test_the_cheapest_joint_maps_are_those_of_plain_least_squares(data: st.DataObject) -> None:
-    trace = data.draw(joint_traces().filter(lambda trace: trace.has_displacements), label="trace")
+    drawn = joint_traces(closures=True).filter(lambda trace: trace.has_displacements)
+    trace = data.draw(drawn, label="trace")
     theory = data.draw(theories(trace, fixed=("displacement",)), label="theory")
     prices = data.draw(st.sampled_from(test_weighing.PRICES), label="prices")
     test_weighing.agree(trace, test_weighing.weighed(theory, prices))
@@ -338,3 +340,33 @@ def test_the_checker_and_the_solver_have_one_misfit_of_joint_maps(known: truth.K
     where = dict(zip(names, places, strict=True))
     poses = Poses(known.trace, names, [where[name] for name in range(len(where))])
     assert misfit(known.trace, names, places) == pytest.approx(poses.misfit(), rel=1e-5)
+
+
+def test_worlds_are_cut_where_the_robot_jumped(tmp_path: Path) -> None:
+    walk = Trace.from_steps("abcd", ["travel", "jump1", "travel"])
+    steps = [replace(s, truth={"dstate": k}) for k, s in enumerate(walk.steps)]
+    replace(walk, steps=tuple(steps)).save(tmp_path / "mall.jsonl")
+    (known,) = of_worlds(tmp_path)
+    assert [(d.first, d.stop) for d in drives_of(known.trace)] == [(0, 2), (2, 4)]
+    assert known.dstates == (0, 1, 2, 3)
+    found = report_of_beams(iter([known]), Theory.causal().replace(displacement="none"), 4)
+    assert found == "the cheapest map is true: 1 of 1"
+
+
+@pytest.mark.parametrize("at", [0, 1])
+@pytest.mark.parametrize("ahead", [5.0, 10.0])
+def test_a_closure_between_drives_says_which_places_they_share(at: int, ahead: float) -> None:
+    """A corridor with four places that look alike, and a second drive past two of them."""
+    monday = Trace.from_steps("aaaa", ["travel"] * 3, displacements=[(5.0, 0.0, 0.0)] * 3)
+    tuesday = Trace.from_steps("aa", ["travel"], displacements=[(5.0, 0.0, 0.0)])
+    drives = together([monday, tuesday], ["monday", "tuesday"])
+    noise = ((0.01, 0, 0), (0, 0.01, 0), (0, 0, 0.001))
+    closure = Closure(0, 4 + at, (ahead + 5 * at, 0.0, 0.0), noise)
+    joint = replace(drives, closures=(closure,))
+    first = int(ahead / 5)
+    expected = [first, first + 1]
+    problem = settle(joint, Theory())
+    guess = next(Beam(problem, Log(joint, problem.theory, problem.pairs), 16).maps())
+    for ssh_map in (guess, solve(joint).maps[0]):
+        assert [ssh_map.place_of(t) for t in range(6)] == [0, 1, 2, 3, *expected]
+        assert check(joint, ssh_map) == ()

@@ -87,11 +87,11 @@ def _closings(
     turned = Turned.of(scenes[last], [k * TURN for k in range(begin, end)])
     for (first, gate), some in zip(asked, turns, strict=True):
         found = match(scenes[first], turned.part(some.start - begin, some.stop - begin))
-        if found is not None and _is_reliable(found) and gate.allows(found):
+        if found is not None and is_reliable(found) and gate.allows(found):
             yield Closing(first, last, found)
 
 
-def _is_reliable(found: Match) -> bool:
+def is_reliable(found: Match) -> bool:
     return found.score >= SCORE and found.mutual >= MUTUAL
 
 

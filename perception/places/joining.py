@@ -2,19 +2,25 @@
 
 The scans of one drive follow those of another. Nothing is known of how the frames of two drives
 relate. So the track of each drive begins where the track before it ends, without any meaning.
+Closures between drives say how visits of two drives lie relative to each other.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import accumulate, chain
+from itertools import accumulate, chain, combinations
 
 import numpy as np
 
+from perception.places.between import closures_between, scenes_of
+from perception.places.closures import Closing
 from perception.places.importing import Imported, with_views
+from perception.places.tracing import closure_of
 from perception.places.track import Array, Track
+from perception.places.visits import Visit
 from perception.readers.scans import RobotLog
 from ssh_abduction.data.drives import together
 from ssh_abduction.data.trace import Trace
@@ -53,15 +59,46 @@ def join_logs(logs: Sequence[RobotLog], parts: Sequence[Imported]) -> tuple[Robo
     )
     counts = [0, *accumulate(len(part.visits) for part in parts)]
     traces = [_counted_from(n, part.trace) for n, part in zip(counts, parts, strict=False)]
+    trace = together(traces)
+    begin = time.process_time()
+    arrivals = _arrivals(trace, track, visits)
+    found = [closure_of(closing, arrivals) for closing in _closings(logs, parts, counts)]
+    seconds = _total([part.seconds for part in parts])
+    seconds["drives"] = round(time.process_time() - begin, 3)
     return log, Imported(
-        with_views(together(traces)),
+        with_views(replace(trace, closures=(*trace.closures, *found))),
         track,
         parts[0].width,
         visits,
-        _total([part.seconds for part in parts]),
+        seconds,
         _named(names, [part.notes for part in parts]),
         tuple(begins[1:]),
     )
+
+
+def _closings(
+    logs: Sequence[RobotLog], parts: Sequence[Imported], counts: Sequence[int]
+) -> Iterator[Closing]:
+    """Yield the closures between drives, with visits numbered over all drives.
+
+    Args:
+        logs: The logs.
+        parts: What they were imported as.
+        counts: The number of visits before each drive.
+    """
+    scenes = [scenes_of(log, part) for log, part in zip(logs, parts, strict=True)]
+    for a, b in combinations(range(len(parts)), 2):
+        for closing in closures_between(parts[a], parts[b], scenes[a], scenes[b]):
+            yield replace(closing, first=closing.first + counts[a], last=closing.last + counts[b])
+
+
+def _arrivals(trace: Trace, track: Track, visits: Sequence[Visit]) -> list[tuple[int, float]]:
+    """The first step of each visit, and its heading in the frame of the track."""
+    first = {int(step.extra["visit"]): t for t, step in reversed([*enumerate(trace.steps)])}
+    return [
+        (first[k], float(track.poses[visit.scan, 2] + trace[first[k]].extra["seen"][2]))
+        for k, visit in enumerate(visits)
+    ]
 
 
 def _named(names: Sequence[str | None], notes: Sequence[Sequence[str]]) -> tuple[str, ...]:

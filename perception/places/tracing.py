@@ -83,12 +83,13 @@ def to_trace(
         odometry=Odometry(scale=SCALE, bend=DRIFT, offset=MIDDLE, facing=DIRECTION),
         extra={"beams": {"first": -90, "step": 1}},
         closures=tuple(
-            _closure(found, arrivals) for found in find_closures(track, visits, patches, 2 * WINDOW)
+            closure_of(found, arrivals)
+            for found in find_closures(track, visits, patches, 2 * WINDOW)
         ),
     )
 
 
-def _closure(found: Closing, arrivals: Sequence[tuple[int, float]]) -> Closure:
+def closure_of(found: Closing, arrivals: Sequence[tuple[int, float]]) -> Closure:
     """Make a closure between the first steps of two visits.
 
     Args:

@@ -55,7 +55,8 @@ def solve(
 
     Args:
         trace: The trace; or several traces of one building, for their joint maps
-            (`data.together`). `data.by_drive` splits the labels of a joint map.
+            (`data.together`). `by_drive(solution.trace, ssh_map.labels)` of `data` has one
+            sequence of labels for each trace.
         theory: The axioms and the preference; Theory.topological() by default.
         time_limit: Seconds of wall-clock time. At this limit the best answer so far is returned.
         max_maps: List at most this many maps; None lists all. After the last one, the search goes

@@ -98,6 +98,27 @@ def fitted(found: Hypothesis, place: int, dstate: int | None = None) -> Hypothes
     return replace(turned, pieces=joined.merged(other))
 
 
+def closed(found: Hypothesis, dstate: int, turn: float) -> Hypothesis:
+    """Turn the piece of the robot, and join it with that of a dstate, as a closure says.
+
+    Without this, a closure could not be linear: the piece may have any heading. If the dstate is in
+    the piece of the robot, nothing changes.
+
+    Args:
+        found: The hypothesis.
+        dstate: The dstate of the earlier step of the closure.
+        turn: By how many radians the robot is turned to the left of this dstate.
+    """
+    pieces, n = found.pieces, len(found.mean) - 3
+    other = pieces.of_heading[dstate]
+    if other == pieces.here:
+        return found
+    angle = found.mean[found.heading[dstate]] + turn - found.mean[n + 2]
+    turned = _turned(found, float(angle), pieces.hinges.get(pieces.here, n))
+    joins = (*pieces.joins, (pieces.here, found.places[dstate], dstate))
+    return replace(turned, pieces=replace(pieces, joins=joins).merged(other))
+
+
 def _turned(found: Hypothesis, angle: float, centre: int) -> Hypothesis:
     """Turn the poses of the piece of the robot.
 

@@ -24,7 +24,7 @@ from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.equations import noises, spreads_of
 from ssh_abduction.solver.fit import Poses
-from ssh_abduction.solver.guesses.pieces import Pieces
+from ssh_abduction.solver.guesses.pieces import Pieces, closed
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -131,7 +131,8 @@ class Reckoning:
             pieces=replace(found.pieces, here=piece),
         )
         for closure in self._closures.get(t, ()):
-            moved = self._closed(moved, closure)
+            turned = closed(moved, moved.labels[closure.first], closure.displacement[2])
+            moved = self._closed(turned, closure)
         return moved
 
     def _closed(self, moved: Hypothesis, closure: Closure) -> Hypothesis:
