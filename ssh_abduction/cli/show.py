@@ -10,6 +10,7 @@ from ssh_abduction.data.corrections_file import named_beside
 from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.maps import SSHMap, maps_of
+from ssh_abduction.data.regions import described
 from ssh_abduction.solver import drives_in
 
 
@@ -47,5 +48,5 @@ def run(options: argparse.Namespace) -> int:
 
 def _with_regions(ssh_map: SSHMap) -> str:
     """Describe a map and its regions: sets of places beside paths, or behind one place."""
-    regions = [f"  {region.told(ssh_map.called)}" for region in ssh_map.regions or ()]
+    regions = [f"  {described(region, ssh_map.called)}" for region in ssh_map.regions or ()]
     return "\n".join([describe(ssh_map), *regions])

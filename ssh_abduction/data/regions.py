@@ -42,24 +42,7 @@ class Region:
     inside: tuple[int, ...] = ()
 
     def __str__(self) -> str:
-        return self.told(numbered)
-
-    def told(self, called: Callable[[str, int], str]) -> str:
-        """Say what the region is.
-
-        Args:
-            called: Returns words for a kind ("place", "region") and a number, as `SSHMap.called`.
-        """
-        places = f"place{'' if len(self.places) == 1 else 's'} {listed(self.places)}"
-        told = [f"{called('region', self.id)}: {places}"]
-        if self.bounds:
-            told.append(f"right of {listed(map(course_named, self.bounds))}")
-        if self.door is not None:
-            told.append(f"behind {called('place', self.door)}")
-        if self.inside:
-            plural = "" if len(self.inside) == 1 else "s"
-            told.append(f"in region{plural} {listed(self.inside)}")
-        return ", ".join(told)
+        return described(self, numbered)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the region as plain data, without fields that are empty."""
@@ -71,6 +54,25 @@ class Region:
         if self.inside:
             data["inside"] = [*self.inside]
         return data
+
+
+def described(region: Region, called: Callable[[str, int], str]) -> str:
+    """Say what the region is.
+
+    Args:
+        region: The region.
+        called: Returns words for a kind ("place", "region") and a number, as `SSHMap.called`.
+    """
+    places = f"place{'' if len(region.places) == 1 else 's'} {listed(region.places)}"
+    told = [f"{called('region', region.id)}: {places}"]
+    if region.bounds:
+        told.append(f"right of {listed(map(course_named, region.bounds))}")
+    if region.door is not None:
+        told.append(f"behind {called('place', region.door)}")
+    if region.inside:
+        plural = "" if len(region.inside) == 1 else "s"
+        told.append(f"in region{plural} {listed(region.inside)}")
+    return ", ".join(told)
 
 
 def of_members(members: Mapping[Reason, Collection[int]]) -> tuple[Region, ...]:
