@@ -34,6 +34,11 @@ def run(options: argparse.Namespace) -> int:
             if axiom.level == level
         ]
         print(table(["axiom", *PRESETS, "sentence", "source"], rows))
+    print("\nregions, which follow from a map: no search has these axioms")
+    rows = [
+        [axiom.name, axiom.sentence, f"[{axiom.source}]"] for axiom in encodings.region_axioms()
+    ]
+    print(table(["axiom", "sentence", "source"], rows))
     print(f"\nThe encodings are in {encodings.folder()}")
     return 0
 
