@@ -91,7 +91,7 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, metavar="SEED", help="the first seed")
     parser.add_argument("--views", type=int, default=8, metavar="N", help="looks of dstates")
     parser.add_argument("--most", type=int, default=3, metavar="N", help="the most changes")
-    parser.add_argument("--price", type=float, default=0.5, metavar="DSTATES")
+    parser.add_argument("--price", type=float, default=1.5, metavar="DSTATES")
     parser.add_argument("--limit", type=float, default=20, metavar="S", help="seconds for each")
     options = parser.parse_args()
     theory = Theory(changed=options.price, star="frame")

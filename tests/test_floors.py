@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
 
+import instances
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -15,7 +16,8 @@ from test_property import agree, checker_rejects_foreign_maps
 
 from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
-from ssh_abduction.data import Action, MapError, TheoryError, TraceError
+from ssh_abduction.data import Action, MapError, Odometry, TheoryError, TraceError
+from ssh_abduction.online import route
 from ssh_abduction.output import to_networkx, to_svg
 from ssh_abduction.output.export import export_map
 from ssh_abduction.output.layout import layout
@@ -172,3 +174,22 @@ def test_floors_are_drawn_below_each_other_and_exported() -> None:
         nodes = json.loads(export_map(ssh_map, "nav2", level="dstates"))["features"][:5]
         assert [n["properties"]["metadata"]["floor"] for n in nodes] == [0, 0, 1, 1, 1]
     assert "floor" not in to_svg(solve(trace[:2]).maps[0])
+
+
+@pytest.mark.parametrize("floors", [2, 3])
+def test_a_robot_in_a_tower_of_mazes_changes_floors_by_lifts_only(floors: int) -> None:
+    walk = instances.tower(floors, 3, steps=200, seed=5, odometry=Odometry(along=0.05))
+    states = [state for state in walk.truth if isinstance(state, tuple)]
+    assert len({state[0] for state in states}) == floors
+    for t, action in enumerate(walk.trace.actions):
+        assert (states[t][0] != states[t + 1][0]) == action.changes_floor
+        assert (walk.trace.steps[t + 1].displacement is None) == action.changes_floor
+
+
+def test_a_route_changes_floors_by_the_lift_only() -> None:
+    """A path of the first map leads on at the other floor. Nobody can travel along it."""
+    ssh_map = solve(SHAFT).maps[0]
+    assert any({0, 2} <= set(path.order) for path in ssh_map.paths)
+    found = route(ssh_map, 0, 3, by="places")
+    assert found is not None
+    assert found.actions == ("travel", "up", "travel")

@@ -155,11 +155,22 @@ class MoveGraph:
         return s.place, s.path, s.direction
 
     def metres(self, source: Node, target: Node) -> float | None:
-        """The straight distance of a move in metres; None if the map has no poses."""
+        """The straight distance of a move in metres; None if the map has no poses.
+
+        A lift has the length 0, as floors have no common frame.
+        """
         if self._poses is None:
             return None
+        if self._floor(source) != self._floor(target):
+            return 0.0
         a, b = (self._pose(node, self._poses) for node in (source, target))
         return math.hypot(a.x - b.x, a.y - b.y)
+
+    def _floor(self, node: Node) -> int | None:
+        """The floor of a node; None if the map has no floors."""
+        if not isinstance(node, tuple):
+            return self.map.dstates[node].floor
+        return next((s.floor for s in self.map.dstates if s.place == node[0]), None)
 
     def _of_links(self) -> nx.DiGraph[Any]:
         """Make the graph of all dstates and the links between them."""
@@ -203,12 +214,15 @@ class MoveGraph:
     def _imply(self, source: Node, target: Node, action: str | None) -> None:
         """Add a move that the paths of the map imply, unless the map has a link for it.
 
+        Paths do not lead to another floor: nothing shows that one goes on there.
+
         Args:
             source: The start.
             target: The end.
             action: The name of its action; None if it is unknown.
         """
-        if not self._graph.has_edge(source, target):
+        is_known = self._graph.has_edge(source, target)
+        if not is_known and self._floor(source) == self._floor(target):
             cost = self._cost(source, target, UNTRIED_MOVE if action else OPEN_TURN)
             self._graph.add_edge(source, target, action=action, implied=True, cost=cost)
 

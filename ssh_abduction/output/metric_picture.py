@@ -229,11 +229,11 @@ class _Picture:
             spots: The point of each place on the page.
         """
         orders, travels = [], []
-        u = self.unit
+        u, floor = self.unit, {s.place: s.floor for s in self.map.dstates}
         for path in self.map.paths:
             colour, streets = COLOURS[path.id % len(COLOURS)], travelled(self.map, path)
             for p, q in pairwise(path.order):
-                if (min(p, q), max(p, q)) not in streets:
+                if (min(p, q), max(p, q)) not in streets and floor.get(p) == floor.get(q):
                     dotted = {"stroke_dasharray": "2 5", "opacity": 0.7}
                     orders.append(_line(spots[p], spots[q], colour, 2 * u, **dotted))
             for p, q in streets:

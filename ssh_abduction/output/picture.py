@@ -103,7 +103,12 @@ def _path(ssh_map: SSHMap, path: MapPath, spots: dict[int, Point]) -> list[str]:
     colour, streets = COLOURS[path.id % len(COLOURS)], travelled(ssh_map, path)
     dotted = {"stroke_width": 2, "stroke_dasharray": "2 6", "opacity": 0.7}
     broad = {"stroke_width": 9, "stroke_linecap": "round", "opacity": 0.55}
-    untravelled = [(p, q) for p, q in pairwise(path.order) if (min(p, q), max(p, q)) not in streets]
+    floor = {s.place: s.floor for s in ssh_map.dstates}
+    untravelled = [
+        (p, q)
+        for p, q in pairwise(path.order)
+        if (min(p, q), max(p, q)) not in streets and floor.get(p) == floor.get(q)
+    ]
     return [
         element("path", d=line(spots[p], spots[q]), stroke=colour, **style)
         for pairs, style in ((untravelled, dotted), (streets, broad))
