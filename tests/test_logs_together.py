@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -22,14 +23,16 @@ from simulator.world import World
 from ssh_abduction.cli import main
 from ssh_abduction.cli.run_folders import digest, distinct
 from ssh_abduction.cli.simulate import scans_of
-from ssh_abduction.data import Trace, drives_of
+from ssh_abduction.data import Trace, drives_of, together
 from ssh_abduction.data.drives import starts_of
 from ssh_abduction.data.odometry import between, moved
 from ssh_abduction.evaluation import evaluate_visits
+from ssh_abduction.robot_logs import log_report
 from ssh_abduction.robot_logs.drive_frames import BESIDE, laid_over
 from ssh_abduction.robot_logs.log_maps import map_log
 from ssh_abduction.robot_logs.log_picture import colour_of
-from ssh_abduction.solver import Solution
+from ssh_abduction.solver import Solution, solve
+from ssh_abduction.theory.theory import Theory
 
 SHARED = 30  # scans that both drives have
 
@@ -207,3 +210,13 @@ def test_logs_that_do_not_go_together_are_refused(
 def test_map_log_says_what_it_takes(given: Any, names: Any, said: str) -> None:
     with pytest.raises(LogError, match=said):
         map_log(given, name=names)
+
+
+def test_the_report_names_a_drive_that_shares_nothing() -> None:
+    drives = [("monday", "ab"), ("tuesday", "xy")]
+    joint = together([Trace.from_steps(views, ["travel"], name=name) for name, views in drives])
+    run = {"drives": [{"scans": 9, "metres": 5.0, "visits": 2, "steps": 2}] * 2}
+    imported: Any = SimpleNamespace(trace=joint)
+    told = "".join(log_report._drives(imported, solve(joint, Theory.causal()), run))
+    assert "The map is in 2 pieces that share no place: monday alone; tuesday alone." in told
+    assert "monday and tuesday: nothing in common in any of the maps." in told

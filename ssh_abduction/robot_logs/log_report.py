@@ -118,7 +118,7 @@ def _drives(imported: Imported, solution: Solution, run: Mapping[str, Any]) -> I
     if len(drives) < 2 or not solution.maps:
         return
     places = place_of_steps(solution.maps[0])
-    at = [set(places[drive.first : drive.stop]) for drive in drives]
+    at = [set(places[drive.first : drive.stop]) - {None} for drive in drives]
     rows = []
     for k, (drive, told) in enumerate(zip(drives, run["drives"], strict=True)):
         others = set().union(*at[:k], *at[k + 1 :])
