@@ -118,6 +118,18 @@ def test_a_search_near_a_guess_changes_no_answer(
     assert found.complete == (not most or expected.count <= most)
 
 
+def test_known_labels_end_a_search_only_if_they_reach_the_bound() -> None:
+    known = name_search.Incumbent(lambda labels: labels[0] == labels[-1])
+    known.take([0, 1, 2, 0], 2)
+    assert not known.is_settled()
+    known.take([0, 1, 0, 1], 2)  # few enough, but not allowed
+    known.take([0, 1, 2, 3, 0], 2)  # more than are known
+    assert not known.is_settled()
+    known.raise_bound(3)
+    assert known.is_settled()
+    assert known.labels == [0, 1, 2, 0]
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_some_maps_where_the_search_near_a_guess_has_the_proof(seed: int) -> None:
     """Then names may still be fewer than dstates: what is at a rest is no map."""
