@@ -439,7 +439,7 @@ def solved(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> str:
 def test_the_shell_prints_a_table(solved: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["evaluate", solved, ACES]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == "no map is the true one, of 4 maps"
+    assert lines[0] == "none of 4 maps is the true one"
     assert (
         lines[1] == "the truth, told at 23 of 23 steps: 22 dstates, 9 places; "
         "13 % of the pairs of dstates share a view"
@@ -478,7 +478,7 @@ def test_the_shell_says_which_map_is_true(
     (tmp_path / "map.json").write_text(json.dumps(cut))
     assert main(["evaluate", *files]) == 0
     assert capsys.readouterr().out.startswith(
-        "no map is the true one, of 1 map, and there may be more\n"
+        "none of 1 map is the true one, and there may be more\n"
     )
     told(trace, [{"place": name} for name in names]).save(tmp_path / "trace.jsonl")
     assert main(["evaluate", *files]) == 0

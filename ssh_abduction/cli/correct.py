@@ -14,7 +14,7 @@ HELPS = {
     "same": "steps I and J, such as monday:12,tuesday:3, are one dstate; may be given again",
     "different": "steps I and J are different dstates; may be given again",
     "elsewhere": "steps I and J are at different places; may be given again",
-    "open": "a gateway is open; may be given again",
+    "open": "a gateway is open, named as with --closed; may be given again",
     "closed": (
         "a gateway is closed: a place and a direction on the drawn map, such as 'p4 north', or a "
         "step and a direction from the robot, such as 'monday:12 left'; may be given again"
@@ -24,8 +24,8 @@ HELPS = {
 
 def add_parser(verbs: Verbs) -> None:
     text = (
-        "Say what a map has wrong. It is written to corrections.yaml beside the map. solve obeys "
-        "this file where it writes a map beside it (-o), and with --corrections."
+        "Correct a map. The corrections are saved in corrections.yaml beside it. solve obeys this "
+        "file if it writes its map beside the file (-o), or with --corrections."
     )
     parser = verbs.add_parser("correct", help="say what a map has wrong", description=text)
     parser.add_argument("maps", help="file that solve -o wrote, or a folder with maps.json")
@@ -37,7 +37,10 @@ def add_parser(verbs: Verbs) -> None:
         action="append",
         nargs=2,
         metavar=("WHAT", "NAME"),
-        help="name a place or a path, as the verb name does; may be given again",
+        help=(
+            "name a place, path or region (p4, path2, region3), or the place of a step "
+            "(monday:12); may be given again"
+        ),
     )
     parser.add_argument(
         "--map",

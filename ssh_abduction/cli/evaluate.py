@@ -219,7 +219,8 @@ def _headline(found: Evaluation, may_be_more: bool) -> str:
         return f"map {found.rank} is the true one, {of}"
     if all(one.isomorphic is None for one in found.maps):
         return f"unknown which map is the true one, {of}: the truth names places or paths only"
-    return f"no map is the true one, {of}"
+    number, more = counted(len(found.maps), "maps"), ", and there may be more"
+    return f"none of {number} is the true one{more if may_be_more else ''}"
 
 
 def _truth(found: Evaluation, steps: int) -> str:

@@ -53,8 +53,9 @@ def add_parser(verbs: Verbs) -> None:
         type=float,
         metavar="S",
         help=(
-            "seconds for finding minimal maps (default: import and mapping together take a "
-            "twentieth of the time that the robot drove, but this part gets at least 5)"
+            "seconds for the search (default: three quarters of what the import leaves of a "
+            "twentieth of the driving time, but at least 30; a search that finds no map goes "
+            "on for longer)"
         ),
     )
     parser.add_setting(

@@ -103,8 +103,8 @@ def add_parser(verbs: Verbs) -> None:
         "--corrections",
         metavar="FILE",
         help=(
-            "obey the names and corrections in this file, or in a folder (default: "
-            "corrections.yaml beside the file of --output, if it exists)"
+            "obey the names and corrections in this file, or in corrections.yaml of this folder "
+            "(default: corrections.yaml beside the file of --output, if it exists)"
         ),
     )
     front = (

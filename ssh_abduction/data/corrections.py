@@ -244,13 +244,16 @@ class Corrections:
         )
 
     def assertions(self, trace: Trace) -> dict[str, tuple[tuple[int, int], ...]]:
-        """Return the pairs of steps as fields of a theory for a trace.
+        """Convert the pairs of steps to the fields same, different and elsewhere of a theory.
+
+        Pairs of other drives are left out.
 
         Returns:
             For same, different and elsewhere: the pairs, by the numbers of the steps.
 
         Raises:
-            MapError: The trace has no drive, or no step, that is named.
+            MapError: A sentence names a drive that neither the trace nor these corrections list,
+                or a step that its drive does not have.
         """
         drives = drives_of(checked_trace(trace))
         return {

@@ -55,9 +55,9 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
     """A scikit-learn estimator that learns to recognise dstates from images and actions.
 
     It needs no place names. Given several traces of one building, it clusters the images of all
-    traces into views, and labels them all by the joint map of the traces. Of several minimal joint
-    maps, it takes those by which most images are at the dstate of the most similar image of another
-    trace.
+    traces into views, and labels them all by the joint map of the traces. For each image, it finds
+    the most similar image of another trace. If several joint maps are minimal and `choose` is None,
+    it keeps the maps that put most of these pairs at one dstate.
 
     Args:
         theory: The axioms; Theory.topological() by default.

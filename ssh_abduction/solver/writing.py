@@ -21,7 +21,7 @@ def summary_of(solution: Solution, count: int, backbone: Backbone | None) -> str
 
     Args:
         solution: The solution.
-        count: The number of maps given. The solution need not hold the maps.
+        count: The number of maps that were found. They need not be in the solution.
         backbone: What the known minimal maps share; None if no minimal map is known.
     """
     if solution.status is Status.UNSATISFIABLE:

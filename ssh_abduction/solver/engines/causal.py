@@ -59,7 +59,7 @@ class CausalEngine:
         return map(self._found, self._named.all_of(cost[0], enough))
 
     def labellings(self, cost: tuple[int, ...]) -> None:
-        """Return None: these maps have no places and paths that could differ for a labelling."""
+        """Return None: a labelling has only one map here, as there are no places and paths."""
 
     def forbid(self, equalities: Collection[Equality]) -> bool:
         self._named.forbid_together([(equality.first, equality.second) for equality in equalities])

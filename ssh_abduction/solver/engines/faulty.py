@@ -189,7 +189,7 @@ class FaultyEngine:
                 self._control.give_around([failed])
 
     def labellings(self, cost: tuple[int, ...]) -> None:
-        """Return None: these maps have no places and paths that could differ for a labelling."""
+        """Return None: a labelling has only one map here, as there are no places and paths."""
 
     def forbid(self, equalities: Collection[Equality]) -> bool:
         self._control.forbidden.append(equalities)

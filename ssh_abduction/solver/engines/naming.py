@@ -198,11 +198,12 @@ class NamedLabels:
         self.program.tell_forbidden(len(self._forbidden) - 1)
 
     def all_of(self, dstates: int, enough: int) -> Generator[list[int], None, None]:
-        """Yield all labels with this many dstates, each once. Labels already known come first.
+        """Yield each labelling with this many dstates once, the known one first.
 
         Args:
             dstates: The number of dstates.
-            enough: Clingo is asked for this many labels, beside the known ones; 0 for all.
+            enough: Ask clingo for at most this many labellings; 0 for all. Clingo is not asked
+                if this is 1 and one is known.
         """
         known = self._incumbent.labels
         if known and len(set(known)) != dstates:

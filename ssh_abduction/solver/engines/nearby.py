@@ -100,11 +100,12 @@ class NearbySearch:
         self._random = random.Random(0)
 
     def fewer(self, guess: Sequence[int], tries: int | None = None) -> Iterator[Labels]:
-        """Yield labels of all nodes, each time with fewer dstates.
+        """Yield the guess, or a map near it, and then maps with fewer and fewer dstates.
 
         Args:
             guess: The dstate of each node, -1 if it is unknown. It need not be a map.
-            tries: Give up after this many rounds without a proof; None to go on until there is one.
+            tries: Give up after this many rounds that neither save a dstate nor prove that all are
+                needed; None to go on until there is a proof.
         """
         if known := self._pinned.chart.is_map(guess):
             yield list(guess)

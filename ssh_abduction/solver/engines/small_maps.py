@@ -35,7 +35,7 @@ GUESSED = 24_000
 
 
 class SmallMaps:
-    """Labels of small maps of the first steps of a trace."""
+    """Finds small maps of first steps by merging and guessing, for a search that stops early."""
 
     def __init__(self, task: Task, pinned: Pinned) -> None:
         """Prepare for a chart.

@@ -29,7 +29,7 @@ AT_FIRST, FIRST_STEPS = 8, 32
 
 
 class StepEngine:
-    """The engine that grounds the readable encodings. The first step at a dstate is its name."""
+    """The engine that grounds the readable encodings. The first step at a dstate names it."""
 
     lists_least = False
     goes_on = True

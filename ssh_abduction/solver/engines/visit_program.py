@@ -273,9 +273,9 @@ class VisitProgram:
         return [self._pair_of[symbol] for symbol in model.symbols(shown=True)]
 
     def read_literals(self) -> Mapping[Pair, int]:
-        """Look up the literal of each pair of visits: that they are at one place.
+        """Return the literal that says that two visits are at one place, for each pair.
 
-        The pairs come in the order in which clingo got them. Looking up many literals takes
+        Pairs are in the order in which they were given to clingo. Looking up many literals takes
         seconds, so call this only if they are needed.
         """
         atoms = self._asker.control.symbolic_atoms

@@ -138,8 +138,8 @@ def settled_facts(
     return "\n".join([*facts, *preferred(theory)])
 
 
-def read_rivals(control: Control) -> tuple[list[int], list[tuple[int, int]]]:
-    """Read all segments, and the pairs of segments that cannot be one path, from a control."""
+def read_distinct(control: Control) -> tuple[list[int], list[tuple[int, int]]]:
+    """Read all segments from a grounded control, and the pairs of them that cannot be one path."""
     segments = sorted(
         read_atom(atom.symbol)[1][0] for atom in control.symbolic_atoms.by_signature("segment", 1)
     )
@@ -184,7 +184,7 @@ class Segments:
             [(c, p) for c, p in atoms("elsewhere", 2)],
             [(g, c, b) for g, c, b in atoms("travel_on", 3)],
         )
-        return cls(places, elsewhere, travels, *read_rivals(control))
+        return cls(places, elsewhere, travels, *read_distinct(control))
 
 
 def tight_facts(homes: Mapping[int, Iterable[int]]) -> str:
