@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import replace
 
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import heeding
 from ssh_abduction.runtime.logs import log_of
 from ssh_abduction.solver.answer import Answer
@@ -12,6 +15,7 @@ from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.map_list import Priced, note
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.values import Status
+from ssh_abduction.theory.theory import Theory
 
 # If the time limit stops a search, making and checking a map may take OVERTIME seconds more, plus
 # OVERTIME_SHARE of the limit.
@@ -47,6 +51,27 @@ def fall_back(parts: Parts, answer: Answer, *, may_search: bool) -> None:
     answer.count_apart()
     if known.best is not None and known.status is Status.UNKNOWN:
         known.status = Status.FEASIBLE
+
+
+def two_steps_clash(
+    trace: Trace, theory: Theory, maps_of: Callable[[Trace, Theory], tuple[Sequence[SSHMap], bool]]
+) -> bool:
+    """Whether some step and the next one have no map by themselves. Then the trace has none.
+
+    Args:
+        trace: The trace.
+        theory: Its theory, with all defaults filled in. With faults nothing is tried.
+        maps_of: Solves a trace: some map, and whether the answer is proven.
+    """
+    bare = theory.replace(weigh="count", displacement="none")
+    for t, action in enumerate(() if theory.has_faults else trace.actions):
+        steps = trace.steps[t], replace(trace.steps[t + 1], action=None)
+        if not action.starts:
+            two = Trace(steps, odometry=trace.odometry)
+            maps, proven = maps_of(two, bare.of_steps(t, 2))
+            if proven and not maps:
+                return True
+    return False
 
 
 def salvage(parts: Parts) -> None:

@@ -26,7 +26,7 @@ from ssh_abduction.runtime.logs import log_of
 from ssh_abduction.solver.answer import Answer
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError, Stop
 from ssh_abduction.solver.asp.rules import check_rules
-from ssh_abduction.solver.fallback import OVERTIME, best_map, fall_back
+from ssh_abduction.solver.fallback import OVERTIME, best_map, fall_back, two_steps_clash
 from ssh_abduction.solver.map_list import Priced, by_count, listed
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.ranking import Ranking
@@ -296,9 +296,13 @@ class Search:
         from threadpoolctl import threadpool_limits
 
         watch = self._parts.watch
+
+        def maps_of(trace: Trace, theory: Theory) -> tuple[tuple[SSHMap, ...], bool]:
+            return self._solve_mended(trace, theory, 1, watch.left())
+
         # The matrices are small: threads of BLAS would mostly wait for each other.
         with threadpool_limits(1, user_api="blas"):
-            if not weighing.guess(self._two_steps_clash):
+            if not weighing.guess(lambda: two_steps_clash(self.trace, self.theory, maps_of)):
                 self._parts.known.status = Status.UNSATISFIABLE
                 return
         if watch.left() < math.inf:
@@ -309,21 +313,6 @@ class Search:
         if self._parts.known.status is not Status.UNSATISFIABLE:
             most = self.limits.most
             weighing.search(lambda trace, theory, s: self._solve_mended(trace, theory, most, s))
-
-    def _two_steps_clash(self) -> bool:
-        """Whether some step and the next one have no map by themselves. Then the trace has none."""
-        if self.theory.has_faults:
-            return False
-        bare = self.theory.replace(weigh="count", displacement="none")
-        for t, action in enumerate(self.trace.actions):
-            steps = self.trace.steps[t], replace(self.trace.steps[t + 1], action=None)
-            two = Trace(steps, odometry=self.trace.odometry)
-            if action.starts:
-                continue
-            maps, proven = self._solve_mended(two, bare.of_steps(t, 2), 1, self._parts.watch.left())
-            if proven and not maps:
-                return True
-        return False
 
     def _solve_mended(
         self, mended: Trace, theory: Theory, most: int, seconds: float

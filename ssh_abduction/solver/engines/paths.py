@@ -174,7 +174,7 @@ class Paths:
             control.add(
                 "pinned",
                 [],
-                paths_lp.pinned_facts(pairwise_distinct(*paths_lp.read_rivals(control))),
+                paths_lp.pinned_facts(pairwise_distinct(*paths_lp.read_distinct(control))),
             )
         control.ground([("pinned", []), ("paths", []), ("each", [])])
         return control
