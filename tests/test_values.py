@@ -272,6 +272,8 @@ def test_a_solution_survives_files(kind: str, tmp_path: Path) -> None:
     file = tmp_path / "maps.json"
     solution.save(file)
     data = json.loads(file.read_text())
+    written = data.pop("trace", None)
+    assert (written is None) == (solution.trace is None)
     for loaded in (Solution.load(file), Solution.load(file, trace), Solution.from_dict(data)):
         assert loaded == solution
         assert loaded.to_dict() == data == solution.to_dict()

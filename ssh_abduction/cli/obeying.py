@@ -19,6 +19,12 @@ from ssh_abduction.solver import Solution, obeyed, with_names
 from ssh_abduction.theory.theory import Theory
 
 
+def corrections_of(options: argparse.Namespace) -> Corrections | None:
+    """Read the corrections that --corrections names, or those beside the output; None for none."""
+    file = options.corrections or beside(options.output)
+    return None if file is None else load_corrections(file)
+
+
 @dataclass(frozen=True)
 class Obeying:
     """The corrections that a search obeys.
@@ -44,10 +50,9 @@ class Obeying:
         Raises:
             MapError: The file is malformed, is of other drives, or contradicts the trace.
         """
-        file = options.corrections or beside(options.output)
-        if file is None:
+        said = corrections_of(options)
+        if said is None:
             return cls(Corrections(), trace, theory, trace, theory)
-        said = load_corrections(file)
         corrected = cls(said, *obeyed(said, trace, theory), trace, theory)
         corrected.say()
         return corrected

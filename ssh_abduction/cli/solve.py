@@ -100,6 +100,14 @@ def add_parser(verbs: Verbs) -> None:
         help="with --together: also write the joint trace to this file",
     )
     parser.add_argument(
+        "--onto",
+        metavar="MAPS",
+        help=(
+            "add the trace to the first map in this file, which solve -o wrote, and keep its "
+            "dstates and places; costs about what the new trace costs"
+        ),
+    )
+    parser.add_argument(
         "--corrections",
         metavar="FILE",
         help=(
@@ -156,6 +164,10 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    if options.onto is not None:
+        from ssh_abduction.cli import onto
+
+        return onto.run(options)
     if options.front is not None:
         from ssh_abduction.cli import front
 

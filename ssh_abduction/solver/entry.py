@@ -27,6 +27,7 @@ from ssh_abduction.solver.engines.base import Engine, Task
 from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.obeying import obeyed, with_names
+from ssh_abduction.solver.onto import Solving, solve_onto
 from ssh_abduction.solver.result import Solution
 from ssh_abduction.solver.search import Search
 from ssh_abduction.solver.sharing import Backbone, Sharing
@@ -48,6 +49,7 @@ def solve(
     speedups: Speedups = ALL,
     on_progress: Callable[[Progress], None] | None = None,
     corrections: Corrections | None = None,
+    onto: Solution | None = None,
 ) -> Solution:
     """Find the minimal maps of a trace.
 
@@ -69,6 +71,9 @@ def solve(
         speedups: The speed-ups that are on. None of them changes the answer.
         on_progress: A function that is called now and then with a `Progress`.
         corrections: Names and corrections of a person, to be obeyed.
+        onto: The solution of earlier drives, with their trace. Its first map stands, and the
+            minimal maps among those that keep its dstates and places are found. This costs about
+            what the new drive costs.
 
     Returns:
         The maps, their cost, and what is proven about them.
@@ -77,29 +82,36 @@ def solve(
         TraceError: A view, a star or the kind of an action that the theory needs is missing.
         TheoryError: The theory needs stars or displacements, but the trace has none; or the theory
             names steps that the trace does not have.
-        SolverError: A limit, `max_maps` or `within` is out of range.
+        SolverError: A limit, `max_maps` or `within` is out of range; or the trace contradicts the
+            map of `onto`.
         MapError: The corrections are of other drives, or contradict the trace.
 
     Reference:
         Kuipers & Beeson 2002, "Bootstrap Learning for Place Recognition", step 2.
     """
-    theory = checked_theory(theory)
     joint = together(trace) if isinstance(trace, list | tuple) else checked_trace(trace)
+
+    def find(trace: Trace, theory: Theory) -> Solution:
+        search = Search(
+            trace,
+            theory,
+            time_limit=time_limit,
+            max_maps=max_maps,
+            within=within,
+            memory_limit=memory_limit,
+            speedups=speedups,
+            on_progress=on_progress,
+        )
+        return search.solution(tuple(search))
+
+    if onto is not None:
+        return solve_onto(joint, onto, theory, corrections, Solving(find, speedups))
+    theory = checked_theory(theory)
     theory.check_steps(joint)
-    if corrections is not None:
-        joint, theory = obeyed(corrections, joint, theory)
-    search = Search(
-        joint,
-        theory,
-        time_limit=time_limit,
-        max_maps=max_maps,
-        within=within,
-        memory_limit=memory_limit,
-        speedups=speedups,
-        on_progress=on_progress,
-    )
-    solution = search.solution(tuple(search))
-    return solution if corrections is None else with_names(corrections, solution, joint)
+    if corrections is None:
+        return find(joint, theory)
+    joint, theory = obeyed(corrections, joint, theory)
+    return with_names(corrections, find(joint, theory), joint)
 
 
 def find_backbone(

@@ -5,6 +5,8 @@ Each function takes a `FieldReader`, which checks fields and knows the name of t
 
 from __future__ import annotations
 
+import io
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,6 +15,8 @@ from ssh_abduction.checker.joins import Join
 from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.errors import MapError, TheoryError
 from ssh_abduction.data.fields import FieldReader
+from ssh_abduction.data.trace import Trace
+from ssh_abduction.data.trace_file import read_trace
 from ssh_abduction.solver.sharing import Backbone
 from ssh_abduction.solver.steps.certificate import Basis, Certificate
 from ssh_abduction.solver.values import Bound, Cost, Effort, Grounding, Level, Seconds
@@ -32,7 +36,8 @@ class Recorded:
         warnings: Sentences that say what makes the trace suspicious.
         explanation: Why there is no map, as in the file; None if the file does not say.
         joins: The joins of the first map that rest on minimality alone.
-        drives: The drives of the trace; empty if it has one.
+        drives: The drives of the trace; empty if the file does not say.
+        onto: The names of the drives whose map stood; empty if all drives were solved.
     """
 
     certificate: Certificate | None
@@ -41,6 +46,7 @@ class Recorded:
     explanation: Mapping[str, Any] | None
     joins: tuple[Join, ...]
     drives: tuple[Drive, ...]
+    onto: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, read: FieldReader, record: Mapping[str, Any], steps: int) -> Recorded:
@@ -72,6 +78,7 @@ class Recorded:
             else read.mapping(record["explanation"], "explanation"),
             joins=joins_in(read, record, steps),
             drives=drives_in(read, record, steps),
+            onto=tuple(map(str, read.list(record, "onto", optional=True))),
         )
 
 
@@ -89,6 +96,7 @@ class Support:
         weighed: The costs in nats and the rival maps, if maps were compared by cost; else None.
         recorded: The certificate and warnings of the file, if the solution was read from a file;
             else None.
+        onto: The names of the drives whose map stood; empty if all drives were solved.
     """
 
     basis: Basis | None = None
@@ -96,6 +104,7 @@ class Support:
     weigh_warning: str | None = None
     weighed: Weighed | None = None
     recorded: Recorded | None = None
+    onto: tuple[str, ...] = ()
 
     @property
     def certificate(self) -> Certificate | None:
@@ -113,6 +122,14 @@ def backbone_in(read: FieldReader, record: Mapping[str, Any], steps: int) -> Bac
     if record.get("backbone") is None:
         return None
     return Backbone.from_dict(record["backbone"], steps, f"{read.where}: backbone")
+
+
+def trace_in(record: Mapping[str, Any], where: str) -> Trace | None:
+    """Read the trace that was solved; None if the file has none. Raises TraceError."""
+    if not isinstance(record.get("trace"), list):
+        return None
+    lines = "".join(f"{json.dumps(line)}\n" for line in record["trace"])
+    return Trace(**read_trace(io.BytesIO(lines.encode()), f"{where}: trace"))
 
 
 def drives_in(read: FieldReader, record: Mapping[str, Any], steps: int) -> tuple[Drive, ...]:

@@ -35,6 +35,7 @@ from ssh_abduction.solver.recorded import (
     effort_in,
     levels_in,
     theory_in,
+    trace_in,
 )
 from ssh_abduction.solver.sharing import Backbone, Sharing
 from ssh_abduction.solver.steps.certificate import Certificate
@@ -49,7 +50,7 @@ from ssh_abduction.solver.values import (
     cost_as_counted,
 )
 from ssh_abduction.solver.weighed import Weighed
-from ssh_abduction.solver.writing import ending, opening, summary_of, written_map
+from ssh_abduction.solver.writing import ending, opening, summary_of, written_map, written_trace
 from ssh_abduction.theory.theory import Theory
 
 
@@ -358,7 +359,7 @@ class Solution(MapSequence):
         }
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the answer to a file as `solve --json` does, with a line for each map.
+        """Write the answer as `solve --json` does, with a line for each map, and the trace.
 
         Raises:
             MapError: The file cannot be written, or the maps are not those that the search gave.
@@ -367,6 +368,7 @@ class Solution(MapSequence):
         maps = data.pop("maps")
         head = opening(self.theory, self.steps, self.within)
         end = {name: value for name, value in data.items() if name not in head}
+        end |= {} if self.trace is None else written_trace(self.trace)
         lines = ",\n".join(json_line(m) for m in maps)
         write_map(
             path, f'{json_line(head)[:-1]}, "maps": [\n{lines}\n],{json_line(end)[1:]}', "solution"
@@ -378,8 +380,8 @@ class Solution(MapSequence):
 
         Args:
             path: The file; "-" for standard input.
-            trace: The trace that was solved. If it is given, the maps are checked against it, and
-                the solution keeps it.
+            trace: The trace that was solved; None for the one in the file, if it has one. The maps
+                are checked against it, and the solution keeps it.
 
         Raises:
             MapError: The file has another version, or contradicts itself or the trace.
@@ -403,6 +405,7 @@ class Solution(MapSequence):
         record = _checked_record(read, data)
         maps = tuple(maps_of(record, where))
         steps = read.integer(record["steps"], "steps")
+        trace = trace or trace_in(record, where)
         theory = theory_in(record["theory"], where)
         if (false := next(contradictions(record, maps, steps, theory), None)) is not None:
             raise MapError(f"{where}: {false}; it was changed by hand, or cut")

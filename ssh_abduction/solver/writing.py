@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+import json
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
-from ssh_abduction.data.drives import with_fingerprints
+from ssh_abduction.data.drives import drives_of, with_fingerprints
 from ssh_abduction.data.map_file import SOLUTION_FORMAT, VERSION
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.sharing import Backbone
 from ssh_abduction.solver.values import Cost, Status
 from ssh_abduction.theory.theory import Theory
@@ -76,6 +78,13 @@ def written_map(ssh_map: SSHMap, cost: Cost | None = None) -> dict[str, Any]:
     return ssh_map.to_dict() | ({"cost": cost.to_dict()} if cost else {})
 
 
+def written_trace(trace: Trace) -> dict[str, Any]:
+    """A trace as the file of its solution has it: the lines of its file, without images."""
+    steps = tuple(replace(step, image=None, truth=None) for step in trace.steps)
+    bare = replace(trace, steps=steps, images=None, drive=drives_of(trace)[0].name)
+    return {"trace": [json.loads(line) for line in bare.to_lines()]}
+
+
 def ending(solution: Solution, count: int, backbone: Backbone | None) -> dict[str, Any]:
     """The fields of a solution's JSON that come after the maps, by name.
 
@@ -101,6 +110,8 @@ def ending(solution: Solution, count: int, backbone: Backbone | None) -> dict[st
     drives = () if recorded is None else recorded.drives
     if recorded is None and solution.trace is not None:
         drives = with_fingerprints(solution.trace)
+    if onto := solution.support.onto or (() if recorded is None else recorded.onto):
+        end["onto"] = list(onto)
     if drives:
         end["drives"] = [drive.to_dict() for drive in drives]
     # Leave out fields that would say nothing.

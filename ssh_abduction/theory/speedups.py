@@ -47,6 +47,7 @@ class Speedups:
     ways: bool = True
     processes: bool = True
     greedy: bool = True
+    digest: bool = True
 
     def __post_init__(self) -> None:
         for name in SPEEDUPS:
@@ -345,7 +346,12 @@ TABLE = (
         "Places with frames: settle dstates, as visits that are one, before places and paths.",
         _has_frames,
         FRAMES,
-        _kept_by("visits", "sides_framed", "paths_framed", and_also=(*PAIRS_OF_STEPS, *OF_TRACES)),
+        _kept_by(
+            "visits",
+            "sides_framed",
+            "paths_framed",
+            and_also=(*PAIRS_OF_STEPS, *OF_TRACES, "asserted same"),
+        ),
     ),
     Speedup(
         "ways",
@@ -424,6 +430,15 @@ TABLE = (
         _keeps_headings,
         PLACES - {"course_needs_travel"},
         lambda: SURVIVE_A_CUT - {"asserted same", *PAIRS_OF_STEPS},
+    ),
+    Speedup(
+        "digest",
+        "digest",
+        "A drive is added to a standing map: give the solver each link of the map once, instead "
+        "of all old steps.",
+        lambda theory: not theory.has_faults,
+        ONE_OF_EACH,
+        lambda: (SURVIVE_A_CUT | GATEWAYS | {"the field unknown_views"}) - {"one_pose", "closure"},
     ),
     Speedup(
         "framing",

@@ -156,11 +156,10 @@ class VisitLabels:
         ]
 
     def _first_visits(self, chart: FramedChart) -> set[int]:
-        """Return the visits that clingo gets first.
-
-        These are all visits, or those of the clique and some first ones if there are many pairs.
-        """
-        first = chart.visits_with(FIRST_PAIRS) if self._task.speedups.lazy else len(chart.stars)
+        """Return the visits that clingo gets first: all, or the clique's and some first ones."""
+        # Clingo has to know all visits that the user says are at one place.
+        is_lazy = self._task.speedups.lazy and not self._task.log.pairs.one
+        first = chart.visits_with(FIRST_PAIRS) if is_lazy else len(chart.stars)
         return {*range(first), *(chart.facing[node][0] for node in self.clique)}
 
     def _give(

@@ -20,6 +20,7 @@ from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.transitive import Pair, PairOf, Three, Transitive, intransitive
 from ssh_abduction.solver.steps.chart import FramedChart, numbered
 from ssh_abduction.solver.steps.localising import Located, State, faced, located
+from ssh_abduction.theory.pairs import pairs_in
 
 # Clingo takes about this many seconds to ground one pair of visits that may be at one place. It
 # cannot be stopped meanwhile.
@@ -145,6 +146,7 @@ class _Known:
         ends: The visits for which the control has the action that ends them.
         turns: The turns, as (node, direction, node).
         fits: The pairs of visits that may be at one place.
+        joined: The pairs of visits that the user says are at one place.
     """
 
     visits: set[int] = field(default_factory=set)
@@ -152,6 +154,7 @@ class _Known:
     ends: set[int] = field(default_factory=set)
     turns: set[tuple[int, str, int]] = field(default_factory=set)
     fits: frozenset[Pair] = frozenset()
+    joined: frozenset[Pair] = frozenset()
 
 
 class VisitProgram:
@@ -178,6 +181,7 @@ class VisitProgram:
         self.batch = -1
         self._asker, self._trace, self._sides = asker, task.trace, sides
         self._core_guided = task.speedups.core_guided
+        self._one = pairs_in(task.log.pairs.one)
         asker.control = new_control("visits", "", ["--heuristic=Domain"])
         self.cores = Cores(asker, self.tell)
         self.transitive = Transitive()
@@ -245,14 +249,29 @@ class VisitProgram:
         known.turns.update(turns)
         new, unfit = sorted(fits - known.fits), sorted(known.fits - fits)
         known.fits = fits
+        joined = sorted(self._joined() - known.joined)
+        known.joined |= frozenset(joined)
         part = f"visits_{self.batch}"
-        control.add(part, [], visits_lp.visit_facts(self.batch, nodes, leaves, new, unfit))
+        facts = visits_lp.visit_facts(self.batch, nodes, leaves, new, unfit, joined)
+        control.add(part, [], facts)
         control.add(part, [], sides_lp.turn_facts(self.batch, chart, added, turns))
         control.ground([(part, []), ("more", numbers(self.batch))])
         control.assign_external(visits_lp.listed(self.batch), True)
         self._avoid_lone(place for place, *_ in nodes)
         self._unread += new
         self._sides.extend(self.batch)
+
+    def _joined(self) -> set[Pair]:
+        """The pairs of visits that the user says are at one place: a step of each is one dstate."""
+        chart, found = self.chart, set()
+        for i, t in self._one:
+            if t < len(chart.node_of):
+                (first, slot), (last, other) = (chart.facing[chart.node_of[x]] for x in (i, t))
+                # A visit has one node a slot, so different slots of one visit are a contradiction.
+                if first != last or slot != other:
+                    earlier = (first, last, (other - slot) % 4)
+                    found.add(earlier if first <= last else (last, first, (slot - other) % 4))
+        return found
 
     def _avoid_lone(self, places: Iterable[int]) -> None:
         """Assume that none of these new nodes is lone; count those that are lone in any case.

@@ -20,6 +20,7 @@ def visit_facts(
     leaves: Iterable[tuple[int, int, int]],
     fits: Iterable[tuple[int, int, int]],
     unfit: Iterable[tuple[int, int, int]] = (),
+    joined: Iterable[tuple[int, int, int]] = (),
 ) -> str:
     """The facts for one batch.
 
@@ -30,8 +31,9 @@ def visit_facts(
             action.
         fits: Pairs of visits (I, J, R) that may be at one place.
         unfit: Pairs (I, J, R) of earlier batches that turned out not to be at one place.
+        joined: Pairs (I, J, R) that the user says are at one place.
     """
-    new = {"node": nodes, "leaves": leaves, "fits": fits, "unfit": unfit}
+    new = {"node": nodes, "leaves": leaves, "fits": fits, "unfit": unfit, "joined": joined}
     return "\n".join(
         f"{name}({batch},{','.join(map(str, args))})."
         for name, rows in new.items()

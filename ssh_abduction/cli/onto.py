@@ -1,0 +1,47 @@
+"""ssh-abduction solve TRACE --onto MAPS: add a drive to a map that stands."""
+
+from __future__ import annotations
+
+import argparse
+
+from ssh_abduction.cli.obeying import corrections_of
+from ssh_abduction.cli.options import number_steps, theory_of
+from ssh_abduction.cli.outcome import dump, exit_code
+from ssh_abduction.cli.text import describe, headline
+from ssh_abduction.data.drives import sentence_of, together
+from ssh_abduction.data.errors import AbductionError, printable
+from ssh_abduction.data.trace import Trace
+from ssh_abduction.solver import Solution, solve
+from ssh_abduction.theory.speedups import Speedups
+
+
+def run(options: argparse.Namespace) -> int:
+    for name in ("front", "jobs", "scheduler", "joint_trace"):
+        if getattr(options, name) is not None:
+            flag = f"--{name.replace('_', '-')}"
+            raise AbductionError(f"{flag}: expected none with --onto; leave it out")
+    standing = Solution.load(options.onto)
+    trace = together([Trace.load(path) for path in options.traces])
+    if standing.trace is not None:
+        number_steps(options, together([standing.trace, trace]))
+    solution = solve(
+        trace,
+        theory_of(options, standing.theory.replace(returns=0)),
+        onto=standing,
+        time_limit=options.time_limit,
+        max_maps=options.maps or None,
+        within=options.within,
+        memory_limit=options.memory_limit,
+        speedups=Speedups.without(options.without_speedups),
+        corrections=corrections_of(options),
+    )
+    if options.output is not None:
+        solution.save(options.output)
+    if options.json:
+        print(dump(solution.to_dict()))
+        return exit_code(solution)
+    stands = ", ".join(solution.support.onto)
+    print(headline(solution, len(solution.maps), None))
+    print(printable(f"the map of {stands} stands; {sentence_of(solution.drives, solution[0])}"))
+    print(f"\n{'map 1' if len(solution) > 1 else 'map'}\n{describe(solution[0])}")
+    return exit_code(solution)

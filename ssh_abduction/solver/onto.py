@@ -1,0 +1,344 @@
+"""Add a drive to a map that stands, at about the cost of the new drive.
+
+The solver does not see the old drives, but the standing map: a *digest* of it, which is a trace in
+which each link of the map occurs once. Axioms are about links and observations, so a map of the
+digest and the new drive is a map of all drives. Steps of the digest at different dstates or places
+are asserted to be different. If the best maps also keep its equal steps equal, they are the best
+of all maps that keep the standing one. If not, the readable encodings get rules that keep them
+equal, as far as the traces are short enough.
+
+>>> from ssh_abduction import Trace, solve
+>>> monday = Trace.from_steps("abcd", ["travel", "around", "travel"], name="monday")
+>>> tuesday = Trace.from_steps("bcd", ["around", "travel"], name="tuesday")
+>>> solution = solve(tuesday, onto=solve(monday))
+>>> solution[0].labels
+(0, 1, 2, 3, 1, 2, 3)
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+from ssh_abduction.data.action import Action
+from ssh_abduction.data.checks import an_instance
+from ssh_abduction.data.corrections import Corrections
+from ssh_abduction.data.drives import drives_of, step_name, together
+from ssh_abduction.data.errors import SolverError
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.step import Step
+from ssh_abduction.data.trace import Trace
+from ssh_abduction.data.words import counted
+from ssh_abduction.solver.choosing import READABLE
+from ssh_abduction.solver.obeying import obeyed, with_names
+from ssh_abduction.solver.recorded import Support
+from ssh_abduction.solver.result import Solution
+from ssh_abduction.solver.values import Level, Status
+from ssh_abduction.theory.rules import Rules
+from ssh_abduction.theory.settle import settle
+from ssh_abduction.theory.speedups import Speedups
+from ssh_abduction.theory.theory import Theory, checked_theory
+
+# The rules that keep equal steps of the standing map equal. Each theory has the first one.
+_KEEPS_DSTATES = """\
+% @axiom(standing) The standing map is kept.
+#program step(t).
+violation(standing,t) :- stands(I,t), not same(I,t).
+"""
+_KEEPS_PLACES = "violation(standing,t) :- beside(I,t), at(I,P), not at(t,P).\n"
+
+
+@dataclass(frozen=True)
+class Solving:
+    """How to solve a trace.
+
+    Attributes:
+        solve: Solves a trace under a theory.
+        speedups: The speed-ups that are on.
+    """
+
+    solve: Callable[[Trace, Theory], Solution]
+    speedups: Speedups
+
+
+@dataclass(frozen=True)
+class Digest:
+    """A trace that stands for the old drives.
+
+    Attributes:
+        trace: The trace.
+        labels: The dstate of each of its steps in the standing map.
+    """
+
+    trace: Trace
+    labels: tuple[int, ...]
+
+    @classmethod
+    def of(cls, trace: Trace, ssh_map: SSHMap, *, short: bool) -> Digest:
+        """Make a digest of the drives of a map.
+
+        Args:
+            trace: The drives.
+            ssh_map: Their map.
+            short: Whether each link occurs once. If not, the digest has all steps.
+        """
+        if not short:
+            return cls(trace, ssh_map.labels)
+        shown = _observations(trace, ssh_map)
+        actions = {action.name: action for action in trace.actions}
+        steps: list[Step] = []
+        labels: list[int] = []
+        for trail in _trails(ssh_map):
+            if steps:
+                steps[-1] = replace(steps[-1], action=Action(f"standing {len(steps)}", "start"))
+            for s, action in trail:
+                done = None if action is None else actions[action]
+                steps.append(replace(shown[s][0], action=done))
+                labels.append(s)
+        for s, seen in shown.items():
+            for step in seen[1:]:
+                steps[-1] = replace(steps[-1], action=Action(f"standing {len(steps)}", "start"))
+                steps.append(replace(step, action=None))
+                labels.append(s)
+        return cls(Trace(tuple(steps), drive="standing"), tuple(labels))
+
+
+def solve_onto(
+    trace: Trace,
+    standing: Solution,
+    theory: Theory | None,
+    corrections: Corrections | None,
+    solving: Solving,
+) -> Solution:
+    """Find the least joint maps of a new drive and old ones that keep the map of the old ones.
+
+    Args:
+        trace: The new drive, or several.
+        standing: The solution of the old drives, with their trace. Its first map stands.
+        theory: The theory; None for that of the solution. Its steps are those of the joint trace.
+        corrections: Names and corrections of a person, to be obeyed; None for none.
+        solving: How to solve a trace.
+
+    Raises:
+        SolverError: The solution has no map or no trace, or the new drive contradicts the map.
+    """
+    old, ssh_map = _standing(standing)
+    theory = checked_theory(theory or standing.theory.replace(returns=0))
+    joint = together([old, trace])
+    theory.check_steps(joint)
+    if corrections is not None:
+        joint, theory = obeyed(corrections, joint, theory)
+        old, trace = joint[: len(old)], joint[len(old) :]
+    in_use = settle(joint, theory).theory
+    digest = Digest.of(old, ssh_map, short=solving.speedups.that_hold_for(in_use).digest)
+    with warnings.catch_warnings():  # a digest may have the steps of the new drive
+        warnings.simplefilter("ignore")
+        part = together([digest.trace, trace])
+    pinned = _pinned(theory, digest, ssh_map, old, joins=in_use.star == "frame")
+    found = solving.solve(part, pinned)
+    kept = tuple(m for m in found.maps if _keeps(m, digest, ssh_map))
+    if not kept and found.status is not Status.UNSATISFIABLE:
+        found, kept = _with_rules(part, pinned, digest, ssh_map, found, solving)
+    if not kept:
+        raise _contradiction(old, trace, ssh_map, digest, found)
+    assert found.cost is not None
+    solution = replace(
+        found,
+        maps=tuple(_of_all(m, digest, ssh_map) for m in kept),
+        theory=_settled(found.theory, theory),
+        steps=len(joint),
+        levels=(Level(found.cost, len(kept), found.complete),) if found.within else (),
+        shared=None,
+        trace=joint,
+        support=Support(onto=tuple(drive.name for drive in drives_of(old))),
+    )
+    return solution if corrections is None else with_names(corrections, solution, joint)
+
+
+def _standing(standing: object) -> tuple[Trace, SSHMap]:
+    """The trace of a solution and its first map. Raise SolverError if it lacks one."""
+    mend = "take what solve returned, or Solution.load"
+    solution = an_instance("onto", standing, Solution, SolverError, mend=mend)
+    if not solution.maps or solution.trace is None:
+        raise SolverError(
+            "onto: expected a solution with a map and its trace, got one without; read a file that "
+            "solve -o wrote"
+        )
+    if solution.maps[0].faults or solution.theory.has_faults:
+        raise SolverError(
+            "onto: expected a map without faults, got a theory that allows them; solve all drives "
+            "together"
+        )
+    return solution.trace, solution.maps[0]
+
+
+def _observations(trace: Trace, ssh_map: SSHMap) -> dict[int, list[Step]]:
+    """For each dstate, the different observations made there, those with a view first."""
+    shown: dict[int, dict[object, Step]] = {s.id: {} for s in ssh_map.dstates}
+    for step, label in zip(trace.steps, ssh_map.labels, strict=True):
+        shown[label].setdefault((step.view, step.star), step)
+    return {
+        s: sorted(
+            (Step(view=step.view, star=step.star) for step in seen.values()),
+            key=lambda step: step.view is None,
+        )
+        for s, seen in shown.items()
+    }
+
+
+def _trails(ssh_map: SSHMap) -> list[list[tuple[int, str | None]]]:
+    """Cover the links of a map by few trails, each of dstates with the actions that lead on."""
+    leaving: dict[int, list[tuple[str, int]]] = {s.id: [] for s in ssh_map.dstates}
+    excess = dict.fromkeys(leaving, 0)
+    for s, action, x in sorted(ssh_map.links, reverse=True):
+        leaving[s].append((action, x))
+        excess[s] += 1
+        excess[x] -= 1
+    trails: list[list[tuple[int, str | None]]] = []
+    # A trail that starts where more links leave than arrive cannot be a part of another one.
+    for start in sorted(leaving, key=lambda s: -excess[s]):
+        while leaving[start]:
+            trail: list[tuple[int, str | None]] = []
+            here = start
+            while leaving[here]:
+                action, there = leaving[here].pop()
+                trail.append((here, action))
+                here = there
+            trails.append([*trail, (here, None)])
+    visited = {s for trail in trails for s, _ in trail}
+    return trails + [[(s, None)] for s in leaving if s not in visited]
+
+
+def _pinned(theory: Theory, digest: Digest, ssh_map: SSHMap, old: Trace, *, joins: bool) -> Theory:
+    """The theory for a digest and a new drive: different dstates and places of the map differ.
+
+    Args:
+        theory: The theory.
+        digest: The digest of the old drives.
+        ssh_map: Their map.
+        old: The old drives.
+        joins: Whether to assert equal dstates, too. The fast engine of places with frames obeys
+            this. For other theories, it would switch fast engines off.
+    """
+    place = [ssh_map.dstates[s].place for s in digest.labels]
+    first = {s: t for t, s in reversed([*enumerate(digest.labels)])}
+    apart, elsewhere = [], []
+    for s, i in first.items():
+        # If equal steps are asserted to be equal, their first steps are enough.
+        for x, j in first.items() if joins else ((x, j) for j, x in enumerate(digest.labels)):
+            if s != x and place[i] != place[j]:
+                elsewhere.append((min(i, j), max(i, j)))
+            elif s != x:
+                apart.append((min(i, j), max(i, j)))
+    shift = len(digest.labels) - len(old)
+
+    def moved(pairs: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+        steps = [
+            tuple(first[ssh_map.labels[t]] if t < len(old) else t + shift for t in pair)
+            for pair in pairs
+        ]
+        return [(i, j) for i, j in steps if i != j]
+
+    same = [pair for pair in moved(theory.same) if max(pair) >= len(digest.labels)]
+    if joins:
+        same += [(first[s], t) for t, s in enumerate(digest.labels) if first[s] != t]
+    return theory.replace(
+        same=tuple(same),
+        different=(*moved(theory.different), *apart),
+        elsewhere=(*moved(theory.elsewhere), *elsewhere),
+    )
+
+
+def _keeps(found: SSHMap, digest: Digest, ssh_map: SSHMap) -> bool:
+    """Whether a map of a digest and a new drive has the dstates and places of the standing map."""
+    return not any(_broken(found, digest, ssh_map))
+
+
+def _broken(
+    found: SSHMap, digest: Digest, ssh_map: SSHMap
+) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+    """The pairs of dstates of the standing map that a map splits or merges: dstates, places."""
+    number: dict[int, int] = {}
+    split = {
+        (s, s)
+        for s, x in zip(digest.labels, found.labels, strict=False)
+        if number.setdefault(s, x) != x
+    }
+    pairs = list(combinations(number, 2))
+    merged = {(s, x) for s, x in pairs if number[s] == number[x]}
+    places = {
+        (s, x)
+        for s, x in pairs
+        if (ssh_map.dstates[s].place == ssh_map.dstates[x].place)
+        != (found.dstates[number[s]].place == found.dstates[number[x]].place)
+        and ssh_map.dstates[s].place is not None
+    }
+    return sorted(split | merged), sorted(places)
+
+
+def _with_rules(
+    part: Trace,
+    pinned: Theory,
+    digest: Digest,
+    ssh_map: SSHMap,
+    found: Solution,
+    solving: Solving,
+) -> tuple[Solution, tuple[SSHMap, ...]]:
+    """Solve again with rules that keep the standing map, if the trace is short enough."""
+    if len(part) > READABLE:
+        return found, ()
+    pairs = list(combinations(range(len(digest.labels)), 2))
+    place = [ssh_map.dstates[s].place for s in digest.labels]
+    text = "#program base.\n#defined stands/2. #defined beside/2.\n"
+    text += "".join(f"stands({i},{j}).\n" for i, j in pairs if digest.labels[i] == digest.labels[j])
+    text += "".join(f"beside({i},{j}).\n" for i, j in pairs if place[i] == place[j] is not None)
+    text += _KEEPS_DSTATES + (_KEEPS_PLACES if pinned.level == "topological" else "")
+    rules = Rules("standing.lp", text)
+    again = solving.solve(part, pinned.replace(rules=(*pinned.rules, rules)))
+    if again.status is Status.UNSATISFIABLE:
+        return found, ()
+    return again, tuple(m for m in again.maps if _keeps(m, digest, ssh_map))
+
+
+def _of_all(found: SSHMap, digest: Digest, ssh_map: SSHMap) -> SSHMap:
+    """The map of all drives, from a map of a digest and a new drive."""
+    number = dict(zip(digest.labels, found.labels, strict=False))
+    new = found.labels[len(digest.labels) :]
+    labels = (*(number[s] for s in ssh_map.labels), *new)
+    return replace(found, labels=labels, names=()).renumbered()
+
+
+def _settled(found: Theory, theory: Theory) -> Theory:
+    """The settled theory without what pins the standing map."""
+    return found.replace(
+        same=theory.same,
+        different=theory.different,
+        elsewhere=theory.elsewhere,
+        rules=theory.rules,
+    )
+
+
+def _contradiction(
+    old: Trace, trace: Trace, ssh_map: SSHMap, digest: Digest, found: Solution
+) -> SolverError:
+    """The error that says why the standing map cannot be kept, and what it would take."""
+    told, drives = "the standing map cannot be, as no map keeps it", drives_of(old)
+    if found.maps:
+        dstates, places = _broken(found.maps[0], digest, ssh_map)
+        first = {s: t for t, s in reversed([*enumerate(ssh_map.labels)])}
+        pairs = [
+            f"{step_name(drives, first[s])} and {step_name(drives, first[x])}" for s, x in places
+        ]
+        parts = [counted(len(dstates), "dstates")] if dstates else []
+        parts += [f"the places of {', '.join(pairs[:3])}"] if pairs else []
+        told = (
+            f"the best map found, of {counted(len(found.maps[0].dstates), 'dstates')}, changes "
+            f"{' and '.join(parts)}"
+        )
+    new = ", ".join(drive.name for drive in drives_of(trace))
+    return SolverError(
+        f"onto: expected a drive that agrees with the standing map, got {new}: {told}; solve all "
+        "drives together (solve --together)"
+    )

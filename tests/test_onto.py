@@ -1,0 +1,144 @@
+"""A drive is added to a map that stands."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from unittest.mock import patch
+
+import pytest
+from brute_force import Key, key, minimal_maps
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import TOYS, theories
+from test_together import joint_traces
+
+from ssh_abduction import Solution, SSHMap, Theory, Trace, check, solve
+from ssh_abduction.cli import main
+from ssh_abduction.data.drives import starts_of
+from ssh_abduction.data.errors import SolverError
+from ssh_abduction.solver import Status, choosing
+from ssh_abduction.solver.onto import Digest
+from ssh_abduction.theory import Speedups
+
+
+def keeps(ssh_map: SSHMap) -> Callable[[Key], bool]:
+    """Whether a map of the brute force has the dstates and places of a standing map."""
+    labels, places, _ = key(ssh_map)
+
+    def allows(found: Key) -> bool:
+        first = dict.fromkeys(found[0][: len(labels)])
+        number = {s: i for i, s in enumerate(first)}
+        if tuple(number[s] for s in found[0][: len(labels)]) != labels:
+            return False
+        there = [found[1][s] for s in first]
+        named: dict[object, int] = {}
+        return all(p is None for p in places) or places == tuple(
+            named.setdefault(p, len(named)) for p in there
+        )
+
+    return allows
+
+
+@pytest.mark.filterwarnings("ignore:traces 1 and 2 have the same steps")
+@settings(max_examples=15)
+@given(st.data())
+def test_the_maps_are_the_least_of_those_that_keep_the_standing_map(data: st.DataObject) -> None:
+    joint = data.draw(joint_traces(), label="trace")
+    theory = data.draw(theories(joint), label="theory")
+    toys = [toy for toy in TOYS if toy.rules in theory.rules]
+    digest = data.draw(st.booleans(), label="digest")
+    start = starts_of(joint)[0]
+    old, new = joint[:start], joint[start:]
+    standing = solve(old, theory.of_steps(0, start), max_maps=1)
+    if not standing.maps:
+        return
+    allows = keeps(standing.maps[0])
+    counts, expected = minimal_maps(
+        joint, theory, lambda found: allows(found) and all(toy.allows(found) for toy in toys)
+    )
+    speedups = Speedups(digest=digest)
+    few_steps = data.draw(st.sampled_from([0, choosing.FEW_STEPS]), label="few steps")
+    with patch.object(choosing, "FEW_STEPS", few_steps):
+        if counts is None:
+            with pytest.raises(
+                SolverError, match="expected a drive that agrees with the standing map"
+            ):
+                solve(new, theory, onto=standing, max_maps=None, speedups=speedups)
+            return
+        solution = solve(new, theory, onto=standing, max_maps=None, speedups=speedups)
+    assert solution.status is Status.OPTIMAL
+    assert {key(ssh_map) for ssh_map in solution.maps} == expected
+    assert len(solution.maps) == len(expected)
+    assert solution.trace is not None
+    assert solution.trace.steps == joint.steps
+    for ssh_map in solution.maps:
+        assert check(joint, ssh_map, theory) == ()
+
+
+MONDAY = Trace.from_steps("abcd", ["travel", "around", "travel"], name="monday")
+TUESDAY = Trace.from_steps("bcd", ["around", "travel"], name="tuesday")
+
+
+def test_a_drive_is_added_in_the_shell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for trace in (MONDAY, TUESDAY):
+        replace(trace, name=None).save(tmp_path / f"{trace.name}.jsonl")
+    monday, tuesday, maps = (str(tmp_path / f) for f in ("monday.jsonl", "tuesday.jsonl", "m.json"))
+    assert main(["solve", monday, "-o", maps]) == 0
+    assert main(["name", maps, "p0", "kitchen"]) == 0
+    capsys.readouterr()
+    assert main(["solve", tuesday, "--onto", maps, "-o", maps]) == 0
+    told = capsys.readouterr().out
+    assert "the map of monday stands; the map joins all 2 drives: monday, tuesday" in told
+    assert "0 (kitchen)" in told
+    loaded = Solution.load(maps)
+    assert [drive.name for drive in loaded.drives] == ["monday", "tuesday"]
+    assert loaded.maps == solve([MONDAY, TUESDAY]).maps
+    assert loaded.trace is not None
+    assert check(loaded.trace, loaded.maps[0], loaded.theory) == ()
+    again = json.loads(Path(maps).read_text())
+    assert again["onto"] == ["monday"]
+    assert loaded.to_dict()["onto"] == ["monday"]
+    assert main(["solve", tuesday, "--onto", maps]) == 1
+    assert "a different name for each drive, got 'tuesday' twice" in capsys.readouterr().err
+    assert main(["solve", tuesday, "--onto", maps, "--front", "1"]) == 1
+    assert "--front: expected none with --onto" in capsys.readouterr().err
+
+
+def test_a_drive_that_contradicts_the_map_is_refused() -> None:
+    """Monday saw b twice. Its minimal map makes that one dstate; Tuesday shows that it is two."""
+    monday = Trace.from_steps("abcb", ["on", "on", "back"], name="monday")
+    tuesday = Trace.from_steps("bcb", ["on", "back"], name="tuesday")
+    theory = Theory.causal()
+    standing = solve(monday, theory)
+    assert standing[0].labels == (0, 1, 2, 1)
+    assert solve(tuesday, onto=standing)[0].labels == (0, 1, 2, 1, 1, 2, 1)
+    wrong = Trace.from_steps("cbd", ["back", "on"], name="tuesday")
+    sure = theory.replace(same=[(2, 4)])  # the two steps that show c
+    with pytest.raises(SolverError, match=r"got tuesday: .*; solve all drives together"):
+        solve(wrong, sure, onto=standing)
+    assert solve([monday, wrong], sure)[0].labels == (0, 1, 2, 3, 2, 3, 4)
+
+
+def test_a_map_without_its_trace_does_not_stand(tmp_path: Path) -> None:
+    standing = solve(MONDAY)
+    for bad in (replace(standing, trace=None), replace(standing, maps=())):
+        with pytest.raises(SolverError, match="onto: expected a solution with a map and its trace"):
+            solve(TUESDAY, onto=bad)
+    with pytest.raises(SolverError, match="onto: expected a Solution, got"):
+        solve(TUESDAY, onto=standing[0])  # type: ignore[arg-type]
+    faulty = solve(MONDAY, Theory.causal().replace(misread=1.0))
+    with pytest.raises(SolverError, match="expected a map without faults"):
+        solve(TUESDAY, onto=faulty)
+
+
+def test_a_digest_has_each_link_once() -> None:
+    long = Trace.from_steps("ab" * 50, ["travel"] * 99, name="long")
+    standing = solve(long, Theory.causal())
+    digest = Digest.of(long, standing[0], short=True)
+    assert digest.trace.views == ("a", "b", "a")
+    assert digest.labels == (0, 1, 0)
+    short = replace(long[:7], name="short")
+    assert solve(short, onto=standing)[0].labels == (0, 1) * 50 + (0, 1, 0, 1, 0, 1, 0)
