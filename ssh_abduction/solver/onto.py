@@ -132,10 +132,11 @@ def solve_onto(
         joint, theory = obeyed(corrections, joint, theory)
         old, trace = joint[: len(old)], joint[len(old) :]
     in_use = settle(joint, theory).theory
-    digest = Digest.of(old, ssh_map, short=solving.speedups.that_hold_for(in_use).digest)
+    short = solving.speedups.that_hold_for(in_use).digest and in_use.displacement == "none"
+    digest = Digest.of(old, ssh_map, short=short)
     with warnings.catch_warnings():  # a digest may have the steps of the new drive
         warnings.simplefilter("ignore")
-        part = together([digest.trace, trace])
+        part = together([digest.trace, trace.without_displacements() if short else trace])
     pinned = _pinned(theory, digest, ssh_map, old, joins=in_use.star == "frame")
     found = solving.solve(part, pinned)
     kept = tuple(m for m in found.maps if _keeps(m, digest, ssh_map))
