@@ -405,7 +405,7 @@ class Solution(MapSequence):
         record = _checked_record(read, data)
         maps = tuple(maps_of(record, where))
         steps = read.integer(record["steps"], "steps")
-        trace = trace or trace_in(record, where)
+        trace = trace_in(record, where) if trace is None else trace
         theory = theory_in(record["theory"], where)
         if (false := next(contradictions(record, maps, steps, theory), None)) is not None:
             raise MapError(f"{where}: {false}; it was changed by hand, or cut")
