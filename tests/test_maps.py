@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import pickle
 import xml.etree.ElementTree as ET
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -96,10 +95,10 @@ def test_malformed_maps(change: dict[str, object], message: str) -> None:
 
 def positions(picture: str) -> dict[str, tuple[float, float]]:
     """Where the places are drawn, by the number in the circle."""
-    marks = list(ET.fromstring(picture))
     found = {}
-    for circle, label in pairwise(marks):
-        if circle.tag == f"{SVG}circle":
+    for group in ET.fromstring(picture).iter(f"{SVG}g"):
+        circle, label = group.find(f"{SVG}circle"), group.find(f"{SVG}text")
+        if circle is not None and label is not None:
             found[str(label.text)] = (float(circle.attrib["cx"]), float(circle.attrib["cy"]))
     return found
 
