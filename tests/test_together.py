@@ -179,6 +179,17 @@ def test_a_trace_given_twice_is_noticed() -> None:
         together([MONDAY, MONDAY], names=["monday", "again"])
 
 
+def test_other_names_and_other_units_are_noticed() -> None:
+    go = Trace.from_steps("ab", [{"name": "go", "kind": "travel"}], name="other")
+    with pytest.warns(
+        UserWarning, match=r"traces 1 and 2 have different names .*'travel' and 'go'"
+    ):
+        together([MONDAY, go])
+    millimetres = Trace.from_steps("ab", ["travel"], displacements=[(1000, 0, 0)], name="mm")
+    with pytest.warns(UserWarning, match="median travel of trace 1 is 1 m, and that of trace 2 is"):
+        together([replace(MOVED, name="m"), millimetres])
+
+
 def test_the_first_step_of_a_drive_has_no_displacement_and_a_new_name() -> None:
     start = Action("tuesday", "start")
     with pytest.raises(TraceError, match="step 1: displacement: expected none on the first step"):

@@ -17,12 +17,14 @@ robot: nothing is known of how the first step of a drive relates to any step of 
 from __future__ import annotations
 
 import hashlib
+import math
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import accumulate, pairwise
 from pathlib import Path
+from statistics import median
 from typing import Any, TypeVar
 
 from ssh_abduction.data.action import Action
@@ -40,6 +42,9 @@ T = TypeVar("T")
 SEEN = "star_seen"  # the field of a step that keeps the star before a person corrected it
 # The fields of a step that a solver reads.
 _READ = frozenset({"view", "action", "star", "displacement", "covariance", "confidence"})
+# In one building, the median travels of two drives hardly differ by this factor. Millimetres and
+# centimetres are 1000 and 100 to the metre.
+UNITS = 30.0
 ALONE = "drive 1"  # the name of the only drive of a trace without a name
 
 
@@ -226,6 +231,8 @@ def together(traces: Iterable[Trace], names: Iterable[str] | None = None) -> Tra
     if len(drives) == 1:
         return parts[0]
     _warn_of_repeats(parts)
+    _warn_of_other_names(parts)
+    _warn_of_other_units(parts)
     steps: list[Step] = []
     begins = accumulate([0, *map(len, parts[:-1])])
     closures = [
@@ -298,6 +305,47 @@ def _warn_of_repeats(traces: Sequence[Trace]) -> None:
                 f"traces {known + 1} and {i + 1} have the same steps; give each drive once",
                 stacklevel=3,
             )
+
+
+def _warn_of_other_names(traces: Sequence[Trace]) -> None:
+    """Warn if traces have different names for actions that are alike in all else."""
+    known: dict[Action, tuple[int, set[str]]] = {}
+    for i, trace in enumerate(traces):
+        named: dict[Action, set[str]] = {}
+        for action in {a for a in trace.actions if not a.starts and a.kind is not None}:
+            named.setdefault(replace(action, name="?", extra={}), set()).add(action.name)
+        for alike, names in named.items():
+            first, others = known.setdefault(alike, (i, names))
+            if not names & others:
+                told = " and ".join(brief(min(some)) for some in (others, names))
+                warnings.warn(
+                    f"action: traces {first + 1} and {i + 1} have different names for one kind of "
+                    f"action: {told}; give both one name if they are one action",
+                    stacklevel=3,
+                )
+
+
+def _warn_of_other_units(traces: Sequence[Trace]) -> None:
+    """Warn if the displacements of two traces are so different that their units must be."""
+    usual = {i: median(some) for i, trace in enumerate(traces) if (some := _travels(trace))}
+    least, most = (pick(usual, key=usual.__getitem__, default=0) for pick in (min, max))
+    if usual and usual[most] > UNITS * usual[least]:
+        warnings.warn(
+            f"displacement: the median travel of trace {least + 1} is {usual[least]:.3g} m, and "
+            f"that of trace {most + 1} is {usual[most]:.3g} m; give both in metres",
+            stacklevel=3,
+        )
+
+
+def _travels(trace: Trace) -> list[float]:
+    """The lengths of the displacements of all travels that moved the robot."""
+    moved = zip(trace.actions, trace.steps[1:], strict=True)
+    lengths = (
+        math.hypot(*step.displacement[:2])
+        for action, step in moved
+        if action.kind == "travel" and step.displacement is not None
+    )
+    return [length for length in lengths if length > 0]
 
 
 def _check_alike(traces: Sequence[Trace], names: Sequence[str]) -> None:
