@@ -38,9 +38,9 @@ CLASH, CLEAR = 0.5, 0.3
 OVERLAP = 0.3
 # A match is refined only if its coarse score is at least HOPELESS, and if the standard deviation of
 # its shift is less than SPREAD metres. Otherwise quite other shifts match as well.
-HOPELESS, SPREAD = 0.7, 0.9
+HOPELESS, SPREAD = 0.7, 0.85
 # Scores differ by 1 / SHARPNESS where a shift is e times as probable.
-SHARPNESS = 20.0
+SHARPNESS = 25.0
 # Steps of the refinement, in radians and metres; each is repeated at most TRIES times.
 STEPS = tuple(
     (math.radians(degrees), metres)
