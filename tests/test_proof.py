@@ -213,16 +213,24 @@ def test_a_verdict_on_another_theory_or_trace_is_not_believed(
     trace, maps = tmp_path / "trace.jsonl", tmp_path / "maps.json"
     rectangle(400).save(trace)
     assert main(["solve", str(trace), "--json"]) == 0
-    maps.write_text(capsys.readouterr().out)
+    solved = capsys.readouterr().out
+    maps.write_text(solved)
     assert main(["check", "--bound", "--set", "prefer=dstates", str(trace), str(maps)]) == 0
     assert "the maps have 8: no map has fewer" in capsys.readouterr().out
     assert main(["check", "--bound", "--set", "boundary=none", str(trace), str(maps)]) == 0
     shown = capsys.readouterr().out
+    assert "regions are not checked: the file is of another theory" in shown
     assert (
         "clingo's verdict on 4 dstates and more is left out: the file is of another theory" in shown
     )
     assert "the maps have 8, 4 more than proven" in shown
     data = json.loads(maps.read_text())
+    data["maps"][0]["regions"][0]["bounds"] = []
+    maps.write_text(json.dumps(data))
+    assert main(["check", str(trace), str(maps)]) == 20
+    assert "map 1: region_beside" in capsys.readouterr().out
+    assert main(["check", "--set", "boundary=none", str(trace), str(maps)]) == 0
+    data = json.loads(solved)
     del data["theory"]
     maps.write_text(json.dumps(data))
     assert main(["check", "--bound", str(trace), str(maps)]) == 0
