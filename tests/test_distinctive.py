@@ -202,6 +202,14 @@ def test_a_robot_visits_a_fork_each_time_that_it_passes_and_turns_around_at_a_de
     assert abs(degrees(again, again.left) - 90) < 15
 
 
+def test_a_robot_turns_around_in_a_bow() -> None:
+    bow = [(17.5, -0.6), (18, -0.2), (18, 0.2), (17.5, 0.6)]
+    log, track = log_of(FORK, [(1, -0.6), *bow, (10, 0.6), (10, 8)])
+    middles = [visit.middle for visit in find_visits(log, track)]
+    assert len(middles) == 3
+    assert math.dist(middles[1], (18, 0)) < 0.5
+
+
 def test_a_robot_that_turns_around_in_a_disc_has_one_visit() -> None:
     log, track = log_of(FORK, [(1, 0), (11, 0), (10, 0), (10, 8)])
     assert [round(float(visit.middle[0])) for visit in find_visits(log, track)] == [10]

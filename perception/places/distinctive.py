@@ -37,9 +37,10 @@ PASSING, LEFT = 0.75, 0.5
 # Milestones within BESIDE metres along the trajectory are asked about a place. At least a share of
 # AGREED has to show it.
 BESIDE, AGREED = 3.0, 0.5
-# The robot turned around if its directions of motion STRIDE metres before and after differ by more
-# than REVERSED radians, more than ALONE metres from other visits along the trajectory.
-STRIDE, REVERSED, ALONE = 1.0, math.radians(135), 1.5
+# The robot turned around if its directions of motion over some stride in metres, before and after,
+# differ by more than REVERSED radians. It turns on the spot or in a bow, so there are several
+# strides. Other visits are more than a stride and ALONE metres away along the trajectory.
+STRIDES, REVERSED, ALONE = (1.0, 2.0, 4.0), math.radians(135), 1.5
 # Two ways out whose bearings differ by less than this, in radians, are one.
 MERGED = math.radians(45)
 # The bearing of a way is taken at so many metres outside of the disc, whose radius is at least
@@ -295,24 +296,32 @@ def _one_for_each_stay(found: Sequence[Visit]) -> list[Visit]:
 def _with_turnings(found: Sequence[Visit], track: Track) -> list[Visit]:
     """Add a visit at each point far from other visits where the robot turned around."""
     visits = list(found)
-    # Begin with the sharpest turn. Other turns near it belong to the same turning point.
-    for _, i in sorted(_turns(track), reverse=True):
-        if all(
-            abs(track.way[visit.scan] - track.way[i]) > max(ALONE, visit.radius) for visit in visits
-        ):
-            visits.append(Visit(i, track.poses[i, :2].copy(), i, i, support=0.0))
+    for stride in STRIDES:
+        # Begin with the sharpest turn. Other turns near it belong to the same turning point.
+        for _, i in sorted(_turns(track, stride), reverse=True):
+            far = max(ALONE, stride)
+            if all(
+                abs(track.way[visit.scan] - track.way[i]) > max(far, visit.radius)
+                for visit in visits
+            ):
+                visits.append(Visit(i, track.poses[i, :2].copy(), i, i, support=0.0))
     return sorted(visits, key=lambda visit: visit.scan)
 
 
-def _turns(track: Track) -> Iterator[tuple[float, int]]:
-    """The scans at which the robot turned around, each after the angle in radians."""
+def _turns(track: Track, stride: float) -> Iterator[tuple[float, int]]:
+    """The scans at which the robot turned around, each after the angle in radians.
+
+    Args:
+        track: Trajectory of the robot.
+        stride: The directions of motion are taken over so many metres.
+    """
     positions, way = track.poses[:, :2], track.way
-    for i in range(int(np.searchsorted(way, STRIDE)), len(way)):
-        before, after = np.searchsorted(way, way[i] - STRIDE), np.searchsorted(way, way[i] + STRIDE)
+    for i in range(int(np.searchsorted(way, stride)), len(way)):
+        before, after = np.searchsorted(way, way[i] - stride), np.searchsorted(way, way[i] + stride)
         if after >= len(way):
             return
         there, back = positions[i] - positions[before], positions[after] - positions[i]
-        if min(math.hypot(*there), math.hypot(*back)) > STRIDE / 3:
+        if min(math.hypot(*there), math.hypot(*back)) > stride / 3:
             angle = apart(math.atan2(there[1], there[0]), math.atan2(back[1], back[0]))
             if angle > REVERSED:
                 yield angle, i
