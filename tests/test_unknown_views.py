@@ -151,6 +151,7 @@ def test_no_speedup_that_reads_views_is_on() -> None:
         "processes",
         "annealed",
         "greedy",
+        "digest",
     }
     assert {row.name for row in TABLE if row.holds_for(theory)} <= kept
 

@@ -25,7 +25,7 @@ HELPS = {
 def add_parser(verbs: Verbs) -> None:
     text = (
         "Correct a map. The corrections are saved in corrections.yaml beside it. solve obeys this "
-        "file if it writes its map beside the file (-o), or with --corrections."
+        "file if it writes its map beside it, or is given the file."
     )
     parser = verbs.add_parser("correct", help="say what a map has wrong", description=text)
     parser.add_argument("maps", help="file that solve -o wrote, or a folder with maps.json")

@@ -1,4 +1,4 @@
-"""ssh-abduction solve TRACE --onto MAPS: add a drive to a map that stands."""
+"""Add a drive to a map that stands, for the verb solve."""
 
 from __future__ import annotations
 
@@ -19,7 +19,9 @@ def run(options: argparse.Namespace) -> int:
     for name in ("front", "jobs", "scheduler", "joint_trace"):
         if getattr(options, name) is not None:
             flag = f"--{name.replace('_', '-')}"
-            raise AbductionError(f"{flag}: expected none with --onto; leave it out")
+            raise AbductionError(
+                f"{flag}: expected none where a drive is added to a map; leave it out"
+            )
     standing = Solution.load(options.onto)
     trace = together([Trace.load(path) for path in options.traces])
     if standing.trace is not None:
