@@ -1,37 +1,92 @@
 """Are the maps of buildings with several floors true?
 
-    python benchmarks/floors.py [--floors 2] [--cells 3] [--steps 60] [--seeds 10] [--first SEED]
+    python benchmarks/floors.py [--floors 2] [--steps 60] [--seeds 10] [--first SEED]
     python benchmarks/floors.py --folder ../shared/data/worlds/rmf60s [--pictures FOLDER]
 
-Without a folder, a robot drives through mazes that lifts connect, with stars and noisy
-displacements. With a folder, the traces of the Open-RMF sites in it that use lifts are solved by
-the causal theory. No displacement leads from one floor to another. The script prints a table in
-Markdown with a row for each trace: whether the first map is true, and how many of the true floors
-are floors of the map. With `--pictures`, it draws each map.
+Without a folder, a robot drives random routes through a tower of the simulator, with stars and
+noisy displacements. With a folder, the traces of the Open-RMF sites in it that use lifts are
+solved by the causal theory. No displacement leads from one floor to another. The script prints a
+table in Markdown with a row for each trace: whether the first map is true, and how many of the
+true floors are floors of the map. With `--pictures`, it draws each map.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
+import random
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from instances import tower
-from truth import NOISE, Known, is_true, worlds
+from truth import NOISE, Known, is_true, told, worlds
 
+from simulator.errors import SimulatorWarning
+from simulator.motion import between
+from simulator.robot import Body
+from simulator.tours import simulate
+from simulator.world import TrueDState, World
 from ssh_abduction import SSHMap, Theory, solve
-from ssh_abduction.data import Action, Odometry
+from ssh_abduction.data import Action
 from ssh_abduction.output import to_svg
 
+TURNS = {"right": -1, "left": 1, "around": 2}  # in quarters, counterclockwise
 
-def towers(floors: int, cells: int, steps: int, seeds: Sequence[int]) -> Iterator[Known]:
-    """Yield random walks in mazes that lifts connect, one for each seed."""
+
+def towers(floors: int, steps: int, seeds: Sequence[int]) -> Iterator[Known]:
+    """Yield drives on random routes through a simulated tower, one for each seed."""
     for seed in seeds:
-        walk = tower(floors, cells, steps=steps, seed=seed, odometry=Odometry(**NOISE))
-        states = [state for state in walk.truth if isinstance(state, tuple)]
-        places = tuple(state[:3] for state in states)
-        yield Known(f"{floors} floors, {seed}", walk.trace, walk.truth, places)
+        chance = random.Random(seed)
+        tower = World.named(f"tower-{floors}")
+        start = chance.choice(tower.dstates)
+        route = tuple(random_route(tower, start, steps, chance))
+        driven = replace(tower, start=start.pose, route=route)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", SimulatorWarning)  # The route does not return.
+            trace = simulate(driven, seed=seed, body=Body(odometry=NOISE["along"]))
+        views = [str(step.star) for step in trace.steps]
+        yield told(f"{tower.name}, {seed}", trace.with_views(views))
+
+
+def random_route(
+    tower: World, state: TrueDState, steps: int, chance: random.Random
+) -> Iterator[str]:
+    """Yield actions: a lift with probability 1/4 where there is one, otherwise along corridors."""
+    there = {(s.place, quarter(s)): s for s in tower.dstates}
+    place_at = {point: place for place, point in tower.places.items()}
+    for _ in range(steps):
+        at = tower.places[state.place]
+        floors = {lift.name: place_at[lift.end] for lift in tower.lifts if lift.start == at}
+        lifts = {
+            name: there[place, quarter(state)]
+            for name, place in floors.items()
+            if (place, quarter(state)) in there
+        }
+        turns = {
+            turn: there.get((state.place, (quarter(state) + by) % 4)) for turn, by in TURNS.items()
+        }
+        ways = {turn: s for turn, s in turns.items() if s and ahead(tower, s)}
+        if lifts and chance.random() < 0.25:
+            action, state = chance.choice([*lifts.items()])
+        elif (reached := ahead(tower, state)) and chance.random() < 2 / 3:
+            action, state = "travel", reached
+        else:
+            aside = [(turn, s) for turn, s in ways.items() if turn != "around"]
+            action, state = chance.choice(aside or [*ways.items()] or [("travel", reached)])
+        yield action
+
+
+def quarter(state: TrueDState) -> int:
+    """The heading of a dstate in quarter turns, counterclockwise."""
+    return round(state.pose[2] / (math.pi / 2)) % 4
+
+
+def ahead(tower: World, state: TrueDState) -> TrueDState | None:
+    """The next dstate straight ahead on the path of a dstate; None at its end."""
+    course = [s for s in tower.dstates if (s.path, s.direction) == (state.path, state.direction)]
+    far = {s: between(state.pose, s.pose)[0] for s in course}
+    return min((s for s in course if far[s] > 1), key=far.__getitem__, default=None)
 
 
 def sites(folder: Path) -> Iterator[Known]:
@@ -49,8 +104,8 @@ def sites(folder: Path) -> Iterator[Known]:
 
 
 def floor_of(state: object) -> object:
-    """The true floor of a dstate: the first part of its name, or of its tuple."""
-    return state.partition("-")[0] if isinstance(state, str) else next(iter(state))
+    """The true floor of a dstate: the first part of its name."""
+    return str(state).partition("-")[0]
 
 
 def right_floors(ssh_map: SSHMap, known: Known) -> tuple[int, int]:
@@ -67,8 +122,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--folder", type=Path, metavar="FOLDER", help="sites of Open-RMF")
     parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="draw each map here")
-    parser.add_argument("--floors", type=int, default=2, metavar="N")
-    parser.add_argument("--cells", type=int, default=3, metavar="N", help="mazes of N x N cells")
+    parser.add_argument("--floors", type=int, default=2, choices=(2, 3))
     parser.add_argument("--steps", type=int, default=60, metavar="N", help="actions of a walk")
     parser.add_argument("--seeds", type=int, default=10, metavar="N")
     parser.add_argument("--first", type=int, default=0, metavar="SEED", help="the first seed")
@@ -76,9 +130,7 @@ def main() -> None:
     options = parser.parse_args()
     seeds = range(options.first, options.first + options.seeds)
     traces = (
-        sites(options.folder)
-        if options.folder
-        else towers(options.floors, options.cells, options.steps, seeds)
+        sites(options.folder) if options.folder else towers(options.floors, options.steps, seeds)
     )
     print("| trace | steps | true dstates | dstates | true | floors |\n|---|---|---|---|---|---|")
     for known in traces:

@@ -17,7 +17,7 @@ import numpy as np
 
 from simulator.motion import Pose, between, reported
 from ssh_abduction import Trace
-from ssh_abduction.data import Action, Odometry
+from ssh_abduction.data import Odometry
 
 HEADINGS = ((0, 1), (1, 0), (0, -1), (-1, 0))  # north, east, south, west
 TURNS = {"right": 1, "around": 2, "left": 3}
@@ -182,55 +182,6 @@ def maze(
     if odometry is not None:
         trace = displaced(trace, poses, odometry, seed, scale=scale, bend=bend)
     return Walk(trace, tuple(truth))
-
-
-def tower(
-    floors: int, cells: int, *, steps: int, seed: int, odometry: Odometry, lifts: int = 2
-) -> Walk:
-    """Make a random walk in several mazes, one above the other, that lifts connect.
-
-    A state is a floor, a cell and a heading. A view is the openings around. At a cell with a lift,
-    the robot takes it with probability 1/4 to any other floor. Otherwise it drives as `maze` with
-    `follow`. Stars are the openings. No displacement leads from one floor to another.
-
-    Args:
-        floors: Number of mazes.
-        cells: Width and height of each.
-        steps: Number of actions.
-        seed: Seed of the mazes, the lifts and the walk.
-        odometry: Noise of the displacements.
-        lifts: Number of cells with a lift. A lift stops at all floors.
-    """
-    chance = random.Random(f"{seed}, {floors}")
-    doors = [doors_of(cells, cells, chance) for _ in range(floors)]
-    shafts = chance.sample([(x, y) for x in range(cells) for y in range(cells)], lifts)
-    floor, (x, y), heading = 0, shafts[0], chance.randrange(4)
-    seen: list[list[int]] = []
-    truth: list[object] = []
-    poses: list[Pose] = []
-    done: list[Action | str] = []
-    for step in range(steps + 1):
-        around = [(x + dx, y + dy) for dx, dy in (HEADINGS[(heading + k) % 4] for k in range(4))]
-        seen.append([int(((x, y), cell) in doors[floor]) for cell in around])
-        truth.append((floor, x, y, heading))
-        poses.append((CELL * x, CELL * y, math.pi / 2 * (1 - heading)))
-        if step == steps:
-            break
-        ahead_open, right_open, _, left_open = seen[-1]
-        if (x, y) in shafts and chance.random() < 0.25:
-            floor = chance.choice([other for other in range(floors) if other != floor])
-            done.append(Action(f"lift to {floor}", "lift"))
-            continue
-        turns = ["right"] * right_open + ["left"] * left_open or ["around"]
-        action = chance.choice(["travel"] * 4 + ["right", "left"] if ahead_open else turns)
-        if action == "travel":
-            x, y = around[0]
-        else:
-            heading = (heading + TURNS[action]) % 4
-        done.append(action)
-    views = ["".join(map(str, openings)) for openings in seen]
-    bare = Trace.from_steps(views, done, stars=seen, name=f"{floors} floors, seed {seed}")
-    return Walk(displaced(bare, poses, odometry, seed), tuple(truth))
 
 
 def moore(states: int, views: int, *, steps: int, seed: int, actions: int = 2) -> Walk:

@@ -99,6 +99,21 @@ class Driver:
         """Find the walls in the median of this many scans."""
         return sight(self.look(images), self.world.reach, self.laser.reach)
 
+    def ride(self, name: str) -> None:
+        """Take the lift of this name to the place at its other end. The heading stays.
+
+        Raises:
+            SimulatorError: No such lift is here.
+        """
+        x, y, heading = self.robot.pose
+        lift = self.world.lift_at(name, x, y)
+        if lift is None:
+            raise SimulatorError(
+                f"{self.world.name}: {name}: expected a lift of this name at ({x:.2f}, {y:.2f}), "
+                "got none; change the route, or add it to the world"
+            )
+        self.robot.pose = x + lift.end[0] - lift.start[0], y + lift.end[1] - lift.start[1], heading
+
     def go(self, forward: float, turn: float = 0.0) -> None:
         """Move the robot.
 
@@ -234,8 +249,8 @@ class Corridors:
 
     Args:
         driver: The robot.
-        looks_behind: Whether the robot looks behind itself at the start. Elsewhere, it knows that
-            the path by which it came is behind.
+        looks_behind: Whether the robot looks behind itself at the start and after a lift.
+            Elsewhere, it knows that the path by which it came is behind.
     """
 
     def __init__(self, driver: Driver, looks_behind: bool = False) -> None:
@@ -244,7 +259,7 @@ class Corridors:
         self._facing = 0
 
     def begin(self) -> None:
-        """Climb to the dstate near the start, and look behind if required."""
+        """Climb to the dstate near the robot, and look behind if required."""
         climb(self.driver)
         if self.looks_behind:
             self.driver.go(0.0, math.pi)
@@ -255,7 +270,12 @@ class Corridors:
             climb(self.driver)
 
     def act(self, action: str) -> None:
-        """Do an action of a route: "travel", "left", "right" or "around"."""
+        """Do an action of a route: "travel", "left", "right", "around", or the name of a lift."""
+        if action not in QUARTERS:
+            self.driver.ride(action)
+            self._openings, self._facing = {}, 0
+            self.begin()
+            return
         act(self.driver, action)
         self._facing = (self._facing + QUARTERS[action]) % 4
         if action == "travel":

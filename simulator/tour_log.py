@@ -82,7 +82,7 @@ class Log:
     Attributes:
         robot: The robot.
         reports: Motion by odometry from each step to the next.
-        begun: Whether a step was logged already.
+        begun: Whether a step was logged already on this floor.
     """
 
     robot: Robot
@@ -90,7 +90,7 @@ class Log:
     begun: bool = False
 
     def displacement(self) -> Displacement | None:
-        """Return the displacement from the last step by odometry; None for the first step.
+        """Return the displacement from the last step by odometry; None for the first on a floor.
 
         Returns:
             Metres ahead, metres to the left, and radians turned, rounded.

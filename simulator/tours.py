@@ -90,6 +90,11 @@ def simulate(
             mend="make one with Camera(), or leave it out for ranges",
         )
     an_instance("world", world, World, SimulatorError, mend="take World.named or World.load")
+    if every is not None and world.lifts:
+        raise SimulatorError(
+            f"every: expected none in {world.name}, whose images all along would join its floors; "
+            "leave it out"
+        )
     if world.by_places:
         raise SimulatorError(
             f"{world.name}: route: expected actions, got places, to which a robot drives that "
@@ -146,6 +151,11 @@ def record(
         SimulatorError: The route cannot be driven.
     """
     driver = _driver(world, tours, seed, laser, body, None)
+    if world.lifts:
+        raise SimulatorError(
+            f"{world.name}: lifts: expected none in the log of a robot, which does not say that "
+            "the floor changes; leave out --format"
+        )
     recorder = driver.recorder = Recorder(every)
     recorder.note(driver.world, driver.robot.pose)
     steps = []
@@ -226,6 +236,11 @@ def _driver(
                 SimulatorError,
                 mend=f"make one with {kind.__name__}(), or leave it out",
             )
+    if world.lifts and world.angles == "any":
+        raise SimulatorError(
+            f"{world.name}: lifts: expected a world whose streets meet at right angles, got one "
+            'of any angles; write "angles": "right", or leave out the lifts'
+        )
     if not world.route:
         raise SimulatorError(
             f"{world.name}: route: expected at least one action, got none; add it to the "
@@ -256,14 +271,21 @@ def _at_dstates(
     is_square = world.angles == "right"
     pilot = Corridors(driver, looks_behind=stars) if is_square else Pilot(driver)
     done = ""
+    lifts = {lift.name for lift in world.lifts}
     for number, action in _legs(driver, world, tours, pilot):
+        if done in lifts:
+            log.begun = False  # Each floor has a frame of its own.
         image, displacement = driver.look(STILL), log.displacement()
         # If streets meet at any angles, turns to look around differ. So each displacement has its
         # own covariance.
         has_covariance = displacement is not None and not is_square
         yield Step(
             image=eye.image(driver, image, number),
-            action=Action.of(action) if is_square else ACTIONS[action],
+            action=Action(action, "lift")
+            if action in lifts
+            else Action.of(action)
+            if is_square
+            else ACTIONS[action],
             star=pilot.star(image) if stars else None,
             displacement=displacement,
             covariance=covariance_of(log.reports[-1], driver.tolerance, done)

@@ -20,7 +20,7 @@ from simulator.errors import SimulatorError, SimulatorWarning
 from simulator.laser import meetings
 from simulator.motion import Pose, between
 from simulator.world import World
-from simulator.world_files import are_square
+from simulator.world_files import ACTIONS, are_square
 
 # Largest distance from the expected place in metres (`reach` if that is larger), and largest
 # difference of heading in radians.
@@ -135,6 +135,10 @@ class Watch:
             return None
         if action in TURNS:
             return here.place
+        if action not in ACTIONS:
+            lift = self.world.lift_at(action, *pose[:2])
+            at = self.world.places
+            return min(at, key=lambda place: math.dist(at[place], lift.end)) if lift else None
         # The next place straight ahead on the same path.
         ahead = []
         for state in self.world.dstates:

@@ -30,6 +30,7 @@ from simulator.world_files import (
     Angles,
     Array,
     Clutter,
+    Lift,
     Point,
     TrueDState,
     WorldReader,
@@ -47,7 +48,7 @@ from ssh_abduction.data.checks import (
 from ssh_abduction.data.errors import brief, named, printable
 from ssh_abduction.data.files import parse_json, read_at_most
 
-__all__ = ["Clutter", "TrueDState", "World", "checked_segments", "distances_to", "pose_of"]
+__all__ = ["Clutter", "Lift", "TrueDState", "World", "checked_segments", "distances_to", "pose_of"]
 
 # Largest size of a world file in bytes.
 LARGEST = 64 * 2**20
@@ -118,6 +119,7 @@ class World:
             dstates, and those that a route may lead to.
         via: Dict from a name to (x, y) in metres, for points that are no places but that a route of
             places may lead through.
+        lifts: Lifts, each of which is an action of a route.
         own_reach: The reach of the world's file in metres, if `reach` replaces it; otherwise None.
     """
 
@@ -131,6 +133,7 @@ class World:
     angles: Angles = "right"
     places: Mapping[str, Point] = field(default_factory=dict, repr=False)
     via: Mapping[str, Point] = field(default_factory=dict, repr=False)
+    lifts: tuple[Lift, ...] = ()
     own_reach: float | None = None
 
     def __post_init__(self) -> None:
@@ -144,7 +147,12 @@ class World:
             )
         one_of("world.angles", self.angles, get_args(Angles), SimulatorError)
         # The class is frozen; lists become tuples.
-        for name, kind in (("clutter", Clutter), ("route", str), ("dstates", TrueDState)):
+        for name, kind in (
+            ("clutter", Clutter),
+            ("route", str),
+            ("dstates", TrueDState),
+            ("lifts", Lift),
+        ):
             members = all_instances(
                 f"world.{name}",
                 getattr(self, name),
@@ -164,7 +172,8 @@ class World:
     @property
     def by_places(self) -> bool:
         """Whether the route consists of places, instead of actions."""
-        return bool(self.route) and not set(self.route) <= set(ACTIONS)
+        actions = {*ACTIONS, *(lift.name for lift in self.lifts)}
+        return bool(self.route) and not set(self.route) <= actions
 
     @property
     def stops(self) -> dict[str, Point]:
@@ -201,6 +210,20 @@ class World:
         a_number("x", x, SimulatorError, -FARTHEST, FARTHEST, what="metres")
         a_number("y", y, SimulatorError, -FARTHEST, FARTHEST, what="metres")
         return float(distances_to(self.segments, (x, y)).min())
+
+    def lift_at(self, name: str, x: float, y: float) -> Lift | None:
+        """Find the lift of a name that starts within `reach` of a point; None if none does.
+
+        Args:
+            name: Name of the lift.
+            x: Metres.
+            y: Metres.
+        """
+        a_text("name", name, SimulatorError)
+        a_number("x", x, SimulatorError, -FARTHEST, FARTHEST, what="metres")
+        a_number("y", y, SimulatorError, -FARTHEST, FARTHEST, what="metres")
+        near = (lift for lift in self.lifts if math.dist(lift.start, (x, y)) <= self.reach)
+        return next((lift for lift in near if lift.name == name), None)
 
     def nearest(self, pose: Sequence[float]) -> TrueDState | None:
         """Find the true dstate nearest to a pose; None if the world states no dstates.
@@ -244,7 +267,7 @@ class World:
         if route is not None:
             if not isinstance(route, str):
                 raise reader.wrong("route", "actions with commas between", route)
-            world = replace(world, route=reader.route(route.split(","), world.stops))
+            world = replace(world, route=reader.route(route.split(","), world.stops, world.lifts))
         return (
             world
             if reach is None

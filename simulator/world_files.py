@@ -55,6 +55,21 @@ class TrueDState:
 
 
 @dataclass(frozen=True)
+class Lift:
+    """A lift from one point to another. The floors of a world lie beside each other in one plane.
+
+    Attributes:
+        name: Name of the action that takes it. Lifts from different points may share a name.
+        start: (x, y) in metres where the robot gets in.
+        end: (x, y) in metres where it gets out, with the same heading.
+    """
+
+    name: str
+    start: Point
+    end: Point
+
+
+@dataclass(frozen=True)
 class Clutter:
     """A closed polygon that may be moved or absent on each tour, such as a piece of furniture.
 
@@ -132,7 +147,8 @@ class WorldReader:
         )
         via = self.points(data.get("via", {}), "via")
         stops = {**via, **places}
-        route = self.route(self.list(data, "route"), stops)
+        lifts = tuple(self.lift(v, f"lifts[{i}]") for i, v in enumerate(self.list(data, "lifts")))
+        route = self.route(self.list(data, "route"), stops, lifts)
         start = [*stops[route[0]], 0.0] if set(route) & set(stops) else [0, 0, 0]
         return {
             "name": self.name(data.get("name", printable(Path(self.where).stem))),
@@ -147,6 +163,7 @@ class WorldReader:
             "dstates": dstates,
             "places": places,
             "via": via,
+            "lifts": lifts,
         }
 
     def name(self, value: Any) -> str:
@@ -257,8 +274,21 @@ class WorldReader:
         }
         return {text: (x, y) for text, (x, y) in found.items()}
 
-    def route(self, value: Sequence[Any], stops: Mapping[str, Point]) -> tuple[str, ...]:
+    def lift(self, value: Any, name: str) -> Lift:
+        """Read a lift: an object with name, from and to."""
+        if not isinstance(value, Mapping) or not isinstance(value.get("name"), str):
+            raise self.wrong(name, "an object with name, from and to", value)
+        action = value["name"]
+        if not action or action in ACTIONS or "," in action:
+            raise self.wrong(f"{name}.name", "a name without commas that is no action", action)
+        start, end = (self.numbers(value.get(k), 2, f"{name}.{k}") for k in ("from", "to"))
+        return Lift(action, (float(start[0]), float(start[1])), (float(end[0]), float(end[1])))
+
+    def route(
+        self, value: Sequence[Any], stops: Mapping[str, Point], lifts: Sequence[Lift] = ()
+    ) -> tuple[str, ...]:
         """Check a route, which consists of actions only or of the names of `stops` only."""
+        actions = [*ACTIONS, *dict.fromkeys(lift.name for lift in lifts)]
         by_places = any(isinstance(stop, str) and stop in stops for stop in value)
         for i, stop in enumerate(value):
             if by_places and not (isinstance(stop, str) and stop in stops):
@@ -267,10 +297,11 @@ class WorldReader:
                     f"a place ({', '.join(stops)}), as there are others in the route",
                     stop,
                 )
-            if not by_places and stop not in ACTIONS:
+            if not by_places and stop not in actions:
                 raise self.wrong(
                     f"route[{i}]",
-                    "travel, right, left or around" + (", or the name of a place" if stops else ""),
+                    f"{', '.join(actions[:-1])} or {actions[-1]}"
+                    + (", or the name of a place" if stops else ""),
                     stop,
                 )
         return tuple(value)

@@ -7,16 +7,18 @@ from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
 
-import instances
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import theories, traces
 from test_property import agree, checker_rejects_foreign_maps
 
+from simulator.errors import SimulatorError
+from simulator.tours import record, simulate
+from simulator.world import World
 from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
-from ssh_abduction.data import Action, MapError, Odometry, TheoryError, TraceError
+from ssh_abduction.data import Action, MapError, TheoryError, TraceError
 from ssh_abduction.online import route
 from ssh_abduction.output import to_networkx, to_svg
 from ssh_abduction.output.export import export_map
@@ -176,14 +178,42 @@ def test_floors_are_drawn_below_each_other_and_exported() -> None:
     assert "floor" not in to_svg(solve(trace[:2]).maps[0])
 
 
-@pytest.mark.parametrize("floors", [2, 3])
-def test_a_robot_in_a_tower_of_mazes_changes_floors_by_lifts_only(floors: int) -> None:
-    walk = instances.tower(floors, 3, steps=200, seed=5, odometry=Odometry(along=0.05))
-    states = [state for state in walk.truth if isinstance(state, tuple)]
-    assert len({state[0] for state in states}) == floors
-    for t, action in enumerate(walk.trace.actions):
-        assert (states[t][0] != states[t + 1][0]) == action.changes_floor
-        assert (walk.trace.steps[t + 1].displacement is None) == action.changes_floor
+@pytest.mark.parametrize(("floors", "dstates"), [(2, 42), (3, 60)])
+def test_a_robot_in_a_simulated_tower_changes_floors_by_lifts_only(
+    floors: int, dstates: int
+) -> None:
+    trace = simulate(World.named(f"tower-{floors}"), seed=3)
+    found = [step.truth["dstate"] for step in trace.steps]
+    assert len(set(found)) == dstates
+    for t, action in enumerate(trace.actions):
+        before, after = found[t : t + 2]
+        assert (before[0] != after[0]) == action.changes_floor
+        assert (trace.steps[t + 1].displacement is None) == action.changes_floor
+        if action.changes_floor:
+            assert before[1:] == after[1:]
+
+
+def test_the_map_of_a_simulated_tower_is_true() -> None:
+    trace = simulate(World.named("tower-2"), seed=3)
+    trace = trace.with_views([str(step.star) for step in trace.steps])
+    ssh_map = solve(trace, time_limit=60).maps[0]
+    states = {step.truth["dstate"] for step in trace.steps}
+    assert len(ssh_map.dstates) == len(states)
+    pairs = {(s.truth["dstate"], k) for s, k in zip(trace.steps, ssh_map.labels, strict=True)}
+    assert len(pairs) == len(states)
+    assert len(ssh_map.floors) == 2
+
+
+def test_lifts_that_cannot_be_driven(tmp_path: Path) -> None:
+    tower = World.named("tower-2")
+    with pytest.raises(SimulatorError, match="lift to 1: expected a lift of this name at"):
+        simulate(tower.with_choices(route="lift to 1"))
+    with pytest.raises(SimulatorError, match="lifts: expected none in the log of a robot"):
+        record(tower)
+    with pytest.raises(SimulatorError, match="every: expected none"):
+        simulate(tower, every=0.5)
+    with pytest.raises(SimulatorError, match="whose streets meet at right angles"):
+        simulate(replace(tower, angles="any"))
 
 
 def test_a_route_changes_floors_by_the_lift_only() -> None:

@@ -179,6 +179,15 @@ def test_a_world_from_an_occupancy_map(tmp_path: Path) -> None:
             {"clutter": [{"polygon": [[0, 0], [1, 0], [1, 1]], "present": 2}]},
             r"clutter\[0\].present: expected a probability",
         ),
+        ({"lifts": [{"from": [0, 0]}]}, r"lifts\[0\]: expected an object with name"),
+        (
+            {"lifts": [{"name": "up", "from": [0, 0], "to": [1]}]},
+            r"lifts\[0\].to: expected 2 finite numbers",
+        ),
+        (
+            {"lifts": [{"name": "left", "from": [0, 0], "to": [1, 1]}]},
+            r"lifts\[0\].name: expected a name without commas that is no action",
+        ),
         ({"dstates": [{"name": "a"}]}, r"dstates\[0\]: expected an object"),
     ],
 )
@@ -192,7 +201,7 @@ def test_worlds_that_are_not_there(tmp_path: Path) -> None:
         SimulatorError,
         match=(
             "expected one of cluttered, curved, doors, five-ways, notched-rectangle, six-ways, "
-            "taylor-hall, three-ways, triangle, or a file"
+            "taylor-hall, three-ways, tower-2, tower-3, triangle, or a file"
         ),
     ):
         World.named("atlantis")

@@ -29,6 +29,8 @@ SHIPPED = (
     "curved",
     "cluttered",
     "doors",
+    "tower-2",
+    "tower-3",
 )
 
 FLAG: dict[str, Any] = {"type": true_or_false, "metavar": "true|false"}
