@@ -23,7 +23,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import STARS, traces
 
-from ssh_abduction import SSHMap, Theory, Trace, solve
+from ssh_abduction import SSHMap, Theory, Trace, explain_pair, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main
 from ssh_abduction.data import (
@@ -35,6 +35,7 @@ from ssh_abduction.data import (
     drives_of,
     together,
 )
+from ssh_abduction.explain import explain_place
 from ssh_abduction.theory.settle import settle
 
 MONDAY = Trace.from_steps(
@@ -150,6 +151,29 @@ def test_a_change_has_a_name_and_a_place(
     data["faults"][0]["gateway"] = 4
     with pytest.raises(MapError, match="gateway: expected a slot, 0 to 3"):
         SSHMap.from_dict(data)
+
+
+def test_explain_says_what_changed_and_what_it_costs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without changes the stars of place 0 differ, so no two steps are joined."""
+    trace, theory = together([MONDAY, TUESDAY]), Theory(changed=1.5)
+    said = (
+        f"{SAID}; this change costs 1.5 dstates",
+        "without changes, the best map has 8 dstates, not 4 and changes for 1.5",
+    )
+    assert explain_pair(trace, 0, 4, theory).changes == said
+    assert explain_place(trace, 0, theory=theory).changes == said
+    assert explain_pair(trace, 1, 5, theory).changes == ()
+    assert explain_place(trace, 1, theory=theory).changes == ()
+    assert explain_place(trace, 0, theory=theory.replace(changed=0.0)).changes == ()
+    trace.save(tmp_path / "joint.jsonl")
+    where = str(tmp_path / "joint.jsonl")
+    for asked in (["monday:0", "tuesday:0"], ["p0"]):
+        assert main(["explain", where, *asked, "--set", "changed=1.5"]) == 0
+        assert "\n".join(said) in capsys.readouterr().out
+    assert main(["explain", where, "p0", "--set", "changed=1.5", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["changes"] == [*said]
 
 
 def test_without_a_price_nothing_changes() -> None:

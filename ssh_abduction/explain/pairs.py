@@ -21,6 +21,7 @@ from dataclasses import replace
 
 from ssh_abduction.data.checks import a_count_of_maps
 from ssh_abduction.data.errors import SolverError, TraceError, brief, is_whole
+from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.argument import derive
 from ssh_abduction.explain.axioms import Axioms
@@ -131,6 +132,8 @@ class PairQuestion(Question[PairExplanation]):
         self._listed = False
         self._derivation: Derivation | None = None
         self._clash: Explanation | None = None
+        self._first: SSHMap | None = None  # the first minimal map
+        self._changes: tuple[str, ...] = ()
         self._ruling_out: dict[bool, Piece] = {}  # a piece of the trace without a map of the side
 
     def known(self, why: Stop | None = None) -> PairExplanation:
@@ -153,6 +156,7 @@ class PairQuestion(Question[PairExplanation]):
             stopped,
             self.theory,
             self._loop(),
+            self._changes,
         )
 
     def _loop(self) -> str | None:
@@ -208,6 +212,10 @@ class PairQuestion(Question[PairExplanation]):
                 break
         settled = False in (self._sides[True].possible, self._sides[False].possible)
         self._list_minimal_maps(settled)
+        if self._first and self._minimum:
+            places = [self._first.place_of(step) for step in (self.first, self.second)]
+            least = self._minimum, self._least_nats
+            self._changes = self._told_changes(self._first, places, least)
         if not settled and self._verdict() not in (Verdict.NO_MAP, Verdict.DISAGREE):
             for one in (True, False):
                 if not self._minimal[one] and not self._over():
@@ -304,6 +312,7 @@ class PairQuestion(Question[PairExplanation]):
             side = self._sides[one]
             if search.status is Status.OPTIMAL:
                 self._minimum = search.cost
+                self._first = self._first or found
                 self._minimal[one] = True
                 self._least_nats = search.nats
                 self._sides[one] = replace(

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Collection
 from contextlib import suppress
 from typing import Generic, TypeVar
 
+from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.axioms import Interrupted
+from ssh_abduction.explain.changes import changes_at, told
 from ssh_abduction.solver import (
+    Cost,
     LimitError,
     Progress,
     Search,
@@ -116,6 +120,25 @@ class Question(ABC, Generic[_Answer]):
             on_progress=end_with_this,
         )
         return search
+
+    def _told_changes(
+        self, ssh_map: SSHMap, places: Collection[int | None], least: tuple[Cost, float | None]
+    ) -> tuple[str, ...]:
+        """Say which gateways at some places changed between drives, and what that costs.
+
+        Args:
+            ssh_map: A minimal map.
+            places: Places of the map.
+            least: The cost of the map, and its cost in nats; None if maps are not weighed.
+        """
+        changes = changes_at(ssh_map, places)
+        if not changes:
+            return ()
+        search = self._solved(self.trace, self.theory.replace(changed=0.0), 1, self._watch.left())
+        for _ in search:
+            pass
+        self._ended(search)
+        return (*told(changes, least, search),)
 
     def _ended(self, search: Search) -> None:
         """Store in `stopped` why a search ended early, if a limit of this question was reached."""

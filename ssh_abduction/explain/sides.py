@@ -106,6 +106,8 @@ class PlaceExplanation:
         place: The id of the place.
         sides: The sides that were asked for.
         regions: A sentence for each region that contains the place; empty if one path was asked.
+        changes: Sentences about the gateways of the place that changed between drives, and what a
+            map costs without changes; empty if one path was asked.
         maps: The number of listed minimal maps; 0 if no map was found.
         possible: Whether the trace has a map; None if a limit ended the search before.
         stopped: The limit that ended the search; None if it ended by itself.
@@ -114,6 +116,7 @@ class PlaceExplanation:
     place: int
     sides: tuple[PathSide, ...]
     regions: tuple[str, ...]
+    changes: tuple[str, ...]
     maps: int
     possible: bool | None
     stopped: Stop | None
@@ -129,9 +132,10 @@ class PlaceExplanation:
             few = side.agree < self.maps
             also = f"; this holds in {side.agree} of {self.maps} minimal maps" if few else ""
             told.append(f"{side.sentence}{also}")
-        return (*told, *self.regions) or (
-            f"place {self.place} lies on no known side of a path, and in no region",
-        )
+        told += self.regions
+        if not told:
+            told = [f"place {self.place} lies on no known side of a path, and in no region"]
+        return (*told, *self.changes)
 
     def __str__(self) -> str:
         return "\n".join(self.sentences)
@@ -142,6 +146,7 @@ class PlaceExplanation:
             "place": self.place,
             "sides": [side.to_dict() for side in self.sides],
             "regions": list(self.regions),
+            "changes": list(self.changes),
             "maps": self.maps,
             "possible": self.possible,
             "stopped": self.stopped,
@@ -169,6 +174,7 @@ class PlaceQuestion(Question[PlaceExplanation]):
         self._place, self._path = place, path
         self._maps: tuple[SSHMap, ...] = ()
         self._possible: bool | None = None
+        self._changes: tuple[str, ...] = ()
 
     def _find_out(self) -> None:
         search = self._solved(self.trace, self.theory, LISTED, self._watch.left())
@@ -176,12 +182,21 @@ class PlaceQuestion(Question[PlaceExplanation]):
         self._ended(search)
         maps = self._maps = solution.minimal_maps or solution.maps
         self._possible = bool(maps) or (None if search.stopped else False)
+        if maps and self._path is None and search.cost:
+            least = search.cost, search.nats
+            self._changes = self._told_changes(maps[0], [self._place], least)
 
     def known(self, why: Stop | None = None) -> PlaceExplanation:
         """Return what is known so far. Raises MapError if the map has no such place or path."""
         sides, regions = self._told() if self._maps else ((), ())
         return PlaceExplanation(
-            self._place, sides, regions, len(self._maps), self._possible, why or self.stopped
+            self._place,
+            sides,
+            regions,
+            self._changes,
+            len(self._maps),
+            self._possible,
+            why or self.stopped,
         )
 
     def _told(self) -> tuple[tuple[PathSide, ...], tuple[str, ...]]:

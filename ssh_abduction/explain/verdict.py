@@ -85,6 +85,8 @@ class PairExplanation:
         stopped: The limit that ended the search; None if it ended by itself.
         theory: The theory, with each "auto" replaced by the value that was used.
         loop: How far off the loop between the steps closes, in words; None without displacements.
+        changes: Sentences about the gateways at the places of the steps that changed between drives
+            in the first minimal map, and what a map costs without changes.
     """
 
     first: int
@@ -98,6 +100,7 @@ class PairExplanation:
     stopped: Stop | None
     theory: Theory = field(repr=False)
     loop: str | None = None
+    changes: tuple[str, ...] = ()
 
     @property
     def proven(self) -> bool:
@@ -121,7 +124,7 @@ class PairExplanation:
             Verdict.UNKNOWN: f"it is unknown whether {pair} are one dstate "
             f"({self.stopped or 'no proof'})",
         }[self.verdict]
-        return (verdict, *self._of_maps(), *self._of_costs())
+        return (verdict, *self._of_maps(), *self._of_costs(), *self.changes)
 
     def _of_maps(self) -> Iterator[str]:
         """Yield sentences: the number of maps of each side, or why the trace has no map."""
