@@ -4,20 +4,24 @@
 # make bench-grid  localisation over dstates beside that over all poses of an occupancy grid; an hour, or ARGS="--part growing --seeds 1"
 # make parts  times of single parts: circuits, images, exploring step by step, and small traces
 # make docs   the pages of docs/ and a page for each public name as a site, with its links checked; open site/index.html
-# make test   the same, with the tools of development: lint, types, layers, tests
+# make test   the same, with the tools of development: lint, types, layers, tests; make test-all also runs slow tests
 PYTHON ?= python3
 BIN := .venv/bin
 export PIP_CONSTRAINT := $(CURDIR)/requirements.lock
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test lint style types unit docs bench bench-faults bench-grid parts lock clean
+.PHONY: demo test test-all lint style types unit docs bench bench-faults bench-grid parts lock clean
 
 demo: .venv/base
 	$(BIN)/python examples/demo.py out
 
 # Types are checked beside the tests, some of which wait. The tests begin about a hundred processes, which need not compile each module anew where the environment says that nothing compiled is kept.
-test: export PYTHONDONTWRITEBYTECODE :=
+test test-all: export PYTHONDONTWRITEBYTECODE :=
 test: style
+	@$(MAKE) --no-print-directory -j2 types unit WHICH='-m "not slow"'
+
+# Also the tests that take several seconds each.
+test-all: style
 	@$(MAKE) --no-print-directory -j2 types unit
 
 lint: style types
@@ -31,7 +35,7 @@ types: .venv/dev
 	$(BIN)/mypy
 
 unit: .venv/dev
-	$(BIN)/pytest -n auto --dist loadfile
+	$(BIN)/pytest -n auto --dist loadfile $(WHICH)
 
 docs: .venv/dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict -q

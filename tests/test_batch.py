@@ -339,6 +339,7 @@ def test_what_nobody_foresaw_is_an_answer_too(monkeypatch: pytest.MonkeyPatch) -
     )
 
 
+@pytest.mark.slow
 def test_only_the_trace_whose_process_is_killed_is_lost(traces: Path, scheduler: str) -> None:
     deadly = Deadly(*(getattr(QUESTION, name) for name in Question.__slots__))
     paths = [f"{name}.jsonl" for name in ("quick", "deadly", "quick")]
@@ -355,6 +356,7 @@ def test_only_the_trace_whose_process_is_killed_is_lost(traces: Path, scheduler:
             )
 
 
+@pytest.mark.slow
 def test_where_a_worker_is_killed_all_logs_are_mapped_and_none_twice(
     tmp_path: Path,
     scheduler: str,
@@ -485,6 +487,7 @@ def test_ctrl_c_ends_the_processes(
         pytest.fail("processes are left")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="terminals")
 @pytest.mark.parametrize(
     "seen", [False, True], ids=["results to a pipe", "results to the terminal"]

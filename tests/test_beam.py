@@ -58,6 +58,7 @@ def test_gateways_at_any_angles(tmp_path: Path) -> None:
     assert truth.is_true(maps_of(known.trace, Theory.topological(), 4)[0], known)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "seed"), [("misread", 702), ("jumped", 701), ("slipped", 701)])
 def test_a_beam_finds_faults(kind: str, seed: int) -> None:
     (known,) = truth.mazes(5, 120, [seed], DRIFTING)

@@ -72,6 +72,7 @@ def test_x0_and_x4_share_a_view_and_are_told_apart() -> None:
     assert ssh_map.labels[:16] == (0, 1, 2, 3, 4, 5, 6, 7) * 2
 
 
+@pytest.mark.slow
 def test_demo(tmp_path: Path) -> None:
     out = run("demo.py", str(tmp_path))
     assert "fewest: 19 dstates, 10 places, 4 paths; 4 minimal maps" in out

@@ -82,6 +82,7 @@ def partition(names: Collection[Any]) -> list[int]:
     return [numbers.setdefault(name, len(numbers)) for name in names]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("world", "start", "margin"),
     [(STREET, "a", 1), (TEE, "W", 0), (RING, "a", 0)],

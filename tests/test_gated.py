@@ -46,6 +46,7 @@ def drive(world: str, seed: int, steps: int = 24) -> Trace:
     return trace
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world", WORLDS)
 def test_a_greedy_map_satisfies_all_axioms(world: str) -> None:
     for seed in range(2):

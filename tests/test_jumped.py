@@ -129,6 +129,7 @@ def test_the_checker_believes_what_the_map_believes() -> None:
     assert check(trace, best, solution.theory.without_faults())
 
 
+@pytest.mark.slow
 def test_a_maze_with_wrong_displacements_has_a_map_that_costs_no_more_than_the_truth() -> None:
     seed, jumps = 12, 2
     chance = random.Random(seed)

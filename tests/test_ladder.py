@@ -31,6 +31,7 @@ def climbed() -> tuple[Rung, ...]:
     return tuple(ladder(aces3().trace))
 
 
+@pytest.mark.slow
 def test_displacements_make_the_true_map_of_aces3_the_only_minimal_one() -> None:
     rungs = {rung.name: rung for rung in climbed()}
     assert list(rungs) == ["views", "+ star", "+ pairs", "+ geometry", "+ planarity"]

@@ -393,6 +393,7 @@ def test_options_of_the_old_detector_have_no_effect_and_say_so(
     assert "--width METRES" in told
 
 
+@pytest.mark.slow
 def test_the_rooms_of_a_building_are_told_apart(tmp_path: Path) -> None:
     """A robot drives around four rooms in a ring, and the map has a place in each of them."""
     middles = {room: middle for room, middle in MIDDLES.items() if room != "closet"}

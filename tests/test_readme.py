@@ -210,6 +210,7 @@ def test_the_shell_lines_and_python_lines_print_what_is_shown(
     compare(block)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
 def test_the_shell_lines_of_a_tutorial_can_be_followed_in_an_empty_folder(
     page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

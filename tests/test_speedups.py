@@ -187,6 +187,7 @@ def test_each_speedup_is_asked_for_in_some_case() -> None:
     assert read == set(NAMES) - {"processes", "digest"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_each_speedup_that_is_read_off_alone(case: str) -> None:
     trace, theory = CASES[case]

@@ -72,6 +72,7 @@ def test_the_solver_lists_the_joint_maps_of_the_brute_force(data: st.DataObject)
         agree(trace, theory)
 
 
+@pytest.mark.slow
 @settings(max_examples=5)
 @given(st.data())
 def test_the_cheapest_joint_maps_are_those_of_plain_least_squares(data: st.DataObject) -> None:
