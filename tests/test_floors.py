@@ -23,7 +23,7 @@ from ssh_abduction.online import route
 from ssh_abduction.output import to_networkx, to_svg
 from ssh_abduction.output.export import export_map
 from ssh_abduction.output.layout import layout
-from ssh_abduction.solver import choosing, prefixes
+from ssh_abduction.solver import Status, choosing, prefixes
 from ssh_abduction.solver.asp.facts.readable import program
 from ssh_abduction.theory.evidence import Equality, Floors
 from ssh_abduction.theory.settle import settle
@@ -193,10 +193,13 @@ def test_a_robot_in_a_simulated_tower_changes_floors_by_lifts_only(
             assert before[1:] == after[1:]
 
 
-def test_the_map_of_a_simulated_tower_is_true() -> None:
+@pytest.mark.parametrize("theory", [Theory.causal(), Theory(displacement="none")])
+def test_the_map_of_a_simulated_tower_is_true(theory: Theory) -> None:
     trace = simulate(World.named("tower-2"), seed=3)
     trace = trace.with_views([str(step.star) for step in trace.steps])
-    ssh_map = solve(trace, time_limit=60).maps[0]
+    solution = solve(trace, theory, max_maps=1)
+    assert solution.status is Status.OPTIMAL
+    ssh_map = solution.maps[0]
     states = {step.truth["dstate"] for step in trace.steps}
     assert len(ssh_map.dstates) == len(states)
     pairs = {(s.truth["dstate"], k) for s, k in zip(trace.steps, ssh_map.labels, strict=True)}

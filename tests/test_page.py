@@ -614,6 +614,23 @@ def test_regions_in_the_browser(browser: Any, tmp_path: Path) -> None:
     assert page.complaints == []
 
 
+def test_floors_are_named_beside_their_places(browser: Any, tmp_path: Path) -> None:
+    trace = Trace.from_steps("abcde", ["travel", Action("up", "lift"), "travel", "travel"])
+    solution = solve(trace)
+    content = content_of(solution, trace)
+    (_, above), (_, below) = content["layouts"][0]["floors"]
+    assert above > below
+    Page(content).save(tmp_path / "page.html")
+    page = Shown(browser, (tmp_path / "page.html").as_uri())
+    page.click("one")
+    names = browser.find_elements("css selector", "#drawings .name.floor")
+    assert [name.text for name in names] == ["floor 0", "floor 1"]
+    assert names[0].location["y"] < names[1].location["y"]
+    assert page.complaints == []
+    flat = solve(trace[:2])
+    assert "floors" not in content_of(flat, trace[:2])["layouts"][0]
+
+
 def test_the_page_of_a_joint_map_shows_its_drives(browser: Any, tmp_path: Path) -> None:
     monday = Trace.from_steps("abc", ["travel", "travel"], name="monday")
     tuesday = Trace.from_steps("cd", ["travel"], name="<b>tuesday</b>")

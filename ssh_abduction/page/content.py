@@ -304,8 +304,18 @@ def _numbers(found: Layout, ssh_map: SSHMap) -> dict[str, Any]:
             [round(x / unit, 2), round(y / unit, 2), None if h is None else round(h, 2)]
             for x, y, h in found.dstates
         ],
+        **({"floors": _corners(found, ssh_map, unit)} if ssh_map.floors else {}),
         **({"ellipses": _ellipses(found, ssh_map, unit)} if found.metric else {}),
     }
+
+
+def _corners(found: Layout, ssh_map: SSHMap, unit: float) -> list[list[float]]:
+    """Find where the name of each floor is drawn: x and y of the upper left corner of the floor."""
+    points = [[found.dstates[s] for s in floor] for floor in ssh_map.floors]
+    return [
+        [round(min(x for x, _, _ in at) / unit, 2), round(max(y for _, y, _ in at) / unit, 2)]
+        for at in points
+    ]
 
 
 def _ellipses(found: Layout, ssh_map: SSHMap, unit: float) -> list[list[float]]:

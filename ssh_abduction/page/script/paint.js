@@ -61,6 +61,7 @@ function paintFigure(figure) {
       ]);
   });
   paintMarks(figure, see, radiusAt);
+  paintFloors(figure, see, r);
   const named = new Set();
   for (const m of figure.marks)
     if (m.name && apart > (figure.marks.length > 150 ? 70 : m.bare ? 24 : 40))
@@ -299,6 +300,24 @@ function around(m) {
     [0.7, -0.7],
     [-0.7, 0.7],
   ].map(([u, v]) => [m.c * u - m.s * v, m.s * u + m.c * v]);
+}
+
+// Name each floor beside its upper left corner. The floors are drawn below each other.
+function paintFloors(figure, see, r) {
+  for (const [k, corner] of (figure.layout?.floors ?? []).entries())
+    label(
+      figure,
+      `floor ${k}`,
+      see(corner),
+      3 * r,
+      [
+        [-1, 0],
+        [-0.7, -0.7],
+        [0, -1],
+        [0.7, -0.7],
+      ],
+      "floor",
+    );
 }
 
 function paintFaults(figure, r) {
