@@ -9,9 +9,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from perception.places.distinctive import _one_for_each_stay, find_visits
+from perception.places.distinctive import find_visits
 from perception.places.local_map import CELL, Patch
 from perception.places.skeleton import junctions
+from perception.places.stays import joined
 from perception.places.track import Track
 from perception.places.visits import Visit, Way, apart
 from perception.readers.scans import Laser, RobotLog, Scan
@@ -220,13 +221,10 @@ def test_successive_visits_to_one_place_are_one() -> None:
     west, east, north = Way(-math.pi), Way(0.0), Way(math.pi / 2)
     middle = np.zeros(2)
     first = Visit(5, middle, 3, 7, 1.0, (west, east), arrived=0, left=1)
-    second = Visit(12, middle + 0.2, 10, 14, 1.0, (east, north), arrived=0, left=1)
-    (stay,) = _one_for_each_stay([first, second])
+    stay = joined(first, Visit(12, middle + 0.2, 10, 14, 1.0, (east, north), arrived=0, left=1))
     assert (stay.begin, stay.end) == (3, 14)
     assert [way.bearing for way in stay.ways] == [-math.pi, 0.0, math.pi / 2]
     assert (stay.arrived, stay.left) == (0, 2)
-    far = replace(second, middle=middle + 2.0)
-    assert _one_for_each_stay([first, far]) == [first, far]
 
 
 def test_a_wide_robot_has_fewer_ways() -> None:

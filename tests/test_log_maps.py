@@ -18,8 +18,9 @@ from test_plans import DOORS, MIDDLES, plan_of, xml
 from visited import Truth
 
 from perception.errors import LogError
+from perception.places.following import follow
 from perception.places.importing import Imported, import_log
-from perception.places.track import Track, follow
+from perception.places.track import Track
 from perception.readers.logs import read_log
 from perception.readers.scans import Laser, RobotLog, Scan
 from perception.readers.writers import write_carmen

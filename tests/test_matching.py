@@ -11,11 +11,12 @@ import pytest
 from test_distinctive import log_of
 
 from perception.places.closures import Closing, find_closures, relative
-from perception.places.distinctive import HALF, WINDOW, find_visits
-from perception.places.local_map import CELL, LocalMaps, Patch
+from perception.places.distinctive import WINDOW, find_visits
+from perception.places.following import _matched
+from perception.places.local_map import CELL, Patch
 from perception.places.matching import Match, Scene, Turned, match
 from perception.places.tracing import to_trace
-from perception.places.track import Track, _matched, points_turned
+from perception.places.track import Track, points_turned
 from perception.places.trust import Trust
 from perception.places.visits import Visit
 from perception.readers.scans import RobotLog
@@ -84,8 +85,7 @@ def rounds() -> tuple[RobotLog, Track, tuple[Visit, ...], list[Patch]]:
     walls += [(4, 1, 4, 9), (6, 1, 6, 9), (4, 9, 6, 9), (-9, -1, -9, 1), (19, -1, 19, 1)]
     log, track = log_of(walls, [(-7, 0), (5, 0), (5, 7), (5, 0), (17, 0), (5, 0), (5, 7)])
     visits = find_visits(log, track)
-    maps = LocalMaps(log.scans, track, WINDOW)
-    return log, track, visits, [maps.around(visit.scan, visit.middle, HALF) for visit in visits]
+    return log, track, visits, [visit.patch for visit in visits if visit.patch is not None]
 
 
 def test_visits_to_one_fork_have_a_closure() -> None:

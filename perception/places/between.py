@@ -15,12 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from perception.places.closures import KEPT, TURN, Closing, is_reliable
-from perception.places.distinctive import HALF, WINDOW
 from perception.places.importing import Imported
-from perception.places.local_map import LocalMaps
 from perception.places.matching import Scene, Turned, match
 from perception.places.track import Array, points_turned
-from perception.readers.scans import RobotLog
 
 # Two matches agree if the middle of the visit of one is where the other one says, within NEAR
 # metres and DRIFT metres for each metre between the two visits, and if their rotations differ by
@@ -30,12 +27,9 @@ VOTES = 3
 TURNS = [k * TURN for k in range(round(math.tau / TURN))]
 
 
-def scenes_of(log: RobotLog, part: Imported) -> list[Scene]:
+def scenes_of(part: Imported) -> list[Scene]:
     """Prepare the local map of each visit of a drive for matching."""
-    maps = LocalMaps(log.scans, part.track, WINDOW)
-    return [
-        Scene.of(maps.around(visit.scan, visit.middle, HALF), visit.middle) for visit in part.visits
-    ]
+    return [Scene.of(visit.patch, visit.middle) for visit in part.visits if visit.patch is not None]
 
 
 def closures_between(

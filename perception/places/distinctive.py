@@ -4,21 +4,30 @@ Milestones are scans a metre apart on the trajectory. The local map of each mile
 skeleton with junctions. Junctions near each other at successive milestones are one chain. If the
 robot drives through the disc of a chain, and half of the local maps nearby show its junction, then
 this is a visit. The robot comes and leaves where its trajectory crosses the disc.
+
+Visits are found while the robot drives. A visit is final when the robot is at most DELAY metres
+beyond its last scan. Only the last scans, the open chains and the visits that are not final yet are
+kept.
 """
 
 from __future__ import annotations
 
+import heapq
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import count
 
 import numpy as np
 
-from perception.places.local_map import LocalMaps
+from perception.places.following import Followed
+from perception.places.local_map import Beams, LocalMaps
+from perception.places.recent import Recent
 from perception.places.skeleton import Junction, junctions
+from perception.places.stays import AROUND, RIM, SAME, SHARE, SMALL, Stays
 from perception.places.track import Array, Track
-from perception.places.visits import Visit, Way, apart
-from perception.readers.scans import RobotLog
+from perception.places.visits import MERGED, Visit, Way, apart
+from perception.readers.scans import Pose, RobotLog, Scan
 
 # The usual width of a robot in metres. It has to fit through the doors that the robot uses.
 WIDTH = 0.5
@@ -27,40 +36,226 @@ WIDTH = 0.5
 EVERY, WINDOW, HALF = 1.0, 8.0, 8.0
 # Junctions farther than this from the robot, in metres, are too uncertain.
 SEEN = 5.0
-# Junctions are one place within SAME metres, or within this share of the smaller radius.
-SAME, SHARE = 0.6, 0.5
 # A chain ends if so many milestones in a row do not show it. Its middle is the median of so many.
 GAP, RECENT = 4, 9
+# A chain that is LIFE metres long ends, too. Another one begins with its last sightings.
+LIFE = 60.0
 # The robot visits a place within this distance in metres, even if its disc is smaller. It has left
 # at LEFT metres outside of the disc.
 PASSING, LEFT = 0.75, 0.5
 # Milestones within BESIDE metres along the trajectory are asked about a place. At least a share of
 # AGREED has to show it.
 BESIDE, AGREED = 3.0, 0.5
-# The robot turned around if its directions of motion over some stride in metres, before and after,
-# differ by more than REVERSED radians. It turns on the spot or in a bow, so there are several
-# strides. Other visits are more than a stride and ALONE metres away along the trajectory.
-STRIDES, REVERSED, ALONE = (1.0, 2.0, 4.0), math.radians(135), 1.5
-# Two ways out whose bearings differ by less than this, in radians, are one.
-MERGED = math.radians(45)
-# The bearing of a way is taken at so many metres outside of the disc, whose radius is at least
-# SMALL metres.
-RIM, SMALL = 0.5, 0.5
+# A visit is final at most so many metres after its end if scans are at most 0.5 m apart: a local
+# map waits for WINDOW, a chain for LIFE and GAP, and a visit twice for STAY and for turns nearby.
+# The rest is the distance of scans and of milestones.
+DELAY = 125.0
+
+
+def find_visits(log: RobotLog, track: Track, width: float = WIDTH) -> tuple[Visit, ...]:
+    """Find the visits to distinctive places in a log, in order: the list of `visits_of`.
+
+    Args:
+        log: The scans. Corrected poses are not read.
+        track: Their poses.
+        width: Width of the robot in metres.
+    """
+    breaks = set(track.breaks)
+    poses = ((float(x), float(y), float(heading)) for x, y, heading in track.poses)
+    posed = (
+        Followed(scan, pose, broken=i in breaks)
+        for i, (scan, pose) in enumerate(zip(log.scans, poses, strict=True))
+    )
+    return tuple(visits_of(posed, width))
+
+
+def visits_of(posed: Iterable[Followed], width: float = WIDTH) -> Iterator[Visit]:
+    """Find the visits to distinctive places while a robot drives.
+
+    Each unbroken part of the track is searched separately.
+
+    Args:
+        posed: The scans with their poses, in order.
+        width: Width of the robot in metres.
+
+    Yields:
+        Each visit, in order, when it is final. Its scans are counted from 0 over all of `posed`.
+    """
+    detector, begin = _Detector(width), 0
+    for number, one in enumerate(posed):
+        if one.broken:
+            yield from (visit.later(begin) for visit in detector.finish())
+            detector, begin = _Detector(width), number
+        yield from (visit.later(begin) for visit in detector.add(one.scan, one.pose))
+    yield from (visit.later(begin) for visit in detector.finish())
+
+
+class _Detector:
+    """Finds the visits in an unbroken part of a drive.
+
+    Args:
+        width: Width of the robot in metres.
+    """
+
+    def __init__(self, width: float) -> None:
+        """Start before the first scan."""
+        self._room = width / 2
+        self._recent = Recent()
+        beams = Beams(self._recent, WINDOW)
+        self._maps = LocalMaps(self._recent, beams, WINDOW)
+        self._stays = Stays(self._recent, LocalMaps(self._recent, beams, WINDOW), HALF)
+        self._milestones: list[int] = []  # scans; those after the first _seen have no local map yet
+        self._first = self._seen = 0  # numbers of the first milestone that is kept, and of the next
+        self._open: list[_Chain] = []
+        self._numbers = count()
+        self._found: list[tuple[int, int, int, Visit]] = []  # a heap by scan, chain and pass
+
+    def add(self, scan: Scan, pose: Pose) -> Iterator[Visit]:
+        """Add the next scan, and yield the visits that are final now."""
+        recent = self._recent
+        recent.append(scan, pose)
+        here = recent.end - 1
+        if not self._milestones or (recent.way(here) - recent.way(self._milestones[-1]) >= EVERY):
+            self._milestones.append(here)
+        # The local map of a milestone needs the scans up to WINDOW metres after it.
+        while (at := self._next) is not None and recent.way(here) > recent.way(at) + WINDOW:
+            self._look(at)
+            yield from self._stays.add(self._released(self._horizon), self._horizon)
+            self._forget()
+
+    def finish(self) -> Iterator[Visit]:
+        """End the drive, and yield all visits that are left."""
+        while (at := self._next) is not None:
+            self._look(at)
+        for chain in list(self._open):
+            self._end(chain)
+        yield from self._stays.add(self._released(self._recent.end), None)
+
+    @property
+    def _next(self) -> int | None:
+        """The scan of the next milestone; None if the robot has not reached it."""
+        k = self._seen - self._first
+        return self._milestones[k] if k < len(self._milestones) else None
+
+    @property
+    def _horizon(self) -> int:
+        """No visit will be found whose first scan is before this one."""
+        last = self._recent.way(self._milestones[self._seen - self._first - 1])
+        first = min([last, *(chain.sightings[0].way for chain in self._open)])
+        return self._recent.at(first - GAP * EVERY)
+
+    def _look(self, at: int) -> None:
+        """Chain the junctions in the local map of the next milestone, and end old chains."""
+        milestone, way = self._seen, self._recent.way(at)
+        self._seen += 1
+        continued = list(self._open)
+        for junction in self._junctions_at(at):
+            near = [
+                (far, number)
+                for number, chain in enumerate(continued)
+                if chain.last < milestone and (far := _distance(chain, junction)) is not None
+            ]
+            sighting = _Sighting(milestone, way, junction)
+            if near:
+                continued[min(near)[1]].sightings.append(sighting)
+            else:
+                self._open.append(_Chain(next(self._numbers), [sighting]))
+        for chain in list(self._open):
+            if milestone - chain.last >= GAP:
+                self._end(chain)
+            elif way - chain.sightings[0].way >= LIFE:
+                self._end(chain)
+                late = [one for one in chain.sightings if one.way >= way - 2 * BESIDE]
+                self._open.append(_Chain(next(self._numbers), late))
+
+    def _junctions_at(self, scan: int) -> list[Junction]:
+        """The junctions near the robot in the local map of a scan, the largest first."""
+        here = self._recent.poses(scan, scan + 1)[0, :2]
+        found = junctions(self._maps.around(scan, here, HALF), self._room)
+        near = [junction for junction in found if math.dist(junction.middle, here) <= SEEN]
+        return sorted(near, key=lambda junction: -junction.radius)
+
+    def _end(self, chain: _Chain) -> None:
+        """Close a chain, and find its visits."""
+        self._open.remove(chain)
+        if len(chain.sightings) > 1:
+            for k, visit in enumerate(self._passes(chain)):
+                heapq.heappush(self._found, (visit.scan, chain.number, k, visit))
+
+    def _released(self, horizon: int) -> list[Visit]:
+        """Remove and return the visits before a scan, in order."""
+        released = []
+        while self._found and self._found[0][0] < horizon:
+            released.append(heapq.heappop(self._found)[-1])
+        return released
+
+    def _forget(self) -> None:
+        """Forget what is too old for any visit."""
+        oldest = self._recent.way(min(self._horizon, self._stays.oldest))
+        self._recent.drop_before(self._recent.at(oldest - AROUND))
+        while self._milestones[0] < self._recent.begin:
+            del self._milestones[0]
+            self._first += 1
+
+    def _passes(self, chain: _Chain) -> Iterator[Visit]:
+        """Make a visit of each time that the robot drives through the disc of a chain."""
+        recent, sightings = self._recent, chain.sightings
+        first = recent.at(sightings[0].way - GAP * EVERY)
+        last = recent.at(sightings[-1].way + GAP * EVERY, "right")
+        middle, radius = chain.middle(), chain.radius()
+        far = np.hypot(*(recent.poses(first, last)[:, :2] - middle).T)
+        for begin, end in _stays(far, max(PASSING, radius)):
+            scan = first + begin + int(far[begin : end + 1].argmin())
+            near = self._near(scan, middle)
+            mine = [sighting for sighting in sightings if sighting.milestone in near]
+            if mine and len(mine) >= AGREED * len(near):
+                yield Visit(
+                    scan,
+                    _middle(mine),
+                    first + begin,
+                    first + end,
+                    radius,
+                    _ways(mine, radius),
+                    support=len(mine) / len(near),
+                )
+
+    def _near(self, scan: int, middle: Array) -> set[int]:
+        """The numbers of the milestones near a scan from which a middle can be seen."""
+        way = self._recent.way(scan)
+        return {
+            number
+            for number, at in enumerate(self._milestones, self._first)
+            if abs(self._recent.way(at) - way) <= BESIDE
+            and math.dist(self._recent.poses(at, at + 1)[0, :2], middle) < SEEN - 0.5
+        }
 
 
 @dataclass(frozen=True, eq=False)
 class _Sighting:
-    """A junction in the local map of a milestone, which is counted from 0."""
+    """A junction in the local map of a milestone.
+
+    Attributes:
+        milestone: Number of the milestone, from 0.
+        way: Metres driven up to it.
+        junction: The junction.
+    """
 
     milestone: int
+    way: float
     junction: Junction
 
 
 @dataclass(eq=False)
 class _Chain:
-    """Sightings of one junction at successive milestones."""
+    """Sightings of one junction at successive milestones.
 
-    sightings: list[_Sighting] = field(default_factory=list)
+    Attributes:
+        number: Number of the chain, in the order in which they began.
+        sightings: The sightings, in order.
+    """
+
+    number: int
+    sightings: list[_Sighting]
 
     @property
     def first(self) -> int:
@@ -84,125 +279,11 @@ def _middle(sightings: Sequence[_Sighting]) -> Array:
     return np.asarray(np.median([one.junction.middle for one in sightings], axis=0))
 
 
-def find_visits(log: RobotLog, track: Track, width: float = WIDTH) -> tuple[Visit, ...]:
-    """Find the visits to distinctive places in a log, in order.
-
-    Each unbroken part of the track is searched separately. Corrected poses are not read.
-
-    Args:
-        log: The scans.
-        track: Their poses.
-        width: Width of the robot in metres.
-    """
-    return tuple(
-        visit.later(begin)
-        for begin, end in track.spans
-        for visit in _visits_of_span(
-            replace(log, scans=log.scans[begin:end]), track.part(begin, end), width
-        )
-    )
-
-
-def milestones(track: Track, every: float) -> list[int]:
-    """Choose scans along the trajectory, one after each `every` metres or more.
-
-    Returns:
-        Indices of scans, ascending; the first is 0.
-    """
-    kept = [0]
-    for i, way in enumerate(track.way):
-        if way - track.way[kept[-1]] >= every:
-            kept.append(i)
-    return kept
-
-
-def _visits_of_span(log: RobotLog, track: Track, width: float) -> list[Visit]:
-    """Find the visits in a log whose track is unbroken."""
-    asked = np.array(milestones(track, EVERY))
-    maps = LocalMaps(log.scans, track, WINDOW)
-    chains = _chains(_seen_at(maps, track, int(i), width) for i in asked)
-    found = [
-        visit
-        for chain in chains
-        if len(chain.sightings) > 1
-        for visit in _passes(chain, track, asked)
-    ]
-    found = _one_for_each_pass(sorted(found, key=lambda visit: visit.scan))
-    return _one_for_each_stay(
-        [_with_gateways(visit, track) for visit in _with_turnings(found, track)]
-    )
-
-
-def _seen_at(maps: LocalMaps, track: Track, scan: int, width: float) -> list[Junction]:
-    """The junctions near the robot in the local map of a scan, the largest first."""
-    here = track.poses[scan, :2]
-    found = junctions(maps.around(scan, here, HALF), width / 2)
-    near = [junction for junction in found if math.dist(junction.middle, here) <= SEEN]
-    return sorted(near, key=lambda junction: -junction.radius)
-
-
-def _chains(seen: Iterator[list[Junction]]) -> list[_Chain]:
-    """Chain the junctions that successive milestones see.
-
-    Args:
-        seen: The junctions of each milestone, the largest first.
-    """
-    chains: list[_Chain] = []
-    for milestone, found in enumerate(seen):
-        open_chains = [chain for chain in chains if milestone - chain.last <= GAP]
-        for junction in found:
-            near = [
-                (far, number)
-                for number, chain in enumerate(open_chains)
-                if chain.last < milestone and (far := _distance(chain, junction)) is not None
-            ]
-            if near:
-                chain = open_chains[min(near)[1]]
-            else:
-                chain = _Chain()
-                chains.append(chain)
-            chain.sightings.append(_Sighting(milestone, junction))
-    return chains
-
-
 def _distance(chain: _Chain, junction: Junction) -> float | None:
     """The distance of a junction from a chain in metres; None if it is too far for one place."""
     far = math.dist(chain.middle(RECENT), junction.middle)
     near = max(SAME, SHARE * min(chain.radius(RECENT), junction.radius))
     return far if far < near else None
-
-
-def _passes(chain: _Chain, track: Track, asked: Array) -> Iterator[Visit]:
-    """Make a visit of each time that the robot drives through the disc of a chain.
-
-    Args:
-        chain: The sightings.
-        track: Trajectory of the robot.
-        asked: (n,) the scans of the milestones.
-    """
-    way, positions = track.way, track.poses[:, :2]
-    first = max(int(np.searchsorted(way, way[asked[chain.first]] - GAP * EVERY)), 0)
-    last = int(np.searchsorted(way, way[asked[chain.last]] + GAP * EVERY, side="right"))
-    middle, radius = chain.middle(), chain.radius()
-    far = np.hypot(*(positions[first:last] - middle).T)
-    for begin, end in _stays(far, max(PASSING, radius)):
-        scan = first + begin + int(far[begin : end + 1].argmin())
-        near = {
-            number
-            for number in np.flatnonzero(np.abs(way[asked] - way[scan]) <= BESIDE)
-            if math.dist(positions[asked[number]], middle) < SEEN - 0.5
-        }
-        mine = [sighting for sighting in chain.sightings if sighting.milestone in near]
-        if mine and len(mine) >= AGREED * len(near):
-            yield Visit(
-                scan,
-                _middle(mine),
-                first + begin,
-                first + end,
-                radius,
-                _ways(mine, radius),
-                support=len(mine) / len(near),
-            )
 
 
 def _stays(far: Array, radius: float) -> Iterator[tuple[int, int]]:
@@ -252,124 +333,3 @@ def _bearings(junction: Junction, radius: float) -> Iterator[float]:
         outside = np.flatnonzero(far >= max(radius, SMALL) + RIM)
         x, y = branch[outside[0] if len(outside) else -1] - junction.middle
         yield math.atan2(y, x)
-
-
-def _one_for_each_pass(found: Sequence[Visit]) -> list[Visit]:
-    """Keep one of successive visits that overlap and are too close for two places.
-
-    The visit with the largest support times radius is kept.
-    """
-    kept: list[Visit] = []
-    for visit in found:
-        last = kept[-1] if kept else None
-        if last is None or not _overlap(last, visit):
-            kept.append(visit)
-        elif visit.support * visit.radius > last.support * last.radius:
-            kept[-1] = replace(visit, begin=min(visit.begin, last.begin))
-    return kept
-
-
-def _overlap(first: Visit, second: Visit) -> bool:
-    """Check whether two successive visits are to one place."""
-    return _are_near(first, second) and second.begin <= first.end + 2
-
-
-def _are_near(first: Visit, second: Visit) -> bool:
-    near = max(SAME, SHARE * max(first.radius, second.radius))
-    return math.dist(first.middle, second.middle) < near
-
-
-def _one_for_each_stay(found: Sequence[Visit]) -> list[Visit]:
-    """Join successive visits to one place: the robot left its disc, but went to no other place."""
-    kept: list[Visit] = []
-    for visit in found:
-        last = kept[-1] if kept else None
-        if last is None or not _are_near(last, visit):
-            kept.append(visit)
-        else:
-            ways = list(last.ways)
-            left = None if visit.left is None else _taken(ways, visit.ways[visit.left].bearing)
-            kept[-1] = _in_order(replace(last, end=visit.end, ways=tuple(ways), left=left))
-    return kept
-
-
-def _with_turnings(found: Sequence[Visit], track: Track) -> list[Visit]:
-    """Add a visit at each point far from other visits where the robot turned around."""
-    visits = list(found)
-    for stride in STRIDES:
-        # Begin with the sharpest turn. Other turns near it belong to the same turning point.
-        for _, i in sorted(_turns(track, stride), reverse=True):
-            far = max(ALONE, stride)
-            if all(
-                abs(track.way[visit.scan] - track.way[i]) > max(far, visit.radius)
-                for visit in visits
-            ):
-                visits.append(Visit(i, track.poses[i, :2].copy(), i, i, support=0.0))
-    return sorted(visits, key=lambda visit: visit.scan)
-
-
-def _turns(track: Track, stride: float) -> Iterator[tuple[float, int]]:
-    """The scans at which the robot turned around, each after the angle in radians.
-
-    Args:
-        track: Trajectory of the robot.
-        stride: The directions of motion are taken over so many metres.
-    """
-    positions, way = track.poses[:, :2], track.way
-    for i in range(int(np.searchsorted(way, stride)), len(way)):
-        before, after = np.searchsorted(way, way[i] - stride), np.searchsorted(way, way[i] + stride)
-        if after >= len(way):
-            return
-        there, back = positions[i] - positions[before], positions[after] - positions[i]
-        if min(math.hypot(*there), math.hypot(*back)) > stride / 3:
-            angle = apart(math.atan2(there[1], there[0]), math.atan2(back[1], back[0]))
-            if angle > REVERSED:
-                yield angle, i
-
-
-def _with_gateways(visit: Visit, track: Track) -> Visit:
-    """Complete a visit by the ways that the robot took: those by which it crossed the disc."""
-    ways, numbers = list(visit.ways), []
-    for side in (-1, 1):
-        bearing = _crossing(track, visit, side)
-        numbers.append(None if bearing is None else _taken(ways, bearing))
-    return _in_order(replace(visit, ways=tuple(ways), arrived=numbers[0], left=numbers[1]))
-
-
-def _in_order(visit: Visit) -> Visit:
-    """The visit with its ways in counterclockwise order."""
-    order = sorted(range(len(visit.ways)), key=lambda k: visit.ways[k].bearing)
-    arrived, left = (None if k is None else order.index(k) for k in (visit.arrived, visit.left))
-    ways = tuple(visit.ways[k] for k in order)
-    return replace(visit, ways=ways, arrived=arrived, left=left)
-
-
-def _taken(ways: list[Way], bearing: float) -> int:
-    """Mark the way that the robot took as sure, or add it, and return its index."""
-    near = [k for k in range(len(ways)) if apart(ways[k].bearing, bearing) < MERGED]
-    if not near:
-        ways.append(Way(bearing))
-        return len(ways) - 1
-    k = min(near, key=lambda k: apart(ways[k].bearing, bearing))
-    ways[k] = replace(ways[k], sure=True)
-    return k
-
-
-def _crossing(track: Track, visit: Visit, side: int) -> float | None:
-    """The direction in radians in which the robot crosses the disc of a place.
-
-    Args:
-        track: Trajectory of the robot.
-        visit: Visit to the place.
-        side: -1 for entering the disc, 1 for leaving it.
-
-    Returns:
-        None if the log begins or ends in the disc.
-    """
-    i = visit.scan
-    while 0 <= i < len(track.poses):
-        x, y = track.poses[i, :2] - visit.middle
-        if math.hypot(x, y) >= max(visit.radius, SMALL) + RIM:
-            return math.atan2(y, x)
-        i += side
-    return None

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
@@ -19,14 +19,16 @@ import numpy as np
 from perception.errors import ImageWarning, LogError
 from perception.places import jumps, log_checks
 from perception.places.agreement import disagreement
-from perception.places.distinctive import WIDTH, find_visits
+from perception.places.distinctive import WIDTH, find_visits, visits_of
+from perception.places.following import follow, followed, turned_wrongly
 from perception.places.tracing import to_trace
-from perception.places.track import Track, follow, turned_wrongly
+from perception.places.track import Track
+from perception.places.trust import Trust
 from perception.places.visits import Visit
-from perception.readers.scans import RobotLog
+from perception.readers.scans import Damage, RobotLog, Scan
 from perception.reciprocal import ReciprocalTransformer
 from perception.views import ViewClusterer
-from ssh_abduction.data.errors import named
+from ssh_abduction.data.errors import brief, named
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.logs import log_of
 
@@ -126,6 +128,46 @@ def import_log(
     with _timed(seconds, "views"):
         trace = with_views(trace)
     return Imported(trace, track, width, visits, seconds, notes)
+
+
+def stream_visits(scans: Iterable[Scan | Damage], width: float = WIDTH) -> Iterator[Visit]:
+    """Find the distinctive places that a robot passes, while it drives.
+
+    A visit is final, and yielded, when the robot is at most 125 m of trajectory beyond the last
+    scan of the stay, if scans are at most 0.5 m apart. Usually this is after 30 to 40 m. At the end
+    of the scans, the other visits follow. Only the scans of the last metres are kept, so that
+    memory does not grow with the drive.
+
+    The visits are those of `import_log` if the odometry is good. Unlike there, a jump of the
+    odometer is judged by the steps before it only, and neither the units nor the order of the log
+    are examined.
+
+    Args:
+        scans: The scans with odometry in metres, in order, for example those of `stream_log`.
+            Damaged parts are skipped.
+        width: Width of the robot in metres. Narrower parts of the free space are no ways.
+
+    Yields:
+        Each visit with its local map. Scans are counted from 0.
+
+    Raises:
+        LogError: The width is no positive number, or an item is no scan.
+
+    Example:
+        >>> [visit.scan for visit in stream_visits([])]
+        []
+    """
+    if not (isinstance(width, int | float) and 0 < width < math.inf):
+        raise LogError(f"width: expected a positive number of metres, got {brief(width)}")
+    return visits_of(followed(_scans_of(scans), jumps.LiveJumps(), Trust()), width)
+
+
+def _scans_of(items: Iterable[Scan | Damage]) -> Iterator[Scan]:
+    for number, item in enumerate(items):
+        if isinstance(item, Scan):
+            yield item
+        elif not isinstance(item, Damage):
+            raise LogError(f"scans: expected scans, got {brief(item)} as item {number}")
 
 
 def tracked(

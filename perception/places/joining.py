@@ -54,7 +54,7 @@ def join_logs(logs: Sequence[RobotLog], parts: Sequence[Imported]) -> tuple[Robo
     begins = [0, *accumulate(len(part.track.poses) for part in parts)][: len(parts)]
     track, shifts = _joint_track([part.track for part in parts], begins)
     visits = tuple(
-        replace(visit, middle=visit.middle + shift).later(begin)
+        replace(visit, middle=visit.middle + shift, patch=None).later(begin)
         for part, shift, begin in zip(parts, shifts, begins, strict=True)
         for visit in part.visits
     )
@@ -66,7 +66,7 @@ def join_logs(logs: Sequence[RobotLog], parts: Sequence[Imported]) -> tuple[Robo
         trace = together(traces)
     begin = time.process_time()
     arrivals = _arrivals(trace, track, visits)
-    found = [closure_of(closing, arrivals) for closing in _closings(logs, parts, counts)]
+    found = [closure_of(closing, arrivals) for closing in _closings(parts, counts)]
     seconds = _total([part.seconds for part in parts])
     seconds["drives"] = round(time.process_time() - begin, 3)
     return log, Imported(
@@ -80,17 +80,14 @@ def join_logs(logs: Sequence[RobotLog], parts: Sequence[Imported]) -> tuple[Robo
     )
 
 
-def _closings(
-    logs: Sequence[RobotLog], parts: Sequence[Imported], counts: Sequence[int]
-) -> Iterator[Closing]:
+def _closings(parts: Sequence[Imported], counts: Sequence[int]) -> Iterator[Closing]:
     """Yield the closures between drives, with visits numbered over all drives.
 
     Args:
-        logs: The logs.
         parts: What they were imported as.
         counts: The number of visits before each drive.
     """
-    scenes = [scenes_of(log, part) for log, part in zip(logs, parts, strict=True)]
+    scenes = [scenes_of(part) for part in parts]
     for a, b in combinations(range(len(parts)), 2):
         for closing in closures_between(parts[a], parts[b], scenes[a], scenes[b]):
             yield replace(closing, first=closing.first + counts[a], last=closing.last + counts[b])

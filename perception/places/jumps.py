@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass, replace
+from enum import Enum
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -36,6 +38,8 @@ MISSING = 0.5
 # A clock starts anew if it goes back by more than ANEW_CLOCK seconds or on by more than a DAY, at
 # most SEAMS times in a log.
 ANEW_CLOCK, DAY, SEAMS = 60.0, 86400.0, 3
+# Number of steps before a step that say how long a usual one is, while a robot drives.
+LATELY = 100
 # Limit of ranges in metres, for comparing scans.
 NO_RANGE = 25.0
 # A step to within this many metres of the origin means that the odometer restarted.
@@ -216,6 +220,43 @@ def _where(log: RobotLog, number: int) -> str:
     return f"line or message {scan.line}{time}"
 
 
+class Doubt(Enum):
+    """How far the odometry of a step can be trusted. The values explain it."""
+
+    NONE = "as usual"
+    DOUBTFUL = "the step is long: it is a jump if the scan matches only near the previous pose"
+    UNKNOWN = "the odometer jumped, or missed a motion"
+    CARRIED = "the robot was carried while nothing was logged"
+
+
+class LiveJumps:
+    """Judges each step by those before it, while a robot drives.
+
+    A step is a jump by the same measure as in `unknown_steps`. The usual step is the median of the
+    last LATELY steps. Clocks are not read.
+    """
+
+    def __init__(self) -> None:
+        """Start without any step."""
+        self._steps: deque[float] = deque(maxlen=LATELY)
+
+    def __call__(self, scan: int, onward: Pose) -> Doubt:
+        """Judge a step.
+
+        Args:
+            scan: Index of the scan that it leads to.
+            onward: The motion by odometry, in metres and radians.
+        """
+        far = math.hypot(*onward[:2])
+        usual = float(np.median(self._steps)) if self._steps else 0.0
+        least = max(FAR, UNUSUAL * usual)
+        if far > 0:
+            self._steps.append(far)
+        if far > least:
+            return Doubt.UNKNOWN
+        return Doubt.DOUBTFUL if far > least / 2 else Doubt.NONE
+
+
 @dataclass(frozen=True)
 class Unknown:
     """Scans for which the odometry of the step before them cannot be trusted, by index.
@@ -233,6 +274,14 @@ class Unknown:
     carried: frozenset[int] = frozenset()
     doubtful: frozenset[int] = frozenset()
     still: tuple[tuple[int, int], ...] = ()
+
+    def doubt_of(self, scan: int) -> Doubt:
+        """How far the odometry of the step to a scan can be trusted."""
+        if scan in self.carried:
+            return Doubt.CARRIED
+        if scan in self.unknown:
+            return Doubt.UNKNOWN
+        return Doubt.DOUBTFUL if scan in self.doubtful else Doubt.NONE
 
     def without(self, standing: frozenset[int]) -> Unknown:
         """Make a copy in which the scans of a standing robot are not unknown."""

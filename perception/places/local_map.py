@@ -19,10 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from perception.places.track import Array, Track
-from perception.readers.scans import Scan
+from perception.places.recent import Recent
+from perception.places.track import Array
 
 Bools = NDArray[np.bool_]
+Cells = NDArray[np.int32]
 Cell = tuple[int, int]
 
 # Side of a cell in metres.
@@ -65,23 +66,74 @@ class Patch:
         return np.asarray(cell) * CELL + self.corner
 
 
-class LocalMaps:
-    """Makes local maps along a track, with a moving window of scans.
+class Beams:
+    """The cells that the beams of each recent scan passed and met, found once for each scan.
 
     Args:
-        scans: Scans of the log.
-        track: Their poses.
+        recent: The scans with their poses.
+        reach: Metres of trajectory, on both sides of a scan, that share one grid.
+    """
+
+    def __init__(self, recent: Recent, reach: float) -> None:
+        """Start without any scan."""
+        self._recent = recent
+        # The torus covers all that the scans of one window can see, and a patch around any of them.
+        self.side = int(2 * (reach + SIGHT + 2) / CELL)
+        self._known: dict[int, tuple[Cells, Cells]] = {}
+
+    def of(self, i: int) -> tuple[Cells, Cells]:
+        """Find the cells that scan i looked through, and the cells in which it hit something.
+
+        Both are indices in the torus.
+        """
+        if i not in self._known:
+            for old in [old for old in self._known if old < self._recent.begin]:
+                del self._known[old]
+            self._known[i] = self._cells(i)
+        return self._known[i]
+
+    def _cells(self, i: int) -> tuple[Cells, Cells]:
+        scan, pose = self._recent.scan(i), self._recent.poses(i, i + 1)[0]
+        cos, sin = math.cos(pose[2]), math.sin(pose[2])
+        x = pose[0] + cos * scan.laser.mount[0] - sin * scan.laser.mount[1]
+        y = pose[1] + sin * scan.laser.mount[0] + cos * scan.laser.mount[1]
+        angles = pose[2] + scan.laser.mount[2] + scan.laser.bearings
+        told = ~np.isnan(scan.ranges)
+        ranges = np.minimum(np.where(told, scan.ranges, 0.0), SIGHT)
+        met = told & (scan.ranges < min(SIGHT, scan.laser.reach))
+        # Sample each beam along its free part.
+        along = np.arange(0.0, SIGHT, 0.8 * CELL)
+        through = along < (ranges - CELL)[:, None]
+        rays = np.broadcast_to(along, through.shape)[through]
+        which = np.nonzero(through)[0]
+        passed = self._numbers(x + np.cos(angles)[which] * rays, y + np.sin(angles)[which] * rays)
+        ends = self._numbers(
+            x + ranges[met] * np.cos(angles[met]), y + ranges[met] * np.sin(angles[met])
+        )
+        return np.setdiff1d(passed, ends, assume_unique=True), ends
+
+    def _numbers(self, x: Array, y: Array) -> Cells:
+        """The indices in the torus of the cells of positions, ascending and each once."""
+        rows, columns = (np.rint(values / CELL).astype(np.int32) % self.side for values in (x, y))
+        return np.unique(rows * self.side + columns)
+
+
+class LocalMaps:
+    """Makes local maps along a trajectory, with a moving window of scans.
+
+    Args:
+        recent: The scans with their poses.
+        beams: Their cells.
         reach: Metres of trajectory. The window of a scan reaches this far before and after it.
     """
 
-    def __init__(self, scans: Sequence[Scan], track: Track, reach: float) -> None:
+    def __init__(self, recent: Recent, beams: Beams, reach: float) -> None:
         """Start with an empty window."""
-        self._scans, self._track, self._reach = scans, track, reach
-        # The torus covers all that the scans of one window can see, and a patch around any of them.
-        self._side = int(2 * (reach + SIGHT + 2) / CELL)
+        self._recent, self._beams, self._reach = recent, beams, reach
+        self._side = beams.side
         self._passed = np.zeros(self._side**2, np.int32)
         self._met = np.zeros(self._side**2, np.int32)
-        self._window: deque[tuple[NDArray[np.int64], NDArray[np.int64]]] = deque()
+        self._window: deque[tuple[Cells, Cells]] = deque()
         self._begin = self._end = 0
 
     def around(self, scan: int, middle: Array | Sequence[float], half: float) -> Patch:
@@ -92,11 +144,8 @@ class LocalMaps:
             middle: (x, y) of the centre of the patch in metres, in the frame of the track.
             half: Half the side of the patch in metres.
         """
-        # The window stays within one unbroken part of the track.
-        way = self._track.way
-        first_scan, last_scan = self._track.span_of(scan)
-        begin = max(int(np.searchsorted(way, way[scan] - self._reach)), first_scan)
-        end = min(int(np.searchsorted(way, way[scan] + self._reach, side="right")), last_scan)
+        way = self._recent.way(scan)
+        begin, end = self._recent.at(way - self._reach), self._recent.at(way + self._reach, "right")
         self._move(begin, end)
         first = np.rint(np.asarray(middle) / CELL).astype(int) - round(half / CELL)
         rows, columns = (np.arange(n, n + 2 * round(half / CELL) + 1) % self._side for n in first)
@@ -121,7 +170,7 @@ class LocalMaps:
             first: Cell at the corner of the patch, counted from the origin.
             shape: Rows and columns of the patch.
         """
-        path = self._track.poses[begin:end, :2]
+        path = self._recent.poses(begin, end)[:, :2]
         legs = [
             np.linspace(a, b, 2 + int(math.dist(a, b) / CELL)) for a, b in itertools.pairwise(path)
         ]
@@ -139,7 +188,7 @@ class LocalMaps:
             self._window.clear()
             self._begin = self._end = begin
         for i in range(self._end, end):
-            passed, met = self._cells(i)
+            passed, met = self._beams.of(i)
             self._passed[passed] += 1
             self._met[met] += 1
             self._window.append((passed, met))
@@ -154,32 +203,3 @@ class LocalMaps:
             self._passed[passed] -= 1
             self._met[met] -= 1
             self._end -= 1
-
-    def _cells(self, i: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """The cells that scan i looked through, and the cells in which it hit something.
-
-        Both are indices in the torus.
-        """
-        scan, pose = self._scans[i], self._track.poses[i]
-        cos, sin = math.cos(pose[2]), math.sin(pose[2])
-        x = pose[0] + cos * scan.laser.mount[0] - sin * scan.laser.mount[1]
-        y = pose[1] + sin * scan.laser.mount[0] + cos * scan.laser.mount[1]
-        angles = pose[2] + scan.laser.mount[2] + scan.laser.bearings
-        told = ~np.isnan(scan.ranges)
-        ranges = np.minimum(np.where(told, scan.ranges, 0.0), SIGHT)
-        met = told & (scan.ranges < min(SIGHT, scan.laser.reach))
-        # Sample each beam along its free part.
-        along = np.arange(0.0, SIGHT, 0.8 * CELL)
-        through = along < (ranges - CELL)[:, None]
-        rays = np.broadcast_to(along, through.shape)[through]
-        which = np.nonzero(through)[0]
-        passed = self._numbers(x + np.cos(angles)[which] * rays, y + np.sin(angles)[which] * rays)
-        ends = self._numbers(
-            x + ranges[met] * np.cos(angles[met]), y + ranges[met] * np.sin(angles[met])
-        )
-        return np.setdiff1d(passed, ends, assume_unique=True), ends
-
-    def _numbers(self, x: Array, y: Array) -> NDArray[np.int64]:
-        """The indices in the torus of the cells of positions, ascending and each once."""
-        rows, columns = (np.rint(values / CELL).astype(np.int64) % self._side for values in (x, y))
-        return np.unique(rows * self._side + columns)

@@ -14,7 +14,8 @@ import numpy as np
 
 from perception.errors import LogError
 from perception.places import jumps
-from perception.places.track import POOR, Array, Track, wrapped
+from perception.places.following import POOR
+from perception.places.track import Array, Track, wrapped
 from perception.places.trust import Trust
 from perception.readers.scans import Pose, RobotLog, Scan
 from ssh_abduction.data.errors import named

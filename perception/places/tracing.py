@@ -15,8 +15,8 @@ from dataclasses import replace
 import numpy as np
 
 from perception.places.closures import NOISE, Closing, find_closures, relative, uncertainty
-from perception.places.distinctive import HALF, WINDOW
-from perception.places.local_map import CELL, LocalMaps, Patch
+from perception.places.distinctive import WINDOW
+from perception.places.local_map import CELL, Patch
 from perception.places.track import Array, Track, wrapped
 from perception.places.visits import Visit, apart
 from perception.readers.scans import Pose, RobotLog
@@ -57,13 +57,16 @@ def to_trace(
         A trace with one or two steps a visit. A step has an image, a star, the displacement from
         the previous step, and the next action.
     """
-    maps = LocalMaps(log.scans, track, WINDOW)
     steps: list[Step] = []
     last: tuple[Visit, Pose] | None = None
     patches: list[Patch] = []
     arrivals: list[tuple[int, float]] = []  # the first step of each visit, and its heading
     for number, visit in enumerate(visits):
-        patch = maps.around(visit.scan, visit.middle, HALF)
+        if (patch := visit.patch) is None:
+            raise ValueError(
+                f"visits: expected visits with their local maps, got none for visit {number}; take "
+                "those of find_visits or stream_visits"
+            )
         headings = _headings(visit, track)
         patches.append(patch)
         arrivals.append((len(steps), headings[0]))

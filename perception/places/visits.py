@@ -5,7 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+from perception.places.local_map import Patch
 from perception.places.track import Array
+
+# Two ways out whose bearings differ by less than this, in radians, are one.
+MERGED = math.radians(45)
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +40,7 @@ class Visit:
             log.
         left: Index in `ways` of the way by which the robot left; None at the end of the log.
         support: Share of the local maps nearby that show the place, from 0 to 1.
+        patch: Local map around the middle; None while the visit is not final.
     """
 
     scan: int
@@ -47,6 +52,7 @@ class Visit:
     arrived: int | None = None
     left: int | None = None
     support: float = 1.0
+    patch: Patch | None = None
 
     def later(self, scans: int) -> Visit:
         """Copy the visit, with its indices of scans increased by `scans`."""

@@ -1,0 +1,467 @@
+"""Follows the robot from scan to scan: odometry, corrected by matching each scan with recent ones.
+
+Points are matched with lines (Chen & Medioni 1992; Censi 2008): the pose moves until the points of
+the scan lie on the walls that the last scans saw. Odometry is a prior. In a bare corridor, walls do
+not show how far the robot went, so the odometer decides. An increment is the motion from one scan
+to the next. There is no global map, so errors of increments accumulate along the trajectory. Each
+increment has a covariance.
+
+If the odometer jumps (`jumps`), the scan is matched near the previous pose without odometry. If it
+matches, the track goes on, and only the increment is unknown: this is a cut. If nothing in the scan
+was seen before, the robot may be anywhere. Then the track is broken, and a new trajectory begins.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from perception.places.jumps import Doubt, Unknown, unknown_steps
+from perception.places.track import Array, Track, points_moved, points_turned, rotation, wrapped
+from perception.places.trust import Trust
+from perception.readers.scans import Pose, RobotLog, Scan
+from ssh_abduction.data.odometry import between, moved
+
+# Number of previous scans to match a scan with.
+RECENT = 40
+# Longer beams are not matched, in metres, since neighbouring beams are too far apart to show a
+# wall.
+FARTHEST = 25.0
+# Largest number of points of a scan to match, evenly spread. It bounds the time for a scan.
+POINTS = 150
+# Standard deviation in metres of the distance from a point to its wall: noise of the laser and
+# unevenness of walls.
+ROUGHNESS = 0.05
+# Errors of neighbouring points are correlated: this many points count as one independent point.
+TOGETHER = 3
+# Largest distance in metres from a point to a wall: BEGIN in the first round, then SHRINK times as
+# large in each round, but at least END. ROUNDS is the largest number of rounds.
+BEGIN, END, SHRINK, ROUNDS = 1.0, 0.25, 0.75, 12
+# A match is poor if less than the share POOR of the points lies on walls. Then HEADINGS headings
+# are tried, because odometers miss turns, and logs miss lines.
+POOR, HEADINGS = 0.5, 24
+# A scan is of an unseen place if less than STRANGE of its points lies on walls, in IN_A_ROW scans
+# in a row.
+STRANGE, IN_A_ROW = 0.3, 3
+# After at most this many metres, by odometry, a robot still sees some earlier walls.
+NEARBY = 1.0
+# Standard deviations of the motion without odometry, in metres and radians.
+UNKNOWN = (0.5, 0.5, 0.5)
+# The odometer turned wrongly if a well-matched scan differs by more than this, in radians.
+TURNED = math.radians(60)
+# A robot whose odometer stands still was carried if scans moved by more than this many metres.
+CARRIED = 1.0
+# Share of points on walls that a match needs without odometry.
+SURE = 0.7
+# A match contradicts the odometer from this chi-square on (3 degrees of freedom). If less than the
+# share CLEAR of the points lies on walls then, either may be right. So the covariance is widened by
+# the difference of the two.
+CONTRARY, CLEAR = 25.0, 0.8
+# In a bare corridor, moving on and standing still match equally well. If their shares of points on
+# walls differ by at most this, the robot is taken to have moved on.
+ALIKE = 0.03
+
+
+def follow(log: RobotLog, trust: Trust | None = None) -> Track:
+    """Compute the trajectory of a robot from its log, by odometry and scan matching.
+
+    Corrected poses are not read.
+
+    Args:
+        log: The scans with odometry.
+        trust: Errors of the odometer; None for those of a usual one.
+    """
+    steps = unknown_steps(log)
+    follower = _Follower(log, trust or Trust(), steps)
+    track = follower.followed(steps.carried)
+    # People or an arm of the robot can change what the laser sees while the robot stands.
+    standing = frozenset(
+        k
+        for first, last in steps.still
+        for k in range(first, last + 1)
+        if np.hypot(*(track.poses[first : last + 1, :2] - track.poses[first - 1, :2]).T).max()
+        <= CARRIED
+    )
+    if standing:
+        follower = replace(follower, steps=steps.without(standing))
+        track = follower.followed(steps.carried)
+    if more := frozenset(_carried(log, track)):
+        track = follower.followed(steps.carried | more)
+    return track
+
+
+@dataclass(frozen=True)
+class _Follower:
+    """Computes the track of a log.
+
+    Attributes:
+        log: The log.
+        trust: Standard deviations of the errors of the odometer.
+        steps: Scans for which the odometry of the step before them cannot be trusted.
+    """
+
+    log: RobotLog
+    trust: Trust
+    steps: Unknown
+
+    def followed(self, carried: frozenset[int]) -> Track:
+        """Make the track, which is broken before each scan to which the robot was carried."""
+        steps = replace(self.steps, carried=carried)
+        done = list(followed(self.log.scans, lambda i, _: steps.doubt_of(i), self.trust))
+        return Track(
+            np.array([one.pose for one in done]),
+            np.array([one.covariance for one in done]),
+            np.array([one.share for one in done]),
+            tuple(i for i, one in enumerate(done) if one.cut),
+            tuple(i for i, one in enumerate(done) if one.broken),
+        )
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Followed:
+    """A scan with its pose on the track.
+
+    Attributes:
+        scan: The scan.
+        pose: x, y in metres and heading in radians, in the frame of the first scan.
+        covariance: (3, 3) covariance of the motion from the previous scan, in the frame of the
+            robot at the previous scan.
+        share: Share of the points of the scan that lie on known walls.
+        cut: Whether the motion from the previous scan is unknown.
+        broken: Whether the robot may be anywhere, so that a new trajectory begins.
+    """
+
+    scan: Scan
+    pose: Pose
+    covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    share: float = 1.0
+    cut: bool = False
+    broken: bool = False
+
+
+def followed(
+    scans: Iterable[Scan], doubt_of: Callable[[int, Pose], Doubt], trust: Trust
+) -> Iterator[Followed]:
+    """Compute the pose of each scan from the scans before it.
+
+    Args:
+        scans: The scans with odometry, in order.
+        doubt_of: Says for the index of a scan, and for the motion to it by odometry, how far the
+            odometry of this step can be trusted.
+        trust: Standard deviations of the errors of the odometer.
+
+    Yields:
+        Each scan with its pose. The next scan is not read before.
+    """
+    recent: deque[tuple[Array, Array]] = deque(maxlen=RECENT)
+    last: Followed | None = None
+    before: Pose = (0.0, 0.0, 0.0)
+    for i, scan in enumerate(scans):
+        points, normals = surfaces(scan)
+        if last is None:
+            one = Followed(scan, (0.0, 0.0, 0.0))
+        else:
+            onward = between(last.scan.odometry, scan.odometry)
+            step = _Step(scan, points, normals, recent, last.pose, onward, before, trust)
+            one = step.judged(doubt_of(i, onward))
+            before = between(last.pose, one.pose)
+        if one.broken:
+            recent.clear()
+        recent.append((points_moved(one.pose, points), points_turned(one.pose[2], normals)))
+        last = one
+        yield one
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """A motion from one scan to the next.
+
+    Attributes:
+        scan: The next scan.
+        points: (m, 2) its points in metres.
+        normals: (m, 2) their unit normals.
+        recent: Points and normals of previous scans, in the frame of the track.
+        last: Pose of the previous scan.
+        onward: The motion by odometry.
+        before: The motion to the previous scan.
+        trust: Standard deviations of the errors of the odometer.
+    """
+
+    scan: Scan
+    points: Array
+    normals: Array
+    recent: deque[tuple[Array, Array]]
+    last: Pose
+    onward: Pose
+    before: Pose
+    trust: Trust
+
+    def judged(self, doubt: Doubt) -> Followed:
+        """Match the scan: with the odometry if it can be trusted, otherwise without."""
+        nowhere = Followed(
+            self.scan, self.last, self.trust.covariance((0.0, 0.0, 0.0)), 0.0, True, True
+        )
+        if doubt is Doubt.CARRIED:
+            return nowhere
+        if doubt is Doubt.UNKNOWN:
+            return self._without_odometry() or nowhere
+        prior = self.trust.covariance(self.onward)
+        # An odometer that misses a large turn mostly stands still.
+        most = TURNED if 0 < math.hypot(*self.onward[:2]) < 2 * NEARBY else math.pi
+        found = _matched(
+            self.points, self.normals, self.recent, self.last, self.onward, prior, most
+        )
+        if found[2] < POOR and doubt is Doubt.DOUBTFUL and (other := self._without_odometry()):
+            return other
+        return Followed(self.scan, *found)
+
+    def _without_odometry(self) -> Followed | None:
+        found = _bridged(self.points, self.normals, self.recent, self.last, self.before)
+        return found and Followed(self.scan, *found, cut=True)
+
+
+def _bridged(
+    points: Array, normals: Array, recent: deque[tuple[Array, Array]], last: Pose, before: Pose
+) -> tuple[Pose, Array, float] | None:
+    """Match a scan without odometry.
+
+    Two guesses are tried: the robot moved as it did before, or it stood still.
+
+    Args:
+        points: (m, 2) points of the scan in metres.
+        normals: (m, 2) unit normals.
+        recent: Points and normals of previous scans, in the frame of the track.
+        last: Pose of the previous scan.
+        before: Motion to the previous scan.
+
+    Returns:
+        The pose, the covariance of the motion, and the share of the points on walls; None if the
+        scan matches at neither guess.
+    """
+    wide = np.diag(UNKNOWN) ** 2
+    onward, stayed = (
+        _matched(points, normals, recent, last, guess, wide) for guess in (before, (0.0, 0.0, 0.0))
+    )
+    best = stayed if stayed[2] > onward[2] + ALIKE else onward
+    return best if best[2] >= SURE else None
+
+
+def _carried(log: RobotLog, track: Track) -> list[int]:
+    """Find scans to which the robot was carried while nothing was logged.
+
+    That scan and the next ones show nothing that was seen before, although the odometer does not
+    jump.
+    """
+    found: list[int] = []
+    for i in np.flatnonzero(track.shares < STRANGE).tolist():
+        if (
+            math.dist(log.scans[i - 1].odometry[:2], log.scans[i].odometry[:2]) > NEARBY
+            or i in track.breaks
+            or i + IN_A_ROW > len(log)
+            or (found and i < found[-1] + IN_A_ROW)
+        ):
+            continue
+        begin = max(0, i - RECENT, *(b for b in (*track.breaks, *found) if b <= i))
+        known: deque[tuple[Array, Array]] = deque()
+        for k in range(begin, i):
+            points, normals = surfaces(log.scans[k])
+            known.append(
+                (points_moved(track.poses[k], points), points_turned(track.poses[k, 2], normals))
+            )
+        wide = np.diag(UNKNOWN) ** 2
+        if not sum(len(walls) for walls, _ in known):
+            continue
+        shares = [
+            _matched(
+                *surfaces(log.scans[k]), known, _as_pose(track.poses[k]), (0.0, 0.0, 0.0), wide
+            )[2]
+            for k in range(i, i + IN_A_ROW)
+        ]
+        # The scans must match each other; otherwise the laser sees nothing.
+        if max(shares) < STRANGE and track.shares[i + 1 : i + IN_A_ROW].min() >= POOR:
+            found.append(i)
+    return found
+
+
+def turned_wrongly(log: RobotLog, track: Track) -> list[tuple[int, float]]:
+    """Find scans that match well but turned differently from the odometry.
+
+    Returns:
+        The index of each such scan, and its turn minus that of the odometry, in radians.
+    """
+    found: list[tuple[int, float]] = []
+    for i in range(1, len(log)):
+        told = between(log.scans[i - 1].odometry, log.scans[i].odometry)[2]
+        off = wrapped(float(track.poses[i, 2] - track.poses[i - 1, 2]) - told)
+        if abs(off) > TURNED and track.shares[i] >= POOR and i not in track.cuts:
+            found.append((i, off))
+    return found
+
+
+def _as_pose(row: Array) -> Pose:
+    return float(row[0]), float(row[1]), float(row[2])
+
+
+def surfaces(scan: Scan) -> tuple[Array, Array]:
+    """Find the points of a scan that lie on a smooth surface, and the normals of the surface.
+
+    Returns:
+        (m, 2) points in metres and (m, 2) unit normals, in the frame of the robot.
+    """
+    laser, ranges = scan.laser, scan.ranges
+    good = np.isfinite(ranges) & (ranges < min(FARTHEST, laser.reach))
+    r = np.where(good, ranges, 0.0)
+    points = np.stack([r * np.cos(laser.bearings), r * np.sin(laser.bearings)], axis=1)
+    normals = np.full(points.shape, np.nan)
+    # The farthest neighbours that still lie on one line with the point give the best normal.
+    for k in (1, 2, 3):
+        if len(points) <= 2 * k:
+            break
+        middle = slice(k, len(points) - k)
+        line = points[2 * k :] - points[: -2 * k]
+        length = np.hypot(*line.T)
+        normal = np.stack([-line[:, 1], line[:, 0]], axis=1) / np.maximum(length, 1e-9)[:, None]
+        off = np.abs(((points[middle] - points[: -2 * k]) * normal).sum(axis=1))
+        smooth = (
+            good[2 * k :]
+            & good[: -2 * k]
+            & good[middle]
+            & (length > 1e-6)
+            & (length < 0.25 + 0.1 * r[middle])
+            & (off < ROUGHNESS)
+        )
+        normals[middle][smooth] = normal[smooth]
+    on_surface = good & np.isfinite(normals[:, 0])
+    return points_moved(laser.mount, points[on_surface]), points_turned(
+        laser.mount[2], normals[on_surface]
+    )
+
+
+def _matched(
+    points: Array,
+    normals: Array,
+    recent: deque[tuple[Array, Array]],
+    last: Pose,
+    onward: Pose,
+    prior: Array,
+    most: float = math.pi,
+) -> tuple[Pose, Array, float]:
+    """Match a scan with the walls that previous scans saw.
+
+    Args:
+        points: (m, 2) points of the scan in metres.
+        normals: (m, 2) unit normals.
+        recent: Points and normals of previous scans, in the frame of the track.
+        last: Pose of the previous scan.
+        onward: Expected motion since the previous scan.
+        prior: (3, 3) covariance of that motion.
+        most: By how much the heading may differ from the expected one, in radians.
+
+    Returns:
+        The pose; the covariance of the motion, in the frame of the robot at the previous scan; and
+        the share of the points on walls.
+    """
+    turn: Array = np.eye(3)
+    turn[:2, :2] = rotation(last[2])
+    walls, wall_normals = (np.concatenate(parts) for parts in zip(*recent, strict=True))
+    guess: Array = np.array(moved(last, onward))
+    weight: Array = np.asarray(np.linalg.inv(turn @ prior @ turn.T), np.float64)
+    pose, information, share = guess, weight, 0.0
+    if len(walls) and len(points):
+        kept = np.unique(np.linspace(0, len(points) - 1, min(len(points), POINTS)).astype(int))
+        fit = _Fit(points[kept], normals[kept], walls, wall_normals, cKDTree(walls))
+        share, pose, information = fit.improved(guess, weight)
+        # A poor match may have a wrong heading: try others.
+        if share < POOR:
+            turns = (wrapped(2 * math.pi * k / HEADINGS) for k in range(HEADINGS))
+            turned = [guess + np.array([0, 0, turn]) for turn in turns if abs(turn) <= most]
+            best = max(
+                (fit.improved(other, weight) for other in turned), key=lambda found: found[0]
+            )
+            if best[0] > 1.5 * share:
+                share, pose, information = best
+    covariance = np.asarray(turn.T @ _accumulating(information, weight) @ turn)
+    astray = turn.T @ (pose - guess)
+    astray[2] = wrapped(float(astray[2]))
+    if share < CLEAR and astray @ np.linalg.solve(prior, astray) > CONTRARY:
+        covariance += np.diag(astray**2)
+    return (float(pose[0]), float(pose[1]), wrapped(float(pose[2]))), covariance, share
+
+
+def _accumulating(information: Array, prior: Array) -> Array:
+    """The covariance that one step adds to the error of the track in the long run, (3, 3).
+
+    In directions in which no wall shows the position, the error of the odometer accumulates fully.
+    In the other directions, a pose is measured against the mean of the n previous scans. So an
+    error shifts later poses by only 2 / (n + 1) of itself.
+
+    Args:
+        information: (3, 3) inverse covariance of the pose by odometer and walls.
+        prior: (3, 3) inverse covariance of the pose by the odometer alone.
+    """
+    posterior = np.linalg.inv(information)
+    by_odometer = posterior @ prior
+    by_walls = posterior @ (information - prior) @ posterior
+    return np.asarray(
+        by_odometer @ np.linalg.inv(prior) @ by_odometer.T + 2 / (RECENT + 1) * by_walls
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Moves a scan until its points lie on walls.
+
+    Points are in the frame of the robot, walls in the frame of the track.
+    """
+
+    points: Array
+    normals: Array
+    walls: Array
+    wall_normals: Array
+    tree: cKDTree
+
+    def improved(self, guess: Array, weight: Array) -> tuple[float, Array, Array]:
+        """Move a pose until the points lie on the walls, by Gauss-Newton steps.
+
+        Args:
+            guess: (3,) initial pose.
+            weight: (3, 3) inverse covariance of the guess.
+
+        Returns:
+            The share of the points on walls, the pose, (3,), and its inverse covariance, (3, 3).
+        """
+        information, pose, share = weight, guess, 0.0
+        for count in range(ROUNDS):
+            placed = points_moved(pose, self.points)
+            distance, nearest = self.tree.query(
+                placed, distance_upper_bound=max(END, BEGIN * SHRINK**count)
+            )
+            met = np.flatnonzero(np.isfinite(distance))
+            alike = (
+                points_turned(pose[2], self.normals[met]) * self.wall_normals[nearest[met]]
+            ).sum(axis=1)
+            met = met[np.abs(alike) > 0.8]
+            share = float((distance[met] < END).sum() / len(placed))
+            if len(met) < 5:
+                break
+            normal = self.wall_normals[nearest[met]]
+            off = ((placed[met] - self.walls[nearest[met]]) * normal).sum(axis=1)
+            arm = placed[met] - pose[:2]
+            jacobian = np.column_stack(
+                [normal, arm[:, 0] * normal[:, 1] - arm[:, 1] * normal[:, 0]]
+            )
+            # Cauchy weights give little influence to points that are far off.
+            weights = 1 / (TOGETHER * ROUGHNESS**2 * (1 + (off / (2 * ROUGHNESS)) ** 2))
+            astray = pose - guess
+            astray[2] = wrapped(astray[2])
+            information = jacobian.T @ (jacobian * weights[:, None]) + weight
+            step = np.linalg.solve(information, jacobian.T @ (weights * off) + weight @ astray)
+            pose = pose - step
+            if np.abs(step).max() < 1e-4:
+                break
+        return share, pose, information

@@ -1,0 +1,262 @@
+"""Completes the visits that were found: one for each stay, with turning points and gateways.
+
+Visits pass through in order while the robot drives. No visit waits for more than a bounded number
+of metres.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from perception.places.local_map import LocalMaps
+from perception.places.recent import Recent
+from perception.places.visits import MERGED, Visit, Way, apart
+
+# Junctions are one place within SAME metres, or within this share of the smaller radius.
+SAME, SHARE = 0.6, 0.5
+# The robot turned around if its directions of motion over some stride in metres, before and after,
+# differ by more than REVERSED radians. It turns on the spot or in a bow, so there are several
+# strides. Other visits are more than a stride and ALONE metres away along the trajectory.
+STRIDES, REVERSED, ALONE = (1.0, 2.0, 4.0), math.radians(135), 1.5
+# A turn waits for visits up to NEARBY metres of trajectory away. No stride is longer, and discs are
+# taken to be no larger. Turns near each other wait for each other up to TURNING metres.
+NEARBY, TURNING = 4.0, 8.0
+# A robot that comes back within STAY metres after it left a disc, and visited no other place, did
+# not leave the place.
+STAY = 16.0
+# The robot crosses a disc within AROUND metres before and after the scan nearest to the middle.
+AROUND = 16.0
+# The bearing of a way is taken at so many metres outside of the disc, whose radius is at least
+# SMALL metres.
+RIM, SMALL = 0.5, 0.5
+
+
+@dataclass(frozen=True)
+class _Turn:
+    """A scan at which the robot turned around.
+
+    Attributes:
+        way: Metres driven up to it.
+        stride: The directions of motion are taken over so many metres.
+        angle: The angle between them in radians.
+        scan: Index of the scan.
+    """
+
+    way: float
+    stride: float
+    angle: float
+    scan: int
+
+
+class Stays:
+    """Makes final visits of those that chains of junctions show.
+
+    Args:
+        recent: The last scans with their poses.
+        maps: Makes the local map of a visit.
+        half: Half the side of such a map in metres.
+    """
+
+    def __init__(self, recent: Recent, maps: LocalMaps, half: float) -> None:
+        """Start before the first visit."""
+        self._recent, self._maps, self._half = recent, maps, half
+        self._passing: Visit | None = None  # the last visit, which the next one may replace
+        self._found: list[tuple[float, Visit]] = []  # the metres driven up to each visit
+        self._turns: list[_Turn] = []
+        self._asked = dict.fromkeys(STRIDES, 0)  # the next scan that may be a turn
+        self._done = 0  # all visits before this scan are complete
+        self._staying: Visit | None = None
+        self._left = 0.0  # metres driven at the end of the stay
+
+    @property
+    def oldest(self) -> int:
+        """The first scan that may still become a visit."""
+        return self._done
+
+    def add(self, visits: Sequence[Visit], horizon: int | None) -> Iterator[Visit]:
+        """Add visits that were found, and yield those that are final.
+
+        Args:
+            visits: The next visits, in the order of their scans.
+            horizon: No visit will come that begins before this scan; None at the end of the drive.
+        """
+        for visit in visits:
+            self._pass(visit)
+        if self._passing and (horizon is None or not self._may_overlap(self._passing, horizon)):
+            self._settle()
+        self._find_turns()
+        for visit in self._complete(self._limit(horizon)):
+            if self._staying and self._comes_back(visit):
+                self._staying = joined(self._staying, visit)
+            else:
+                yield from [self._staying] if self._staying else []
+                patch = self._maps.around(visit.scan, visit.middle, self._half)
+                self._staying = replace(visit, patch=patch)
+            self._left = self._recent.way(visit.end)
+        if self._staying and (horizon is None or self._recent.way(self._done) > self._left + STAY):
+            yield self._staying
+            self._staying = None
+
+    def _pass(self, visit: Visit) -> None:
+        """Keep one of successive visits that overlap and are too close for two places.
+
+        The visit with the largest support times radius is kept.
+        """
+        last = self._passing
+        near = last is not None and _are_near(last, visit)
+        if last is None or not near or not self._may_overlap(last, visit.scan, visit.begin):
+            self._settle()
+            self._passing = visit
+        elif visit.support * visit.radius > last.support * last.radius:
+            self._passing = replace(visit, begin=min(visit.begin, last.begin))
+
+    def _may_overlap(self, last: Visit, scan: int, begin: int | None = None) -> bool:
+        """Whether a visit overlaps with the visit before it.
+
+        Args:
+            last: The visit before it.
+            scan: The first scan that the visit may have in its middle.
+            begin: The first scan that it may begin with; None if that is `scan`.
+        """
+        soon = self._recent.way(scan) <= self._recent.way(last.scan) + STAY
+        return soon and (scan if begin is None else begin) <= last.end + 2
+
+    def _settle(self) -> None:
+        """Take the last visit as found."""
+        if self._passing:
+            self._found.append((self._recent.way(self._passing.scan), self._passing))
+        self._passing = None
+
+    def _find_turns(self) -> None:
+        """Find the next scans at which the robot turned around."""
+        recent, here = self._recent, self._recent.end - 1
+        for stride in STRIDES:
+            while recent.way(here) >= (way := recent.way(self._asked[stride])) + stride:
+                angle = self._angle(self._asked[stride], stride) if way >= stride else 0.0
+                if angle > REVERSED:
+                    self._turns.append(_Turn(way, stride, angle, self._asked[stride]))
+                self._asked[stride] += 1
+        self._turns.sort(key=lambda turn: turn.scan)
+
+    def _angle(self, scan: int, stride: float) -> float:
+        """By how many radians the robot turned at a scan; 0 if it hardly moved before or after."""
+        recent, way = self._recent, self._recent.way(scan)
+        before, after = recent.at(way - stride), recent.at(way + stride)
+        first, here, last = (recent.poses(i, i + 1)[0, :2] for i in (before, scan, after))
+        there, back = here - first, last - here
+        if min(math.hypot(*there), math.hypot(*back)) <= stride / 3:
+            return 0.0
+        return apart(math.atan2(there[1], there[0]), math.atan2(back[1], back[0]))
+
+    def _limit(self, horizon: int | None) -> int:
+        """The scan before which all visits and turns can be completed."""
+        recent = self._recent
+        if horizon is None:
+            return recent.end
+        known = self._passing.scan if self._passing else horizon
+        limit = min(
+            recent.at(recent.way(known) - NEARBY),
+            recent.at(recent.way(min(self._asked.values())) - NEARBY),
+            recent.at(recent.way(recent.end - 1) - AROUND),
+        )
+        return max(self._done, self._before_turns(limit))
+
+    def _before_turns(self, limit: int) -> int:
+        """The last scan up to a limit that does not split turns near each other."""
+        first: _Turn | None = None  # of the turns near each other
+        last = -math.inf
+        for turn in self._turns:
+            if first is None or turn.way - last > NEARBY or turn.way - first.way > TURNING:
+                first = turn
+            if turn.scan >= limit:
+                return min(limit, first.scan)
+            last = turn.way
+        return limit
+
+    def _complete(self, limit: int) -> list[Visit]:
+        """Complete the next visits before a scan, in order, with turning points far from others."""
+        # Begin with the shortest stride and the sharpest turn. Other turns near it belong to the
+        # same turning point.
+        for turn in sorted(self._turns, key=lambda turn: (turn.stride, -turn.angle, -turn.scan)):
+            far = max(ALONE, turn.stride)
+            if turn.scan < limit and all(
+                abs(at - turn.way) > max(far, visit.radius) for at, visit in self._found
+            ):
+                i, position = turn.scan, self._recent.poses(turn.scan, turn.scan + 1)[0, :2].copy()
+                self._found.append((turn.way, Visit(i, position, i, i, support=0.0)))
+        done = [visit for _, visit in self._found if self._done <= visit.scan < limit]
+        # Visits are remembered until turns near them are decided.
+        least = self._recent.way(min(limit, self._recent.end - 1)) - NEARBY
+        self._found = [(way, visit) for way, visit in self._found if way >= least]
+        self._turns = [turn for turn in self._turns if turn.scan >= limit]
+        self._done = limit
+        return [self._with_gateways(visit) for visit in sorted(done, key=lambda one: one.scan)]
+
+    def _with_gateways(self, visit: Visit) -> Visit:
+        """Complete a visit by the ways that the robot took: those by which it crossed the disc."""
+        ways, numbers = list(visit.ways), []
+        for side in (-1, 1):
+            bearing = self._crossing(visit, side)
+            numbers.append(None if bearing is None else _taken(ways, bearing))
+        return _in_order(replace(visit, ways=tuple(ways), arrived=numbers[0], left=numbers[1]))
+
+    def _crossing(self, visit: Visit, side: int) -> float | None:
+        """The direction in radians in which the robot crosses the disc of a place.
+
+        Args:
+            visit: Visit to the place.
+            side: -1 for entering the disc, 1 for leaving it.
+
+        Returns:
+            None if the log begins or ends in the disc.
+        """
+        way = self._recent.way(visit.scan)
+        begin, end = self._recent.at(way - AROUND), self._recent.at(way + AROUND, "right")
+        part = (begin, visit.scan + 1) if side < 0 else (visit.scan, end)
+        onward = (self._recent.poses(*part)[:, :2] - visit.middle)[::side]
+        outside = np.flatnonzero(np.hypot(*onward.T) >= max(visit.radius, SMALL) + RIM)
+        if not len(outside) and (begin == 0 if side < 0 else end == self._recent.end):
+            return None
+        x, y = onward[outside[0] if len(outside) else -1]
+        return math.atan2(y, x)
+
+    def _comes_back(self, visit: Visit) -> bool:
+        """Whether the robot left the disc of its last place, but went to no other place."""
+        last = self._staying
+        soon = self._recent.way(visit.scan) <= self._left + STAY
+        return last is not None and soon and _are_near(last, visit)
+
+
+def _are_near(first: Visit, second: Visit) -> bool:
+    near = max(SAME, SHARE * max(first.radius, second.radius))
+    return math.dist(first.middle, second.middle) < near
+
+
+def joined(first: Visit, last: Visit) -> Visit:
+    """Join two successive visits to one place."""
+    ways = list(first.ways)
+    left = None if last.left is None else _taken(ways, last.ways[last.left].bearing)
+    return _in_order(replace(first, end=last.end, ways=tuple(ways), left=left))
+
+
+def _in_order(visit: Visit) -> Visit:
+    """The visit with its ways in counterclockwise order."""
+    order = sorted(range(len(visit.ways)), key=lambda k: visit.ways[k].bearing)
+    arrived, left = (None if k is None else order.index(k) for k in (visit.arrived, visit.left))
+    ways = tuple(visit.ways[k] for k in order)
+    return replace(visit, ways=ways, arrived=arrived, left=left)
+
+
+def _taken(ways: list[Way], bearing: float) -> int:
+    """Mark the way that the robot took as sure, or add it, and return its index."""
+    near = [k for k in range(len(ways)) if apart(ways[k].bearing, bearing) < MERGED]
+    if not near:
+        ways.append(Way(bearing))
+        return len(ways) - 1
+    k = min(near, key=lambda k: apart(ways[k].bearing, bearing))
+    ways[k] = replace(ways[k], sure=True)
+    return k
