@@ -45,6 +45,12 @@ def read(text: str) -> Corrections:
     return from_yaml(HEAD + text, "c.yaml")
 
 
+def seeing(name: str, first: tuple[int, ...], last: tuple[int, ...]) -> Trace:
+    """A drive along a corridor and back, with the stars of its first and last step."""
+    stars = [first, (0, 0, 1, 0), (1, 0, 0, 0), last]
+    return Trace.from_steps("abcd", ["travel", "around", "travel"], stars=stars, name=name)
+
+
 @pytest.fixture
 def folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
     """A folder with traces and their joint map, in which the b of Tuesday is that of Monday."""
@@ -232,6 +238,39 @@ def test_gateways_are_opened_and_closed(folder: Path, capsys: pytest.CaptureFixt
         assert main(["correct", maps, "--closed", way]) == 0
         assert main(solving(folder, "round")) == 1
         assert "it contradicts the trace: the robot" in capsys.readouterr().err
+
+
+def test_verbs_with_the_recorded_trace_obey_what_was_said_of_its_stars(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """On Tuesday the robot overlooked a gateway at the corner. The map of both drives has it."""
+    monday = seeing("monday", (1, 1, 0, 0), (0, 0, 1, 1))
+    joint = together([monday, seeing("tuesday", (1, 0, 0, 0), (0, 0, 1, 0))])
+    trace, maps = str(folder / "joint.jsonl"), str(folder / "building" / "maps.json")
+    joint.save(trace)
+    ways = [("tuesday:0", 90.0), ("tuesday:3", 270.0)]
+    file = folder / "building" / "corrections.yaml"
+    save_corrections(Corrections.for_drives(joint).with_gateway(True, ways), file)
+    assert main(["solve", trace, "-o", maps]) == 0
+    assert "optimal: 4 dstates" in capsys.readouterr().out
+    page = str(folder / "page.html")
+    pair = ["explain", trace, "monday:0", "tuesday:0"]
+    for words in (["check", maps, trace], ["view", maps, trace, "-o", page]):
+        assert main(words) == 0
+        assert "obeying 1 sentence of" in capsys.readouterr().err
+    assert f"--corrections {file}" in Path(page).read_text()
+    for given in (["--theory", maps], ["--corrections", str(file)]):
+        assert main([*pair, *given]) == 0
+        assert "are one dstate in every minimal map" in capsys.readouterr().out
+    assert main(pair) == 0
+    assert "are different dstates in every map" in capsys.readouterr().out
+    # A file of other drives is not obeyed, and an error if the user names it.
+    other = Corrections.for_drives(ROUND).with_gateway(True, [("round:1", 0.0)])
+    save_corrections(other, file)
+    assert main(["check", maps, trace]) == 20
+    assert "it is not obeyed" in capsys.readouterr().err
+    assert main([*pair, "--corrections", str(file)]) == 1
+    assert "it belongs to another map" in capsys.readouterr().err
 
 
 def test_directions_on_the_map_are_those_of_its_drawing(

@@ -11,6 +11,7 @@ from typing import Any
 from ssh_abduction.checker.checker import check, unchecked
 from ssh_abduction.checker.claims import false_claims
 from ssh_abduction.checker.proof import check_bound
+from ssh_abduction.cli.obeying import as_corrected
 from ssh_abduction.cli.options import Verbs, add_theory, in_order, theory_of
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import MapError, brief, is_finite, printable
@@ -41,7 +42,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.set_defaults(run=run)
     parser.epilog = (
         "Without --theory, the theory is that of the file of maps. The other options change "
-        "single fields of it."
+        "single fields of it. Corrections in corrections.yaml beside the maps are obeyed."
     )
 
 
@@ -51,7 +52,7 @@ def run(options: argparse.Namespace) -> int:
     data = read_json(options.maps)
     found = data.get("theory") if isinstance(data, dict) else None
     solved = None if found is None else Theory.from_dict(found)
-    theory = theory_of(options, solved)
+    trace, theory = as_corrected(trace, theory_of(options, solved), options.maps)
     theory.check_steps(trace)
     maps = maps_of(data, str(options.maps))
     if not maps and not options.bound:

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import argparse
 import re
+from pathlib import Path
 from typing import Any, TypeAlias
 
 from ssh_abduction.cli.guard import Guard
+from ssh_abduction.cli.obeying import as_corrected
 from ssh_abduction.cli.options import Verbs, add_theory, number_steps, theory_of
 from ssh_abduction.cli.outcome import dump, on_ctrl_c
 from ssh_abduction.data.drives import step_named
@@ -78,6 +80,14 @@ def add_parser(verbs: Verbs) -> None:
         metavar="MIB",
         help="stop when the process has used this many MiB, and print what is known",
     )
+    parser.add_argument(
+        "--corrections",
+        metavar="FILE",
+        help=(
+            "obey the corrections in this file, or in corrections.yaml of this folder (default: "
+            "corrections.yaml beside the file of --theory, if both exist)"
+        ),
+    )
     add_theory(parser)
     parser.epilog = (
         "Exit codes: 0 explained; 20 the trace has no map; 30 no explanation in time; 1, 2, 130 "
@@ -95,7 +105,8 @@ def run(options: argparse.Namespace) -> int:
         )
     trace = Trace.load(options.trace)
     number_steps(options, trace)
-    theory = theory_of(options)
+    maps = options.theory if options.theory and Path(options.theory).is_file() else None
+    trace, theory = as_corrected(trace, theory_of(options), maps, options.corrections)
     limits: dict[str, Any] = {
         "time_limit": options.time_limit,
         "memory_limit": options.memory_limit,

@@ -6,11 +6,12 @@ import argparse
 import sys
 from dataclasses import dataclass, replace
 
+from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.standing import told
 from ssh_abduction.data.corrections import Corrections, Passage, Said
 from ssh_abduction.data.corrections_file import beside, load_corrections
-from ssh_abduction.data.drives import drives_of, step_of
-from ssh_abduction.data.errors import named, printable
+from ssh_abduction.data.drives import drives_of, fingerprints_of, step_of
+from ssh_abduction.data.errors import MapError, named, printable
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted
@@ -23,6 +24,39 @@ def corrections_of(options: argparse.Namespace) -> Corrections | None:
     """Read the corrections that --corrections names, or those beside the output; None for none."""
     file = options.corrections or beside(options.output)
     return None if file is None else load_corrections(file)
+
+
+def as_corrected(
+    trace: Trace, theory: Theory, maps: str | None, given: str | None = None
+) -> tuple[Trace, Theory]:
+    """Return the trace and the theory as the corrections beside a file of maps change them.
+
+    What is obeyed is printed on stderr. If the file beside the maps is of other drives, a warning
+    says so.
+
+    Args:
+        trace: The trace, as it was recorded or corrected already.
+        theory: The theory.
+        maps: The file of maps; None for none.
+        given: The file of corrections that the user names instead; None for none.
+
+    Raises:
+        MapError: The file is malformed or contradicts the trace, or the named one is of other
+            drives.
+    """
+    file = given or beside(maps)
+    said = Corrections() if file is None else load_corrections(file)
+    if not said.pairs and not said.gateways:
+        return trace, theory
+    if given is None:
+        try:
+            said.check_drives(dict(fingerprints_of(trace)))
+        except MapError as error:
+            warn([f"{error}; it is not obeyed"])
+            return trace, theory
+    obeying = Obeying(said, *obeyed(said, trace, theory), trace, theory)
+    obeying.say()
+    return obeying.trace, obeying.theory
 
 
 @dataclass(frozen=True)

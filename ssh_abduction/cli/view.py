@@ -84,6 +84,8 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    from ssh_abduction.cli.obeying import as_corrected
+    from ssh_abduction.data.corrections_file import beside
     from ssh_abduction.data.map_file import read_json
     from ssh_abduction.data.trace import Trace
     from ssh_abduction.page.content import Called, content_of  # loads numpy
@@ -108,15 +110,15 @@ def run(options: argparse.Namespace) -> int:
     theory = (
         Theory.from_dict(data["theory"]) if isinstance(data, dict) and "theory" in data else None
     )
-    flags = (
-        ""
-        if theory is None
-        else "".join(f" {shlex.quote(flag)}" for flag in flags_of(theory, trace))
-    )
+    seen = trace
+    if trace is not None and theory is not None:
+        trace, theory = as_corrected(trace, theory, options.maps)
+    flags = [] if theory is None else flags_of(theory, trace)
+    flags += [] if trace == seen else ["--corrections", str(beside(options.maps))]
     called = Called(
         "maps.json" if options.maps == "-" else shlex.quote(options.maps),
         shlex.quote(options.trace) if options.trace else "TRACE",
-        flags,
+        "".join(f" {shlex.quote(flag)}" for flag in flags),
     )
     localised = _run(options, trace, data)
     if options.serve:
