@@ -148,16 +148,17 @@ class _Detector:
         """Chain the junctions in the local map of the next milestone, and end old chains."""
         milestone, way = self._seen, self._recent.way(at)
         self._seen += 1
-        continued = list(self._open)
+        continued = [(chain, chain.middle(RECENT), chain.radius(RECENT)) for chain in self._open]
         for junction in self._junctions_at(at):
             near = [
                 (far, number)
-                for number, chain in enumerate(continued)
-                if chain.last < milestone and (far := _distance(chain, junction)) is not None
+                for number, (chain, middle, radius) in enumerate(continued)
+                if chain.last < milestone
+                and (far := _distance(middle, radius, junction)) is not None
             ]
             sighting = _Sighting(milestone, way, junction)
             if near:
-                continued[min(near)[1]].sightings.append(sighting)
+                continued[min(near)[1]][0].sightings.append(sighting)
             else:
                 self._open.append(_Chain(next(self._numbers), [sighting]))
         for chain in list(self._open):
@@ -279,11 +280,16 @@ def _middle(sightings: Sequence[_Sighting]) -> Array:
     return np.asarray(np.median([one.junction.middle for one in sightings], axis=0))
 
 
-def _distance(chain: _Chain, junction: Junction) -> float | None:
-    """The distance of a junction from a chain in metres; None if it is too far for one place."""
-    far = math.dist(chain.middle(RECENT), junction.middle)
-    near = max(SAME, SHARE * min(chain.radius(RECENT), junction.radius))
-    return far if far < near else None
+def _distance(middle: Array, radius: float, junction: Junction) -> float | None:
+    """The distance of a junction from a chain in metres; None if it is too far for one place.
+
+    Args:
+        middle: The middle of the chain: (2,) metres.
+        radius: The radius of the chain in metres.
+        junction: The junction.
+    """
+    far = math.dist(middle, junction.middle)
+    return far if far < max(SAME, SHARE * min(radius, junction.radius)) else None
 
 
 def _stays(far: Array, radius: float) -> Iterator[tuple[int, int]]:

@@ -13,16 +13,14 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
+from perception.places.masks import Bools, grown, shrunk
 from perception.places.recent import Recent
 from perception.places.track import Array
 
-Bools = NDArray[np.bool_]
 Cells = NDArray[np.int32]
 Cell = tuple[int, int]
 
@@ -33,8 +31,6 @@ SIGHT = 12.0
 # A cell is occupied if at least this share of the scans that looked there hit something. So passing
 # people soon disappear.
 OCCUPIED = 0.25
-
-_EIGHT = np.ones((3, 3), bool)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,11 +51,6 @@ class Patch:
     occupied: Bools
     trail: Bools
     corner: Array
-
-    @cached_property
-    def room(self) -> Array:
-        """The distance from each cell to the nearest occupied cell: (rows, columns), metres."""
-        return np.asarray(ndimage.distance_transform_edt(~self.occupied)) * CELL
 
     def position(self, cell: Array | Cell) -> Array:
         """Compute the centre (x, y) of a cell in metres, in the frame of the track."""
@@ -106,16 +97,22 @@ class Beams:
         through = along < (ranges - CELL)[:, None]
         rays = np.broadcast_to(along, through.shape)[through]
         which = np.nonzero(through)[0]
-        passed = self._numbers(x + np.cos(angles)[which] * rays, y + np.sin(angles)[which] * rays)
-        ends = self._numbers(
-            x + ranges[met] * np.cos(angles[met]), y + ranges[met] * np.sin(angles[met])
+        cells = np.zeros(self.side**2, np.bool_)
+        cells[self._numbers(x + np.cos(angles)[which] * rays, y + np.sin(angles)[which] * rays)] = (
+            True
         )
-        return np.setdiff1d(passed, ends, assume_unique=True), ends
+        ends = np.unique(
+            self._numbers(
+                x + ranges[met] * np.cos(angles[met]), y + ranges[met] * np.sin(angles[met])
+            )
+        )
+        cells[ends] = False
+        return np.flatnonzero(cells).astype(np.int32), ends
 
     def _numbers(self, x: Array, y: Array) -> Cells:
-        """The indices in the torus of the cells of positions, ascending and each once."""
+        """The indices in the torus of the cells of positions."""
         rows, columns = (np.rint(values / CELL).astype(np.int32) % self.side for values in (x, y))
-        return np.unique(rows * self.side + columns)
+        return np.asarray(rows * self.side + columns)
 
 
 class LocalMaps:
@@ -153,10 +150,10 @@ class LocalMaps:
         passed, met = self._passed[cells], self._met[cells]
         occupied = (met > 0) & (met >= OCCUPIED * (met + passed))
         trail = self._trail(begin, end, first, passed.shape)
-        free = ((passed > 0) & ~occupied) | ndimage.binary_dilation(trail, _EIGHT, iterations=2)
+        free = ((passed > 0) & ~occupied) | grown(grown(trail))
         # A cell between two beams may have been missed. So close gaps of up to two cells, but do
         # not free cells with an obstacle.
-        closed = ndimage.binary_closing(np.pad(free, 3), _EIGHT)[3:-3, 3:-3]
+        closed = shrunk(grown(np.pad(free, 1)))[1:-1, 1:-1]
         return Patch((free | closed) & ~(occupied & ~free), occupied & ~trail, trail, first * CELL)
 
     def _trail(

@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-from perception.places.local_map import CELL, Bools, Patch
+from perception.places.local_map import CELL, Patch
+from perception.places.masks import Bools
 from perception.places.track import Array, points_turned
 
 # The map within REACH metres of the middle of a place is matched, with shifts of up to MOST metres.

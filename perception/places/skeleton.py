@@ -27,7 +27,8 @@ import numpy as np
 from scipy import ndimage
 
 from perception.places.bends import bends
-from perception.places.local_map import CELL, Bools, Patch
+from perception.places.local_map import CELL, Patch
+from perception.places.masks import Bools, box_of, grown, near, shrunk
 from perception.places.thinning import Edge, Graph, Node, graph_of, thinned
 from perception.places.track import Array
 
@@ -127,10 +128,11 @@ def open_space(distance: Array, far: float) -> Bools:
         distance: (rows, columns) distance of each cell to the nearest obstacle, in cells.
         far: Distance of a shore from obstacles, in cells.
     """
+    if distance.max() < WIDE * far:
+        return np.zeros(distance.shape, np.bool_)
     parts, count = ndimage.label(distance > far, _EIGHT)
-    widest = ndimage.maximum(distance, parts, np.arange(count + 1))
-    is_open = np.asarray(widest) >= WIDE * far
-    is_open[0] = False
+    is_open = np.zeros(count + 1, np.bool_)
+    is_open[parts[distance >= WIDE * far]] = True
     return np.asarray(is_open[parts])
 
 
@@ -153,13 +155,15 @@ def passable(patch: Patch, room: float) -> Bools:
         patch: The local map.
         room: Half the width of the robot in metres.
     """
-    trail = np.asarray(ndimage.binary_dilation(patch.trail, _EIGHT))
-    fits = (patch.free & (patch.room >= room)) | trail
-    fits = ndimage.binary_opening(fits, _EIGHT) | trail
-    parts, _ = ndimage.label(fits, _EIGHT)
-    reached = np.isin(parts, np.setdiff1d(parts[trail], [0]))
+    trail = grown(patch.trail)
+    fits = (patch.free & ~near(patch.occupied, room, CELL)) | trail
+    fits = grown(shrunk(fits)) | trail
+    parts, count = ndimage.label(fits, _EIGHT)
+    is_reached = np.zeros(count + 1, np.bool_)
+    is_reached[parts[trail]] = True
+    reached = is_reached[parts]
     holes, count = ndimage.label(~reached)
-    sizes = ndimage.sum_labels(~reached, holes, np.arange(count + 1)) * CELL**2
+    sizes = np.bincount(holes.ravel(), minlength=count + 1) * CELL**2
     small = sizes < FURNITURE
     small[0] = False
     for side in (holes[0], holes[-1], holes[:, 0], holes[:, -1]):
@@ -168,7 +172,9 @@ def passable(patch: Patch, room: float) -> Bools:
 
 
 def _distances(mask: Bools) -> Array:
-    return np.asarray(ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1])
+    found, box = np.zeros(mask.shape), box_of(mask)
+    found[box] = ndimage.distance_transform_edt(np.pad(mask[box], 1))[1:-1, 1:-1]
+    return found
 
 
 def pruned(graph: Graph) -> Graph:
@@ -197,9 +203,9 @@ def _out(edge: Edge, nodes: Mapping[int, Node], degrees: Mapping[int, int]) -> f
     Returns:
         None if the edge is no dead end, or leads far enough.
     """
-    junction, end = (nodes[node] for node in edge.ends)
-    if degrees[edge.ends[0]] < 3 or degrees[edge.ends[1]] > 1 or end.cut:
+    if degrees[edge.ends[0]] < 3 or degrees[edge.ends[1]] > 1 or nodes[edge.ends[1]].cut:
         return None
+    junction, end = (nodes[node] for node in edge.ends)
     out = (edge.length + end.radius - junction.radius) * CELL
     return out if out < max(OUT, SHARE * junction.radius * CELL) else None
 

@@ -11,15 +11,16 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from perception.places.local_map import Bools, Cell
+from perception.places.masks import Bools, box_of
 from perception.places.track import Array
 
 _EIGHT = np.ones((3, 3), bool)
@@ -45,7 +46,7 @@ class Node:
     cut: bool = False
 
     @property
-    def cell(self) -> Cell:
+    def cell(self) -> tuple[int, int]:
         """The cell at or nearest to the node."""
         row, column = np.rint(self.at).astype(int)
         return int(row), int(column)
@@ -63,12 +64,12 @@ class Edge:
     ends: tuple[int, int]
     cells: Array
 
-    @property
+    @cached_property
     def length(self) -> float:
         """The length in cells."""
         return float(np.hypot(*np.diff(self.cells, axis=0).T).sum())
 
-    @property
+    @cached_property
     def reverse(self) -> Edge:
         return Edge((self.ends[1], self.ends[0]), self.cells[::-1])
 
@@ -118,7 +119,10 @@ def thinned(mask: Bools) -> Bools:
     # The import takes a while, and only logs need it.
     from skimage.morphology import skeletonize
 
-    return np.asarray(skeletonize(mask), dtype=np.bool_)
+    lines, box = np.zeros_like(mask), box_of(mask)
+    if mask.any():
+        lines[box] = skeletonize(np.ascontiguousarray(mask[box]))
+    return lines
 
 
 def graph_of(lines: Bools, distance: Array) -> Graph:
@@ -129,12 +133,24 @@ def graph_of(lines: Bools, distance: Array) -> Graph:
         distance: (rows, columns) distance of each cell to the nearest one outside of the mask that
             was thinned, in cells.
     """
-    neighbours = ndimage.convolve(lines.astype(int), _EIGHT.astype(int), mode="constant") - 1
-    forks, count = ndimage.label(lines & (neighbours > 2), _EIGHT)
-    nodes = {k: _junction(np.argwhere(forks == k), distance) for k in range(1, count + 1)}
+    # The cells are numbered row by row, with a margin, so that neighbours have fixed offsets.
+    lines = np.pad(lines, 1)
+    columns = lines.shape[1]
+    steps = [row * columns + column for row, column in _STEPS]
+    cells = np.flatnonzero(lines)
+    neighbours = sum(lines.ravel()[cells + step].astype(int) for step in steps)
+    forks = np.zeros_like(lines)
+    forks.ravel()[cells[neighbours > 2]] = True
+    known: dict[int, int] = {}
+    nodes: dict[int, Node] = {}
+    for number, part in enumerate(_parts(forks), 1):
+        known |= dict.fromkeys(part, number)
+        nodes[number] = _junction(_at(part, columns), distance)
     graph = Graph(nodes, [])
-    for cells in _parts(lines & (forks == 0)):
-        _add_line(graph, _in_order(cells), forks, distance)
+    for part in _parts(lines & ~forks):
+        line = _in_order(part, steps)
+        beside = [_forks_beside(known, cell, steps) for cell in (line[0], line[-1])]
+        _add_line(graph, _at(line, columns), beside, distance)
     for node in [*graph.nodes]:
         graph = graph.joined_at(node)
     return graph
@@ -144,33 +160,50 @@ def _junction(cells: NDArray[np.int64], distance: Array) -> Node:
     return Node(cells.mean(axis=0), float(distance[cells[:, 0], cells[:, 1]].max()))
 
 
-def _parts(mask: Bools) -> Iterator[NDArray[np.int64]]:
-    """The connected parts of a mask, each as its cells: (n, 2) rows and columns."""
-    labels, _ = ndimage.label(mask, _EIGHT)
-    for number, box in enumerate(ndimage.find_objects(labels), 1):
-        corner = np.array([box[0].start, box[1].start])
-        yield np.argwhere(labels[box] == number) + corner
+def _at(cells: Sequence[int], columns: int) -> NDArray[np.int64]:
+    """The rows and columns of numbered cells: (n, 2)."""
+    return np.stack(np.divmod(np.asarray(cells), columns), axis=1) - 1
 
 
-def _in_order(cells: NDArray[np.int64]) -> list[Cell]:
-    """The cells of a line from one end to the other."""
-    left = {(int(row), int(column)) for row, column in cells}
+def _parts(mask: Bools) -> list[list[int]]:
+    """The connected parts of a mask, each as the numbers of its cells, ascending."""
+    labels, count = ndimage.label(mask, _EIGHT)
+    parts: list[list[int]] = [[] for _ in range(count)]
+    cells = np.flatnonzero(mask)
+    for cell, label in zip(cells.tolist(), labels.ravel()[cells].tolist(), strict=True):
+        parts[label - 1].append(cell)
+    return parts
 
-    def next_to(cell: Cell) -> list[Cell]:
-        around = ((cell[0] + row, cell[1] + column) for row, column in _STEPS)
-        return [other for other in around if other in left]
 
-    line = [next((cell for cell in sorted(left) if len(next_to(cell)) < 2), min(left))]
-    left.discard(line[0])
-    while onward := next_to(line[-1]):
-        line.append(onward[0])
-        left.discard(onward[0])
+def _in_order(cells: Sequence[int], steps: Sequence[int]) -> list[int]:
+    """The cells of a line from one end to the other.
+
+    Args:
+        cells: The numbers of the cells, ascending.
+        steps: The offsets of the eight neighbours of a cell, in the order in which they are tried.
+    """
+    left = set(cells)
+    is_end = (cell for cell in cells if sum(cell + step in left for step in steps) < 2)
+    cell: int | None = next(is_end, cells[0])
+    line = []
+    while cell is not None:
+        line.append(cell)
+        left.discard(cell)
+        cell = next((cell + step for step in steps if cell + step in left), None)
     return line
 
 
-def _add_line(graph: Graph, line: list[Cell], forks: NDArray[np.int32], distance: Array) -> None:
-    """Add a line to a graph, with a node at each of its ends that is at no junction."""
-    touched = [_forks_beside(forks, line[0]), _forks_beside(forks, line[-1])]
+def _add_line(
+    graph: Graph, line: NDArray[np.int64], touched: Sequence[list[int]], distance: Array
+) -> None:
+    """Add a line to a graph, with a node at each of its ends that is at no junction.
+
+    Args:
+        graph: The graph.
+        line: (n, 2) rows and columns along the line.
+        touched: The junctions that touch its first and its last cell.
+        distance: (rows, columns) distances to the outside, in cells.
+    """
     if len(line) == 1:  # Both ends are at one cell.
         touched = [touched[0][:1], touched[0][1:2]]
     ends = []
@@ -180,20 +213,19 @@ def _add_line(graph: Graph, line: list[Cell], forks: NDArray[np.int32], distance
         else:
             ends.append(max(graph.nodes, default=0) + 1)
             graph.nodes[ends[-1]] = _end(cell, distance)
-    cells = np.array([graph.nodes[ends[0]].at, *line, graph.nodes[ends[1]].at], float)
+    cells = np.concatenate([graph.nodes[ends[0]].at[None], line, graph.nodes[ends[1]].at[None]])
     graph.edges.append(Edge((ends[0], ends[1]), cells))
 
 
-def _forks_beside(forks: NDArray[np.int32], cell: Cell) -> list[int]:
-    """The numbers of the junctions that touch a cell."""
-    row, column = cell
-    around = forks[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
-    return [int(number) for number in np.unique(around) if number]
+def _forks_beside(known: Mapping[int, int], cell: int, steps: Sequence[int]) -> list[int]:
+    """The numbers of the junctions that touch a cell, ascending."""
+    return sorted({known[cell + step] for step in steps if cell + step in known})
 
 
-def _end(cell: Cell, distance: Array) -> Node:
+def _end(cell: NDArray[np.int64], distance: Array) -> Node:
     """The node at the end of a line. It is cut if its disc reaches the border of the map."""
     rows, columns = distance.shape
-    border = min(cell[0], cell[1], rows - 1 - cell[0], columns - 1 - cell[1])
-    radius = float(distance[cell])
-    return Node(np.array(cell, float), radius, border <= math.ceil(radius) + 5)
+    row, column = int(cell[0]), int(cell[1])
+    border = min(row, column, rows - 1 - row, columns - 1 - column)
+    radius = float(distance[row, column])
+    return Node(cell.astype(float), radius, border <= math.ceil(radius) + 5)
