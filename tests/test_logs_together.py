@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -154,6 +155,40 @@ def test_a_run_of_the_same_logs_is_done(folder: Path, capsys: pytest.CaptureFixt
     assert main([*command, "--set", "ladder=false"]) == 0
     assert "2 logs: done already" in capsys.readouterr().out
     assert digest(logs) != digest(logs[::-1])
+
+
+def test_maps_of_logs_obey_what_a_person_says(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A person denies a join between the drives, and names a place."""
+    building = str(shutil.copytree(folder, tmp_path / "building"))
+    trace, before = Trace.load(folder / "trace.jsonl"), Solution.load(folder / "maps.json").maps[0]
+    start = starts_of(trace)[0]
+    joined = next(t for t in range(start, len(trace)) if before.labels[t] in before.labels[:start])
+    first = before.labels.index(before.labels[joined])
+    pair = f"monday:{first},tuesday:{joined - start}"
+    assert main(["name", building, "monday:0", "kitchen"]) == 0
+    assert main(["correct", building, "--different", pair]) == 0
+    logs = [str(folder.parent / f"{name}.log") for name in ("monday", "tuesday")]
+    settings = ["--together", "-o", building, "--time-limit", "5", "--set", "ladder=false"]
+    capsys.readouterr()
+    main(["map", *logs, *settings])
+    told = capsys.readouterr()
+    assert "obeying 2 sentences of" in told.err
+    assert "done already" not in told.out
+    solution = Solution.load(Path(building) / "maps.json")
+    assert solution.theory.different == ((first, joined),)
+    ssh_map = solution.maps[0]
+    assert ssh_map.labels[first] != ssh_map.labels[joined]
+    assert ssh_map.name_of("place", ssh_map.place_of(0)) == "kitchen"
+    assert main(["map", *logs, *settings]) == 0
+    assert "2 logs: done already" in capsys.readouterr().out
+    # A call that maps each log alone does not know of this folder's file.
+    for log in logs:
+        (tmp_path / Path(log).stem).mkdir()
+        shutil.copy(Path(building) / "corrections.yaml", tmp_path / Path(log).stem)
+    assert main(["map", *logs, "-o", str(tmp_path), "--time-limit", "5"]) == 1
+    assert capsys.readouterr().out.count("expected no corrections, got") == 2
 
 
 def test_drives_are_laid_over_each_other(

@@ -12,7 +12,7 @@ import hashlib
 import json
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +22,7 @@ from ssh_abduction.cli.cluster_jobs import answers_on_cluster
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.import_log import WIDTH, named_after, reading_of
 from ssh_abduction.cli.jobs import StopFlag, answers_here, final_code, in_a_line
+from ssh_abduction.cli.obeying import say_obeyed
 from ssh_abduction.cli.options import choices_of, theory_of
 from ssh_abduction.cli.outcome import exit_code, on_ctrl_c, warn
 from ssh_abduction.cli.run_folders import (
@@ -33,7 +34,9 @@ from ssh_abduction.cli.run_folders import (
     write_run,
 )
 from ssh_abduction.cli.text import counted
-from ssh_abduction.data.errors import AbductionError, SolverError, named
+from ssh_abduction.data.corrections import Corrections
+from ssh_abduction.data.corrections_file import beside, load_corrections, to_yaml
+from ssh_abduction.data.errors import AbductionError, MapError, SolverError, named
 from ssh_abduction.runtime.program import interrupted_code
 from ssh_abduction.solver import Stop, check_limit, workers
 from ssh_abduction.theory.theory import Theory
@@ -82,6 +85,7 @@ class MapQuestion:
         limit: Seconds for the search for minimal maps; None for the default of `map_log`.
         maps: The largest number of maps to list; 0 for all.
         ladder: Whether to compute what each kind of evidence contributes.
+        corrections: Names and corrections of a person, to be obeyed; None for none.
     """
 
     theory: Theory | None
@@ -91,6 +95,16 @@ class MapQuestion:
     limit: float | None
     maps: int
     ladder: bool
+    corrections: Corrections | None = None
+
+    def obeying(self, folder: Path) -> MapQuestion:
+        """Return this question with the corrections in a folder, if it has a file of them.
+
+        Raises:
+            MapError: The file is malformed.
+        """
+        file = beside(folder / "maps.json")
+        return self if file is None else replace(self, corrections=load_corrections(file))
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -105,6 +119,7 @@ class MapQuestion:
             "limit": self.limit,
             "maps": self.maps,
             "ladder": self.ladder,
+            **({} if self.corrections is None else {"corrections": to_yaml(self.corrections)}),
         }
 
     def load(self, path: str) -> bytes | None:
@@ -229,9 +244,12 @@ class MapQuestion:
                     time_limit=self.limit,
                     max_maps=self.maps or None,
                     with_ladder=self.ladder,
+                    corrections=self.corrections,
                     mapping=begun[0],
                     tell=tell,
                 )
+                if self.corrections:
+                    say_obeyed(self.corrections, done.imported.trace)
             return self._told(number, paths, done, content)
 
     def _told(
@@ -345,7 +363,8 @@ def run(options: argparse.Namespace) -> int:
     left = [
         path
         for path in folders
-        if options.again or not is_done(folders[path], [path], question.settings)
+        if options.again
+        or not is_done(folders[path], [path], question.obeying(folders[path]).settings)
     ]
     for path in folders:
         if path not in left:
@@ -357,6 +376,7 @@ def run(options: argparse.Namespace) -> int:
     for path in [*left]:
         try:
             check_folder(folders[path])
+            _check_alone(path, folders[path])
         except AbductionError as error:
             print(f"{named(path)}: error: {error}", flush=True)
             left.remove(path)
@@ -388,10 +408,19 @@ def _together(question: MapQuestion, options: argparse.Namespace) -> int:
                 "the drives; rename one of them"
             )
     folder = Path(options.output)
-    if not options.again and is_done(folder, logs, question.settings):
+    if not options.again and is_done(folder, logs, question.obeying(folder).settings):
         print(f"{counted(len(logs), 'logs')}: done already, in {named(str(folder))}")
         return 0
     return _here(question, logs, folder)
+
+
+def _check_alone(path: str, folder: Path) -> None:
+    """Raise MapError if a log that is mapped among others has corrections in its folder."""
+    if (file := beside(folder / "maps.json")) is not None:
+        raise MapError(
+            f"{named(path)}: expected no corrections, got {named(file)}, which a call for many "
+            f"logs does not obey; map this log alone, with -o {named(str(folder))}"
+        )
 
 
 def _here(question: MapQuestion, logs: Sequence[str], folder: Path) -> int:
@@ -419,6 +448,7 @@ def _here(question: MapQuestion, logs: Sequence[str], folder: Path) -> int:
         warn([warning for warning in answer.warnings if warning not in told])
 
     check_folder(folder)
+    question = question.obeying(folder)
     if len(logs) == 1:
         answer = question.answer(0, logs[0], answer_last=keep, tell=tell)
     else:

@@ -54,9 +54,19 @@ def as_corrected(
         except MapError as error:
             warn([f"{error}; it is not obeyed"])
             return trace, theory
-    obeying = Obeying(said, *obeyed(said, trace, theory), trace, theory)
-    obeying.say()
-    return obeying.trace, obeying.theory
+    corrected = obeyed(said, trace, theory)
+    say_obeyed(said, trace)
+    return corrected
+
+
+def say_obeyed(said: Corrections, trace: Trace) -> None:
+    """Print on stderr how many sentences about the drives of a trace are obeyed."""
+    here, all_of_them = (
+        sum(1 for _ in told(some)) for some in (said.known_in(drives_of(trace)), said)
+    )
+    aside = f"; {all_of_them - here} are of drives that are not solved" * (here < all_of_them)
+    text = f"obeying {counted(here, 'sentences')} of {named(said.source)}{aside}"
+    print(printable(text), file=sys.stderr)
 
 
 @dataclass(frozen=True)
@@ -88,18 +98,8 @@ class Obeying:
         if said is None:
             return cls(Corrections(), trace, theory, trace, theory)
         corrected = cls(said, *obeyed(said, trace, theory), trace, theory)
-        corrected.say()
+        say_obeyed(said, trace)
         return corrected
-
-    def say(self) -> None:
-        """Print on stderr how many sentences are obeyed."""
-        known = self.corrections.known_in(drives_of(self.trace))
-        here, all_of_them = (sum(1 for _ in told(said)) for said in (known, self.corrections))
-        aside = f"; {all_of_them - here} are of drives that are not solved" * (here < all_of_them)
-        source = named(self.corrections.source)
-        print(
-            printable(f"obeying {counted(here, 'sentences')} of {source}{aside}"), file=sys.stderr
-        )
 
     def named(self, ssh_map: SSHMap) -> SSHMap:
         """Return a map with the names that a person gave."""

@@ -28,6 +28,7 @@ from perception.readers.scans import RobotLog
 from perception.recognition import recogniser as new_recogniser
 from perception.store import written
 from ssh_abduction.data.checks import all_instances
+from ssh_abduction.data.corrections import Corrections
 from ssh_abduction.data.drives import drives_of, sentence_of
 from ssh_abduction.data.files import json_line
 from ssh_abduction.evaluation.ladder import Rung, UnderWay, ladder, rungs
@@ -35,7 +36,7 @@ from ssh_abduction.page.html import view_page
 from ssh_abduction.robot_logs.log_report import report
 from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.runtime.logs import log_of
-from ssh_abduction.solver import Solution, Status, find_backbone
+from ssh_abduction.solver import Solution, Status, find_backbone, obeyed, with_names
 from ssh_abduction.theory.theory import Theory
 
 _log = log_of(__name__)
@@ -298,6 +299,7 @@ def map_log(
     time_limit: float | None = None,
     max_maps: int | None = MAPS,
     with_ladder: bool = True,
+    corrections: Corrections | None = None,
     mapping: LogMapping | None = None,
     tell: Callable[[str], None] = lambda note: None,
 ) -> LogMap:
@@ -320,6 +322,7 @@ def map_log(
         max_maps: List at most this many minimal maps; None lists all.
         with_ladder: Whether to solve the trace with fewer kinds of evidence, too, to show what each
             kind contributes.
+        corrections: Names and corrections of a person, to be obeyed.
         mapping: An object through which another thread can interrupt the mapping; None for none.
         tell: Takes each note on the log and on the search as soon as it is known.
 
@@ -327,16 +330,20 @@ def map_log(
         LogError: A log cannot be imported.
         TraceError: Two drives have one name, or their logs differ in what they record.
         TheoryError: The theory does not suit the trace.
+        MapError: The corrections are of other drives, or contradict the trace.
     """
     mapping = mapping or LogMapping()
 
-    # 1. Trace: import the logs.
+    # 1. Trace and theory: import the logs, and obey the corrections.
     log, imported = _imported(log, name, width, tell)
-    trace, seconds, notes = imported.trace, dict(imported.seconds), imported.notes
+    seconds, notes = dict(imported.seconds), imported.notes
+    trace, chosen = imported.trace, (theory or BARE).replace(**choices or {})
+    if corrections is not None:
+        trace, chosen = obeyed(corrections, trace, chosen)
+        imported = replace(imported, trace=trace)
     _log.info("%d visits, %d steps", len(imported.visits), len(trace))
 
-    # 2. Theory, and time as it suits the log.
-    chosen = (theory or BARE).replace(**choices or {})
+    # 2. Time as it suits the log.
     left = seconds_left(log, imported)
     by_drive = max(left * (1 - LADDER if with_ladder else 1), LEAST)
     allowed = by_drive if time_limit is None else time_limit
@@ -344,9 +351,10 @@ def map_log(
 
     def outcome(solution: Solution, interrupted: bool = True) -> LogMap:
         ended = INTERRUPTED if interrupted else how_it_ended(solution, allowed)
-        said = (*notes, ended) if ended else notes
+        told = (*notes, ended) if ended else notes
+        solution = solution if corrections is None else with_names(corrections, solution, trace)
         return LogMap(
-            log, imported, solution, tuple(climbed), dict(seconds), allowed, said, interrupted
+            log, imported, solution, tuple(climbed), dict(seconds), allowed, told, interrupted
         )
 
     # 3. Maps: solve the trace.
