@@ -19,7 +19,7 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.data import Odometry
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.explain.no_map import explain
-from ssh_abduction.solver import Status
+from ssh_abduction.solver import Search, Status
 from ssh_abduction.solver.guesses.beam import Beam
 from ssh_abduction.solver.guesses.completing import completed
 from ssh_abduction.solver.steps.log import Log
@@ -98,7 +98,7 @@ def test_all_maps_of_a_beam_satisfy_the_axioms(data: st.DataObject) -> None:
 
 def test_a_search_that_is_stopped_gives_the_map_of_least_cost() -> None:
     """Without the beam, the best map after this time has more places."""
-    (known,) = truth.mazes(6, 120, [700], DRIFTING)
+    (known,) = truth.mazes(6, 80, [700], DRIFTING)
     solution = solve(known.trace, time_limit=2)
     assert solution.stopped == "time limit"
     assert truth.is_true(solution.maps[0], known)
@@ -106,7 +106,10 @@ def test_a_search_that_is_stopped_gives_the_map_of_least_cost() -> None:
 
 def test_a_broad_beam_and_a_small_misfit_make_sure() -> None:
     (known,) = truth.mazes(4, 60, [701], DRIFTING)
-    weighed = solve(known.trace, time_limit=3).weighed
+    weighing = Search(known.trace)._weighing
+    assert weighing is not None
+    weighing.guess(lambda: False)
+    weighed = weighing.weighed()
     assert weighed is not None
     assert weighed.searched
     assert not weighed.proven

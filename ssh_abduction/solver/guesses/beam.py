@@ -152,29 +152,44 @@ class Beam:
     def _onward(self, beam: list[Hypothesis], end: int) -> list[Hypothesis]:
         """Extend a beam to a number of steps. Nothing is checked."""
         for t in range(len(beam[0].labels), end):
-            options = self._options_of(beam, t, joins=True)
-            beam = list(self._best((self._child(option, t) for option in options), self._width))
+            beam = list(self._best(self._options_of(beam, t, joins=True), t, self._width))
         return beam
 
-    def _best(self, found: Iterator[Hypothesis], width: int) -> Iterator[Hypothesis]:
-        """The first `width` hypotheses.
+    def _best(
+        self, options: Sequence[_Extension], t: int, width: int, checked: bool = False
+    ) -> Iterator[Hypothesis]:
+        """The first `width` hypotheses that options make.
 
         With several drives or floors, the first hypotheses for each choice of how they are joined:
         at most ALIKE, and LOST times as many in all. Those that leave one loose come on top. They
-        cost more until they join it to others.
+        cost more until they join it to others. Of the others, none is DEAREST dearer than the best.
+
+        Args:
+            options: Ways to extend the beam by step t, by their cost.
+            t: The step.
+            width: How many hypotheses are kept.
+            checked: Whether the checker looks at each.
         """
-        most = width
+        most, dearest = width, math.inf
         if self._frames:
             width = min(width, ALIKE)
             most = LOST * width
         count: Counter[tuple[object, ...]] = Counter()
-        for hypothesis in found:
-            pieces, enough = hypothesis.pieces, count.total() >= most
+        for option in options:
+            pieces, enough = option.of.pieces, count.total() >= most
             if enough and not self._frames:
                 return
-            if count[pieces.joins] < width and (pieces.is_loose or not enough):
-                count[pieces.joins] += 1
-                yield hypothesis
+            if count[pieces.joins] >= width or (
+                not pieces.is_loose and (enough or option.nats > dearest)
+            ):
+                continue
+            child = self._child(option, t)
+            if checked and self._map(child, t) is None:
+                continue
+            count[pieces.joins] += 1
+            if self._frames and not pieces.is_loose:
+                dearest = min(dearest, option.nats + DEAREST)
+            yield child
 
     def _extended(self, beam: list[Hypothesis], end: int) -> list[Hypothesis]:
         """Extend a beam to a number of steps, and check it then."""
@@ -213,9 +228,8 @@ class Beam:
                 place only if it has to.
         """
         for t in range(len(beam[0].labels) if beam else end, end):
-            children = (self._child(option, t) for option in self._options_of(beam, t, joins))
-            valid = (child for child in children if self._map(child, t) is not None)
-            beam = list(self._best(valid, WIDER * self._width))
+            options = self._options_of(beam, t, joins)
+            beam = list(self._best(options, t, WIDER * self._width, checked=True))
         return self._settled(beam)
 
     def _first(self) -> Hypothesis:
