@@ -16,14 +16,13 @@ def changes_at(ssh_map: SSHMap, places: Collection[int | None]) -> tuple[Fault, 
     return tuple(f for f in ssh_map.faults if f.kind == "changed" and f.place in places)
 
 
-def told(
-    changes: Collection[Fault], least: tuple[Cost, float | None], without: Search
-) -> list[str]:
+def told(changes: Collection[Fault], cost: Cost, nats: float | None, without: Search) -> list[str]:
     """Say what changed, and what a map costs without changes.
 
     Args:
         changes: Some changes of a map.
-        least: The cost of this map, and its cost in nats; None if maps are not weighed.
+        cost: The cost of this map.
+        nats: Its cost in nats; None if maps are not weighed.
         without: An ended search for the best map without any changes.
 
     Returns:
@@ -35,7 +34,6 @@ def told(
     if without.cost is None:
         return [*said, "no map without changes was found in time"]
     best = "the best map" if without.status is Status.OPTIMAL else "the best map found"
-    cost, nats = least
     if nats is not None and without.nats is not None:
         more = f"costs {without.nats:.1f} nats, not {nats:.1f}"
     else:

@@ -132,7 +132,8 @@ class PairQuestion(Question[PairExplanation]):
         self._listed = False
         self._derivation: Derivation | None = None
         self._clash: Explanation | None = None
-        self._first: SSHMap | None = None  # the first minimal map
+        # The first map that was found, with its cost, and its cost in nats.
+        self._best: tuple[SSHMap, Cost | None, float | None] | None = None
         self._changes: tuple[str, ...] = ()
         self._ruling_out: dict[bool, Piece] = {}  # a piece of the trace without a map of the side
 
@@ -212,10 +213,6 @@ class PairQuestion(Question[PairExplanation]):
                 break
         settled = False in (self._sides[True].possible, self._sides[False].possible)
         self._list_minimal_maps(settled)
-        if self._first and self._minimum:
-            places = [self._first.place_of(step) for step in (self.first, self.second)]
-            least = self._minimum, self._least_nats
-            self._changes = self._told_changes(self._first, places, least)
         if not settled and self._verdict() not in (Verdict.NO_MAP, Verdict.DISAGREE):
             for one in (True, False):
                 if not self._minimal[one] and not self._over():
@@ -231,6 +228,10 @@ class PairQuestion(Question[PairExplanation]):
                 self._derivation = derive(
                     piece, self.trace, self.first, self.second, one=not one, stop=self._over
                 )
+        if self._best:
+            ssh_map, cost, nats = self._best
+            places = [ssh_map.place_of(step) for step in (self.first, self.second)]
+            self._changes = self._told_changes(ssh_map, places, cost, nats)
 
     # Few steps around the pair
 
@@ -308,11 +309,11 @@ class PairQuestion(Question[PairExplanation]):
         )
         search = self._solved(self.trace, self.theory, 1 if settled else self._maps, seconds)
         for found in search:
+            self._best = self._best or (found, search.cost, search.nats)
             one = found.labels[self.first] == found.labels[self.second]
             side = self._sides[one]
             if search.status is Status.OPTIMAL:
                 self._minimum = search.cost
-                self._first = self._first or found
                 self._minimal[one] = True
                 self._least_nats = search.nats
                 self._sides[one] = replace(

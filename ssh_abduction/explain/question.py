@@ -122,23 +122,28 @@ class Question(ABC, Generic[_Answer]):
         return search
 
     def _told_changes(
-        self, ssh_map: SSHMap, places: Collection[int | None], least: tuple[Cost, float | None]
+        self,
+        ssh_map: SSHMap,
+        places: Collection[int | None],
+        cost: Cost | None,
+        nats: float | None,
     ) -> tuple[str, ...]:
         """Say which gateways at some places changed between drives, and what that costs.
 
         Args:
-            ssh_map: A minimal map.
+            ssh_map: The best map.
             places: Places of the map.
-            least: The cost of the map, and its cost in nats; None if maps are not weighed.
+            cost: The cost of the map.
+            nats: Its cost in nats; None if maps are not weighed.
         """
         changes = changes_at(ssh_map, places)
-        if not changes:
+        if not changes or cost is None:
             return ()
         search = self._solved(self.trace, self.theory.replace(changed=0.0), 1, self._watch.left())
         for _ in search:
             pass
         self._ended(search)
-        return (*told(changes, least, search),)
+        return (*told(changes, cost, nats, search),)
 
     def _ended(self, search: Search) -> None:
         """Store in `stopped` why a search ended early, if a limit of this question was reached."""

@@ -182,9 +182,9 @@ class PlaceQuestion(Question[PlaceExplanation]):
         self._ended(search)
         maps = self._maps = solution.minimal_maps or solution.maps
         self._possible = bool(maps) or (None if search.stopped else False)
-        if maps and self._path is None and search.cost:
-            least = search.cost, search.nats
-            self._changes = self._told_changes(maps[0], [self._place], least)
+        if maps and self._path is None:
+            found = maps[0], [self._place], search.cost, search.nats
+            self._changes = self._told_changes(*found)
 
     def known(self, why: Stop | None = None) -> PlaceExplanation:
         """Return what is known so far. Raises MapError if the map has no such place or path."""

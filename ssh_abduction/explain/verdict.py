@@ -86,7 +86,7 @@ class PairExplanation:
         theory: The theory, with each "auto" replaced by the value that was used.
         loop: How far off the loop between the steps closes, in words; None without displacements.
         changes: Sentences about the gateways at the places of the steps that changed between drives
-            in the first minimal map, and what a map costs without changes.
+            in the best map, and what a map costs without changes.
     """
 
     first: int
