@@ -626,6 +626,10 @@ def test_floors_are_named_beside_their_places(browser: Any, tmp_path: Path) -> N
     names = browser.find_elements("css selector", "#drawings .name.floor")
     assert [name.text for name in names] == ["floor 0", "floor 1"]
     assert names[0].location["y"] < names[1].location["y"]
+    assert [lift[-1] for lift in content["layouts"][0]["lifts"]] == ["up"]
+    for figure in ("one", "overview"):
+        page.click(figure)
+        assert len(browser.find_elements("css selector", "#drawings .street.lift")) == 1
     assert page.complaints == []
     flat = solve(trace[:2])
     assert "floors" not in content_of(flat, trace[:2])["layouts"][0]

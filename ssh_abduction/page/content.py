@@ -304,7 +304,11 @@ def _numbers(found: Layout, ssh_map: SSHMap) -> dict[str, Any]:
             [round(x / unit, 2), round(y / unit, 2), None if h is None else round(h, 2)]
             for x, y, h in found.dstates
         ],
-        **({"floors": _corners(found, ssh_map, unit)} if ssh_map.floors else {}),
+        **(
+            {"floors": _corners(found, ssh_map, unit), "lifts": _lifts(found, ssh_map, unit)}
+            if ssh_map.floors
+            else {}
+        ),
         **({"ellipses": _ellipses(found, ssh_map, unit)} if found.metric else {}),
     }
 
@@ -315,6 +319,24 @@ def _corners(found: Layout, ssh_map: SSHMap, unit: float) -> list[list[float]]:
     return [
         [round(min(x for x, _, _ in at) / unit, 2), round(max(y for _, y, _ in at) / unit, 2)]
         for at in points
+    ]
+
+
+def _lifts(found: Layout, ssh_map: SSHMap, unit: float) -> list[list[Any]]:
+    """Find both ends of each lift between two places, with its actions.
+
+    Returns:
+        For each lift: x and y of one end, x and y of the other end, and the actions in words.
+    """
+    floor = [s.floor for s in ssh_map.dstates]
+    actions: dict[tuple[int, int], set[str]] = {}
+    for source, action, target in ssh_map.links:
+        p, q = (ssh_map.dstates[s].place for s in (source, target))
+        if p is not None and q is not None and floor[source] != floor[target]:
+            actions.setdefault((min(p, q), max(p, q)), set()).add(action)
+    return [
+        [*(round(v / unit, 2) for end in ends for v in found.places[end]), ", ".join(sorted(names))]
+        for ends, names in sorted(actions.items())
     ]
 
 

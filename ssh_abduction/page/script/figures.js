@@ -54,6 +54,7 @@ function overviewFigure() {
         (path < count ? `; what else is along its path is the same in ${path} of them` : ""),
     }))
     .sort((p, q) => p.count - q.count);
+  figure.streets.unshift(...liftsOf(data.layouts[data.maps[0].layout]));
   const known = new Map();
   for (const told of data.maps)
     for (const k of told.faults ?? []) known.set(k, (known.get(k) ?? 0) + 1);
@@ -132,6 +133,7 @@ function mapFigure(i, rival) {
       names: [...actions].join(", "),
       title: `${[...actions].join(", ") || "an action"}: from dstate ${from} to dstate ${to}`,
     });
+  figure.streets.unshift(...liftsOf(ssh.layout));
   figure.faults = ssh.faults.map(([step, text]) => ({
     step,
     disputed: other !== null && !other.faults.some(([, said]) => said === text),
@@ -145,6 +147,16 @@ function mapFigure(i, rival) {
   figure.layout = ssh.layout;
   figure.labels = ssh.labels;
   return figure;
+}
+
+// The lifts between places on two floors.
+function liftsOf(layout) {
+  return (layout?.lifts ?? []).map(([x, y, u, v, actions]) => ({
+    a: [x, y],
+    b: [u, v],
+    kind: "order lift",
+    title: actions,
+  }));
 }
 
 // The colour of a dstate: that of its path. In a joint map it is that of the only drive there.
