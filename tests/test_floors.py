@@ -207,6 +207,27 @@ def test_the_map_of_a_simulated_tower_is_true(theory: Theory) -> None:
     assert len(ssh_map.floors) == 2
 
 
+def test_signs_at_the_lifts_tell_three_floors_apart() -> None:
+    """Without signs, the third floor may be the first one, if the robot came by the second."""
+    tower = World.named("tower-3")
+    trace = simulate(tower, seed=3)
+    truth = [(step.truth["dstate"], step.truth["place"]) for step in trace.steps]
+    starts = {lift.start for lift in tower.lifts}
+    lifts = {place for place, at in tower.places.items() if tuple(at) in starts}
+    stars = [str(step.star) for step in trace.steps]
+    signs = [
+        f"{place[0]} {star}" if place in lifts else star
+        for star, (_, place) in zip(stars, truth, strict=True)
+    ]
+    for views, floors in ((stars, 2), (signs, 3)):
+        solution = solve(trace.with_views(views), Theory.causal())
+        assert solution.status is Status.OPTIMAL
+        (ssh_map,) = solution.maps
+        assert len(ssh_map.floors) == floors
+    labels = {(dstate, k) for (dstate, _), k in zip(truth, ssh_map.labels, strict=True)}
+    assert len(labels) == len(ssh_map.dstates) == 60
+
+
 def test_lifts_that_cannot_be_driven(tmp_path: Path) -> None:
     tower = World.named("tower-2")
     with pytest.raises(SimulatorError, match="lift to 1: expected a lift of this name at"):
