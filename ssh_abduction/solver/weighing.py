@@ -148,7 +148,8 @@ class Weighing:
         # With several drives or floors, a broad beam keeps as many hypotheses as a wider one.
         several = parts.task.theory.several_drives or parts.task.theory.lifts
         widths = {w: share for w, share in WIDTHS.items() if w <= BROAD or not several}
-        widest, narrow = max(widths), math.inf  # and the seconds that the narrowest beam took
+        # The widest beam of all, that of those that ended, and the seconds of the narrowest one.
+        widest, ended, narrow = max(widths), 0, math.inf
         for width, share in widths.items():
             began = watch.elapsed()
             if width < widest and widest * narrow < widths[widest] * left - (began - begun):
@@ -158,6 +159,7 @@ class Weighing:
                 break
             with suppress(StageTimeError):
                 found = [self.add(ssh_map) for ssh_map in parts.candidates.maps_of(beam)]
+                ended = width
                 if width >= BROAD:
                     self._searched = min(found, default=math.inf), beam.nats
                     # A beam without axioms would be the same if the checker refused nothing.
@@ -171,7 +173,7 @@ class Weighing:
         watch.end_stage_after(begun + BREAKING * left)
         with suppress(StageTimeError):
             is_open = self._searched[1] < math.inf and math.isinf(self._broken)
-            if is_open and (beam := parts.candidates.beam(widest)):
+            if is_open and (beam := parts.candidates.beam(ended)):
                 self._broken = self._searched[1] - beam.nats_without_axioms()
         watch.end_stage_after(math.inf)
         return True
