@@ -93,6 +93,7 @@ def peak(metres: float) -> tuple[int, int]:
         tracemalloc.stop()
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_drive() -> None:
     list(stream_visits(corridor(20)))  # imports
     (visits, short), (more, long) = peak(80), peak(320)
