@@ -19,6 +19,7 @@ from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.maps import SSHMap, maps_of
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver import RESTS_ON, Ranking, Sharing, Solution, summary_of
+from ssh_abduction.theory.fields import AUTO
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory
 
@@ -112,7 +113,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _axioms_of(theory: Theory) -> Theory:
     """The theory without its choice of what is minimal."""
-    return theory.replace(prefer=(), weigh="count")
+    return theory.replace(prefer=AUTO, weigh="count")
 
 
 def _costs_hold(
