@@ -144,9 +144,17 @@ class Beam:
     def nats_without_axioms(self) -> float:
         """The cost of the best hypothesis if the checker does not look; inf if none is left.
 
-        Actions still lead to one dstate, and stars at one place still agree.
+        Actions still lead to one dstate, and stars at one place still agree. Where no hypothesis is
+        left otherwise, the checker looks at each step.
         """
-        beam = self._settled(self._onward([self._first()], len(self._trace)))
+        beam = [self._first()]
+        while beam and (done := len(beam[0].labels)) < len(self._trace):
+            end = min(done + CHECKED_EVERY, len(self._trace))
+            beam = (
+                self._settled(self._onward(beam, end))
+                or self._checked(beam, end)
+                or self._checked(beam, end, joins=False)
+            )
         return float(beam[0].nats) if beam else math.inf
 
     def _onward(self, beam: list[Hypothesis], end: int) -> list[Hypothesis]:
