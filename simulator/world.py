@@ -119,7 +119,7 @@ class World:
             dstates, and those that a route may lead to.
         via: Dict from a name to (x, y) in metres, for points that are no places but that a route of
             places may lead through.
-        lifts: Lifts, each of which is an action of a route.
+        lifts: Lifts. Each lift is an action of a route.
         own_reach: The reach of the world's file in metres, if `reach` replaces it; otherwise None.
     """
 

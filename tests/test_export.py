@@ -383,7 +383,7 @@ def test_undecided_places_are_hidden_and_their_roads_joined(
 
 
 def test_a_road_past_a_hidden_place_is_that_of_the_robot() -> None:
-    """There and back along a corridor of four places, of which two are undecided."""
+    """There and back along a corridor of four places. Two of them are undecided."""
     moves = [(5, 0, 0), (7, 0, 0), (5, 0, 0), (0, 0, math.pi)]
     moves += moves[:3]
     trace = Trace.from_steps(

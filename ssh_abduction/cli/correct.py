@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from ssh_abduction.cli.options import Verbs
+from ssh_abduction.cli.options import Verbs, add_map
 from ssh_abduction.cli.standing import Standing, told
 from ssh_abduction.data.corrections import PAIRS
 from ssh_abduction.data.errors import MapError, brief, named, printable
@@ -42,12 +42,7 @@ def add_parser(verbs: Verbs) -> None:
             "(monday:12); may be given again"
         ),
     )
-    parser.add_argument(
-        "--map",
-        default="1",
-        metavar="I",
-        help="the number of the map, from 1, or its id (default: 1)",
-    )
+    add_map(parser)
     parser.set_defaults(run=run)
     parser.epilog = "Without an option, it prints what was said so far."
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from ssh_abduction.cli.options import Verbs
+from ssh_abduction.cli.options import Verbs, add_map
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.trace import Trace
 
@@ -26,12 +26,7 @@ def add_parser(verbs: Verbs) -> None:
         "maps", help="output of solve --json, or one saved map; - for standard input"
     )
     parser.add_argument("--to", required=True, choices=FORMATS, help="the format to write")
-    parser.add_argument(
-        "--map",
-        default="1",
-        metavar="I",
-        help="the number of the map, from 1, or its id (default: 1)",
-    )
+    add_map(parser)
     parser.add_argument(
         "--level",
         choices=("places", "dstates"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from ssh_abduction.cli.options import Verbs
+from ssh_abduction.cli.options import Verbs, add_map
 from ssh_abduction.cli.standing import Standing
 from ssh_abduction.data.errors import named, printable
 
@@ -23,12 +23,7 @@ def add_parser(verbs: Verbs) -> None:
         "as monday:12, for its place",
     )
     parser.add_argument("name", help='the name, such as "kitchen"')
-    parser.add_argument(
-        "--map",
-        default="1",
-        metavar="I",
-        help="the number of the map, from 1, or its id (default: 1)",
-    )
+    add_map(parser)
     parser.set_defaults(run=run)
 
 

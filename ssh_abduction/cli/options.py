@@ -309,3 +309,13 @@ def flags_of(theory: Theory, trace: Trace | None = None) -> list[str]:
             own = [f"--{field.name}", text]
             flags += own if field.name in FLAGS else ["--set", f"{field.name}={text}"]
     return flags
+
+
+def add_map(parser: argparse.ArgumentParser) -> None:
+    """Add the option that chooses one of the maps in a file."""
+    parser.add_argument(
+        "--map",
+        default="1",
+        metavar="I",
+        help="the number of the map, from 1, or its id (default: 1)",
+    )

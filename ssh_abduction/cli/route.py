@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from ssh_abduction.cli.options import Verbs
+from ssh_abduction.cli.options import Verbs, add_map
 from ssh_abduction.cli.text import course, table
 from ssh_abduction.data.errors import MapError, printable
 from ssh_abduction.data.files import json_line
@@ -48,12 +48,7 @@ def add_parser(verbs: Verbs) -> None:
         "all moves along the paths of the map, even if the robot never did them (default: actions)"
     )
     parser.add_argument("--by", choices=("actions", "places", "metres"), default="actions", help=by)
-    parser.add_argument(
-        "--map",
-        default="1",
-        metavar="I",
-        help="the number of the map, from 1, or its id (default: 1)",
-    )
+    add_map(parser)
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(run=run)
     parser.epilog = (

@@ -178,7 +178,7 @@ def from_yaml(text: str, source: str = "corrections") -> Corrections:
 
 
 def _check_keys(node: Any) -> None:
-    """Raise ValueError if an object has a field twice, of which YAML would keep the last one."""
+    """Raise ValueError if an object has a field twice. YAML would keep only the last one."""
     if isinstance(getattr(node, "value", None), list):
         for child in node.value:
             pair = child if isinstance(child, tuple) else (child,)

@@ -1,6 +1,6 @@
 """Draw the regions of a map: bands along the streets of a region behind one place, and titles.
 
-Regions beside paths overlap each other. They are told in the titles of places, which browsers show
+Regions beside paths overlap each other. The titles of places name them, which browsers show
 under the pointer.
 """
 
