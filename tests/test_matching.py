@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from test_distinctive import log_of
 
-from perception.places.closures import Closing, find_closures, relative
+from perception.places import closures
+from perception.places.closures import Closing, find_closures, relative, uncertainty
 from perception.places.distinctive import WINDOW, find_visits
 from perception.places.following import _matched
 from perception.places.local_map import CELL, Patch
@@ -168,3 +169,38 @@ def test_a_doubtful_match_against_the_odometer_is_uncertain(share: float, is_wid
     assert abs(pose[2]) < 0.05
     assert found == pytest.approx(share, abs=0.1)
     assert bool(covariance[2, 2] > 0.4**2) is is_wide
+
+
+def test_the_uncertainty_of_a_point_is_that_of_all_increments() -> None:
+    """Each increment is an arm that ends at the point; the sum is computed one by one."""
+    rng = np.random.default_rng(1)
+    poses = np.column_stack([np.cumsum(rng.normal(0, 1, (9, 2)), axis=0), rng.normal(0, 1, 9)])
+    halves = rng.normal(0, 0.1, (9, 3, 3))
+    track = Track(poses, halves @ halves.transpose(0, 2, 1))
+    end, expected = np.array([4.0, -2.0]), np.zeros((3, 3))
+    for i in range(3, 8):
+        x, y = end - poses[i, :2]
+        cos, sin = math.cos(poses[i - 1, 2]), math.sin(poses[i - 1, 2])
+        arm = np.array([[cos, -sin, -y], [sin, cos, x], [0.0, 0.0, 1.0]])
+        expected += arm @ track.covariances[i] @ arm.T
+    assert uncertainty(track, 2, 7, end) == pytest.approx(expected)
+    assert uncertainty(track, 7, 2, end) == pytest.approx(expected)
+
+
+def test_a_visit_is_matched_with_a_bounded_number_of_earlier_ones(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """With one match a visit, it is the nearest one: another pass of the same fork."""
+    _, track, visits, patches = rounds()
+    every = find_closures(track, visits, patches, 2 * WINDOW)
+    asked: list[Scene] = []
+
+    def counted(first: Scene, second: Turned) -> Match | None:
+        asked.append(second.scene)
+        return match(first, second)
+
+    monkeypatch.setattr(closures, "match", counted)
+    monkeypatch.setattr(closures, "MATCHES", 1)
+    found = find_closures(track, visits, patches, 2 * WINDOW)
+    assert len(asked) == len(set(map(id, asked))) <= len(visits)
+    assert {closing.last for closing in found} == {closing.last for closing in every}

@@ -8,14 +8,16 @@ match that counts says how far apart two visits are. It does not say that they a
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from bisect import bisect, bisect_left
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
 from perception.places.local_map import Patch
 from perception.places.matching import MOST, Match, Scene, Turned, match
-from perception.places.track import Array, Track, wrapped
+from perception.places.track import Array, Track, points_turned, wrapped
 from perception.places.visits import Visit
 
 # A match is reliable with at least this score and share of area that both maps observed.
@@ -31,6 +33,8 @@ INFLATED, BEND, BENDS, GATE = 10.0, 2e-4, 10, 20.0
 TURN, SIGMAS = math.radians(6), 3.0
 # Each visit has at most this many closures with earlier ones: those with the best scores.
 KEPT = 2
+# Each visit is matched with at most this many earlier ones, and so many local maps stay prepared.
+MATCHES, SCENES = 32, 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +57,10 @@ def find_closures(
 ) -> list[Closing]:
     """Find the closures between the visits of a log.
 
+    Each visit is matched with at most MATCHES earlier ones, so the time grows with the number of
+    visits, not with its square. They are the nearest ones by the track, in which each closure that
+    was found corrects the poses after it.
+
     Args:
         track: Trajectory of the robot.
         visits: The visits, in order.
@@ -60,33 +68,43 @@ def find_closures(
         apart: Two visits are matched if there are at least this many metres of way between them, so
             that their local maps share no scans.
     """
-    scenes = [Scene.of(patch, visit.middle) for visit, patch in zip(visits, patches, strict=True)]
+
+    @lru_cache(SCENES)
+    def scene(visit: int) -> Scene:
+        return Scene.of(patches[visit], visits[visit].middle)
+
+    gates, corrected = _Gates(track, visits, apart), _Corrected(visits)
     found: list[Closing] = []
-    for last, gates in enumerate(_gates(track, visits)):
-        way = track.way[visits[last].scan] - apart
-        asked = [(first, gate) for first, gate in gates if track.way[visits[first].scan] < way]
-        here = sorted(_closings(scenes, asked, last), key=lambda closing: -closing.match.score)
+    for last in range(len(visits)):
+        corrected.predict(last)
+        earlier = gates.earlier(last)
+        near = corrected.nearest(last, earlier)
+        asked = gates.allowed(last, near)
+        here = sorted(_closings(scene, asked, last), key=lambda closing: -closing.match.score)
         found += here[:KEPT]
+        if here:
+            corrected.correct(here[0])
     return found
 
 
 def _closings(
-    scenes: Sequence[Scene], asked: Sequence[tuple[int, _Gate]], last: int
+    scene: Callable[[int], Scene], asked: Sequence[tuple[int, _Gate]], last: int
 ) -> Iterator[Closing]:
     """Match a visit with earlier ones.
 
     Args:
-        scenes: The local map of each visit.
+        scene: Makes the local map of a visit.
         asked: The earlier visits to try, each with what the track says.
         last: Index of the visit.
     """
+    if not asked:
+        return
     turns = [gate.turns for _, gate in asked]
-    begin = min((some.start for some in turns), default=0)
-    end = max((some.stop for some in turns), default=0)
+    begin, end = min(some.start for some in turns), max(some.stop for some in turns)
     # The visit is rotated once, for all the earlier visits.
-    turned = Turned.of(scenes[last], [k * TURN for k in range(begin, end)])
+    turned = Turned.of(scene(last), [k * TURN for k in range(begin, end)])
     for (first, gate), some in zip(asked, turns, strict=True):
-        found = match(scenes[first], turned.part(some.start - begin, some.stop - begin))
+        found = match(scene(first), turned.part(some.start - begin, some.stop - begin))
         if found is not None and is_reliable(found) and gate.allows(found):
             yield Closing(first, last, found)
 
@@ -126,32 +144,87 @@ class _Gate:
         return bool(np.einsum("di,ij,dj->d", off, inverse, off).min() < GATE)
 
 
-def _gates(track: Track, visits: Sequence[Visit]) -> Iterator[list[tuple[int, _Gate]]]:
-    """For each visit, the earlier visits that may be near, each with what the track says.
+class _Gates:
+    """What the track says about each two visits.
 
-    No gate leads across a cut of the track, where the motion is unknown.
+    Args:
+        track: Trajectory of the robot.
+        visits: The visits, in order.
+        apart: Least number of metres of way between two visits.
     """
-    drifts = BEND * np.arange(-BENDS, BENDS + 1)
-    way = track.way[[visit.scan for visit in visits]]
-    middles = np.array([visit.middle for visit in visits])
-    poses = np.array([_drifted(middles, way, drift) for drift in drifts])
-    covariances, begin = np.zeros((0, 3, 3)), 0  # of the visits since the last cut
-    for last, visit in enumerate(visits):
-        if last and track.cuts_between(visits[last - 1].scan, visit.scan):
-            covariances, begin = covariances[:0], last
-        elif last:
-            covariances = _carried(covariances, track, visits[last - 1], visit)
+
+    def __init__(self, track: Track, visits: Sequence[Visit], apart: float) -> None:
+        """Compute the middles for each drift."""
+        self._track, self._apart = track, apart
+        self._scans = [visit.scan for visit in visits]
+        self._way = track.way[self._scans]
+        self._middles = np.array([visit.middle for visit in visits]).reshape(-1, 2)
+        drifts = BEND * np.arange(-BENDS, BENDS + 1)
+        self._poses = np.array([_drifted(self._middles, self._way, drift) for drift in drifts])
+
+    def earlier(self, last: int) -> range:
+        """The earlier visits far enough before a visit, without a cut of the track between.
+
+        The motion across a cut is unknown.
+        """
+        cuts = bisect(self._track.cuts, self._scans[last])
+        begin = bisect_left(self._scans, self._track.cuts[cuts - 1]) if cuts else 0
+        end = int(np.searchsorted(self._way, self._way[last] - self._apart))
+        return range(begin, max(begin, end))
+
+    def allowed(self, last: int, some: Sequence[int]) -> list[tuple[int, _Gate]]:
+        """The earlier visits of some that may be near a visit, each with what the track says."""
+        if not some:
+            return []
         # The pose by the axes of each earlier visit, for each drift: (drifts, visits, 3).
-        turn = poses[:, begin:last, 2]
+        turn = self._poses[:, some, 2]
         cos, sin = np.cos(turn), np.sin(turn)
-        x, y = np.moveaxis(poses[:, last, None, :2] - poses[:, begin:last, :2], 2, 0)
-        turned = poses[:, last, None, 2] - turn
+        x, y = np.moveaxis(self._poses[:, last, None, :2] - self._poses[:, some, :2], 2, 0)
+        turned = self._poses[:, last, None, 2] - turn
         there = np.stack([cos * x + sin * y, cos * y - sin * x, turned], axis=2)
-        spreads = INFLATED * covariances
+        end = self._middles[last]
+        spreads = [
+            INFLATED * uncertainty(self._track, self._scans[k], self._scans[last], end)
+            for k in some
+        ]
         # Any shift that a match can have is allowed for the visits that are near.
         far = np.hypot(there[..., 0], there[..., 1]).min(axis=0) - MOST
-        near = far <= SIGMAS * np.sqrt(np.linalg.eigvalsh(spreads[:, :2, :2])[:, 1])
-        yield [(begin + k, _Gate(there[:, k], spreads[k])) for k in np.flatnonzero(near).tolist()]
+        near = far <= SIGMAS * np.sqrt(np.linalg.eigvalsh(np.array(spreads)[:, :2, :2])[:, 1])
+        return [(some[k], _Gate(there[:, k], spreads[k])) for k in np.flatnonzero(near).tolist()]
+
+
+class _Corrected:
+    """Where visits are by the track, if each closure corrects the poses after it.
+
+    Args:
+        visits: The visits, in order.
+    """
+
+    def __init__(self, visits: Sequence[Visit]) -> None:
+        """Start without any correction."""
+        self._middles = np.array([visit.middle for visit in visits]).reshape(-1, 2)
+        self._places = self._middles.copy()
+        self._turns = np.zeros(len(visits))
+
+    def predict(self, visit: int) -> None:
+        """Place a visit by the track from the visit before it."""
+        if visit:
+            turn = self._turns[visit - 1]
+            onward = points_turned(turn, self._middles[visit] - self._middles[visit - 1])
+            self._places[visit], self._turns[visit] = self._places[visit - 1] + onward, turn
+
+    def correct(self, closing: Closing) -> None:
+        """Place the later visit of a closure by the earlier one."""
+        turn = self._turns[closing.first]
+        onward = points_turned(turn, closing.match.shift)
+        self._places[closing.last] = self._places[closing.first] + onward
+        self._turns[closing.last] = turn + closing.match.turn
+
+    def nearest(self, visit: int, some: range) -> list[int]:
+        """The MATCHES visits of some that are nearest to a visit, in order."""
+        far = np.hypot(*(self._places[some.start : some.stop] - self._places[visit]).T)
+        kept = np.argsort(far, kind="stable")[:MATCHES] + some.start
+        return sorted(kept.tolist())
 
 
 def _drifted(middles: Array, way: Array, drift: float) -> Array:
@@ -174,25 +247,6 @@ def _drifted(middles: Array, way: Array, drift: float) -> Array:
     return np.column_stack([places, turn])
 
 
-def _carried(covariances: Array, track: Track, before: Visit, visit: Visit) -> Array:
-    """The covariances of the next visit relative to each earlier one, by the axes of the track.
-
-    Args:
-        covariances: (n, 3, 3) those of the visit before.
-        track: Trajectory of the robot.
-        before: The visit before.
-        visit: The next visit.
-
-    Returns:
-        (n + 1, 3, 3); the last one is relative to the visit before.
-    """
-    onward = visit.middle - before.middle
-    arm = np.array([[1.0, 0.0, -onward[1]], [0.0, 1.0, onward[0]], [0.0, 0.0, 1.0]])
-    new = uncertainty(track, before.scan, visit.scan, visit.middle)
-    carried = arm @ np.concatenate([covariances, np.zeros((1, 3, 3))]) @ arm.T + new
-    return np.asarray(carried)
-
-
 def uncertainty(track: Track, first: int, last: int, end: Array) -> Array:
     """Compute the covariance of a point near a later scan relative to an earlier scan.
 
@@ -205,15 +259,11 @@ def uncertainty(track: Track, first: int, last: int, end: Array) -> Array:
     Returns:
         (3, 3) in metres and radians, by the axes of the track.
     """
-    total = np.zeros((3, 3))
-    for i in range(min(first, last) + 1, max(first, last) + 1):
-        cos, sin = math.cos(track.poses[i - 1, 2]), math.sin(track.poses[i - 1, 2])
-        # An error of this increment rotates and shifts all later poses. The point moves as the end
-        # of an arm that begins here.
-        x, y = end - track.poses[i, :2]
-        arm = np.array([[cos, -sin, -y], [sin, cos, x], [0.0, 0.0, 1.0]])
-        total += arm @ track.covariances[i] @ arm.T
-    return total
+    # An error of an increment rotates and shifts all later poses. The point moves as the end of an
+    # arm that begins there.
+    first, last = min(first, last), max(first, last)
+    arm = np.array([[1.0, 0.0, -end[1]], [0.0, 1.0, end[0]], [0.0, 0.0, 1.0]])
+    return np.asarray(arm @ (track.spreads[last] - track.spreads[first]) @ arm.T)
 
 
 def relative(closing: Closing, first: float, last: float) -> tuple[float, float, float]:

@@ -44,6 +44,21 @@ class Track:
         return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(self.poses[:, :2], axis=0).T))])
 
     @cached_property
+    def spreads(self) -> Array:
+        """The sums of the covariances up to each scan: (n, 3, 3).
+
+        They are covariances of the origin of the frame, moved by the errors of all increments.
+        """
+        cos, sin = np.cos(self.poses[:-1, 2]), np.sin(self.poses[:-1, 2])
+        arms = np.zeros((len(self.poses), 3, 3))
+        arms[1:, 0] = np.stack([cos, -sin, self.poses[1:, 1]], axis=1)
+        arms[1:, 1] = np.stack([sin, cos, -self.poses[1:, 0]], axis=1)
+        arms[:, 2, 2] = 1.0
+        steps = arms @ self.covariances @ arms.transpose(0, 2, 1)
+        steps[0] = 0.0
+        return np.asarray(np.cumsum(steps, axis=0))
+
+    @cached_property
     def spans(self) -> tuple[tuple[int, int], ...]:
         """For each unbroken part, the index of its first scan and the index after its last."""
         return tuple(pairwise((0, *self.breaks, len(self.poses))))
