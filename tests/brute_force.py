@@ -192,6 +192,8 @@ def consistent_maps(trace: Trace, theory: Theory) -> Iterator[tuple[Key, Counts]
             if "planar" in on and not _is_planar(labels, places, links, headings, theory):
                 continue
             for courses in _courses(places, links, on):
+                if "path_on_one_floor" in on and not _paths_stay(trace, labels, places, courses):
+                    continue
                 if headings and not any(
                     _goes_straight(labels, places, courses, h, on) for h in headings
                 ):
@@ -230,7 +232,26 @@ def _as_asserted(labels: Labels, places: tuple[int, ...] | None, theory: Theory)
 
 
 def _lifts_lead_away(trace: Trace, labels: Labels, where: Sequence[int]) -> bool:
-    """Whether the floors of the steps, merged until nothing changes, differ at each lift."""
+    """Whether the floors of the steps differ at each lift."""
+    floor = _floors(trace, labels, where)
+    lifts = [t for t, action in enumerate(trace.actions) if action.kind in ("lift", "stairs")]
+    return all(floor[t] != floor[t + 1] for t in lifts)
+
+
+def _paths_stay(trace: Trace, labels: Labels, places: tuple[int, ...], courses: Courses) -> bool:
+    """Whether all steps along a path are on one floor."""
+    floor = _floors(trace, labels, [places[label] for label in labels])
+    along = [courses[label] for label in labels]
+    return all(
+        floor[i] == floor[j]
+        for i, one in enumerate(along)
+        for j, other in enumerate(along)
+        if one and other and one[0] == other[0]
+    )
+
+
+def _floors(trace: Trace, labels: Labels, where: Sequence[int]) -> list[int]:
+    """The floor of each step: steps are merged until nothing changes."""
     floor = list(range(len(labels)))
     pairs = [(i, j) for j in range(len(labels)) for i in range(j)]
     joined = [(i, j) for i, j in pairs if labels[i] == labels[j] or where[i] == where[j]]
@@ -242,8 +263,7 @@ def _lifts_lead_away(trace: Trace, labels: Labels, where: Sequence[int]) -> bool
     for _ in floor:
         for i, j in joined:
             floor[i] = floor[j] = min(floor[i], floor[j])
-    lifts = [t for t, action in enumerate(trace.actions) if action.kind in ("lift", "stairs")]
-    return all(floor[t] != floor[t + 1] for t in lifts)
+    return floor
 
 
 def _stars_alike(trace: Trace, labels: Labels) -> bool:

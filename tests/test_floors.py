@@ -240,10 +240,11 @@ def test_lifts_that_cannot_be_driven(tmp_path: Path) -> None:
         simulate(replace(tower, angles="any"))
 
 
-def test_a_route_changes_floors_by_the_lift_only() -> None:
-    """A path of the first map leads on at the other floor. Nobody can travel along it."""
-    ssh_map = solve(SHAFT).maps[0]
-    assert any({0, 2} <= set(path.order) for path in ssh_map.paths)
+@pytest.mark.parametrize("without", [(), ("path_on_one_floor",)])
+def test_a_route_changes_floors_by_the_lift_only(without: tuple[str, ...]) -> None:
+    """If a path may lead on at the other floor, nobody can travel along it."""
+    ssh_map = solve(SHAFT, Theory(without=without)).maps[0]
+    assert len(ssh_map.paths) == (1 if without else 2)
     found = route(ssh_map, 0, 3, by="places")
     assert found is not None
     assert found.actions == ("travel", "up", "travel")

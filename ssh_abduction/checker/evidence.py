@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from ssh_abduction.checker.floors import other_floor
+from ssh_abduction.checker.floors import other_floor, path_on_one_floor
 from ssh_abduction.checker.moves import Move, heading_of
 from ssh_abduction.checker.planarity import Edges
 from ssh_abduction.checker.reading import Check, Found, Reading
@@ -192,6 +192,7 @@ AXIOMS: dict[str, Check] = {
         closure,
         one_pose,
         other_floor,
+        path_on_one_floor,
         planar,
     )
 }

@@ -42,6 +42,20 @@ def other_floor(m: Reading) -> Found:
             )
 
 
+def path_on_one_floor(m: Reading) -> Found:
+    """Check that each path is on one floor."""
+    floor = m.once(floors_of)
+    for h, there in m.along.items():
+        first, *others = there.values()
+        for s in others:
+            if floor[s] != floor[first]:
+                yield (
+                    m.steps_of(first, s),
+                    f"Dstates {first} and {s} are along path {h}, but on different floors.",
+                )
+                break
+
+
 def floors_are_listed(m: Reading) -> Found:
     """Check that a map lists the floor of each dstate by first visit, or lists no floors."""
     listed = {s.id: s.floor for s in m.map.dstates}

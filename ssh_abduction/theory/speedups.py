@@ -338,6 +338,7 @@ TABLE = (
             SURVIVE_A_CUT
             | {f"{axiom}, excusable" for axiom in SURVIVE_A_CUT}
             | {f"the field {kind}" for kind in EXCUSED}
+            | {"path_on_one_floor"}
         ),
     ),
     Speedup(

@@ -201,7 +201,11 @@ class PlacesAndPaths:
             return None
         with self._asker.grounding_timed():
             control = self._control_for(
-                self._links_of(labels), labels, far=self._far_away(labels), parts=TOLD
+                self._links_of(labels),
+                labels,
+                far=self._far_away(labels),
+                parts=TOLD,
+                labels=labels,
             )
             told = paths_lp.Segments.read(control)
             homes = homes_of(told)
@@ -345,6 +349,7 @@ class PlacesAndPaths:
         far: Collection[_Far] = (),
         single: bool = False,
         parts: Iterable[str] = PARTS,
+        labels: Sequence[int] = (),
     ) -> Control:
         """Make a control whose answers are places and paths of dstates.
 
@@ -355,6 +360,7 @@ class PlacesAndPaths:
             far: Constraints on dstates that are not at one place.
             single: Merge places and segments only if they must be one.
             parts: The parts of the program to ground.
+            labels: The dstate of each step, if paths must not lead to other floors.
         """
         control = Control(options, self._asker.watch.check, PREPARING)
         control.load_encodings("paths_frameless", "preference")
@@ -367,6 +373,8 @@ class PlacesAndPaths:
                 self._task.theory, dstates, links, self._actions, apart, single=single
             ),
         )
+        task = self._task
+        control.add("base", [], paths_lp.stretch_facts(task.trace, task.theory, labels))
         control.ground([(part, []) for part in parts])
         return control
 
@@ -395,6 +403,7 @@ class PlacesAndPaths:
                     options,
                     far=self._far_away(labels),
                     parts=TOLD if at_home else parts,
+                    labels=labels,
                 )
                 if at_home:
                     _go_on_at_home(control, self._tight[key[0]][0], parts)

@@ -167,6 +167,8 @@ class Paths:
         control.add(
             "base", [], paths_lp.settled_facts(self._theory, chart, labels, nodes, single=single)
         )
+        where = [labels[node] for node in chart.node_of]
+        control.add("base", [], paths_lp.stretch_facts(self._trace, self._theory, where))
         control.ground(
             [("base", []), *([("again", [])] if single else []), ("segments", []), ("least", [])]
         )

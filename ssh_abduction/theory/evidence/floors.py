@@ -41,9 +41,7 @@ class Floors:
         return _pairs(stretches_of(trace), _lifted(trace))
 
     def facts(self, trace: Trace, start: int, stop: int) -> str:
-        stretches, lifted = stretches_of(trace), _lifted(trace)
-        facts = [f"stretch({t},{stretches[t]})." for t in range(start, stop)]
-        return "\n".join([*facts, *(f"lifted({t})." for t in lifted if start <= t < stop)])
+        return ""  # all axioms of floors.lp share their facts
 
     def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
         stretches = stretches_of(trace)

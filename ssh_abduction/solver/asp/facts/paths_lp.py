@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 from clingo import Control, Function, Model
 
+from ssh_abduction.data.floors import stretches_of
 from ssh_abduction.data.trace import Action, Trace
 from ssh_abduction.solver.asp.facts.atoms import read_atom
 from ssh_abduction.solver.asp.facts.readable import preferred
@@ -136,6 +137,20 @@ def settled_facts(
         star = chart.stars[visit]
         facts += [f"open({label},{k})." for k in range(4) if star[(slot + k) % 4]]
     return "\n".join([*facts, *preferred(theory)])
+
+
+def stretch_facts(trace: Trace, theory: Theory, labels: Iterable[int]) -> str:
+    """The facts that say on which stretches between lifts the dstates of steps are.
+
+    Args:
+        trace: The trace.
+        theory: The theory. If it lets a path lead to another floor, there are no such facts.
+        labels: The dstate of each step, or of each of the first steps.
+    """
+    if "path_on_one_floor" not in theory.axioms:
+        return ""
+    pairs = dict.fromkeys(zip(labels, stretches_of(trace), strict=False))
+    return "\n".join(f"stretch({label},{stretch})." for label, stretch in pairs)
 
 
 def read_distinct(control: Control) -> tuple[list[int], list[tuple[int, int]]]:

@@ -12,6 +12,7 @@ from itertools import product
 from clingo import Function, Symbol
 
 from ssh_abduction.data.drives import starts_of
+from ssh_abduction.data.floors import stretches_of
 from ssh_abduction.data.trace import Action, Trace
 from ssh_abduction.solver.asp.facts.atoms import constant, numbers
 from ssh_abduction.solver.steps import frames
@@ -112,6 +113,10 @@ def trace_facts(problem: Problem, start: int, stop: int) -> str:
             f"drive({t},{bisect_right(starts, t)}). price(changed,{t},{price})."
             for t in range(start, stop)
         ]
+    if theory.lifts:
+        stretches = stretches_of(trace)
+        facts += [f"stretch({t},{stretches[t]})." for t in range(start, stop)]
+        facts += [f"lifted({t + 1})." for t, action in done.items() if action.changes_floor]
     if theory.slipped:
         facts += [
             f"price(slipped,{t},{theory.fault_tenths('slipped', trace.steps[t])})." for t in done
