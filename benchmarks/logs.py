@@ -9,9 +9,10 @@ events (visits according to a mapper) and its first map are compared with the tr
 done with skeletons of occupancy grids. One grid has the scans at their corrected poses, which a
 robot does not have. The skeleton of this grid is judged without and with nodes at doors. The other
 grid has the scans at the poses of the odometry, which any robot has. The method `pairs` counts
-which pairs of visits and of travels the map joins, and which it should (`courses.py`). The truth of
-a simulated log NAME.log is in NAME.truth.json beside the log. Rows that are stored are not measured
-again.
+which pairs of visits and of travels the map joins, and which it should (`courses.py`). For drives
+through floor plans, it also finds the rooms and doors that the map does not tell apart
+(`rooms.py`). The truth of a simulated log NAME.log is in NAME.truth.json beside the log. Rows that
+are stored are not measured again.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from typing import Any
 import numpy as np
 from courses import counts_of, joins_of
 from pages import print_rows, seeds_from
+from rooms import rooms_and_doors, told_line, untold
 from skeleton import lay, poses_of, skeleton_of
 from truth import diagram, reliability
 from visited import Events, Truth, judged, truth_of
@@ -201,6 +203,8 @@ def pairs_row(log: Path, truth: Truth | None, runs: Path) -> dict[str, Any]:
         return row
     solution = Solution.load(runs / name_of(log) / "maps.json", trace)
     row |= {"confidence": solution.confidence, "joins": joins_of(trace, solution)}
+    if truth.doors and ssh_map is not None and (beside := sidecar(log)) is not None:
+        row["untold"] = untold(trace, ssh_map, *rooms_and_doors(json.loads(beside.read_text())))
     return row | counts_of(trace, ssh_map, truth.poses)
 
 
@@ -451,6 +455,7 @@ def main() -> None:
             options.page,
             r"\| log \| visits",
         )
+        print(told_line(pairs))
         joins = [(p, right) for row in pairs for p, right in row.get("joins", ())]
         if joins:
             error, brier = reliability(joins)

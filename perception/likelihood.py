@@ -13,8 +13,9 @@ distances into densities:
 - p(o|x), the density of image o at place x. The squared distance from o to the nearest image of x
   is modelled as a sum of `dimensions` squared Gaussian deviations of equal variance. Its mean and
   variance are fitted to the distances from each remembered image to the nearest other image of its
-  place (moment matching, Satterthwaite 1946). So `dimensions` is the number of beams that vary
-  independently. It is smaller than the number of beams.
+  place, or of any place if each place has one image (moment matching, Satterthwaite 1946). So
+  `dimensions` is the number of beams that vary independently. It is smaller than the number of
+  beams.
 - p(o|novel), the density of an unknown appearance. It is a Gaussian around the mean of all
   remembered images, with their spread.
 - p(o|nowhere) = (sum over places x of p(o|x) + p(o|novel)) / (places + 1), the density at an
@@ -26,6 +27,7 @@ distances into densities:
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -37,7 +39,7 @@ from scipy.special import logsumexp
 from sklearn.exceptions import NotFittedError
 from sklearn.pipeline import Pipeline
 
-from perception.errors import PerceptionError, equal_length
+from perception.errors import ImageWarning, PerceptionError, equal_length
 from perception.recognition import PlaceRecogniser
 from ssh_abduction.data.errors import brief
 
@@ -79,8 +81,7 @@ class ImageLikelihood:
         """Measure the distances between the images that a recogniser remembers.
 
         Raises:
-            PerceptionError: The recogniser is of another kind, is not fitted, or has no two images
-                of one place.
+            PerceptionError: The recogniser is of another kind, is not fitted, or has one image.
         """
         nearest = _nearest(recogniser)
         if not isinstance(nearest, PlaceRecogniser):
@@ -102,14 +103,7 @@ class ImageLikelihood:
                 "recogniser: expected one that remembers images of finite numbers, got NaN, "
                 "infinity, or numbers too large to square; train it again"
             )
-        squares = np.concatenate(
-            [_to_nearest_other(images[labels == label]) for label in np.unique(labels)]
-        )
-        if not len(squares):
-            raise PerceptionError(
-                "recogniser: expected two images of some place, to learn how images of one "
-                "place differ, got one of each; train it on a longer trace"
-            )
+        squares = _within_places(images, labels)
         centre = images.mean(axis=0)
         spread = float(np.mean(np.sum((images - centre) ** 2, axis=1))) or 1.0
         within = max(float(squares.mean()), LEAST_SPREAD * spread)
@@ -228,6 +222,34 @@ class ImageLikelihood:
 
 def _nearest(recogniser: Any) -> Any:
     return recogniser[-1] if isinstance(recogniser, Pipeline) else recogniser
+
+
+def _within_places(images: NDArray[np.float64], labels: NDArray[Any]) -> NDArray[np.float64]:
+    """Squared distance from each image to the nearest other image of its place.
+
+    If each place has one image, it is the distance to the nearest image of another place. That is
+    too large, so the densities differ less than they should, and a warning says so.
+
+    Raises:
+        PerceptionError: There is only one image.
+    """
+    squares = np.concatenate(
+        [_to_nearest_other(images[labels == label]) for label in np.unique(labels)]
+    )
+    if len(squares):
+        return squares
+    if len(images) < 2:
+        raise PerceptionError(
+            "recogniser: expected two images or more, to learn how images differ, got one; "
+            "train it on a longer trace"
+        )
+    warnings.warn(
+        "Each place has one image. How images of one place differ is estimated from images of "
+        "different places. So the robot is seldom located; train the recogniser on a longer trace.",
+        ImageWarning,
+        stacklevel=3,
+    )
+    return _to_nearest_other(images)
 
 
 def _to_nearest_other(images: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -61,8 +61,7 @@ class Stored:
         """Make the densities of images at the places that the model knows.
 
         Returns:
-            The densities; None if the model is no recogniser of places or has no two images of one
-            place.
+            The densities; None if the model is no recogniser of places or has one image.
         """
         try:
             return ImageLikelihood.of(self.model)

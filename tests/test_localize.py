@@ -18,7 +18,7 @@ from instances import maze, moore
 from sklearn.neighbors import KNeighborsClassifier
 from worlds import rectangle
 
-from perception.errors import PerceptionError
+from perception.errors import ImageWarning, PerceptionError
 from perception.likelihood import ImageLikelihood
 from perception.recognition import PlaceRecogniser, recogniser
 from perception.store import save
@@ -458,6 +458,18 @@ def test_densities_of_images_are_those_of_a_gaussian_about_the_nearest_image() -
     assert ratios == pytest.approx(np.array(places) * 4 / (sum(places) + novel))
 
 
+def test_one_image_of_each_place_is_enough_for_a_careful_localiser() -> None:
+    images, at = pictures(6, 2, seed=1)
+    with pytest.warns(ImageWarning, match="Each place has one image"):
+        likelihood = ImageLikelihood.of(recogniser().fit(images[:6], at[:6]))
+    surer = ImageLikelihood.of(recogniser().fit(images, at))
+    more, truth = pictures(6, 5, seed=2)
+    for image, place in zip(more, truth, strict=True):
+        (ratios,), (more_sure,) = likelihood.ratios([image]), surer.ratios([image])
+        assert ratios.argmax() == place
+        assert 1 < ratios[place] < more_sure[place]
+
+
 def test_a_localiser_reads_images() -> None:
     """Two of the six places look the same; what follows tells them apart.
 
@@ -565,9 +577,9 @@ IMAGES, AT = pictures(3, 4, seed=1)
             "expected the dstates 0 to 2 of the map as labels",
         ),
         (
-            lambda: Localiser(RING, recogniser().fit(IMAGES[:3], AT[:3])),
+            lambda: Localiser(RING, recogniser().fit(IMAGES[:1], AT[:1])),
             PerceptionError,
-            "expected two images of some place",
+            "expected two images or more",
         ),
         (
             lambda: Localiser(RING, PlaceRecogniser().fit(1e200 * IMAGES, AT)),

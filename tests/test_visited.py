@@ -12,6 +12,7 @@ import courses
 import networkx as nx
 import numpy as np
 import pytest
+import rooms
 from skeleton import CELL, _chains, _pixels, _prune, _with_doors, poses_of, skeleton_of
 from visited import (
     ACES_COLUMNS,
@@ -297,3 +298,51 @@ def test_pairs_of_visits_and_of_travels_are_counted() -> None:
     assert counts["visit_pairs"] == {"joined": 3, "right": 3, "true": 6, "found": 3}
     assert counts["travel_pairs"] == {"joined": 0, "right": 0, "true": 4}
     assert courses.counts_of(trace, None, poses)["visit_pairs"]["joined"] == 0
+
+
+def corridor_map(places: str, paths: str, drive: str) -> tuple[Trace, SSHMap, list[str | None]]:
+    """A drive with three scans for each letter: a visit in a room, or a room that it passes.
+
+    Args:
+        places: The place of each visit.
+        paths: The path of each travel.
+        drive: The rooms in order; a visit is in a room in capitals.
+    """
+    scans = [3 * k + 1 for k, room in enumerate(drive) if room.isupper()]
+    steps = [Step("v", action=Action.of("travel"), extra={"scan": scan}) for scan in scans]
+    names = sorted(set(zip(places, [*paths, ""], strict=True)))
+    labels = tuple(names.index(pair) for pair in zip(places, [*paths, ""], strict=True))
+    ways = sorted({*paths})
+    dstates = tuple(
+        DState(i, "v", ord(place), ways.index(way) if way else None, 1 if way else None)
+        for i, (place, way) in enumerate(names)
+    )
+    trace = Trace((*steps[:-1], replace(steps[-1], action=None)))
+    return trace, SSHMap(labels, dstates, (), ()), [room.upper() for room in drive for _ in "abc"]
+
+
+@pytest.mark.parametrize(
+    ("places", "paths", "drive", "doors", "missing", "confused"),
+    [
+        # Into two rooms by doors 1 and 2, with a place in each.
+        ("haji", "pqr", "HAHB", {3: "1", 6: "1", 9: "2"}, [], []),
+        # No visit in room B: the robot turned around there and came back to the hall.
+        ("hahh", "ppr", "HAHbH", {3: "1", 6: "1", 9: "2", 12: "2"}, [], []),
+        # The same, but another travel on this edge went to no room: B is not told apart.
+        ("hhh", "rr", "HbHH", {3: "2", 6: "2"}, ["B"], []),
+        # Into rooms B and C on one edge: neither is told apart, and doors 2 and 3 are confused.
+        ("hhh", "rr", "HbHcH", {3: "2", 6: "2", 9: "3", 12: "3"}, ["B", "C"], ["2 and 3"]),
+        # One place for rooms A and B.
+        ("haha", "pqr", "HAHB", {3: "1", 6: "1", 9: "2"}, ["B"], []),
+    ],
+)
+def test_rooms_and_doors_need_places_or_edges_of_their_own(
+    places: str,
+    paths: str,
+    drive: str,
+    doors: dict[int, str],
+    missing: list[str],
+    confused: list[str],
+) -> None:
+    told = rooms.untold(*corridor_map(places, paths, drive), doors)
+    assert told == {"rooms": missing, "doors": confused}
