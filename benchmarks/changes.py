@@ -79,7 +79,7 @@ def named(ssh_map: SSHMap, known: Known) -> Iterator[Gateway]:
     """The gateways that a map says to have changed, by the true cell and heading of the step."""
     for fault in ssh_map.faults:
         x, y, heading = known.dstates[fault.step]
-        slot = ssh_map.dstates[ssh_map.labels[fault.step]].heading or 0
+        slot = ssh_map.dstates[ssh_map.dstate_at[fault.step]].heading or 0
         yield (x, y), ((fault.gateway or 0) - slot + heading) % 4
 
 

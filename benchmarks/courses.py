@@ -98,7 +98,7 @@ def joins_of(trace: Trace, solution: Solution) -> list[tuple[float, bool]]:
 
 
 def _place(ssh_map: SSHMap | None, step: int) -> int | None:
-    return None if ssh_map is None else ssh_map.dstates[ssh_map.labels[step]].place
+    return None if ssh_map is None else ssh_map.dstates[ssh_map.dstate_at[step]].place
 
 
 def edges_of(ssh_map: SSHMap | None, starts: Sequence[int]) -> list[Hashable]:
@@ -121,12 +121,12 @@ def edges_of(ssh_map: SSHMap | None, starts: Sequence[int]) -> list[Hashable]:
         if ssh_map is None or here is None or there is None:
             edges.append(None)
         elif ssh_map.fit is None or not ssh_map.fit.poses:
-            path = ssh_map.dstates[ssh_map.labels[after - 1]].path
+            path = ssh_map.dstates[ssh_map.dstate_at[after - 1]].path
             edges.append((*sorted([here, there]), path))
         else:
             poses = ssh_map.fit.poses
-            ahead = poses[ssh_map.labels[after - 1]].heading
-            behind = poses[ssh_map.labels[after]].heading + math.pi
+            ahead = poses[ssh_map.dstate_at[after - 1]].heading
+            behind = poses[ssh_map.dstate_at[after]].heading + math.pi
             ends = [(here, _named(gateways[here], ahead)), (there, _named(gateways[there], behind))]
             edges.append(tuple(sorted(ends)))
     return edges

@@ -209,7 +209,7 @@ def _mended(
         alike = views[sure[truth[sure] == truth[i]]]
         views[i] = np.bincount(alike).argmax() if len(alike) else views[i]
     solution = solve(trace.with_views(views.tolist()), VIEWS_ALONE, time_limit=SECONDS)
-    return bool(solution.maps) and one_to_one(np.array(solution.maps[0].labels), truth)
+    return bool(solution.maps) and one_to_one(np.array(solution.maps[0].dstate_at), truth)
 
 
 def rows(seeds: list[int], tours: int) -> Iterator[str]:

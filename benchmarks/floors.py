@@ -112,7 +112,7 @@ def right_floors(ssh_map: SSHMap, known: Known) -> tuple[int, int]:
     """How many true floors are floors of the map, and how many there are where the robot was."""
     true: dict[object, set[int]] = {}
     found: dict[object, set[int]] = {}
-    for t, (label, state) in enumerate(zip(ssh_map.labels, known.dstates, strict=True)):
+    for t, (label, state) in enumerate(zip(ssh_map.dstate_at, known.dstates, strict=True)):
         true.setdefault(floor_of(state), set()).add(t)
         found.setdefault(ssh_map.dstates[label].floor, set()).add(t)
     return sum(steps in found.values() for steps in true.values()), len(true)

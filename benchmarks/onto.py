@@ -77,7 +77,7 @@ def main() -> None:
             print(f"| {known[0].name} | – | – | – | – | {error} |", flush=True)
             continue
         truth = [state for walk in known for state in walk.dstates]
-        right = partition(truth) == partition(ssh_map.labels)
+        right = partition(truth) == partition(ssh_map.dstate_at)
         print(
             f"| {known[0].name} | {len(ssh_map.dstates)} | {seconds[1]:.2f} | {seconds[-1]:.2f} | "
             f"{seconds[-1] / seconds[1]:.1f} | {'yes' if right else 'no'} |",

@@ -99,8 +99,8 @@ def partition(names: Sequence[Hashable]) -> tuple[int, ...]:
 
 def is_true(ssh_map: SSHMap, known: Known) -> bool:
     """Check whether the labels of a map and, if it has any, its places are true up to renaming."""
-    places = [ssh_map.dstates[label].place for label in ssh_map.labels]
-    return partition(ssh_map.labels) == partition(known.dstates) and (
+    places = [ssh_map.dstates[label].place for label in ssh_map.dstate_at]
+    return partition(ssh_map.dstate_at) == partition(known.dstates) and (
         not ssh_map.places or partition(places) == partition(known.places)
     )
 
@@ -256,10 +256,10 @@ def joins(solution: Solution, known: Known) -> tuple[tuple[float, bool], ...]:
     if solution.weighed is None:
         return ()
     ssh_map = solution.maps[0]
-    at = [ssh_map.dstates[label].place for label in ssh_map.labels]
+    at = [ssh_map.dstates[label].place for label in ssh_map.dstate_at]
     last: dict[Hashable, int] = {}
     found = []
-    for step, label in enumerate(ssh_map.labels):
+    for step, label in enumerate(ssh_map.dstate_at):
         place = label if at[step] is None else at[step]
         if place in last and step - last[place] > 1:
             before = last[place]

@@ -258,7 +258,7 @@ class Events:
         """
         starts = [t for t in range(len(trace)) if t == 0 or trace.actions[t - 1].kind != "turn"]
         places = [
-            None if ssh_map is None else ssh_map.dstates[ssh_map.labels[t]].place for t in starts
+            None if ssh_map is None else ssh_map.dstates[ssh_map.dstate_at[t]].place for t in starts
         ]
         told = told_poses(trace)
         poses = [pose for t in starts if (pose := told[t]) is not None]

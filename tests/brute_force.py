@@ -68,7 +68,7 @@ def key(ssh_map: SSHMap) -> Key:
     """The map without its witnesses; dstates, places and paths numbered by the first step, where a
     path is faced in direction +1."""
     by_id = {s.id: s for s in ssh_map.dstates}
-    visited = [by_id[s] for s in dict.fromkeys(ssh_map.labels)]
+    visited = [by_id[s] for s in dict.fromkeys(ssh_map.dstate_at)]
     labels = {s.id: i for i, s in enumerate(visited)}
     places: dict[int, int] = {}
     paths: dict[int, Course] = {}
@@ -78,7 +78,7 @@ def key(ssh_map: SSHMap) -> Key:
         if s.path is not None and s.direction is not None:
             paths.setdefault(s.path, (len(paths), s.direction))
     return (
-        tuple(labels[s] for s in ssh_map.labels),
+        tuple(labels[s] for s in ssh_map.dstate_at),
         tuple(None if s.place is None else places[s.place] for s in visited),
         tuple(
             None

@@ -82,7 +82,7 @@ def moves(ssh_map: SSHMap, trace: Trace) -> Iterator[tuple]:
     slipped = {fault.step for fault in ssh_map.faults if fault.kind == "slipped"}
     for t, action in enumerate(trace.actions):
         if t not in slipped and not action.starts:
-            yield ssh_map.labels[t], action, ssh_map.labels[t + 1]
+            yield ssh_map.dstate_at[t], action, ssh_map.dstate_at[t + 1]
 
 
 def parts(ssh_map: SSHMap, trace: Trace, axioms: Collection[str]) -> dict[frozenset[int], int]:

@@ -427,7 +427,6 @@ def good(call: str, parameter: inspect.Parameter) -> Any:
         "World.named.name": "notched-rectangle",
         "ViewClusterer.k_max": 3,
         "ViewClusterer.n_init": 1,
-        "by_drive.values": trace.views,
         "difference.first": ssh_map,
         "difference.other": ssh_map,
         "evaluate.maps": solution.maps,

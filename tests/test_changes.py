@@ -135,7 +135,7 @@ def test_a_change_has_a_name_and_a_place(
 ) -> None:
     solution = solve([MONDAY, TUESDAY], Theory(changed=1.5))
     (ssh_map,) = solution.maps
-    assert ssh_map.labels == (0, 1, 2, 3, 0, 1, 2, 3)
+    assert ssh_map.dstate_at == (0, 1, 2, 3, 0, 1, 2, 3)
     (fault,) = ssh_map.faults
     assert str(fault) == SAID
     assert (fault.step, fault.place, fault.gateway, fault.cost) == (4, 0, 1, 1.5)
@@ -251,7 +251,7 @@ def test_the_beam_finds_changes_of_drives_with_displacements() -> None:
     )
     solution = solve([monday, tuesday], Theory(changed=0.5))
     ssh_map = solution.maps[0]
-    assert ssh_map.labels == tuple(range(6)) * 12
+    assert ssh_map.dstate_at == tuple(range(6)) * 12
     (fault,) = ssh_map.faults
     assert str(fault) == "the gateway south of place 0 was open on monday and closed on tuesday"
     assert solution.trace is not None

@@ -419,9 +419,9 @@ def test_only_defeasible_sides_are_excused() -> None:
 
 
 def relabel(m: SSHMap, i: int, j: int) -> SSHMap:
-    labels = list(m.labels)
+    labels = list(m.dstate_at)
     labels[i], labels[j] = labels[j], labels[i]
-    return replace(m, labels=tuple(labels))
+    return replace(m, dstate_at=tuple(labels))
 
 
 def change(m: SSHMap, dstate: int, **fields: object) -> SSHMap:
@@ -436,14 +436,14 @@ CAUSAL = CORRECT["causal"]
 MUTATIONS = {
     "labels swapped": (ONCE, relabel(ONCE.map, 2, 6), COHERENCE),
     "labels of two views swapped": (ONCE, relabel(ONCE.map, 2, 3), COHERENCE),
-    "a label too few": (ONCE, replace(ONCE.map, labels=ONCE.map.labels[:-1]), COHERENCE),
-    "a label too many": (ONCE, replace(ONCE.map, labels=(*ONCE.map.labels, 0)), COHERENCE),
+    "a label too few": (ONCE, replace(ONCE.map, dstate_at=ONCE.map.dstate_at[:-1]), COHERENCE),
+    "a label too many": (ONCE, replace(ONCE.map, dstate_at=(*ONCE.map.dstate_at, 0)), COHERENCE),
     "a label out of range": (
         ONCE,
-        replace(ONCE.map, labels=(*ONCE.map.labels[:-1], 99)),
+        replace(ONCE.map, dstate_at=(*ONCE.map.dstate_at[:-1], 99)),
         COHERENCE,
     ),
-    "no label": (ONCE, replace(ONCE.map, labels=()), COHERENCE),
+    "no label": (ONCE, replace(ONCE.map, dstate_at=()), COHERENCE),
     "a link dropped": (ONCE, replace(ONCE.map, links=ONCE.map.links[1:]), COHERENCE),
     "a link twice": (
         ONCE,
@@ -598,7 +598,7 @@ def mutants(draw: st.DrawFn) -> tuple[Case, SSHMap]:
         part = draw(
             st.sampled_from(
                 [
-                    "labels",
+                    "dstate_at",
                     "dstates",
                     "links",
                     "places",
@@ -615,9 +615,9 @@ def mutants(draw: st.DrawFn) -> tuple[Case, SSHMap]:
             m = change(
                 m, draw(st.integers(0, max(len(m.dstates) - 1, 0))), **{draw(FIELDS): draw(NUMBERS)}
             )
-        elif part == "label" and m.labels:
-            i = draw(st.integers(0, len(m.labels) - 1))
-            m = replace(m, labels=(*m.labels[:i], draw(NUMBERS), *m.labels[i + 1 :]))
+        elif part == "label" and m.dstate_at:
+            i = draw(st.integers(0, len(m.dstate_at) - 1))
+            m = replace(m, dstate_at=(*m.dstate_at[:i], draw(NUMBERS), *m.dstate_at[i + 1 :]))
         elif part == "order" and m.paths:
             i = draw(st.integers(0, len(m.paths) - 1))
             m = replace(

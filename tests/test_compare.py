@@ -355,7 +355,7 @@ def test_ids_do_not_depend_on_how_things_are_numbered(seed: int) -> None:
         ]
         other = replace(
             ssh_map,
-            labels=tuple(number[label] for label in ssh_map.labels),
+            dstate_at=tuple(number[label] for label in ssh_map.labels),
             dstates=tuple(sorted(states, key=lambda s: s.id)),
             links=tuple((number[s], action, number[x]) for s, action, x in ssh_map.links),
             paths=tuple(

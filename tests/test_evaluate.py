@@ -407,7 +407,7 @@ def test_maps_that_cannot_be_used() -> None:
     with pytest.raises(
         MapError, match=r"^maps\[0\]: labels: expected 0 to 1, the dstates of the map, got 7"
     ):
-        evaluate([replace(labelled([0, 1, 0]), labels=(0, 1, 7))], trace)
+        evaluate([replace(labelled([0, 1, 0]), dstate_at=(0, 1, 7))], trace)
     with pytest.raises(MapError, match=r"^maps\[0\]: expected an SSHMap, got 5"):
         evaluate([5], trace)  # type: ignore[list-item]
     with pytest.raises(TraceError, match=r"^trace: expected a Trace"):

@@ -75,7 +75,7 @@ SHAFT = Trace.from_steps("ababab", ["travel", UP, "travel", DOWN, "travel"])
 def test_floors_are_listed_saved_and_read(theory: Theory, tmp_path: Path) -> None:
     (ssh_map, *_) = solve(SHAFT, theory).maps
     assert ssh_map.floors == ((0, 1), (2, 3))
-    assert ssh_map.labels == (0, 1, 2, 3, 0, 1)
+    assert ssh_map.dstate_at == (0, 1, 2, 3, 0, 1)
     ssh_map.save(tmp_path / "map.json")
     read = SSHMap.load(tmp_path / "map.json")
     assert read.floors == ssh_map.floors
@@ -91,7 +91,7 @@ def test_floors_are_listed_saved_and_read(theory: Theory, tmp_path: Path) -> Non
 def test_a_lift_is_deterministic_and_leads_along_no_path() -> None:
     """The lift leads from the first b to an a. Later, it leads from this b to this a."""
     trace = Trace.from_steps("ababa", ["travel", UP, DOWN, UP])
-    assert [m.labels for m in solve(trace, Theory.causal()).maps] == [(0, 1, 2, 1, 2)]
+    assert [m.dstate_at for m in solve(trace, Theory.causal()).maps] == [(0, 1, 2, 1, 2)]
     (ssh_map, *_) = solve(trace).maps
     assert ssh_map.floors == ((0, 1), (2,))
     assert [s.path for s in ssh_map.dstates] == [0, 0, None]
@@ -103,7 +103,7 @@ def test_legs_that_meet_elsewhere_are_one_floor() -> None:
     problem = settle(trace, Theory.causal())
     (floors,) = (evidence for evidence in problem.evidence if isinstance(evidence, Floors))
     wrong = solve(trace, Theory.causal().replace(without=("other_floor",))).maps[0]
-    joined = replace(wrong, labels=(0, 1, 1, 0))
+    joined = replace(wrong, dstate_at=(0, 1, 1, 0))
     assert floors.refuse(trace, joined) == {Equality(1, 2)}
     assert floors.refuse(trace, wrong) is None
     pairs = floors.pairs(trace)
@@ -133,7 +133,7 @@ def test_each_floor_has_a_frame_of_its_own() -> None:
     )
     (ssh_map, *_) = solve(trace).maps
     assert ssh_map.floors == ((0, 1), (2, 3))
-    assert ssh_map.labels == (0, 1, 2, 3, 0, 1)
+    assert ssh_map.dstate_at == (0, 1, 2, 3, 0, 1)
 
 
 def test_actions_that_slip_are_refused_with_lifts() -> None:
@@ -202,7 +202,7 @@ def test_the_map_of_a_simulated_tower_is_true(theory: Theory) -> None:
     ssh_map = solution.maps[0]
     states = {step.truth["dstate"] for step in trace.steps}
     assert len(ssh_map.dstates) == len(states)
-    pairs = {(s.truth["dstate"], k) for s, k in zip(trace.steps, ssh_map.labels, strict=True)}
+    pairs = {(s.truth["dstate"], k) for s, k in zip(trace.steps, ssh_map.dstate_at, strict=True)}
     assert len(pairs) == len(states)
     assert len(ssh_map.floors) == 2
 
@@ -224,7 +224,7 @@ def test_signs_at_the_lifts_tell_three_floors_apart() -> None:
         assert solution.status is Status.OPTIMAL
         (ssh_map,) = solution.maps
         assert len(ssh_map.floors) == floors
-    labels = {(dstate, k) for (dstate, _), k in zip(truth, ssh_map.labels, strict=True)}
+    labels = {(dstate, k) for (dstate, _), k in zip(truth, ssh_map.dstate_at, strict=True)}
     assert len(labels) == len(ssh_map.dstates) == 60
 
 

@@ -164,8 +164,10 @@ def test_maps_of_logs_obey_what_a_person_says(
     building = str(shutil.copytree(folder, tmp_path / "building"))
     trace, before = Trace.load(folder / "trace.jsonl"), Solution.load(folder / "maps.json").maps[0]
     start = starts_of(trace)[0]
-    joined = next(t for t in range(start, len(trace)) if before.labels[t] in before.labels[:start])
-    first = before.labels.index(before.labels[joined])
+    joined = next(
+        t for t in range(start, len(trace)) if before.dstate_at[t] in before.dstate_at[:start]
+    )
+    first = before.dstate_at.index(before.dstate_at[joined])
     pair = f"monday:{first},tuesday:{joined - start}"
     assert main(["name", building, "monday:0", "kitchen"]) == 0
     assert main(["correct", building, "--different", pair]) == 0
@@ -179,7 +181,7 @@ def test_maps_of_logs_obey_what_a_person_says(
     solution = Solution.load(Path(building) / "maps.json")
     assert solution.theory.different == ((first, joined),)
     ssh_map = solution.maps[0]
-    assert ssh_map.labels[first] != ssh_map.labels[joined]
+    assert ssh_map.dstate_at[first] != ssh_map.dstate_at[joined]
     assert ssh_map.name_of("place", ssh_map.place_of(0)) == "kitchen"
     assert main(["map", *logs, *settings]) == 0
     assert "2 logs: done already" in capsys.readouterr().out

@@ -134,7 +134,7 @@ def moved(ssh_map: SSHMap, words: Sequence[str]) -> SSHMap:
     ends, here = {(s, a): x for s, a, x in ssh_map.links}, ssh_map.labels[-1]
     for action in words:
         here = ends[here, action]
-    return replace(ssh_map, labels=(here,))
+    return replace(ssh_map, dstate_at=(here,))
 
 
 def least_worst(maps: Sequence[SSHMap]) -> int:

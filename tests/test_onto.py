@@ -118,13 +118,13 @@ def test_a_drive_that_contradicts_the_map_is_refused() -> None:
     tuesday = Trace.from_steps("bcb", ["on", "back"], name="tuesday")
     theory = Theory.causal()
     standing = solve(monday, theory)
-    assert standing[0].labels == (0, 1, 2, 1)
-    assert solve(tuesday, onto=standing)[0].labels == (0, 1, 2, 1, 1, 2, 1)
+    assert standing[0].dstate_at == (0, 1, 2, 1)
+    assert solve(tuesday, onto=standing)[0].dstate_at == (0, 1, 2, 1, 1, 2, 1)
     wrong = Trace.from_steps("cbd", ["back", "on"], name="tuesday")
     sure = theory.replace(same=[(2, 4)])  # the two steps that show c
     with pytest.raises(SolverError, match=r"got tuesday: .*; solve all drives together"):
         solve(wrong, sure, onto=standing)
-    assert solve([monday, wrong], sure)[0].labels == (0, 1, 2, 3, 2, 3, 4)
+    assert solve([monday, wrong], sure)[0].dstate_at == (0, 1, 2, 3, 2, 3, 4)
 
 
 def test_a_map_without_its_trace_does_not_stand(tmp_path: Path) -> None:
@@ -146,4 +146,4 @@ def test_a_digest_has_each_link_once() -> None:
     assert digest.trace.views == ("a", "b", "a")
     assert digest.labels == (0, 1, 0)
     short = replace(long[:7], name="short")
-    assert solve(short, onto=standing)[0].labels == (0, 1) * 50 + (0, 1, 0, 1, 0, 1, 0)
+    assert solve(short, onto=standing)[0].dstate_at == (0, 1) * 50 + (0, 1, 0, 1, 0, 1, 0)

@@ -536,7 +536,7 @@ def test_a_map_that_breaks_an_axiom_is_an_internal_error() -> None:
 
     def wrong(self: StepEngine, model: object) -> object:
         right = found(self, model)  # type: ignore[arg-type]
-        return replace(right, map=replace(right.map, labels=(0,) * len(right.map.labels)))
+        return replace(right, map=replace(right.map, dstate_at=(0,) * len(right.map.labels)))
 
     with (
         patch.object(StepEngine, "_read", wrong),
@@ -557,7 +557,7 @@ def test_a_replayed_map_that_breaks_an_axiom_is_an_internal_error_while_a_robot_
 
     def wrong(self: ReplayedMap) -> SSHMap:
         found = right(self)
-        return replace(found, labels=(0,) * len(found.labels))
+        return replace(found, dstate_at=(0,) * len(found.labels))
 
     with (
         patch.object(ReplayedMap, "map", wrong),

@@ -168,10 +168,10 @@ def test_only_returns_that_end_later_are_asked_about_once_a_map_was_accepted() -
     size = next(
         n
         for n in range(2, len(trace))
-        if evidence.refuse(trace.prefix(n + 1), replace(wrong, labels=wrong.labels[: n + 1]))
+        if evidence.refuse(trace.prefix(n + 1), replace(wrong, dstate_at=wrong.labels[: n + 1]))
     )
     for n in range(2, size + 2):
-        prefix, ssh_map = trace.prefix(n), replace(wrong, labels=wrong.labels[:n])
+        prefix, ssh_map = trace.prefix(n), replace(wrong, dstate_at=wrong.labels[:n])
         grown = evidence.refuse(prefix, ssh_map, since=n - 1)
         assert grown == Returns(evidence, prefix).refused_together(ssh_map)
         assert (grown is None) == (n <= size)

@@ -482,7 +482,10 @@ def test_mutated_maps_fail_the_check() -> None:
         labels = list(ssh_map.labels)
         i, j = next((i, j) for i in range(len(labels)) for j in range(i) if labels[i] != labels[j])
         labels[i], labels[j] = labels[j], labels[i]
-        wrong = [replace(ssh_map, labels=tuple(labels)), replace(ssh_map, links=ssh_map.links[1:])]
+        wrong = [
+            replace(ssh_map, dstate_at=tuple(labels)),
+            replace(ssh_map, links=ssh_map.links[1:]),
+        ]
         for k, path in enumerate(ssh_map.paths):
             if len(path.order) > 1:
                 turned = replace(path, order=path.order[::-1])

@@ -18,7 +18,7 @@ from strategies import theories, traces
 from test_property import agree, checker_rejects_foreign_maps
 from together import of_mazes, of_worlds, report_of_beams
 
-from ssh_abduction import Localiser, OnlineMapper, Solution, Theory, Trace, solve
+from ssh_abduction import Localiser, OnlineMapper, Solution, SSHMap, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.misfit import misfit
 from ssh_abduction.cli import main
@@ -28,7 +28,6 @@ from ssh_abduction.data import (
     MapError,
     Odometry,
     TraceError,
-    by_drive,
     drives_of,
     together,
 )
@@ -102,7 +101,10 @@ def test_drives_are_joined_and_split() -> None:
         ("tuesday", 4, 7),
         ("again", 7, 8),
     ]
-    assert by_drive(joint, joint.views)["tuesday"] == ("b", "c", "d")
+    ssh_map = solve(joint).maps[0]
+    assert [*map(len, ssh_map.labels)] == [4, 3, 1]
+    assert sum(ssh_map.labels, ()) == ssh_map.dstate_at
+    assert SSHMap.from_dict(ssh_map.to_dict()).labels == ssh_map.labels
     assert joint[5:].drive == "tuesday"
     assert [drive.name for drive in drives_of(joint[5:])] == ["tuesday", "again"]
     assert drives_of(joint.prefix(4)) == drives_of(joint)[:1]
@@ -202,7 +204,7 @@ def test_the_first_step_of_a_drive_has_no_displacement_and_a_new_name() -> None:
 def test_drives_that_share_a_place_have_one_map() -> None:
     """Tuesday adds nothing to the map of Monday. Nothing links the end of Monday to Tuesday."""
     solution = solve([MONDAY, TUESDAY])
-    assert [ssh_map.labels for ssh_map in solution.maps] == [(0, 1, 2, 3, 1, 2, 3)]
+    assert [ssh_map.dstate_at for ssh_map in solution.maps] == [(0, 1, 2, 3, 1, 2, 3)]
     (ssh_map,) = solution.maps
     assert len(ssh_map.pieces) == 1
     assert {action for _, action, _ in ssh_map.links} == {"travel", "around"}
@@ -341,7 +343,9 @@ def test_a_narrow_beam_finds_a_joint_map_as_cheap_as_the_true_one(known: truth.K
         return 8 * sum(len(set(of)) for of in names) + weighing.of_course(*names) / 2
 
     beam = Beam(problem, Log(problem.trace, problem.theory, problem.pairs), 1)
-    found = [nats(m.labels, [m.dstates[label].place for label in m.labels]) for m in beam.maps()]
+    found = [
+        nats(m.dstate_at, [m.dstates[label].place for label in m.dstate_at]) for m in beam.maps()
+    ]
     assert min(found) <= nats(known.dstates, known.places) + 1e-6
 
 

@@ -14,7 +14,7 @@ from ssh_abduction.data.trace import View
 
 def labels_are_dstates(m: Reading) -> Found:
     """Check that each step has a label, and that each label is the id of a dstate."""
-    steps, labels = len(m.trace), len(m.map.labels)
+    steps, labels = len(m.trace), len(m.map.dstate_at)
     if steps != labels:
         yield (
             [min(steps, labels)] if labels < steps else [],
@@ -150,7 +150,7 @@ def frames_start_at_first_visit(m: Reading) -> Found:
     if not {"one_heading", "gateway_heading"} & m.axioms:
         return
     for p, i in m.place_seen.items():
-        s = m.states[m.map.labels[i]]
+        s = m.states[m.map.dstate_at[i]]
         if heading := s.heading if m.theory.star == "gateways" else heading_of(s):
             yield (
                 [i],

@@ -18,7 +18,7 @@ from ssh_abduction.data.star import Star
 def one_star(m: Reading) -> Found:
     """Check that all stars seen at a dstate show the same gateways, in the same directions."""
     seen: dict[int, dict[Star, int]] = {}
-    for t, (label, step) in enumerate(zip(m.map.labels, m.trace.steps, strict=False)):
+    for t, (label, step) in enumerate(zip(m.map.dstate_at, m.trace.steps, strict=False)):
         stars, star = seen.setdefault(label, {}), step.gateways or Star(())
         for other, i in stars.items() if star not in stars else ():
             if not _may_show_the_same(other, star):
@@ -32,7 +32,7 @@ def one_star(m: Reading) -> Found:
 
 def asserted(m: Reading) -> Found:
     """Check that the map satisfies each assertion of the theory about a pair of steps."""
-    labels, theory = m.map.labels, m.theory
+    labels, theory = m.map.dstate_at, m.theory
     told = [
         ("one dstate", theory.same),
         ("different dstates", theory.different),
@@ -81,7 +81,7 @@ def one_pose(m: Reading) -> Found:
 
 def closure(m: Reading) -> Found:
     """Check that each closure agrees with one pose per dstate and one position per place."""
-    labels, odometry = m.map.labels, m.trace.odometry or Odometry()
+    labels, odometry = m.map.dstate_at, m.trace.odometry or Odometry()
     for match in m.trace.closures:
         i, j = match.first, match.last
         if j >= len(labels):

@@ -59,7 +59,7 @@ def _what_is_wrong(m: Reading, fault: Fault) -> str | None:
     without_stars = kind == "misseen" and m.theory.star not in ("pattern", "frame")
     if not _is_allowed(m, kind) or without_stars:
         return f"The map disbelieves step {i} ({kind}), which the theory does not allow."
-    step = m.trace.steps[i] if 0 <= i < min(len(m.trace), len(m.map.labels)) else None
+    step = m.trace.steps[i] if 0 <= i < min(len(m.trace), len(m.map.dstate_at)) else None
     if (
         step is None
         or (kind == "misread" and step.view is None)
@@ -68,7 +68,7 @@ def _what_is_wrong(m: Reading, fault: Fault) -> str | None:
     ):
         return f"The map disbelieves step {i} ({kind}), where there is nothing to disbelieve."
     if kind == "misread":
-        s, seen = m.states.get(m.map.labels[i]), step.view
+        s, seen = m.states.get(m.map.dstate_at[i]), step.view
         if fault.seen != seen or (s and fault.expected != s.view) or seen == fault.expected:
             return (
                 f"The map says that {fault}, but the trace has {seen!r} there, and the dstate "

@@ -180,8 +180,8 @@ def _returns(
         Returns: first step, last step, and degrees of freedom.
     """
     place = {s.id: s.place for s in ssh_map.dstates}
-    size = min(len(trace), len(ssh_map.labels))
-    labels = ssh_map.labels[:size]
+    size = min(len(trace), len(ssh_map.dstate_at))
+    labels = ssh_map.dstate_at[:size]
     arrived = [t for t in range(size) if t == 0 or trace.actions[t - 1].kind != "turn"]
     groups: dict[tuple[int, int], list[int]] = defaultdict(list)
     for t in arrived if of_arrivals else range(size):

@@ -188,7 +188,7 @@ class _Joining:
 
     def joins(self) -> tuple[Join, ...]:
         """Collect the joins, as `joins_by_minimality` says."""
-        labels, found = self.map.labels, list[Join]()
+        labels, found = self.map.dstate_at, list[Join]()
         at = [self.map.dstates[label].place for label in labels]
         last: dict[int, int] = {}  # the last step at each dstate
         last_at: dict[int | None, int] = {}  # the last step of the last visit to each place
@@ -221,7 +221,7 @@ class _Joining:
         """Whether two steps are one dstate by what is known so far, if they are so in the map."""
         if second in self.asserted:
             return True
-        if self.map.dstates[self.map.labels[second]].place is None:
+        if self.map.dstates[self.map.dstate_at[second]].place is None:
             return False
         # Both headings, or both courses, are known relative to each other: so they are equal.
         return self.places.are_one(first, second) and (
@@ -229,5 +229,5 @@ class _Joining:
         )
 
     def _along_one_path(self, first: int, second: int) -> bool:
-        on_path = self.map.dstates[self.map.labels[second]].path is not None
+        on_path = self.map.dstates[self.map.dstate_at[second]].path is not None
         return on_path and self.courses.are_one(first, second)

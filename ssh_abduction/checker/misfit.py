@@ -86,10 +86,10 @@ def false_costs(
         return
     if len(trace) > LONGEST:
         return
-    places = [maps[0].dstates[label].place for label in maps[0].labels]
-    here = [p if p is not None else s for p, s in zip(places, maps[0].labels, strict=True)]
+    places = [maps[0].dstates[label].place for label in maps[0].dstate_at]
+    here = [p if p is not None else s for p, s in zip(places, maps[0].dstate_at, strict=True)]
     of_map: Faults = [(fault.kind, fault.step) for fault in maps[0].faults]
-    courses = [("weighed.nats", nats, maps[0].labels, here, len(maps[0].places), of_map)]
+    courses = [("weighed.nats", nats, maps[0].dstate_at, here, len(maps[0].places), of_map)]
     for i, rival in enumerate(rivals[:RIVALS] if isinstance(rivals, list) else ()):
         at = rival.get("places") or rival.get("dstates")
         there = len(set(at)) if rival.get("places") else 0

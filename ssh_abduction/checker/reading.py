@@ -54,7 +54,7 @@ class Reading:
         self._read()
 
     def _read(self) -> None:
-        labels, with_stars = self.map.labels, self.theory.star in ("pattern", "frame")
+        labels, with_stars = self.map.dstate_at, self.theory.star in ("pattern", "frame")
         # whether the theory allows these faults is checked elsewhere
         doubted = {(fault.kind, fault.step) for fault in self.map.faults}
         for i, (label, step) in enumerate(zip(labels, self.trace.steps, strict=False)):

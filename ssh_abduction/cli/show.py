@@ -32,7 +32,7 @@ def add_parser(verbs: Verbs) -> None:
 def run(options: argparse.Namespace) -> int:
     data, where = read_json(options.maps), str(options.maps)
     found = maps_of(data, where)
-    steps = len(found[0].labels) if found else 0
+    steps = len(found[0].dstate_at) if found else 0
     drives = drives_in(FieldReader(where), data, steps) if found else ()
     maps = named_beside(found, drives, options.maps)
     check_number(options.map, maps, options.maps)

@@ -395,7 +395,7 @@ def _lines(
     if solution.cost is None:
         if solution.partial:
             yield (
-                f"\nbest map of the first {len(solution.partial.labels)} "
+                f"\nbest map of the first {len(solution.partial.dstate_at)} "
                 f"steps\n{describe(solution.partial)}"
             )
         return

@@ -106,7 +106,7 @@ class Standing:
         if found is None:
             return "place", self.step(text)
         kind, number = _KINDS.get(found["kind"], found["kind"]), int(found["number"])
-        here = (t for t, s in enumerate(self.map.labels) if self._of(kind, s) == number)
+        here = (t for t, s in enumerate(self.map.dstate_at) if self._of(kind, s) == number)
         first = next(here, None)
         if first is None:
             raise MapError(
@@ -144,7 +144,7 @@ class Standing:
                 f"gateway: expected a place and a direction such as 'p4 north' or "
                 f"'monday:12 left', got {brief(text)}"
             )
-        label = self.map.labels[step_of(self.drives, step)]
+        label = self.map.dstate_at[step_of(self.drives, step)]
         if way not in COMPASS:
             return self._seen_from(label, self._rounded(direction(way), text))
         drawn = self._drawn(self.map.dstates[label].place)
@@ -175,7 +175,9 @@ class Standing:
             if s.place == here.place and s.heading is not None and here.heading is not None
         } or {label: way}
         return tuple(
-            (step_name(self.drives, t), ways[s]) for t, s in enumerate(self.map.labels) if s in ways
+            (step_name(self.drives, t), ways[s])
+            for t, s in enumerate(self.map.dstate_at)
+            if s in ways
         )
 
     def _drawn(self, place: int | None) -> dict[int, float]:

@@ -227,8 +227,8 @@ def _with_beliefs(followed: Trace, file: str, data: Any) -> Run:
             f"{named(file)}: beliefs: expected {len(followed)}, one for each step of the run, got "
             f"{len(beliefs)}; name that run with --run"
         )
-    chosen, labels = maps[number - 1], maps[number - 1].renumbered().labels
-    visited = dict.fromkeys([*chosen.labels, *range(len(chosen.dstates))])
+    chosen, labels = maps[number - 1], maps[number - 1].renumbered().dstate_at
+    visited = dict.fromkeys([*chosen.dstate_at, *range(len(chosen.dstates))])
     new = {s: i for i, s in enumerate(visited)}  # the page numbers dstates by first visit
     try:
         renumbered = [
@@ -240,7 +240,7 @@ def _with_beliefs(followed: Trace, file: str, data: Any) -> Run:
             f"{named(file)}: probabilities: expected pairs [dstate, probability], got something "
             "else; localise again"
         ) from None
-    return Run(followed, lambda ssh_map: renumbered if ssh_map.labels == labels else None)
+    return Run(followed, lambda ssh_map: renumbered if ssh_map.dstate_at == labels else None)
 
 
 def _serve(

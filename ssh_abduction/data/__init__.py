@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from ssh_abduction.data.closure import Closure
     from ssh_abduction.data.corrections import Corrections, Naming, Passage, Said
     from ssh_abduction.data.corrections_file import load_corrections, save_corrections
-    from ssh_abduction.data.drives import Drive, by_drive, drives_of, together
+    from ssh_abduction.data.drives import Drive, drives_of, together
     from ssh_abduction.data.errors import (
         AbductionError,
         LocaliserError,
@@ -32,7 +32,7 @@ _HOMES = {  # module: the names that this package exports from it
     "closure": ("Closure",),
     "corrections": ("Corrections", "Naming", "Passage", "Said"),
     "corrections_file": ("load_corrections", "save_corrections"),
-    "drives": ("Drive", "by_drive", "drives_of", "together"),
+    "drives": ("Drive", "drives_of", "together"),
     "errors": (
         "AbductionError",
         "LocaliserError",
@@ -87,7 +87,6 @@ __all__ = [
     "TheoryError",
     "Trace",
     "TraceError",
-    "by_drive",
     "drives_of",
     "load_corrections",
     "save_corrections",

@@ -302,7 +302,7 @@ class Corrections:
         checked_map(ssh_map)
         found: dict[tuple[str, int], str] = {}
         for naming in self.known_in(drives).names:
-            dstate = ssh_map.dstates[ssh_map.labels[self._number(drives, naming.step)]]
+            dstate = ssh_map.dstates[ssh_map.dstate_at[self._number(drives, naming.step)]]
             region = region_of(ssh_map.regions, dstate.place)
             number = {"place": dstate.place, "path": dstate.path, "region": region}[naming.kind]
             if number is not None:

@@ -10,8 +10,6 @@ robot: nothing is known of how the first step of a drive relates to any step of 
 >>> joint = together([monday, tuesday])
 >>> joint.views, starts_of(joint), [drive.name for drive in drives_of(joint)]
 (('a', 'b', 'b', 'a'), (2,), ['monday', 'tuesday'])
->>> by_drive(joint, joint.views)
-{'monday': ('a', 'b'), 'tuesday': ('b', 'a')}
 """
 
 from __future__ import annotations
@@ -25,7 +23,7 @@ from dataclasses import asdict, dataclass, field, replace
 from itertools import accumulate, pairwise
 from pathlib import Path
 from statistics import median
-from typing import Any, TypeVar
+from typing import Any
 
 from ssh_abduction.data.action import Action
 from ssh_abduction.data.checks import a_list, a_text, all_instances
@@ -36,8 +34,6 @@ from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.star import is_four
 from ssh_abduction.data.step import Step
 from ssh_abduction.data.trace import Trace, checked_trace
-
-T = TypeVar("T")
 
 SEEN = "star_seen"  # the field of a step that keeps the star before a person corrected it
 # The fields of a step that a solver reads.
@@ -120,26 +116,6 @@ def _fingerprint(steps: Sequence[Step]) -> str:
     return hashlib.sha256("\n".join(map(json_line, lines)).encode()).hexdigest()[:16]
 
 
-def by_drive(trace: Trace, values: Sequence[T]) -> dict[str, tuple[T, ...]]:
-    """Split values, one for each step of a trace, by drives.
-
-    Args:
-        trace: The trace.
-        values: One value for each step, such as the labels of a map.
-
-    Returns:
-        For the name of each drive, the values of its steps.
-
-    Raises:
-        TraceError: There is not one value for each step.
-    """
-    checked_trace(trace)
-    listed = a_list("values", values, TraceError)
-    if len(listed) != len(trace):
-        raise TraceError(f"values: expected {len(trace)}, one a step, got {len(listed)}")
-    return {drive.name: tuple(listed[drive.first : drive.stop]) for drive in drives_of(trace)}
-
-
 def step_named(trace: Trace, name: str) -> int:
     """Return the number of a step, such as "14", or "tuesday:14" for step 14 of a drive.
 
@@ -182,7 +158,7 @@ def joined_drives(drives: Sequence[Drive], ssh_map: SSHMap) -> tuple[tuple[str, 
     piece_of = {s: i for i, piece in enumerate(ssh_map.pieces) for s in piece}
     groups: list[tuple[set[int], list[str]]] = []  # the pieces and the drives of each group
     for drive in drives:
-        pieces = {piece_of[label] for label in ssh_map.labels[drive.first : drive.stop]}
+        pieces = {piece_of[label] for label in ssh_map.dstate_at[drive.first : drive.stop]}
         names = [drive.name]
         for group in [group for group in groups if group[0] & pieces]:
             groups.remove(group)

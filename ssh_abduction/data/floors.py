@@ -52,7 +52,7 @@ def with_floors(ssh_map: SSHMap, trace: Trace) -> SSHMap:
     stretches = stretches_of(trace)
     floor = {stretch: stretch for stretch in stretches}
     first: dict[tuple[str, int], int] = {}  # the first stretch at each dstate and place
-    for label, stretch in zip(checked_map(ssh_map).labels, stretches, strict=False):
+    for label, stretch in zip(checked_map(ssh_map).dstate_at, stretches, strict=False):
         place = ssh_map.dstates[label].place
         for spot in (("dstate", label), *(() if place is None else (("place", place),))):
             one, other = floor[first.setdefault(spot, stretch)], floor[stretch]
@@ -60,7 +60,7 @@ def with_floors(ssh_map: SSHMap, trace: Trace) -> SSHMap:
                 floor[known] = one if floor[known] == other else floor[known]
     number: dict[int, int] = {}
     found: dict[int, int] = {}
-    for label, stretch in zip(ssh_map.labels, stretches, strict=False):
+    for label, stretch in zip(ssh_map.dstate_at, stretches, strict=False):
         found.setdefault(label, number.setdefault(floor[stretch], len(number)))
     return replace(
         ssh_map, dstates=tuple(replace(s, floor=found.get(s.id)) for s in ssh_map.dstates)

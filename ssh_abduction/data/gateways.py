@@ -96,7 +96,7 @@ def sights_of(
     seen: list[Sight | None] = []
     shown: set[int] = set()
     places: set[int | None] = set()
-    for i, (label, step) in enumerate(zip(ssh_map.labels, trace.steps, strict=False)):
+    for i, (label, step) in enumerate(zip(ssh_map.dstate_at, trace.steps, strict=False)):
         s, star = states.get(label), step.gateways or Star(())
         if s and (label, star) not in sights:
             first = s.place not in places

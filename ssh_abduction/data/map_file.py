@@ -183,7 +183,8 @@ def map_fields(data: Any, where: str) -> dict[str, Any]:
             )
     known = set(ids)
     return {
-        "labels": labels,
+        "dstate_at": labels,
+        "starts": _starts(read, record, len(labels)),
         "dstates": dstates,
         "links": read.each(record, "links", lambda x, name: _link(read, x, known, name)),
         "places": places,
@@ -198,6 +199,14 @@ def map_fields(data: Any, where: str) -> dict[str, Any]:
         "regions": _regions(read, record, {*places}, {*path_ids}),
         "names": read.each(record, "names", lambda x, name: _name(read, x, name), optional=True),
     }
+
+
+def _starts(read: FieldReader, record: Mapping[str, Any], steps: int) -> tuple[int, ...]:
+    """Convert and check the steps at which drives start, besides step 0."""
+    starts = read.each(record, "starts", read.integer, optional=True)
+    if list(starts) != sorted({*starts}) or not all(0 < t < steps for t in starts):
+        raise read.wrong("starts", f"steps from 1 to {steps - 1} in order", list(starts))
+    return starts
 
 
 def _check_used(where: str, name: str, known: tuple[int, ...], used: set[int | None]) -> None:

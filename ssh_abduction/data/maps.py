@@ -20,6 +20,7 @@ import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.data.checks import a_whole_number, all_instances, an_instance, one_of
@@ -68,7 +69,7 @@ class SSHMap:
     """A map: one explanation of a trace.
 
     Attributes:
-        labels: The id of the dstate of each step.
+        dstate_at: The id of the dstate of each step of the trace.
         dstates: The dstates (distinctive states: places and directions). The index is the id.
         links: For each action tried at a dstate: the id of the dstate, the name of the action, and
             the id of the dstate that the action leads to.
@@ -81,9 +82,10 @@ class SSHMap:
         regions: Sets of places that directed paths bound, or that one place cuts off; the largest
             first. None if they were not derived (`ssh_abduction.solver.find_regions`).
         names: The names that a person gave to places, paths and regions.
+        starts: The steps, besides step 0, at which a drive starts.
     """
 
-    labels: tuple[int, ...]
+    dstate_at: tuple[int, ...]
     dstates: tuple[DState, ...]
     links: tuple[tuple[int, str, int], ...]
     places: tuple[int, ...] = ()
@@ -93,6 +95,7 @@ class SSHMap:
     faults: tuple[Fault, ...] = ()
     regions: tuple[Region, ...] | None = field(default=None, compare=False, repr=False)
     names: tuple[Name, ...] = field(default=(), compare=False)
+    starts: tuple[int, ...] = field(default=(), compare=False)
 
     def __repr__(self) -> str:
         parts = [counted(len(self.dstates), "dstates")]
@@ -100,7 +103,18 @@ class SSHMap:
             parts += [counted(len(self.places), "places"), counted(len(self.paths), "paths")]
         if self.faults:
             parts.append(counted(len(self.faults), "faults"))
-        return f"<SSHMap: {', '.join(parts)}; {counted(len(self.labels), 'steps')}>"
+        return f"<SSHMap: {', '.join(parts)}; {counted(len(self.dstate_at), 'steps')}>"
+
+    @property
+    def labels(self) -> tuple[Any, ...]:
+        """The id of the dstate of each step: one sequence for each drive if there are several.
+
+        The map of one drive has one flat sequence, which is `dstate_at`.
+        """
+        if not self.starts:
+            return self.dstate_at
+        bounds = pairwise([0, *self.starts, len(self.dstate_at)])
+        return tuple(self.dstate_at[first:stop] for first, stop in bounds)
 
     @property
     def id(self) -> str:
@@ -114,7 +128,7 @@ class SSHMap:
             (fault.step, fault.kind, fault.seen, fault.expected, *_changed(fault))
             for fault in whole.faults
         ]
-        compared = [whole.labels, dstates, whole.links, whole.places, faults]
+        compared = [whole.dstate_at, dstates, whole.links, whole.places, faults]
         text = json.dumps(compared, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()[:ID_LENGTH]
 
@@ -142,12 +156,12 @@ class SSHMap:
         Raises:
             MapError: If the trace has no such step.
         """
-        if not is_whole(step) or not 0 <= step < len(self.labels):
+        if not is_whole(step) or not 0 <= step < len(self.dstate_at):
             raise MapError(
-                f"step: expected 0 to {len(self.labels) - 1}, got {brief(step)}; "
+                f"step: expected 0 to {len(self.dstate_at) - 1}, got {brief(step)}; "
                 f"name a step of the trace that was mapped"
             )
-        return self.dstates[self.labels[step]].place
+        return self.dstates[self.dstate_at[step]].place
 
     def right_of(self, path: int, direction: int) -> tuple[int, ...]:
         """Return the places that are known to lie right of a path in a direction.
@@ -253,7 +267,7 @@ class SSHMap:
         Direction +1 of each path becomes the one in which the robot first faced along it.
         """
         visited = [
-            self.dstates[s] for s in dict.fromkeys([*self.labels, *range(len(self.dstates))])
+            self.dstates[s] for s in dict.fromkeys([*self.dstate_at, *range(len(self.dstates))])
         ]
         number = {s.id: i for i, s in enumerate(visited)}
         place = _numbered([*(s.place for s in visited), *self.places])
@@ -286,7 +300,7 @@ class SSHMap:
         regions, region = renumbered(self.regions or (), place, path, flipped)
         new = {"place": place, "path": path, "region": region}
         return SSHMap(
-            labels=tuple(number[s] for s in self.labels),
+            dstate_at=tuple(number[s] for s in self.dstate_at),
             dstates=dstates,
             links=tuple(sorted({(number[s], action, number[x]) for s, action, x in self.links})),
             places=tuple(sorted(place.values())),
@@ -296,6 +310,7 @@ class SSHMap:
             faults=tuple(replace(fault, place=place.get(fault.place)) for fault in self.faults),
             regions=None if self.regions is None else regions,
             names=tuple(replace(n, id=new[n.kind].get(n.id, n.id)) for n in self.names),
+            starts=self.starts,
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -314,13 +329,15 @@ class SSHMap:
         ]
         data: dict[str, Any] = {
             "id": self.id,
-            "labels": list(self.labels),
+            "labels": list(self.dstate_at),
             "dstates": dstates,
             "links": [list(link) for link in self.links],
             "places": list(self.places),
             "paths": [{"id": p.id, "order": list(p.order)} for p in self.paths],
         }
         # Fields that most maps lack are written only if they are there.
+        if self.starts:
+            data["starts"] = list(self.starts)
         if len(pieces := self.pieces) > 1:
             data["pieces"] = [list(piece) for piece in pieces]
         if self.names:
@@ -438,13 +455,13 @@ def check_of_trace(maps: Iterable[SSHMap], trace: Trace, where: str, *, views: b
         MapError: If a map belongs to another trace.
     """
     for i, ssh_map in enumerate(maps):
-        if len(ssh_map.labels) != len(trace):
+        if len(ssh_map.dstate_at) != len(trace):
             raise MapError(
                 f"{where}: maps[{i}].labels: expected {len(trace)}, one for each step of the "
-                f"trace, got {len(ssh_map.labels)}; the maps are of another trace"
+                f"trace, got {len(ssh_map.dstate_at)}; the maps are of another trace"
             )
         misread = {fault.step for fault in ssh_map.faults}
-        for t, (step, label) in enumerate(zip(trace.steps, ssh_map.labels, strict=True)):
+        for t, (step, label) in enumerate(zip(trace.steps, ssh_map.dstate_at, strict=True)):
             seen, there = step.view, ssh_map.dstates[label].view
             if views and seen is not None and seen != there and t not in misread:
                 raise MapError(

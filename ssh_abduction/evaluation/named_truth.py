@@ -300,12 +300,12 @@ def checked_map(ssh_map: object, where: str, trace: Trace) -> SSHMap:
             f"{where}: expected an SSHMap, got {brief(ssh_map)}; "
             "take the maps of a solution, or SSHMap.load"
         )
-    if len(ssh_map.labels) != len(trace):
+    if len(ssh_map.dstate_at) != len(trace):
         raise MapError(
             f"{where}: labels: expected {len(trace)}, one for each step of the trace, "
-            f"got {len(ssh_map.labels)}; solve this trace"
+            f"got {len(ssh_map.dstate_at)}; solve this trace"
         )
-    if strange := set(ssh_map.labels) - set(range(len(ssh_map.dstates))):
+    if strange := set(ssh_map.dstate_at) - set(range(len(ssh_map.dstates))):
         raise MapError(
             f"{where}: labels: expected 0 to {len(ssh_map.dstates) - 1}, the dstates of the map, "
             f"got {brief(min(strange))}; mend it"
@@ -315,7 +315,7 @@ def checked_map(ssh_map: object, where: str, trace: Trace) -> SSHMap:
 
 def _evaluated(ssh_map: SSHMap, truth: _Truth) -> MapEvaluation:
     """Measure the accuracy of a map."""
-    at = [ssh_map.dstates[label] for label in ssh_map.labels]
+    at = [ssh_map.dstates[label] for label in ssh_map.dstate_at]
     dstates = _Sort([s.id for s in at], truth.dstates)
     places = _Sort([s.place for s in at], truth.places)
     paths = _Sort([s.path for s in at], truth.paths)

@@ -420,7 +420,7 @@ def _evaluated(ssh_map: SSHMap, visit: Steps, places: Verdicts, dstates: Verdict
         places: The verdicts on pairs of visits, (v, v).
         dstates: The verdicts on pairs of steps, (n, n).
     """
-    at = [ssh_map.dstates[label] for label in ssh_map.labels]
+    at = [ssh_map.dstates[label] for label in ssh_map.dstate_at]
     one = np.equal.outer(*[[s.id for s in at]] * 2)
     if not ssh_map.places:
         return MapVisits(None, _joined(one, dstates, len(ssh_map.dstates)))

@@ -310,7 +310,7 @@ class PairQuestion(Question[PairExplanation]):
         search = self._solved(self.trace, self.theory, 1 if settled else self._maps, seconds)
         for found in search:
             self._best = self._best or (found, search.cost, search.nats)
-            one = found.labels[self.first] == found.labels[self.second]
+            one = found.dstate_at[self.first] == found.dstate_at[self.second]
             side = self._sides[one]
             if search.status is Status.OPTIMAL:
                 self._minimum = search.cost

@@ -237,7 +237,7 @@ def _path_side(readings: list[Reading], place: int, path: int) -> PathSide:
     along = next((t, s.direction) for t, s in first.visited if s.path == path)
     agree = 1
     for m in others:
-        there, facing = m.map.place_of(at), m.states[m.map.labels[along[0]]]
+        there, facing = m.map.place_of(at), m.states[m.map.dstate_at[along[0]]]
         if there is None or facing.path is None or facing.direction is None:
             continue
         course = facing.path, facing.direction * (along[1] or 1)

@@ -64,14 +64,14 @@ def labels_of(
         )
     if choose is not None and (not is_whole(choose) or not 0 <= choose < len(maps)):
         raise LearnerError(f"map: expected an index from 0 to {len(maps) - 1}, got {brief(choose)}")
-    labels = np.array(maps[choose or 0].labels, np.intp)
+    labels = np.array(maps[choose or 0].dstate_at, np.intp)
     if choose is not None:
         return labels
     for i, ssh_map in enumerate(maps):
-        if len(ssh_map.labels) != len(labels):
+        if len(ssh_map.dstate_at) != len(labels):
             raise LearnerError(
                 f"maps: expected maps of one trace, {len(labels)} labels each, "
-                f"got {len(ssh_map.labels)} in map {i + 1}; solve one trace"
+                f"got {len(ssh_map.dstate_at)} in map {i + 1}; solve one trace"
             )
     # Maps number their dstates differently. So compare dstates by the first step at each.
     first = [_first_steps(ssh_map) for ssh_map in maps]
@@ -134,7 +134,7 @@ def fitting_best(
         own = (steps >= drive.first) & (steps < drive.stop)
         found = NearestNeighbors(n_neighbors=1).fit(vectors[~own]).kneighbors(vectors[own])[1]
         nearest[own] = steps[~own][found[:, 0]]
-    labels = np.array([ssh_map.labels for ssh_map in maps])
+    labels = np.array([ssh_map.dstate_at for ssh_map in maps])
     fits = (labels == labels[:, nearest]).sum(axis=1)
     return [ssh_map for ssh_map, count in zip(maps, fits, strict=True) if count == fits.max()]
 
@@ -218,5 +218,5 @@ def _followed(
 
 def _first_steps(ssh_map: SSHMap) -> NDArray[np.intp]:
     """For each step, find the first step that is at the same dstate, (n,)."""
-    _, first, dstates = np.unique(ssh_map.labels, return_index=True, return_inverse=True)
+    _, first, dstates = np.unique(ssh_map.dstate_at, return_index=True, return_inverse=True)
     return np.asarray(first[dstates], np.intp)

@@ -160,4 +160,6 @@ def warn_of_second_map(
 
 def partition(ssh_map: SSHMap) -> tuple[tuple[int, ...], tuple[int | None, ...]]:
     """The dstate and the place (None if it has none) of each step, numbered by first visit."""
-    return tuple(ssh_map.labels), tuple(ssh_map.dstates[label].place for label in ssh_map.labels)
+    return tuple(ssh_map.dstate_at), tuple(
+        ssh_map.dstates[label].place for label in ssh_map.dstate_at
+    )

@@ -54,7 +54,7 @@ def mended_map(
     """
     watch = watch or Watch()
     found = FramedEngine(Task.of(Problem.of(trace, theory), watch, speedups)).map_mended_from(
-        known.labels
+        known.dstate_at
     )
     return found.map if found else None
 
@@ -106,7 +106,7 @@ def _make(
     known = known or in_process(
         guessed_map, Trace(tuple(steps), odometry=odometry), theory, speedups, watch=watch
     )
-    if known and len(steps) > len(known.labels):
+    if known and len(steps) > len(known.dstate_at):
         known = in_process(
             mended_map, Trace(tuple(steps), odometry=odometry), theory, known, speedups, watch=watch
         )

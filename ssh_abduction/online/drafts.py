@@ -95,7 +95,7 @@ class Drafts:
         """
         if not self._may_sketch:
             return
-        known = len(ssh_map.labels)
+        known = len(ssh_map.dstate_at)
         sketch = Sketch.beyond(ssh_map, trace.prefix(known), self._theory)
         later = zip(trace.actions[known - 1 :], trace.steps[known:], strict=True)
         if all(sketch.extend(action, step) for action, step in later):

@@ -157,7 +157,7 @@ def view_ratios(ssh_map: SSHMap, trace: Trace | None) -> dict[View, Observation]
     if trace is not None:
         counts.update(
             (x, step.view)
-            for x, step in zip(ssh_map.labels, trace, strict=True)
+            for x, step in zip(ssh_map.dstate_at, trace, strict=True)
             if step.view is not None
         )
     seen = {x for x, _ in counts}
@@ -191,7 +191,7 @@ def transitions(ssh_map: SSHMap, trace: Trace | None) -> dict[str, Links]:
     """
     # Count how often each action led from one dstate to another.
     counts = Counter[tuple[int, str, int]]()
-    labels = ssh_map.labels
+    labels = ssh_map.dstate_at
     if trace is not None:
         counts.update(
             (x, action.name, y)

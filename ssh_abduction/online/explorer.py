@@ -453,5 +453,5 @@ def _is_unique(solution: Solution) -> bool:
 
 def _are_alike(maps: tuple[SSHMap, ...]) -> bool:
     """Whether all maps have the same dstates and places."""
-    labels = {ssh_map.labels for ssh_map in maps}
+    labels = {ssh_map.dstate_at for ssh_map in maps}
     return len(labels) <= 1 and len({tuple(s.place for s in m.dstates) for m in maps}) <= 1

@@ -73,14 +73,14 @@ class Rival:
         """
         wrong = {fault.step for fault in ssh_map.faults if fault.kind != "slipped"}
         looks: dict[int, Seen] = {}
-        for t, label in enumerate(ssh_map.labels):
+        for t, label in enumerate(ssh_map.dstate_at):
             if t not in wrong:
                 looks.setdefault(label, observation(trace.steps[t], theory))
         shows = tuple(looks.get(s.id, (s.view, None)) for s in ssh_map.dstates)
         links = {(s, action): x for s, action, x in ssh_map.links}
         return cls(
             ssh_map,
-            ssh_map.labels,
+            ssh_map.dstate_at,
             shows,
             links,
             ssh_map.faults,
@@ -100,7 +100,7 @@ class Rival:
 
     def explained(self) -> SSHMap:
         """Make the map of all steps so far, with its faults."""
-        if len(self.map.labels) == len(self.labels):
+        if len(self.map.dstate_at) == len(self.labels):
             return self.map
         known = self.map.dstates
         new = (DState(s, self.shows[s][0]) for s in range(len(known), len(self.shows)))  # type: ignore[arg-type]
@@ -110,7 +110,7 @@ class Rival:
         faults = tuple(sorted(self.faults, key=lambda fault: (fault.step, fault.kind)))
         return replace(
             self.map,
-            labels=self.labels,
+            dstate_at=self.labels,
             dstates=(*known, *new),
             links=links,
             faults=faults,

@@ -110,10 +110,10 @@ class Localiser:
                 "make them with Chances(misread=…)"
             )
         self._number = len(ssh_map.dstates)
-        if trace is not None and len(checked_trace(trace)) != len(ssh_map.labels):
+        if trace is not None and len(checked_trace(trace)) != len(ssh_map.dstate_at):
             raise MapError(
                 f"map: labels: expected {len(trace)}, one for each step of the trace, got "
-                f"{len(ssh_map.labels)}; take the trace that the map was found for"
+                f"{len(ssh_map.dstate_at)}; take the trace that the map was found for"
             )
         self._shown = view_ratios(ssh_map, trace)
         self._moves = Moves(ssh_map, trace)
@@ -384,7 +384,8 @@ def _checked(ssh_map: object) -> SSHMap:
         raise MapError(
             f"map: dstates: expected the ids 0, 1, 2, …, got {brief(ids)}; renumber them"
         )
-    if strange := ({*ssh_map.labels} | {s for x, _, y in ssh_map.links for s in (x, y)}) - {*ids}:
+    used = {*ssh_map.dstate_at} | {s for x, _, y in ssh_map.links for s in (x, y)}
+    if strange := used - {*ids}:
         raise MapError(
             f"map: expected dstates 0 to {len(ids) - 1} in labels and links, "
             f"got {brief(min(strange))}; mend the map"

@@ -27,7 +27,7 @@ class ReplayedMap:
     def __init__(self, ssh_map: SSHMap, seen: Sequence[object]) -> None:
         self._map = ssh_map
         self._place_of = [s.place for s in ssh_map.dstates]
-        self._labels = list(ssh_map.labels)
+        self._labels = list(ssh_map.dstate_at)
         self._links = {(s, action): x for s, action, x in ssh_map.links}
         self._sights = dict(zip(self._labels, seen, strict=True))
 
@@ -55,8 +55,8 @@ class ReplayedMap:
 
     def map(self) -> SSHMap:
         """Make the map of all steps so far."""
-        if len(self._map.labels) < len(self._labels):
-            self._map = replace(self._map, labels=tuple(self._labels))
+        if len(self._map.dstate_at) < len(self._labels):
+            self._map = replace(self._map, dstate_at=tuple(self._labels))
         return self._map
 
 

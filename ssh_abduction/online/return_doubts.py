@@ -51,7 +51,9 @@ class ReturnDoubts:
         """
         if not self._margin:
             return
-        at = [ssh_map.dstates[label].place if ssh_map.places else label for label in ssh_map.labels]
+        at = [
+            ssh_map.dstates[label].place if ssh_map.places else label for label in ssh_map.dstate_at
+        ]
         # A travel brings the robot to a place. Any action brings it to a dstate.
         moves = [
             t

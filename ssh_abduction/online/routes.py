@@ -210,7 +210,7 @@ def route(
     number = listing.number(str(map))
     ssh_map = listing.maps[number]
     graph = MoveGraph(ssh_map, by)
-    here, _ = graph.nodes(ssh_map.labels[-1] if start is None else start, "from")
+    here, _ = graph.nodes(ssh_map.dstate_at[-1] if start is None else start, "from")
     there, told = graph.nodes(goal, "to")
     if told.startswith("place"):
         there = graph.nodes_at_places_of(there)
@@ -326,11 +326,11 @@ def _agreeing(
     Returns:
         The numbers of these maps, from 1.
     """
-    steps = [t for t, label in enumerate(ssh_map.labels) if label == start]
+    steps = [t for t, label in enumerate(ssh_map.dstate_at) if label == start]
     agree = []
     for i, rival in enumerate(maps, 1):
         leads = {(source, action): target for source, action, target in rival.links}
-        starts = {rival.labels[t] for t in steps}
+        starts = {rival.dstate_at[t] for t in steps}
         if all(_leads_to(leads, rival, label, moves) for label in starts):
             agree.append(i)
     return tuple(agree)

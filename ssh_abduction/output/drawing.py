@@ -126,7 +126,7 @@ def faults_of(ssh_map: SSHMap) -> dict[int, str]:
     """
     faults: dict[int, list[str]] = {}
     for fault in ssh_map.faults:
-        faults.setdefault(ssh_map.labels[fault.step], []).append(str(fault))
+        faults.setdefault(ssh_map.dstate_at[fault.step], []).append(str(fault))
     return {s: "; ".join(said) for s, said in faults.items()}
 
 

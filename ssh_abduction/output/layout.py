@@ -103,7 +103,7 @@ def located(ssh_map: SSHMap) -> tuple[Pose, ...] | None:
         return None
     if set(ssh_map.places) - {s.place for s in ssh_map.dstates}:
         return None
-    first = {ssh_map.dstates[s].floor: ssh_map.dstates[s] for s in reversed(ssh_map.labels)}
+    first = {ssh_map.dstates[s].floor: ssh_map.dstates[s] for s in reversed(ssh_map.dstate_at)}
     for s in ssh_map.dstates:
         pose, here = poses[s.id], first[s.floor]
         is_origin = pose.x == pose.y == pose.heading == 0.0 and not any(pose.spread)

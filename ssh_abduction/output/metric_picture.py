@@ -98,7 +98,7 @@ class _Picture:
         bands, around = region_marks(self.map, spots, 2 * END * self.unit)
         self.points += around
         # Draw the first place last, on top of the others.
-        first = _site(self.map.dstates[self.map.labels[0]])
+        first = _site(self.map.dstates[self.map.dstate_at[0]])
         dots = [
             self.dot(*spots[site], site) for site in sorted(spots, key=lambda site: site == first)
         ]
@@ -150,7 +150,7 @@ class _Picture:
 
     def dot(self, x: float, y: float, site: int) -> str:
         """Draw the dot of a site at a point. It is white where the robot was first, else black."""
-        is_first = site == _site(self.map.dstates[self.map.labels[0]])
+        is_first = site == _site(self.map.dstates[self.map.dstate_at[0]])
         circle = element(
             "circle",
             cx=f"{x:.1f}",
@@ -198,7 +198,7 @@ class _Picture:
 
     def arrow(self, s: DState) -> str:
         """Draw the arrow of a dstate along its heading. That of the first dstate is black."""
-        pose, colour = self.poses[s.id], "#000" if s.id == self.map.labels[0] else _colour(s)
+        pose, colour = self.poses[s.id], "#000" if s.id == self.map.dstate_at[0] else _colour(s)
         u = self.unit
         (ax, ay), (bx, by) = self.along(s, BEGIN), self.along(s, END)
         for share in (0.0, 0.5, 1.0):
@@ -324,8 +324,8 @@ class _Picture:
         """Draw the numbers of dstates beside or ahead of their arrows, the first dstate first."""
         marks = []
         u = self.unit
-        for s in sorted(self.map.dstates, key=lambda s: s.id != self.map.labels[0]):
-            is_first = s.id == self.map.labels[0]
+        for s in sorted(self.map.dstates, key=lambda s: s.id != self.map.dstate_at[0]):
+            is_first = s.id == self.map.dstate_at[0]
             label = f"x{s.id} start" if is_first else f"x{s.id}"
             w, h = self.half(label, 11)
             heading = self.poses[s.id].heading

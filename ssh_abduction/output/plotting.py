@@ -51,7 +51,7 @@ def plot(ssh_map: SSHMap, ax: Any = None, turns: Trace | Turns | None = None) ->
     for place, spot in found.places.items():
         axes.plot(*spot, "o", color="white", markeredgecolor="black", markersize=14)
         axes.text(*spot, str(place), ha="center", va="center", fontsize=8, fontweight="bold")
-    doubted = {ssh_map.labels[fault.step] for fault in ssh_map.faults}
+    doubted = {ssh_map.dstate_at[fault.step] for fault in ssh_map.faults}
     for s in ssh_map.dstates:
         mark = _draw_dstate(axes, s, found.dstates[s.id], unit)
         if s.id in doubted:

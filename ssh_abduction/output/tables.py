@@ -30,7 +30,7 @@ def to_pandas(ssh_map: SSHMap) -> pd.DataFrame:
             "to_pandas: expected pandas, got none; install it with pip install pandas"
         ) from None
     rows = []
-    for s in (ssh_map.dstates[label] for label in ssh_map.labels):
+    for s in (ssh_map.dstates[label] for label in ssh_map.dstate_at):
         row: dict[str, Any] = {
             "dstate": s.id,
             "view": s.view,

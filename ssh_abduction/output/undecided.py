@@ -11,7 +11,7 @@ from ssh_abduction.data.maps import SSHMap
 def place_of_steps(ssh_map: SSHMap) -> list[int | None]:
     """Return the place of each step of a map."""
     place = {state.id: state.place for state in ssh_map.dstates}
-    return [place[label] for label in ssh_map.labels]
+    return [place[label] for label in ssh_map.dstate_at]
 
 
 def undecided_places(ssh_map: SSHMap) -> frozenset[int]:
@@ -20,7 +20,7 @@ def undecided_places(ssh_map: SSHMap) -> frozenset[int]:
     The robot came from one of two neighbours and went on to the other, at every visit. It neither
     turned around there, nor began or ended a drive.
     """
-    places, labels = place_of_steps(ssh_map), ssh_map.labels
+    places, labels = place_of_steps(ssh_map), ssh_map.dstate_at
     # A drive starts where no action leads from the step before.
     linked = {(s, x) for s, _, x in ssh_map.links}
     starts = [t for t, pair in enumerate(pairwise(labels), 1) if pair not in linked]

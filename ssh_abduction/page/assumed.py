@@ -68,7 +68,7 @@ def assumptions(
     piece = Piece.of(problem, range(len(trace) if len(trace) <= UNCUT else SMALL))
     try:
         axioms = Axioms(piece, lambda: time.monotonic() > end)
-        for pair, one in _agreed([ssh_map.labels for ssh_map in minimal], len(piece.steps)):
+        for pair, one in _agreed([ssh_map.dstate_at for ssh_map in minimal], len(piece.steps)):
             if axioms.consistent(assumed=[(facts.are_one(*pair), not one)]):
                 left.append((pair, one))
             else:

@@ -80,7 +80,7 @@ def content_of(
         one: dict[str, Any] = {
             "id": name,
             "labeling": labelings.number(
-                (ssh_map.labels, tuple(str(s.shown) for s in ssh_map.dstates))
+                (ssh_map.dstate_at, tuple(str(s.shown) for s in ssh_map.dstates))
             ),
             "places": places.number(tuple((s.place, s.path, s.direction) for s in ssh_map.dstates)),
             "orders": orders.number(tuple((path.id, path.order) for path in ssh_map.paths)),
@@ -379,7 +379,7 @@ def _spots(first: SSHMap, found: Layout) -> list[Spot]:
     """
     unit = _unit(found)
     spots: list[Spot] = []
-    for label in first.labels:
+    for label in first.dstate_at:
         x, y, heading = found.dstates[label]
         place = first.dstates[label].place
         if place is not None and place in found.places:

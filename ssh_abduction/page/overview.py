@@ -41,8 +41,8 @@ class _Counts:
 
     def add(self, ssh_map: SSHMap, count: int) -> None:
         """Add `count` maps that are the same as this one."""
-        at = [ssh_map.dstates[label] for label in ssh_map.labels]
-        of_dstate = _members(ssh_map.labels)
+        at = [ssh_map.dstates[label] for label in ssh_map.dstate_at]
+        of_dstate = _members(ssh_map.dstate_at)
         of_place = _members([s.place for s in at])
         of_path = {
             h: self._numbers.setdefault(steps, len(self._numbers))
@@ -57,7 +57,7 @@ class _Counts:
         # Only streets that the robot travelled count: it went between two places along one path.
         # The order of other places on a path is one of many possible ones.
         streets: dict[Pair, int | None] = {}
-        for s, x in set(pairwise(ssh_map.labels)):
+        for s, x in set(pairwise(ssh_map.dstate_at)):
             a, b = ssh_map.dstates[s], ssh_map.dstates[x]
             if None in (a.place, b.place, a.path) or a.place == b.place or a.path != b.path:
                 continue
@@ -90,7 +90,7 @@ def overview(maps: Sequence[SSHMap], spots: Sequence[Spot]) -> dict[str, Any]:
     # Count maps together if they are the same in everything that is counted here.
     alike: dict[Any, list[SSHMap]] = {}
     for ssh_map in maps:
-        key = (ssh_map.labels, tuple((s.place, s.path) for s in ssh_map.dstates))
+        key = (ssh_map.dstate_at, tuple((s.place, s.path) for s in ssh_map.dstates))
         alike.setdefault(key, []).append(ssh_map)
     counts = _Counts()
     for some in alike.values():

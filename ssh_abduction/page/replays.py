@@ -56,7 +56,7 @@ def replays(
     if trace is None:
         mapped = {"name": name, "steps": _steps_of_map(first)}
     else:
-        views = [str(first.dstates[label].shown) for label in first.labels]
+        views = [str(first.dstates[label].shown) for label in first.dstate_at]
         mapped = _replay(trace, name, views)
     if run is None:
         return [mapped]
@@ -114,9 +114,9 @@ def _steps_of_map(first: SSHMap) -> list[dict[str, Any]]:
     actions: dict[tuple[int, int], list[str]] = {}
     for s, action, x in first.links:
         actions.setdefault((s, x), []).append(action)
-    done = [actions.get(pair, []) for pair in pairwise(first.labels)]
+    done = [actions.get(pair, []) for pair in pairwise(first.dstate_at)]
     names = [some[0] if len(some) == 1 else None for some in done]
-    views: list[Any] = [first.dstates[label].shown for label in first.labels]
+    views: list[Any] = [first.dstates[label].shown for label in first.dstate_at]
     for fault in first.faults:
         if fault.kind == "misread" and fault.seen is not None:
             views[fault.step] = fault.seen

@@ -196,10 +196,10 @@ def difference(
     )
     if len(called) != 2:
         raise MapError(f"names: expected two, one for each map, got {brief(names)}; name both")
-    if len(first.labels) != len(other.labels):
+    if len(first.dstate_at) != len(other.dstate_at):
         raise MapError(
-            f"maps: expected two of one trace, got one of {len(first.labels)} steps and one of "
-            f"{len(other.labels)}"
+            f"maps: expected two of one trace, got one of {len(first.dstate_at)} steps and one of "
+            f"{len(other.dstate_at)}"
         )
     first, other = first.renumbered(), other.renumbered()
     table = Table([first, other])
@@ -271,7 +271,7 @@ def _groups(classes: Sequence[int], ones: Sequence[int]) -> list[list[int]]:
 def _named_links(ssh_map: SSHMap) -> set[Link]:
     """Return the links of a map. Each dstate is named by its first step."""
     first: dict[int, int] = {}
-    for t, label in enumerate(ssh_map.labels):
+    for t, label in enumerate(ssh_map.dstate_at):
         first.setdefault(label, t)
     return {
         (first[s], action, first[x]) for s, action, x in ssh_map.links if s in first and x in first
@@ -283,7 +283,7 @@ def _unmoved(first: SSHMap, other: SSHMap) -> set[int]:
     sets: list[set[Steps]] = []
     for ssh_map in (first, other):
         steps: dict[int, list[int]] = {}
-        for t, label in enumerate(ssh_map.labels):
+        for t, label in enumerate(ssh_map.dstate_at):
             steps.setdefault(label, []).append(t)
         sets.append({tuple(some) for some in steps.values()})
     return {some[0] for some in sets[0] & sets[1]}

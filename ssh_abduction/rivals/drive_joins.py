@@ -116,11 +116,11 @@ def _placings(listing: Listing) -> tuple[list[_Placing], list[float], bool]:
     minimal = listing.maps[: listing.minimal]
     placings: list[_Placing] = []
     for ssh_map in minimal:
-        places = [ssh_map.dstates[label].place for label in ssh_map.labels]
+        places = [ssh_map.dstates[label].place for label in ssh_map.dstate_at]
         placings.append(
             [
                 label if place is None else place
-                for label, place in zip(ssh_map.labels, places, strict=True)
+                for label, place in zip(ssh_map.dstate_at, places, strict=True)
             ]
         )
     return placings, [1 / len(minimal)] * len(minimal), listing.complete is True

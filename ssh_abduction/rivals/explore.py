@@ -203,10 +203,10 @@ class Laboratory:
         same: dict[object, tuple[Machine, tuple[int, ...]]] = {}
         for i, ssh_map in enumerate(rivals):
             known_ends = self._consequences[i].sure_ends(self._actions) if implied else ()
-            key = (ssh_map.labels[-1], ssh_map.links, known_ends, tuple(self._sights.of[i]))
+            key = (ssh_map.dstate_at[-1], ssh_map.links, known_ends, tuple(self._sights.of[i]))
             if key not in same:
                 links = with_ends(self._links[i], known_ends)
-                same[key] = machine_of(ssh_map.labels[-1], links, self._sights.of[i])
+                same[key] = machine_of(ssh_map.dstate_at[-1], links, self._sights.of[i])
             machine, reached = same[key]
             found.setdefault(machine, []).append(i)
             self._reached.append(reached)
@@ -416,10 +416,10 @@ def _check(maps: Sequence[SSHMap], trace: Trace | None) -> None:
             raise MapError(
                 f"maps[{i}]: expected an SSHMap, got {brief(ssh_map)}; take a Solution, or its maps"
             )
-        labels = ssh_map.labels
-        if len(labels) != len(maps[0].labels):
+        labels = ssh_map.dstate_at
+        if len(labels) != len(maps[0].dstate_at):
             raise MapError(
-                f"maps[{i}]: labels: expected {len(maps[0].labels)}, as the first map has, "
+                f"maps[{i}]: labels: expected {len(maps[0].dstate_at)}, as the first map has, "
                 f"got {len(labels)}; take the maps of one trace"
             )
         if trace is None:
@@ -454,7 +454,7 @@ def _check(maps: Sequence[SSHMap], trace: Trace | None) -> None:
 
 def _sharing(maps: Sequence[SSHMap]) -> str:
     """Tell what all maps share: "dstates and places", "dstates", or "" for neither."""
-    if len({(ssh_map.labels, ssh_map.links) for ssh_map in maps}) > 1:
+    if len({(ssh_map.dstate_at, ssh_map.links) for ssh_map in maps}) > 1:
         return ""
     places = {tuple(s.place for s in ssh_map.dstates) for ssh_map in maps}
     return "dstates and places" if maps[0].places and len(places) == 1 else "dstates"

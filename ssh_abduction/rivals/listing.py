@@ -60,7 +60,7 @@ class Listing:
     @property
     def steps(self) -> int:
         """The number of steps of the trace."""
-        return len(self.maps[0].labels)
+        return len(self.maps[0].dstate_at)
 
     @property
     def sureness(self) -> str:
@@ -160,9 +160,9 @@ class Listing:
                     f"{where}: maps[{i}]: id: expected {ssh_map.id}, as such a map has, got "
                     f"{brief(record['id'])}; {mend}"
                 )
-        if maps and "steps" in told and told["steps"] != len(maps[0].labels):
+        if maps and "steps" in told and told["steps"] != len(maps[0].dstate_at):
             raise MapError(
-                f"{where}: steps: expected {len(maps[0].labels)}, as map 1 has, got "
+                f"{where}: steps: expected {len(maps[0].dstate_at)}, as map 1 has, got "
                 f"{brief(told['steps'])}; solve the trace again"
             )
         # each map is listed once
@@ -204,11 +204,11 @@ class Listing:
         backbone = None
         if maps and "backbone" in told:
             backbone = Backbone.from_dict(
-                told["backbone"], len(maps[0].labels), f"{where}: backbone"
+                told["backbone"], len(maps[0].dstate_at), f"{where}: backbone"
             )
         is_optimal = status == Status.OPTIMAL.value
         listed = complete or (minimal < len(maps)) if is_optimal else complete
-        read, steps = FieldReader(where), len(maps[0].labels) if maps else 0
+        read, steps = FieldReader(where), len(maps[0].dstate_at) if maps else 0
         weighed = None
         if maps and told.get("weighed"):
             weighed = Weighed.from_dict(read, told["weighed"], steps)
@@ -242,11 +242,11 @@ class Listing:
             )
         first = None
         for i, ssh_map in enumerate(self.maps):
-            if len(ssh_map.labels) != self.steps:
+            if len(ssh_map.dstate_at) != self.steps:
                 mend = "compare maps of one trace"
                 raise MapError(
                     f"{self._name(i)}: expected {self.steps} steps, as {self._name(0)} has, got "
-                    f"{len(ssh_map.labels)}; {mend}"
+                    f"{len(ssh_map.dstate_at)}; {mend}"
                 )
             if not one_view:
                 continue
@@ -326,7 +326,7 @@ def _has_one_view(theory: Theory) -> bool:
 def _seen(ssh_map: SSHMap) -> tuple[View | None, ...]:
     """List the view at each step, from a map whose dstates have one view each."""
     views = [s.view for s in ssh_map.dstates]
-    seen = [views[label] for label in ssh_map.labels]
+    seen = [views[label] for label in ssh_map.dstate_at]
     for fault in ssh_map.faults:
         if fault.kind == "misread" and fault.seen is not None:
             seen[fault.step] = fault.seen

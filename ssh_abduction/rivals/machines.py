@@ -189,7 +189,7 @@ def _reading(maps: Sequence[SSHMap], trace: Trace | None, theory: Theory | None)
 def _sound(ssh_map: SSHMap) -> list[tuple[int, int]]:
     """List the steps whose observation the map does not treat as wrong, each with its dstate."""
     wrong = {fault.step for fault in ssh_map.faults if fault.kind != "slipped"}
-    return [(t, label) for t, label in enumerate(ssh_map.labels) if t not in wrong]
+    return [(t, label) for t, label in enumerate(ssh_map.dstate_at) if t not in wrong]
 
 
 def _first_steps(ssh_map: SSHMap) -> dict[int, int]:

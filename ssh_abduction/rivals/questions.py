@@ -130,7 +130,7 @@ def questions_of(table: Table, maps: Sequence[SSHMap], *, same_places: bool) -> 
             question = Question("faults", fault.step, fault.step, yes, at, at, fault=fault)
             asked = found.setdefault(_key(column), Asked(question, column, {}))
             asked.steps.setdefault("faults", set()).add(fault.step)
-    places = [maps[0].dstates[label].place for label in maps[0].labels] if same_places else []
+    places = [maps[0].dstates[label].place for label in maps[0].dstate_at] if same_places else []
     steps_by_class = members_of(table.classes.tolist())
     for sort in table.ones:
         heads = table.heads(sort).tolist()

@@ -144,8 +144,8 @@ def _sides(maps: Sequence[SSHMap]) -> dict[tuple[int, int], list[_Side | None]]:
         }
         for m in maps
     ]
-    states = [[m.dstates[label] for label in m.labels] for m in maps]
-    steps = range(len(maps[0].labels))
+    states = [[m.dstates[label] for label in m.dstate_at] for m in maps]
+    steps = range(len(maps[0].dstate_at))
     places: dict[tuple[int | None, ...], int] = {}
     courses: dict[tuple[tuple[int, int] | None, ...], int] = {}
     for t in steps:

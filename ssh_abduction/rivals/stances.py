@@ -78,7 +78,7 @@ class Stances:
         self._can = can
         self._implies = theory.star == "frame" and theory.hard >= OF_FRAMES
         first: dict[int, Step] = {}
-        for label, step in zip(ssh_map.labels, trace.steps, strict=True):
+        for label, step in zip(ssh_map.dstate_at, trace.steps, strict=True):
             first.setdefault(label, step)
         self._looks = [first[s.id] for s in ssh_map.dstates]
         self._stars = [

@@ -42,7 +42,7 @@ class Table:
     """
 
     def __init__(self, maps: Sequence[SSHMap]) -> None:
-        labelings = {ssh_map.labels: i for i, ssh_map in enumerate(maps)}
+        labelings = {ssh_map.dstate_at: i for i, ssh_map in enumerate(maps)}
         by_labels = {labels: np.array(labels, dtype=np.int32) for labels in labelings}
         self.classes = _common_classes(list(by_labels.values()))
         _, self.firsts = np.unique(self.classes, return_index=True)
@@ -54,7 +54,7 @@ class Table:
             rows = []
             for ssh_map in maps:
                 of_dstate = [_name(s, sort) for s in ssh_map.dstates]
-                names = tuple(of_dstate[label] for label in label_of[ssh_map.labels])
+                names = tuple(of_dstate[label] for label in label_of[ssh_map.dstate_at])
                 if names not in known:
                     known[names] = _firsts_of(names)
                 rows.append(known[names])

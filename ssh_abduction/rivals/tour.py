@@ -77,7 +77,7 @@ def next_tour(
         [*map(Action.of, actions)],
         can,
     )
-    start, moves = ssh_map.labels[-1], stances.moves()
+    start, moves = ssh_map.dstate_at[-1], stances.moves()
     near = reached_from(moves, start)
     moves = [move for move in moves if move.source in near]
     unseen = {n for n in near if n >= len(ssh_map.dstates)}
@@ -103,7 +103,7 @@ def with_doubted_returns(ssh_map: SSHMap, trace: Trace, margin: int) -> SSHMap:
     while True:
         at = _copies(ssh_map, trace, believed)
         dstates: dict[Copy, set[int]] = {}
-        for copy, label in zip(at, ssh_map.labels, strict=True):
+        for copy, label in zip(at, ssh_map.dstate_at, strict=True):
             dstates.setdefault(copy, set()).add(label)
         beside = [(one, other) for one, other in pairwise(at) if one[1] and other[1]]
         more: set[int] = set()
@@ -116,12 +116,12 @@ def with_doubted_returns(ssh_map: SSHMap, trace: Trace, margin: int) -> SSHMap:
         believed |= more
     numbers: dict[tuple[Copy, int], int] = {}
     labels = tuple(
-        numbers.setdefault(pair, len(numbers)) for pair in zip(at, ssh_map.labels, strict=True)
+        numbers.setdefault(pair, len(numbers)) for pair in zip(at, ssh_map.dstate_at, strict=True)
     )
     places: dict[Copy, int] = {}
     return replace(
         ssh_map,
-        labels=labels,
+        dstate_at=labels,
         dstates=tuple(
             replace(
                 ssh_map.dstates[label],
@@ -148,7 +148,7 @@ def with_doubted_returns(ssh_map: SSHMap, trace: Trace, margin: int) -> SSHMap:
 
 def _copies(ssh_map: SSHMap, trace: Trace, believed: Collection[int]) -> list[Copy]:
     """Find the place of each step, if all returns but those at the steps `believed` are doubted."""
-    places = [ssh_map.dstates[label].place or 0 for label in ssh_map.labels]
+    places = [ssh_map.dstates[label].place or 0 for label in ssh_map.dstate_at]
     at: list[Copy] = [(places[0], 0)]
     known = {places[0]}
     leads: dict[tuple[Copy, int, str], Copy] = {}
@@ -158,7 +158,7 @@ def _copies(ssh_map: SSHMap, trace: Trace, believed: Collection[int]) -> list[Co
         if place == places[t - 1]:
             at.append(here)
             continue
-        tried = here, ssh_map.labels[t - 1], action.name
+        tried = here, ssh_map.dstate_at[t - 1], action.name
         there = leads.get(tried) or next(
             (copy for copy in came.get(here, ()) if copy[0] == place), None
         )

@@ -123,5 +123,5 @@ def _turned(ssh_map: SSHMap | None, first: int, second: int) -> float:
     assert ssh_map is not None
     if ssh_map.fit is None or not ssh_map.fit.poses:
         return 0.0
-    one, other = (ssh_map.fit.poses[ssh_map.labels[step]] for step in (first, second))
+    one, other = (ssh_map.fit.poses[ssh_map.dstate_at[step]] for step in (first, second))
     return other.heading - one.heading

@@ -221,7 +221,7 @@ class LogMap:
             A fitted pipeline of scikit-learn, as `perception.recognition.recogniser` makes it.
         """
         images = [step.image for step in self.imported.trace.steps]
-        return new_recogniser(FLOOR).fit(images, self.solution.maps[0].labels)
+        return new_recogniser(FLOOR).fit(images, self.solution.maps[0].dstate_at)
 
 
 def seconds_driven(log: RobotLog) -> float | None:

@@ -206,7 +206,7 @@ def _map_marks(sheet: _Sheet, imported: Imported, solution: Solution) -> Iterato
     edges = list(_edges(sheet, imported, places, visit_of, shown))
     yield from _bands(sheet, ssh_map, middles, [(places[t], places[t + 1], c) for t, c in edges])
     for step, course in edges:
-        path = path_of[ssh_map.labels[step]] or 0
+        path = path_of[ssh_map.dstate_at[step]] or 0
         colour = COLOURS[path % len(COLOURS)] if colourful else EDGE
         if len(sheet.bounds) > 2:
             colour = colour_of(sheet.drive_of(imported.visits[visit_of[step]].scan))

@@ -233,7 +233,7 @@ def _log(log: RobotLog, run: Mapping[str, Any]) -> str:
 
 def _visits(imported: Imported, solution: Solution) -> str:
     """Make a table with a row for each step: what was seen and done, and its dstate and place."""
-    labels = solution.maps[0].labels if solution.maps else None
+    labels = solution.maps[0].dstate_at if solution.maps else None
     states = {state.id: state for state in solution.maps[0].dstates} if solution.maps else {}
     rows = []
     for t, step in enumerate(imported.trace.steps):

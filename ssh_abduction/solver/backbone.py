@@ -159,9 +159,11 @@ class _Reasoning:
                     if replayed.outcome is not Outcome.PREDICTED:
                         failed = len(replayed.labels)
                         break
-                    if refused := self._judging.why_refused(replace(found, labels=replayed.labels)):
+                    if refused := self._judging.why_refused(
+                        replace(found, dstate_at=replayed.labels)
+                    ):
                         break
-                    self._sharing.absorb(replace(found, labels=replayed.labels))
+                    self._sharing.absorb(replace(found, dstate_at=replayed.labels))
                     found = self._differing_map(settled, replayed.labels)
                 if failed or refused:
                     break
@@ -227,7 +229,7 @@ class _Reasoning:
         engine.grow(size)
         while (found := engine.map_with(list(self._doubts(size)), self._cost)) is not None:
             replayed = self._replay(found)
-            whole = replace(found, labels=replayed.labels)
+            whole = replace(found, dstate_at=replayed.labels)
             if equalities := self._judging.why_refused(found) or self._judging.why_refused(whole):
                 last = max(max(equality.first, equality.second) for equality in equalities)
                 if last >= size:
@@ -245,7 +247,9 @@ class _Reasoning:
     def _replay(self, found: SSHMap) -> Replay:
         """Replay the trace over a map of a prefix: follow the links of the map to the end."""
         return self._task.log.replay(
-            found.labels, None, [s.place for s in found.dstates] if self._task.log.pairs else None
+            found.dstate_at,
+            None,
+            [s.place for s in found.dstates] if self._task.log.pairs else None,
         )
 
     def _doubts(self, size: int) -> Iterator[Doubt]:

@@ -170,7 +170,7 @@ class Candidates:
             return [*beams]
         sketches = Sketch.all_of(trace.steps[0], theory)
         if known is not None:
-            sketches.insert(0, Sketch.beyond(known, trace.prefix(len(known.labels)), theory))
+            sketches.insert(0, Sketch.beyond(known, trace.prefix(len(known.dstate_at)), theory))
         return [*beams, self.merge, *(partial(self._go_on_to_end, sketch) for sketch in sketches)]
 
     def _offer_beam(self, width: int) -> None:
@@ -217,14 +217,14 @@ class Candidates:
                 len(ssh_map.places),
                 len(ssh_map.paths),
             )
-            self._known.keep(found, ssh_map.labels)
+            self._known.keep(found, ssh_map.dstate_at)
             self._task.watch.use_reserve()
 
     def _with_unknown_views(self, ssh_map: SSHMap) -> SSHMap:
         """Undo what `_with_all_views` did to the trace, in a map of it."""
         if self._task.trace is self._trace:
             return ssh_map
-        views = answer_maps.views_of(dict(enumerate(ssh_map.labels)), self._trace)
+        views = answer_maps.views_of(dict(enumerate(ssh_map.dstate_at)), self._trace)
         dstates = tuple(replace(s, view=views[s.id]) for s in ssh_map.dstates)
         return replace(ssh_map, dstates=dstates)
 

@@ -57,8 +57,7 @@ def solve(
 
     Args:
         trace: The trace; or several traces of one building, for their joint maps
-            (`data.together`). `by_drive(solution.trace, ssh_map.labels)` of `data` has one
-            sequence of labels for each trace.
+            (`data.together`). `ssh_map.labels` has one sequence of labels for each trace.
         theory: The axioms and the preference; Theory.topological() by default.
         time_limit: Seconds of wall-clock time. At this limit the best answer so far is returned.
         max_maps: List at most this many maps; None lists all. After the last one, the search goes
@@ -197,6 +196,6 @@ def _labelling_engine(task: Task, solution: Solution) -> Engine | None:
             return None
         from ssh_abduction.solver.engines.frameless import FramelessEngine  # loads numpy
 
-        engine = FramelessEngine(task, solution.maps[0].labels)
+        engine = FramelessEngine(task, solution.maps[0].dstate_at)
     engine.grow(solution.effort.prefix)
     return engine

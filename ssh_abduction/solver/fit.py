@@ -105,7 +105,7 @@ class Poses:
     def of_map(trace: Trace, ssh_map: SSHMap) -> Poses:
         """The poses of the dstates of a map of the whole trace, still unknown."""
         places = [s.place if s.place is not None else -1 - s.id for s in ssh_map.dstates]
-        return Poses(trace, ssh_map.labels, places)
+        return Poses(trace, ssh_map.dstate_at, places)
 
     def misfit(self) -> float:
         """The least chi-square of the displacements."""

@@ -125,7 +125,7 @@ class Judging:
         if not self._shown or ssh_map == self._accepted:
             return
         steps = len(self._trace)
-        shows_all = prefix < steps and len(set(ssh_map.labels[:prefix])) == len(ssh_map.dstates)
+        shows_all = prefix < steps and len(set(ssh_map.dstate_at[:prefix])) == len(ssh_map.dstates)
         if self.has_time_for(steps, elapsed) or (self._judged < ALWAYS and not shows_all):
             self._check(ssh_map, steps)
         elif self._judged < ALWAYS:
@@ -165,7 +165,7 @@ class Judging:
         links = set(ssh_map.links)
         beyond = range(prefix, len(self._trace))
         for t in random.Random(0).sample(beyond, min(SAMPLE, len(beyond))):
-            here, there = ssh_map.labels[t - 1], ssh_map.labels[t]
+            here, there = ssh_map.dstate_at[t - 1], ssh_map.dstate_at[t]
             action = self._trace.steps[t - 1].action
             if (
                 action is None
@@ -191,7 +191,7 @@ class Judging:
 def _of_first_steps(ssh_map: SSHMap, steps: int) -> SSHMap:
     """Cut the labels of a map to the first steps. These steps must show all dstates and links."""
     return SSHMap(
-        ssh_map.labels[:steps],
+        ssh_map.dstate_at[:steps],
         ssh_map.dstates,
         ssh_map.links,
         ssh_map.places,

@@ -52,7 +52,7 @@ class Known:
             found: The map, perhaps of a prefix.
             labels: The dstate of each step of the whole trace.
         """
-        self.best, self.cost = replace(found.map, labels=labels), found.cost
+        self.best, self.cost = replace(found.map, dstate_at=labels), found.cost
 
     def raise_bound(self, proven: int | None) -> None:
         """Raise the lower bound on the count that is preferred first. None changes nothing."""

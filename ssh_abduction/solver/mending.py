@@ -192,15 +192,15 @@ class Mending:
             if self._best is None or self._best is before:
                 return
             labels, places = (
-                self._best.map.labels,
-                [self._best.map.dstates[label].place for label in self._best.map.labels],
+                self._best.map.dstate_at,
+                [self._best.map.dstates[label].place for label in self._best.map.dstate_at],
             )
 
     def _by_causal_maps(self) -> Iterator[Trace]:
         """Yield the traces that causal maps mend, each map cheaper than the one before."""
         self._causal.grow(len(self._task.trace))
         for found in self._causal.improving_maps():
-            self._causal_labels = found.map.labels
+            self._causal_labels = found.map.dstate_at
             yield self._mended(found.map)
 
     def _by_cheapest_causal_maps(self) -> Iterator[Trace]:
@@ -230,8 +230,8 @@ class Mending:
             before, mended = self._best, self._best_mended
             if before is None or mended is None or before.cost[0] == self.bound:
                 return
-            visits = Counter(before.map.labels)
-            rare = [t for t, label in enumerate(before.map.labels) if visits[label] <= RARE]
+            visits = Counter(before.map.dstate_at)
+            rare = [t for t, label in enumerate(before.map.dstate_at) if visits[label] <= RARE]
             suspected = dict.fromkeys(
                 k
                 for t in rare
@@ -256,11 +256,11 @@ class Mending:
         }
         steps = list(self._task.trace.steps)
         right: dict[int, Step] = {}
-        for t, label in enumerate(causal.labels):
+        for t, label in enumerate(causal.dstate_at):
             if t not in wrong["misread"]:
                 right.setdefault(label, steps[t])
         for t in wrong["misread"]:
-            seen = right[causal.labels[t]]
+            seen = right[causal.dstate_at[t]]
             star = seen.star if self._task.theory.star in ("pattern", "frame") else steps[t].star
             steps[t] = replace(steps[t], view=seen.view, star=star)
         for t in wrong["slipped"]:
@@ -316,7 +316,7 @@ class Mending:
             problem = self._problem(again)
             pairs = problem.pairs
             place_of = [s.place for s in ssh_map.dstates]
-            fits = all(pairs.allow(k, ssh_map.labels, place_of) for k in range(len(again)))
+            fits = all(pairs.allow(k, ssh_map.dstate_at, place_of) for k in range(len(again)))
             if fits and not Judging(problem).why_refused(replace(ssh_map, faults=())):
                 mended = again
         return mended
@@ -341,4 +341,4 @@ def _places(ssh_map: SSHMap) -> list[tuple[int, int] | None]:
         None if s.place is None or s.heading is None else (s.place, s.heading)
         for s in ssh_map.dstates
     ]
-    return [at[label] for label in ssh_map.labels]
+    return [at[label] for label in ssh_map.dstate_at]

@@ -91,7 +91,7 @@ class Misfit:
         found: list[Equality] = []
         at_dstate: dict[int, int] = {}
         at_place: dict[int, int] = {}
-        for t, label in enumerate(ssh_map.labels):
+        for t, label in enumerate(ssh_map.dstate_at):
             place = ssh_map.dstates[label].place
             if label in at_dstate:
                 found.append(Equality(at_dstate[label], t))

@@ -12,7 +12,7 @@ equal, as far as the traces are short enough.
 >>> tuesday = Trace.from_steps("bcd", ["around", "travel"], name="tuesday")
 >>> solution = solve(tuesday, onto=solve(monday))
 >>> solution[0].labels
-(0, 1, 2, 3, 1, 2, 3)
+((0, 1, 2, 3), (1, 2, 3))
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from itertools import combinations
 from ssh_abduction.data.action import Action
 from ssh_abduction.data.checks import an_instance
 from ssh_abduction.data.corrections import Corrections
-from ssh_abduction.data.drives import drives_of, step_name, together
+from ssh_abduction.data.drives import drives_of, starts_of, step_name, together
 from ssh_abduction.data.errors import SolverError
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.step import Step
@@ -85,7 +85,7 @@ class Digest:
             short: Whether each link occurs once. If not, the digest has all steps.
         """
         if not short:
-            return cls(trace, ssh_map.labels)
+            return cls(trace, ssh_map.dstate_at)
         shown = _observations(trace, ssh_map)
         actions = {action.name: action for action in trace.actions}
         steps: list[Step] = []
@@ -147,7 +147,7 @@ def solve_onto(
     assert found.cost is not None
     solution = replace(
         found,
-        maps=tuple(_of_all(m, digest, ssh_map) for m in kept),
+        maps=tuple(_of_all(m, digest, ssh_map, joint) for m in kept),
         theory=_settled(found.theory, theory),
         steps=len(joint),
         levels=(Level(found.cost, len(kept), found.complete),) if found.within else (),
@@ -178,7 +178,7 @@ def _standing(standing: object) -> tuple[Trace, SSHMap]:
 def _observations(trace: Trace, ssh_map: SSHMap) -> dict[int, list[Step]]:
     """For each dstate, the different observations made there, those with a view first."""
     shown: dict[int, dict[object, Step]] = {s.id: {} for s in ssh_map.dstates}
-    for step, label in zip(trace.steps, ssh_map.labels, strict=True):
+    for step, label in zip(trace.steps, ssh_map.dstate_at, strict=True):
         shown[label].setdefault((step.view, step.star), step)
     return {
         s: sorted(
@@ -237,7 +237,7 @@ def _pinned(theory: Theory, digest: Digest, ssh_map: SSHMap, old: Trace, *, join
 
     def moved(pairs: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
         steps = [
-            tuple(first[ssh_map.labels[t]] if t < len(old) else t + shift for t in pair)
+            tuple(first[ssh_map.dstate_at[t]] if t < len(old) else t + shift for t in pair)
             for pair in pairs
         ]
         return [(i, j) for i, j in steps if i != j]
@@ -264,7 +264,7 @@ def _broken(
     number: dict[int, int] = {}
     split = {
         (s, s)
-        for s, x in zip(digest.labels, found.labels, strict=False)
+        for s, x in zip(digest.labels, found.dstate_at, strict=False)
         if number.setdefault(s, x) != x
     }
     pairs = list(combinations(number, 2))
@@ -303,12 +303,13 @@ def _with_rules(
     return again, tuple(m for m in again.maps if _keeps(m, digest, ssh_map))
 
 
-def _of_all(found: SSHMap, digest: Digest, ssh_map: SSHMap) -> SSHMap:
+def _of_all(found: SSHMap, digest: Digest, ssh_map: SSHMap, joint: Trace) -> SSHMap:
     """The map of all drives, from a map of a digest and a new drive."""
-    number = dict(zip(digest.labels, found.labels, strict=False))
-    new = found.labels[len(digest.labels) :]
-    labels = (*(number[s] for s in ssh_map.labels), *new)
-    return replace(found, labels=labels, names=()).renumbered()
+    number = dict(zip(digest.labels, found.dstate_at, strict=False))
+    new = found.dstate_at[len(digest.labels) :]
+    labels = (*(number[s] for s in ssh_map.dstate_at), *new)
+    whole = replace(found, dstate_at=labels, starts=starts_of(joint), names=())
+    return whole.renumbered()
 
 
 def _settled(found: Theory, theory: Theory) -> Theory:
@@ -328,7 +329,7 @@ def _contradiction(
     told, drives = "the standing map cannot be, as no map keeps it", drives_of(old)
     if found.maps:
         dstates, places = _broken(found.maps[0], digest, ssh_map)
-        first = {s: t for t, s in reversed([*enumerate(ssh_map.labels)])}
+        first = {s: t for t, s in reversed([*enumerate(ssh_map.dstate_at)])}
         pairs = [
             f"{step_name(drives, first[s])} and {step_name(drives, first[x])}" for s, x in places
         ]

@@ -336,9 +336,9 @@ class Prefixes:
         """
         log = self._task.log
         replayed = log.replay(
-            ssh_map.labels, known, [s.place for s in ssh_map.dstates] if log.pairs else None
+            ssh_map.dstate_at, known, [s.place for s in ssh_map.dstates] if log.pairs else None
         )
-        replays = replayed.outcome is Outcome.PREDICTED and len(ssh_map.labels) < len(
+        replays = replayed.outcome is Outcome.PREDICTED and len(ssh_map.dstate_at) < len(
             replayed.labels
         )
         if (
@@ -346,12 +346,12 @@ class Prefixes:
             and replays
             and turned(
                 self._task.trace,
-                replace(ssh_map, labels=replayed.labels),
+                replace(ssh_map, dstate_at=replayed.labels),
                 self._task.theory.axioms,
             )
             is None
         ):
-            return Replay(replayed.labels[: len(ssh_map.labels)], Outcome.CONTRADICTED)
+            return Replay(replayed.labels[: len(ssh_map.dstate_at)], Outcome.CONTRADICTED)
         return replayed
 
     def _whole(self, ssh_map: SSHMap, replayed: Replay) -> SSHMap:
@@ -359,7 +359,7 @@ class Prefixes:
 
         If stars need to agree only within tolerance, give the map headings that all stars allow.
         """
-        whole = replace(ssh_map, labels=replayed.labels)
-        if not self._in_tolerance or len(ssh_map.labels) == len(replayed.labels):
+        whole = replace(ssh_map, dstate_at=replayed.labels)
+        if not self._in_tolerance or len(ssh_map.dstate_at) == len(replayed.labels):
             return whole
         return turned(self._task.trace, whole, self._task.theory.axioms) or whole

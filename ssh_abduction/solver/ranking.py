@@ -50,7 +50,7 @@ class Ranking:
         """The same map with its field `fit`: the poses, and how well they agree."""
         from ssh_abduction.solver.fit import fit  # loads scipy
 
-        key = ssh_map.labels, tuple(s.place for s in ssh_map.dstates), jumped(ssh_map)
+        key = ssh_map.dstate_at, tuple(s.place for s in ssh_map.dstates), jumped(ssh_map)
         if key not in self._known:
             self._known[key] = fit(self._trace.without_displacements_at(jumped(ssh_map)), ssh_map)
         return with_compass(replace(ssh_map, fit=self._known[key]))
@@ -115,7 +115,7 @@ def _order(ssh_map: SSHMap) -> tuple[object, ...]:
     faults = [(f.step, f.kind, str(f.seen), str(f.expected)) for f in ssh_map.faults]
     return (
         ssh_map.fit.chi2 if ssh_map.fit else math.inf,
-        ssh_map.labels,
+        ssh_map.dstate_at,
         places,
         paths,
         [s.direction or 0 for s in dstates],

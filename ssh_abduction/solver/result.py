@@ -116,7 +116,7 @@ class Solution(MapSequence):
         if self.maps:
             parts.append(cards.map_card(self.maps[0]))
         elif self.partial is not None:
-            steps = counted(len(self.partial.labels), "steps")
+            steps = counted(len(self.partial.dstate_at), "steps")
             parts.append(
                 cards.paragraph(f"the best map of the first {steps}:")
                 + cards.map_card(self.partial)
@@ -465,10 +465,10 @@ def _check_steps(
 ) -> None:
     """Raise MapError if a map does not have this many steps, or is not of the trace (if given)."""
     for i, ssh_map in enumerate(maps):
-        if len(ssh_map.labels) != steps:
+        if len(ssh_map.dstate_at) != steps:
             raise MapError(
                 f"{where}: maps[{i}].labels: expected {steps}, one a step, got "
-                f"{len(ssh_map.labels)}; it was changed by hand"
+                f"{len(ssh_map.dstate_at)}; it was changed by hand"
             )
     if trace is not None:
         check_of_trace(maps, checked_trace(trace), where, views="functional_view" in theory.hard)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, get_args
 
 from ssh_abduction.data.checks import an_instance, one_of
 from ssh_abduction.data.errors import SolverError, TheoryError, brief
+from ssh_abduction.data.drives import starts_of
 from ssh_abduction.data.floors import with_floors
 from ssh_abduction.data.maps import SSHMap, checked_maps
 from ssh_abduction.data.trace import Trace, checked_trace
@@ -233,9 +234,9 @@ class Search:
         for cost, level in groupby(self._found(), key=lambda priced: priced[1]):
             maps = (ssh_map for ssh_map, _ in level)
             for ssh_map in ranking.ranked(maps, self.over) if ranking else maps:
-                on_floors = with_floors(ssh_map, self.trace)
-                self._answer.take_down(on_floors, cost)
-                yield on_floors
+                told = _told(ssh_map, self.trace)
+                self._answer.take_down(told, cost)
+                yield told
 
     def _found(self) -> Iterator[Priced]:
         """Run the search, and yield each map with its preferred counts as it is found.
@@ -420,6 +421,11 @@ class Search:
             known.status = Status.FEASIBLE
         known.stopped = stopped
         # clingo cannot say how large its program is while another thread is in it.
-        maps = () if best is None else (with_floors(best, self.trace),)
+        maps = () if best is None else (_told(best, self.trace),)
         solution = self._answer.solution(maps, Grounding(0, 0))
         return replace(solution, complete=known.status is Status.UNSATISFIABLE)
+
+
+def _told(ssh_map: SSHMap, trace: Trace) -> SSHMap:
+    """Return a map with the drives and floors that the trace tells of."""
+    return replace(with_floors(ssh_map, trace), starts=starts_of(trace))

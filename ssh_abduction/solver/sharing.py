@@ -213,8 +213,8 @@ class Sharing:
     def absorb(self, ssh_map: SSHMap) -> None:
         """Take in a map: keep only what it shares with all maps before."""
         self.maps += 1
-        if ssh_map.labels != self._labels:
-            self._split_by(ssh_map.labels)
+        if ssh_map.dstate_at != self._labels:
+            self._split_by(ssh_map.dstate_at)
         for sort, kept in self._sorts(ssh_map.dstates).items():
             names = tuple(_name(ssh_map.dstates[label], sort) for label in self._label_of)
             kept.absorb(names)

@@ -116,7 +116,7 @@ class Stages:
         if self.mended_maps:
             first = self.mended_maps[0]
             known.status = Status.OPTIMAL
-            known.keep(Found.of(first, parts.task.theory), first.labels)
+            known.keep(Found.of(first, parts.task.theory), first.dstate_at)
             parts.rivals.reasons = False  # engines do not know mended traces
         return bool(self.mended_maps)
 
@@ -149,7 +149,7 @@ class Stages:
         Such an engine begins with a map. If no map is known or can be made, change nothing.
         """
         parts, best = self._parts, self._parts.known.best
-        labels = best.labels if best else ()
+        labels = best.dstate_at if best else ()
         parts.candidates.sketch()
         if parts.known.best is not None:
             from ssh_abduction.solver.engines.frameless import FramelessEngine

@@ -226,7 +226,7 @@ class Weighing:
             self.bound = max(self.bound, self._price(least) + self._base)
         if self.candidates:
             best = self.candidates[0].map
-            known.keep(Found.of(best, self._parts.task.theory), best.labels)
+            known.keep(Found.of(best, self._parts.task.theory), best.dstate_at)
 
     def maps(self) -> Generator[Priced, None, None]:
         """The maps of least cost, and then those that cost up to `within` nats more."""
@@ -441,13 +441,13 @@ def _with(faults: Sequence[Fault], ssh_map: SSHMap) -> SSHMap:
 
 def _course(ssh_map: SSHMap) -> Course:
     """The dstate and the place of each step, numbered by first visit."""
-    places = [ssh_map.dstates[label].place for label in ssh_map.labels]
-    return tuple(numbered(ssh_map.labels)), tuple(numbered(places))
+    places = [ssh_map.dstates[label].place for label in ssh_map.dstate_at]
+    return tuple(numbered(ssh_map.dstate_at)), tuple(numbered(places))
 
 
 def _pinned(theory: Theory, ssh_map: SSHMap) -> Theory:
     """The theory that counts, and demands the dstates of a map and its different places."""
-    labels = ssh_map.labels
+    labels = ssh_map.dstate_at
     first = {label: labels.index(label) for label in dict.fromkeys(labels)}
     same = [(first[label], t) for t, label in enumerate(labels) if t != first[label]]
     different: list[tuple[int, int]] = []
@@ -496,5 +496,5 @@ def _engine(task: Task, parts: Parts) -> Engine:
     if isinstance(engine, StepEngine) and takes_all(task) and task.speedups.ways and best:
         from ssh_abduction.solver.engines.frameless import FramelessEngine  # loads numpy
 
-        return FramelessEngine(task, best.labels)
+        return FramelessEngine(task, best.dstate_at)
     return engine

@@ -86,7 +86,7 @@ def outcome(notch: float, scale: float, seed: int = 0) -> Outcome:
         spread=scale * float(np.sqrt((offsets[:, :2] ** 2).sum(1).mean())),
         k=clusterer.k_,
         uncertainty=uncertainty_coefficient(clusterer.labels_, truth),
-        right=is_only and one_to_one(np.array(solution.maps[0].labels), truth),
+        right=is_only and one_to_one(np.array(solution.maps[0].dstate_at), truth),
         rate=rate(ranges, np.unique(truth, return_inverse=True)[1], truth, seed),
     )
 

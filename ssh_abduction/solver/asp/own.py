@@ -118,7 +118,7 @@ def _shown(trace: Trace, ssh_map: SSHMap) -> Iterator[str]:
     before: dict[int, list[int]] = {}
     here: dict[int, list[int]] = {}
     along: dict[tuple[int, int], list[int]] = {}
-    for t, label in enumerate(ssh_map.labels):
+    for t, label in enumerate(ssh_map.dstate_at):
         s = ssh_map.dstates[label]
         yield f"is({t},{first.setdefault(label, t)})"
         yield from (f"same({i},{t})" for i in before.setdefault(label, []))

@@ -136,14 +136,14 @@ class Sketch:
             theory: The theory.
         """
         sketch = cls(trace.steps[0], theory)
-        sketch._map, sketch._tree, sketch.labels = ssh_map, False, list(ssh_map.labels)
+        sketch._map, sketch._tree, sketch.labels = ssh_map, False, list(ssh_map.dstate_at)
         sketch._links = {(s, action): x for s, action, x in ssh_map.links}
         sketch._excused = ssh_map.excused
         sketch._orders = [list(path.order) for path in ssh_map.paths]
         sketch._states, sketch._along, sketch._facing, sketch._slots = [], {}, {}, {}
         stars: dict[int, object] = {}
         # The observation of a dstate is that of its first step.
-        seen = dict(zip(reversed(ssh_map.labels), reversed(trace.steps), strict=True))
+        seen = dict(zip(reversed(ssh_map.dstate_at), reversed(trace.steps), strict=True))
         for s in ssh_map.dstates:
             place, heading, direction = s.place or 0, s.heading or 0, s.direction or 1
             assert s.view is not None
@@ -189,7 +189,7 @@ class Sketch:
     def map(self) -> SSHMap:
         """Return the map of all steps so far. Numbers follow the order of first visits."""
         labels = tuple(self.labels)
-        self._map = replace(self._map, labels=labels) if self._map else self._made(labels)
+        self._map = replace(self._map, dstate_at=labels) if self._map else self._made(labels)
         return self._map
 
     def _untried(self, here: int, action: Action, step: Step) -> int:

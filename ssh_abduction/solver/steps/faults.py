@@ -92,7 +92,7 @@ def with_changes(ssh_map: SSHMap, trace: Trace, theory: Theory) -> SSHMap | None
     names = [drive.name for drive in drives_of(trace)]
     last: dict[int | None, tuple[int, tuple[bool, ...]]] = {}  # what was last seen at each place
     faults = []
-    for t, label in enumerate(ssh_map.labels):
+    for t, label in enumerate(ssh_map.dstate_at):
         drive, s = bisect_right(begins, t), ssh_map.dstates[label]
         seen = turned_to_frame(trace.steps[t].openings or (), s.heading or 0)
         before, known = last.setdefault(s.place, (drive, seen))
@@ -145,13 +145,13 @@ def with_faults(ssh_map: SSHMap, trace: Trace, mended: Trace, theory: Theory) ->
         theory: The theory, with the costs of faults.
     """
     votes: dict[int, Counter[View]] = {}
-    for label, step in zip(ssh_map.labels, trace.steps, strict=True):
+    for label, step in zip(ssh_map.dstate_at, trace.steps, strict=True):
         assert step.view is not None
         votes.setdefault(label, Counter())[step.view] += theory.fault_tenths("misread", step) or 1
     shows = {label: max(counts, key=lambda view: counts[view]) for label, counts in votes.items()}
     faults: list[tuple[int, str]] = []
     for t, (step, other) in enumerate(zip(trace.steps, mended.steps, strict=True)):
-        if step.view != shows[ssh_map.labels[t]]:
+        if step.view != shows[ssh_map.dstate_at[t]]:
             faults.append((t, "misread"))
         if theory.star in ("pattern", "frame") and step.openings != other.openings:
             faults.append((t, "misseen"))
@@ -159,11 +159,11 @@ def with_faults(ssh_map: SSHMap, trace: Trace, mended: Trace, theory: Theory) ->
             faults.append((t, "slipped"))
         if step.displacement != other.displacement:
             faults.append((t, "jumped"))
-    told = faults_of(faults, dict(enumerate(ssh_map.labels)), shows, trace, theory)
+    told = faults_of(faults, dict(enumerate(ssh_map.dstate_at)), shows, trace, theory)
     dstates = tuple(replace(s, view=shows[s.id]) for s in ssh_map.dstates)
     return replace(
         ssh_map,
         dstates=dstates,
-        links=links_of(ssh_map.labels, trace, faults),
+        links=links_of(ssh_map.dstate_at, trace, faults),
         faults=told,
     )

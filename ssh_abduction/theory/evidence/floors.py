@@ -51,7 +51,7 @@ class Floors:
             beside.setdefault(one, {}).setdefault(other, found)
             beside.setdefault(other, {}).setdefault(one, found)
         for t in _lifted(trace):
-            if t < len(ssh_map.labels) and (way := _way(stretches[t - 1], stretches[t], beside)):
+            if t < len(ssh_map.dstate_at) and (way := _way(stretches[t - 1], stretches[t], beside)):
                 return frozenset(way)
         return None
 
@@ -78,7 +78,7 @@ def _meetings(ssh_map: SSHMap) -> Iterator[Equality]:
     """Yield each step at a known dstate or place, with the first step there."""
     dstates: dict[int, int] = {}
     places: dict[int, int] = {}
-    for t, label in enumerate(ssh_map.labels):
+    for t, label in enumerate(ssh_map.dstate_at):
         place = ssh_map.dstates[label].place
         if (first := dstates.setdefault(label, t)) != t:
             yield Equality(first, t)

@@ -96,9 +96,9 @@ class Planar:
         return ""
 
     def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
-        places = [ssh_map.dstates[label].place for label in ssh_map.labels]
-        labels: Mapping[int, int] = dict(enumerate(ssh_map.labels))
-        moves = _first_moves(trace, ssh_map.labels)
+        places = [ssh_map.dstates[label].place for label in ssh_map.dstate_at]
+        labels: Mapping[int, int] = dict(enumerate(ssh_map.dstate_at))
+        moves = _first_moves(trace, ssh_map.dstate_at)
         if since and all(t + 1 < since for t in moves):  # no edge or turn is new since then
             return None
         at = {t: place for t, place in enumerate(places) if place is not None}

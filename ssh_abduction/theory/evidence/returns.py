@@ -294,7 +294,7 @@ class Returns:
         """
         import numpy as np
 
-        labels, places = ssh_map.labels, tuple(s.place for s in ssh_map.dstates)
+        labels, places = ssh_map.dstate_at, tuple(s.place for s in ssh_map.dstates)
         course = Course.of(labels, places)
         if course in self._accepted:
             return None

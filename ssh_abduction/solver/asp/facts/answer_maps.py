@@ -120,7 +120,7 @@ def _map(
         if h in path_of and p in place_of and q in place_of
     ]
     return SSHMap(
-        labels=labels,
+        dstate_at=labels,
         dstates=dstates,
         links=links_of(labels, trace, faults),
         places=tuple(place_of.values()),
