@@ -15,8 +15,8 @@ from itertools import groupby
 from typing import TYPE_CHECKING, get_args
 
 from ssh_abduction.data.checks import an_instance, one_of
-from ssh_abduction.data.errors import SolverError, TheoryError, brief
 from ssh_abduction.data.drives import starts_of
+from ssh_abduction.data.errors import SolverError, TheoryError, brief
 from ssh_abduction.data.floors import with_floors
 from ssh_abduction.data.maps import SSHMap, checked_maps
 from ssh_abduction.data.trace import Trace, checked_trace
