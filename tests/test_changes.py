@@ -36,6 +36,8 @@ from ssh_abduction.data import (
     together,
 )
 from ssh_abduction.explain import explain_place
+from ssh_abduction.solver.guesses.beam import Beam
+from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import settle
 
 MONDAY = Trace.from_steps(
@@ -256,3 +258,28 @@ def test_the_beam_finds_changes_of_drives_with_displacements() -> None:
     assert str(fault) == "the gateway south of place 0 was open on monday and closed on tuesday"
     assert solution.trace is not None
     assert check(solution.trace, ssh_map, Theory(changed=0.5)) == ()
+
+
+def test_the_beam_finds_two_changes_where_a_drive_starts() -> None:
+    """On Tuesday the first end of a corridor looks like the other end, as two ways are closed."""
+    there = ["travel", "travel", "travel", "around"]
+    moved = [(5.0, 0.0, 0.0)] * 3 + [(0.0, 0.0, math.pi)]
+    stars = [[1, 1, 0, 1], *[[1, 0, 1, 0]] * 2, [0, 0, 1, 0]]
+    stars += [[1, 0, 0, 0], *[[1, 0, 1, 0]] * 2, [0, 1, 1, 1]]
+    closed = [[1, 0, 0, 0], *stars[1:7], [0, 0, 1, 0]]
+    monday, tuesday = (
+        Trace.from_steps(
+            list("abcaefgh") * 4,
+            (there * 8)[:-1],
+            stars=seen * 4,
+            displacements=(moved * 8)[:-1],
+            odometry=Odometry(along=0.05, heading=0.01),
+            name=name,
+        )
+        for name, seen in (("monday", stars), ("tuesday", closed))
+    )
+    problem = settle(together([monday, tuesday]), Theory(changed=1.5))
+    beam = Beam(problem, Log(problem.trace, problem.theory, problem.pairs), 1)
+    ssh_map = next(beam.maps())
+    assert ssh_map.labels == tuple(range(8)) * 8
+    assert [(fault.kind, fault.place) for fault in ssh_map.faults] == [("changed", 0)] * 2

@@ -59,6 +59,8 @@ LOST, ALIKE = 32, 4
 SPARE = 2
 # An extension that costs this many nats more than the best one of its hypothesis is not made.
 DEAREST = 20.0
+# So many gateways of one place may have changed between drives. An extension may cost this more.
+CHANGES = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +106,7 @@ class Beam:
         self._leaves = self._has_places and "travel_leaves" in theory.hard
         # The prices of a dstate and of a place.
         self._prices = theory.prices[0], theory.prices[1] if self._has_places else 0.0
+        self._dearest = DEAREST + CHANGES * theory.changed * theory.prices[0]
         self._reckoning, self._frames = Reckoning(trace), frames_of(trace)
         self.nats, self.refuses = math.inf, False
         self._sights = Sights(trace, self._bare, log, misreads=theory.misread > 0)
@@ -196,7 +199,7 @@ class Beam:
                 continue
             count[pieces.joins] += 1
             if self._frames and not pieces.is_loose:
-                dearest = min(dearest, option.nats + DEAREST)
+                dearest = min(dearest, option.nats + self._dearest)
             yield child
 
     def _extended(self, beam: list[Hypothesis], end: int) -> list[Hypothesis]:
@@ -388,7 +391,7 @@ class Beam:
         return [
             option
             for option in options
-            if option.nats <= least + DEAREST and self._is_allowed(option, t)
+            if option.nats <= least + self._dearest and self._is_allowed(option, t)
         ]
 
     def _near(
