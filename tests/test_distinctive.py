@@ -212,8 +212,22 @@ def test_a_robot_turns_around_in_a_bow() -> None:
 
 
 def test_a_robot_that_turns_around_in_a_disc_has_one_visit() -> None:
-    log, track = log_of(FORK, [(1, 0), (11, 0), (10, 0), (10, 8)])
+    log, track = log_of(FORK, [(1, 0), (10.8, 0), (10, 0), (10, 8)])
     assert [round(float(visit.middle[0])) for visit in find_visits(log, track)] == [10]
+
+
+def test_a_robot_that_turns_around_just_outside_of_a_disc_has_a_visit_there() -> None:
+    """The robot passes the fork, comes back from the east, and leaves to the north."""
+    log, track = log_of(FORK, [(1, 0), (11.4, 0), (10, 0), (10, 8)])
+    fork, end, again = find_visits(log, track)
+    assert fork.scan < end.scan < again.scan
+    assert math.dist(end.middle, (11.4, 0)) < 0.3
+    ways = [fork.arrived, fork.left], [end.arrived, end.left], [again.arrived, again.left]
+    quarters = [
+        [round(2 * visit.ways[way].bearing / math.pi) % 4 for way in both]
+        for visit, both in zip((fork, end, again), ways, strict=True)
+    ]
+    assert quarters == [[2, 0], [2, 2], [0, 1]]
 
 
 def test_successive_visits_to_one_place_are_one() -> None:

@@ -20,8 +20,8 @@ from perception.places.visits import MERGED, Visit, Way, apart
 SAME, SHARE = 0.6, 0.5
 # The robot turned around if its directions of motion over some stride in metres, before and after,
 # differ by more than REVERSED radians. It turns on the spot or in a bow, so there are several
-# strides. Other visits are more than a stride and ALONE metres away along the trajectory.
-STRIDES, REVERSED, ALONE = (1.0, 2.0, 4.0), math.radians(135), 1.5
+# strides. Other visits are farther away along the trajectory than a stride and than their radius.
+STRIDES, REVERSED = (1.0, 2.0, 4.0), math.radians(135)
 # A turn waits for visits up to NEARBY metres of trajectory away. No stride is longer, and discs are
 # taken to be no larger. Turns near each other wait for each other up to TURNING metres.
 NEARBY, TURNING = 4.0, 8.0
@@ -182,19 +182,40 @@ class Stays:
         # Begin with the shortest stride and the sharpest turn. Other turns near it belong to the
         # same turning point.
         for turn in sorted(self._turns, key=lambda turn: (turn.stride, -turn.angle, -turn.scan)):
-            far = max(ALONE, turn.stride)
             if turn.scan < limit and all(
-                abs(at - turn.way) > max(far, visit.radius) for at, visit in self._found
+                abs(at - turn.way) > max(turn.stride, visit.radius) for at, visit in self._found
             ):
-                i, position = turn.scan, self._recent.poses(turn.scan, turn.scan + 1)[0, :2].copy()
-                self._found.append((turn.way, Visit(i, position, i, i, support=0.0)))
-        done = [visit for _, visit in self._found if self._done <= visit.scan < limit]
+                self._add_turn(turn.scan)
+        done = sorted(
+            (visit for _, visit in self._found if self._done <= visit.scan < limit),
+            key=lambda visit: visit.scan,
+        )
+        completed = [self._with_gateways(visit) for visit in done]
         # Visits are remembered until turns near them are decided.
         least = self._recent.way(min(limit, self._recent.end - 1)) - NEARBY
         self._found = [(way, visit) for way, visit in self._found if way >= least]
         self._turns = [turn for turn in self._turns if turn.scan >= limit]
         self._done = limit
-        return [self._with_gateways(visit) for visit in sorted(done, key=lambda one: one.scan)]
+        return completed
+
+    def _add_turn(self, scan: int) -> None:
+        """Add a visit where the robot turned around. It splits a stay that it is part of."""
+        parts = [part for _, visit in self._found for part in self._split(visit, scan)]
+        position = self._recent.poses(scan, scan + 1)[0, :2].copy()
+        parts.append(Visit(scan, position, scan, scan, support=0.0))
+        self._found = [(self._recent.way(visit.scan), visit) for visit in parts]
+
+    def _split(self, visit: Visit, scan: int) -> Iterator[Visit]:
+        """The visits to a place before and after a turn that is outside of its disc."""
+        begin = max(visit.begin, self._recent.begin)
+        if not begin < scan < visit.end:
+            yield visit
+            return
+        for first, last in ((begin, scan), (scan, visit.end)):
+            far = np.hypot(*(self._recent.poses(first, last + 1)[:, :2] - visit.middle).T)
+            if far.min() <= visit.radius:
+                nearest = first + int(far.argmin())
+                yield replace(visit, scan=nearest, begin=first, end=last)
 
     def _with_gateways(self, visit: Visit) -> Visit:
         """Complete a visit by the ways that the robot took: those by which it crossed the disc."""
@@ -215,7 +236,11 @@ class Stays:
             None if the log begins or ends in the disc.
         """
         way = self._recent.way(visit.scan)
-        begin, end = self._recent.at(way - AROUND), self._recent.at(way + AROUND, "right")
+        turns = [one.scan for _, one in self._found if not one.support]
+        begin = max([self._recent.at(way - AROUND), *(i for i in turns if i < visit.scan)])
+        end = min(
+            [self._recent.at(way + AROUND, "right"), *(i + 1 for i in turns if i > visit.scan)]
+        )
         part = (begin, visit.scan + 1) if side < 0 else (visit.scan, end)
         onward = (self._recent.poses(*part)[:, :2] - visit.middle)[::side]
         outside = np.flatnonzero(np.hypot(*onward.T) >= max(visit.radius, SMALL) + RIM)
