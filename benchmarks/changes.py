@@ -6,13 +6,18 @@ Two robots drive through a maze with stars and noisy displacements, and start an
 second drive, 0 to `--most` ways between cells are closed or opened, at a cell that the first drive
 saw. A view is one of `--views` looks of a cell and a heading, the same on both drives. The script
 prints a row in Markdown for each number of changes: how many gateways changed at cells that both
-drives saw, how many of these the first map names, and how many others it names.
+drives saw, how many of these the first map names, and how many others it names. It names each map
+that is false, and each change that is missed.
+
+With --beam, only the beams of width 1 and of this width search, without a time limit. So the load
+of the machine does not matter. Their cheapest map is judged.
 """
 
 from __future__ import annotations
 
 import argparse
 import random
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
@@ -21,8 +26,12 @@ from instances import HEADINGS, doors_of, maze
 from together import joined
 from truth import NOISE, Known, is_true
 
-from ssh_abduction import SSHMap, Theory, solve
+from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.data import Odometry
+from ssh_abduction.solver.guesses.beam import Beam
+from ssh_abduction.solver.misfit import Misfit
+from ssh_abduction.solver.steps.log import Log
+from ssh_abduction.theory.settle import settle
 
 Cell = tuple[int, int]
 Gateway = tuple[Cell, int]  # a cell, and 0 to 3 for north, east, south, west
@@ -83,6 +92,19 @@ def named(ssh_map: SSHMap, known: Known) -> Iterator[Gateway]:
         yield (x, y), ((fault.gateway or 0) - slot + heading) % 4
 
 
+def cheapest(trace: Trace, theory: Theory, width: int) -> SSHMap:
+    """The map of least cost that beams of width 1 and of another width find."""
+    problem = settle(trace, theory)
+    log, misfit = Log(trace, problem.theory, problem.pairs), Misfit(problem)
+    dstate, place, _ = theory.prices
+
+    def nats(found: SSHMap) -> float:
+        dstates = len(found.dstates) + sum(fault.cost for fault in found.faults)
+        return dstate * dstates + place * len(found.places) + misfit.of_map(found) / 2
+
+    return min((m for w in {1, width} for m in Beam(problem, log, w).maps()), key=nats)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--cells", type=int, default=4, metavar="N", help="mazes of N x N cells")
@@ -91,18 +113,28 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, metavar="SEED", help="the first seed")
     parser.add_argument("--views", type=int, default=8, metavar="N", help="looks of dstates")
     parser.add_argument("--most", type=int, default=3, metavar="N", help="the most changes")
-    parser.add_argument("--price", type=float, default=1.5, metavar="DSTATES")
+    parser.add_argument("--least", type=int, default=0, metavar="N", help="the fewest changes")
+    parser.add_argument("--price", type=float, default=1.2, metavar="DSTATES")
     parser.add_argument("--limit", type=float, default=20, metavar="S", help="seconds for each")
+    parser.add_argument("--beam", type=int, metavar="WIDTH", help="search by beams alone")
     options = parser.parse_args()
     theory = Theory(changed=options.price, star="frame")
     print("| changes | true maps | changed gateways | named | others named | maps that name none |")
     print("|---|---|---|---|---|---|")
-    for changes in range(options.most + 1):
+    for changes in range(options.least, options.most + 1):
         true = changed = found = others = none = 0
         for seed in range(options.first, options.first + options.seeds):
             one = case(options.cells, options.steps, seed, changes, options.views)
-            best = solve(one.known.trace, theory, time_limit=options.limit).maps[0]
+            trace = one.known.trace
+            best = (
+                solve(trace, theory, time_limit=options.limit).maps[0]
+                if options.beam is None
+                else cheapest(trace, theory, options.beam)
+            )
             told = set(named(best, one.known))
+            if told != one.changed or not is_true(best, one.known):
+                missed, more = sorted(one.changed - told), sorted(told - one.changed)
+                print(f"{one.known.name}: missed {missed}, others {more}", file=sys.stderr)
             true += is_true(best, one.known)
             changed += len(one.changed)
             found += len(told & one.changed)

@@ -207,7 +207,8 @@ def _apart(one: float, other: float) -> float:
 def _with_opposites(found: Sequence[Gateway]) -> tuple[Gateway, ...]:
     """Set `opposite` for two gateways of a room if each is the best opposite of the other.
 
-    They may differ from exactly opposite by at most STRAIGHT degrees.
+    They may differ from exactly opposite by at most STRAIGHT degrees. Two doors to one other room
+    are never opposite: no path comes back to a room.
     """
 
     def nearest(k: int) -> int:
@@ -219,7 +220,9 @@ def _with_opposites(found: Sequence[Gateway]) -> tuple[Gateway, ...]:
     pairs = {
         k: other
         for k in range(len(found))
-        if k == nearest(other := nearest(k)) and _bend(found, k, other) <= STRAIGHT
+        if k == nearest(other := nearest(k))
+        and _bend(found, k, other) <= STRAIGHT
+        and found[k].to != found[other].to
     }
     return tuple(replace(gateway, opposite=pairs.get(k)) for k, gateway in enumerate(found))
 
