@@ -5,9 +5,12 @@ import contextlib
 import gc
 import math
 import signal
+from pathlib import Path
 
+import pytest
 from hypothesis import HealthCheck, settings
 from threadpoolctl import threadpool_limits
+from worlds import rectangle
 
 from ssh_abduction.cli import verbosity, view
 
@@ -39,3 +42,14 @@ def pytest_collection_finish() -> None:
     threadpool_limits(1)
     gc.freeze()
     gc.set_threshold(50_000, 20, 50)
+
+
+@pytest.fixture
+def room(tmp_path: Path) -> str:
+    """The path of a short trace that has one minimal map, of 8 dstates.
+
+    Tests of what surrounds a search take this one: the route of ACES3 takes ten times as long.
+    """
+    path = tmp_path / "room.jsonl"
+    rectangle(8).save(path)
+    return str(path)

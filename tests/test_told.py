@@ -170,15 +170,15 @@ EAGER = (
 
 @pytest.mark.parametrize(("words", "mixed"), [((), True), (("--json",), False)])
 def test_progress_never_comes_between_the_lines_of_an_answer_for_programs(
-    words: tuple[str, ...], mixed: bool
+    words: tuple[str, ...], mixed: bool, tee: str
 ) -> None:
-    command = [sys.executable, "-c", EAGER, "solve", ACES, *words]
+    command = [sys.executable, "-c", EAGER, "solve", tee, *words]
     done = subprocess.run(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=True
     )
     assert ("ssh-abduction: prefix" in done.stdout) == mixed
     if not mixed:
-        assert json.loads(done.stdout)["count"] == 4
+        assert json.loads(done.stdout)["count"] == 1
 
 
 def test_a_view_cannot_steer_the_terminal_by_the_log(

@@ -21,6 +21,7 @@ import os
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
+from functools import cache
 from importlib.metadata import version
 from types import ModuleType
 
@@ -87,8 +88,9 @@ VERBS: Mapping[str, tuple[ModuleType, ...]] = {
 FOR_PROGRAMS = ("json", "facts", "dot", "graphml", "svg")
 
 
+@cache
 def parser() -> Parser:
-    """Make the parser of the whole command line."""
+    """Make the parser of the whole command line, once: it holds several hundred options."""
     top = Parser(
         prog="ssh-abduction",
         description="Find the topological maps that explain what a robot saw and did.",
