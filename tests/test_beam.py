@@ -19,6 +19,7 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.data import Odometry
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.explain.no_map import explain
+from ssh_abduction.runtime.clock import heeding
 from ssh_abduction.solver import Search, Status
 from ssh_abduction.solver.guesses.beam import Beam
 from ssh_abduction.solver.guesses.completing import completed
@@ -56,6 +57,30 @@ def test_gateways_at_any_angles(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, xml())
     known = truth.told("ring", tour(plan, 60, 5, DRIFTING.odometry))
     assert truth.is_true(maps_of(known.trace, Theory.topological(), 4)[0], known)
+
+
+@pytest.mark.parametrize("looks", [150, 400])
+def test_a_beam_that_did_not_end_begins_a_map(looks: int) -> None:
+    """The steps that the beam reached are joined, and all others are new."""
+    (known,) = truth.mazes(5, 120, [700], DRIFTING)
+    search = Search(known.trace, Theory(star="none"))
+    candidates, left = search._parts.candidates, iter(range(looks))
+    candidates.sketch(0.0)
+    trivial = search.best
+    beam = candidates.beam(1)
+    assert beam
+    assert trivial
+
+    def over() -> None:
+        if next(left, None) is None:
+            raise TimeoutError
+
+    with pytest.raises(TimeoutError), heeding(over):
+        list(beam.maps())
+    candidates.go_on(beam)
+    assert search.best
+    assert len(search.best.dstates) < len(trivial.dstates)
+    assert check(known.trace, search.best, search.theory) == ()
 
 
 @pytest.mark.slow

@@ -93,6 +93,18 @@ class Candidates:
         """The maps that a beam finds, the best one first."""
         yield from filter(self._judging.accepts, map(self._with_unknown_views, beam.maps()))
 
+    def go_on(self, beam: Beam) -> None:
+        """Offer a sketch that begins with the steps that a beam reached before its time was over.
+
+        If what follows contradicts it, begin earlier.
+        """
+        before = self._known.best
+        for first in beam.partial():
+            done = self._task.trace.prefix(len(first.dstate_at))
+            self._go_on_to_end(Sketch.beyond(first, done, self._task.theory, homing=False))
+            if self._known.best is not before:
+                return
+
     def sketch(self, seconds: float = math.inf) -> None:
         """Make a sketch (a map without a search), if no map of the whole trace is known.
 

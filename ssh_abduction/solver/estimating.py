@@ -8,10 +8,10 @@ added. They fit the displacements, and may break axioms.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import TypeAlias
 
+from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.solver.weighed import Rival
 from ssh_abduction.theory.settle import Problem
@@ -20,12 +20,14 @@ from ssh_abduction.theory.settle import Problem
 Course: TypeAlias = tuple[tuple[int, ...], tuple[int, ...]]
 # Computes the cost in nats of a map with these dstates and places.
 CostOf: TypeAlias = Callable[[Sequence[int], Sequence[int]], float]
-# Estimating rivals may take this many seconds. A rival that costs CERTAIN nats more than the best
-# map does not count: a million of them make 0.005 of a doubt.
-ESTIMATING, CERTAIN = 0.5, 19.0
+# A rival that costs CERTAIN nats more than the best map does not count: a million of them make a
+# doubt of 0.005.
+CERTAIN = 19.0
 
 
-def estimated(best: Rival, visit: Sequence[int], cost_of: CostOf) -> Iterator[Rival]:
+def estimated(
+    best: Rival, visit: Sequence[int], cost_of: CostOf, seconds: float
+) -> Iterator[Rival]:
     """Yield rivals that cost little more than the best map, each once.
 
     In each, some visits to a place of the best map are visits to a new place: a single visit, or
@@ -35,19 +37,20 @@ def estimated(best: Rival, visit: Sequence[int], cost_of: CostOf) -> Iterator[Ri
         best: The best map.
         visit: The first step of the visit of each step.
         cost_of: Computes the cost of a map.
+        seconds: The time that this may take.
     """
     at = best.places or best.dstates
     visits: dict[int, list[int]] = {}  # the first steps of the visits to each place
     for step, begin in enumerate(_begins(at, visit)):
         if begin == step:
             visits.setdefault(at[step], []).append(step)
-    ends = time.perf_counter() + ESTIMATING
+    watch = Watch().part(seconds)
     tried: set[Course] = {(best.dstates, best.places)}
     for name, begins in visits.items():
         singly = [{begin} for begin in begins[1:]]
         from_then_on = [set(begins[i:]) for i in range(1, len(begins) - 1)]
         for moved in (*singly, *from_then_on) if len(begins) > 1 else ():
-            if time.perf_counter() > ends:
+            if not watch.allows(0.0):
                 return
             dstates, places = course = _moved(best, visit, name, moved)
             if course in tried:

@@ -44,6 +44,7 @@ def fall_back(parts: Parts, answer: Answer, *, may_search: bool) -> None:
         and known.stopped == "time limit"
         and parts.watch.has_reserve
     )
+    parts.watch.start()  # what is done after the limit counts, too
     with suppress(KeyboardInterrupt):
         parts.candidates.sketch(_overtime(parts))
     if may_salvage:
@@ -100,18 +101,24 @@ def best_map(parts: Parts) -> Iterator[Priced]:
 
     The checker looks at the map first, as far as there is time.
     """
-    known = parts.known
+    known, watch = parts.known, parts.watch
+    watch.start()
     if known.status in (Status.FEASIBLE, Status.OPTIMAL) and not known.count and known.best:
         with suppress(LimitError), heeding(Watch().part(_overtime(parts)).check):
-            parts.judging.pass_map(known.best, parts.engine.size, parts.watch.elapsed())
+            parts.judging.pass_map(known.best, parts.engine.size, watch.elapsed())
+        watch.stop()
         known.count = 1
         note(parts, known.best, known.cost)
         yield known.best, known.cost
+    watch.stop()
 
 
 def _overtime(parts: Parts) -> float:
-    """The seconds that are left to make a map without a search, or to check one."""
+    """The seconds that are left to make a map without a search, or to check one.
+
+    The parts of the search that cannot be stopped may have taken some of them.
+    """
     limit = parts.limits.time_limit
     if parts.known.stopped != "time limit" or limit is None:
         return INTERRUPTED
-    return max(parts.watch.left(), 0.0) + OVERTIME_SHARE * limit + OVERTIME
+    return max(parts.watch.left() + OVERTIME_SHARE * limit + OVERTIME, 0.0)

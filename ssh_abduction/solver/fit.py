@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 from scipy.special import gammaincc
+from threadpoolctl import threadpool_limits
 
 from ssh_abduction.data.maps import Fit, Pose, SSHMap
 from ssh_abduction.data.trace import Trace
@@ -62,7 +63,9 @@ def fit(trace: Trace, ssh_map: SSHMap) -> Fit:
     Returns:
         The poses of the dstates, and chi-square with its degrees of freedom.
     """
-    return Poses.of_map(trace, ssh_map).fit()
+    # The matrices are small: threads of BLAS would mostly wait for each other.
+    with threadpool_limits(1, user_api="blas"):
+        return Poses.of_map(trace, ssh_map).fit()
 
 
 class Poses:

@@ -34,7 +34,7 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.runtime.logs import log_of
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError
-from ssh_abduction.solver.choosing import FEW_STEPS, READABLE, new_engine, takes_all
+from ssh_abduction.solver.choosing import READABLE, new_engine, takes_all
 from ssh_abduction.solver.engines.base import Engine, Found, Task
 from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.equations import spreads_of
@@ -67,14 +67,13 @@ EXCESS = 2.25
 # Without a time limit, give the proof up when no better map was found for this many seconds, and
 # this many times as long as it took to find the best one.
 PATIENCE, MORE = 10.0, 5.0
-# Guess maps by beams of hypotheses of these widths. Each may take time until this share of the time
-# limit is over.
-WIDTHS = {1: 0.8, 4: 0.6, 16: 0.7}
-# The beam that breaks axioms may take time until this share is over.
-BREAKING = 0.8
+# Guess maps by beams of hypotheses of these widths. Each ends when this share of the time limit is
+# over, and the beam that breaks axioms at BREAKING.
+WIDTHS, BREAKING = {1: 0.7, 4: 0.6, 16: 0.7}, 0.8
+# Estimating rivals ends OVERTIME seconds beyond the limit, but takes these numbers of seconds.
+OVERTIME, LEAST_ESTIMATING, ESTIMATING = 1.0, 0.1, 0.5
 # A beam of this width or more ends with the map of least cost, nearly always.
 BROAD = 4
-
 
 # Lists the minimal maps of a trace and a theory within some seconds, and says whether they are
 # proven.
@@ -141,8 +140,7 @@ class Weighing:
         """
         parts, watch = self._parts, self._parts.watch
         begun, left = watch.elapsed(), watch.left()
-        is_long = len(parts.task.trace) > FEW_STEPS
-        if is_long and left > 0 and parts.task.theory.star != "gateways":
+        if left > 0 and parts.task.theory.star != "gateways":
             parts.candidates.sketch(0.0)  # only the surest sketch has time
             self.keep_best()
         # With several drives or floors, a broad beam keeps as many hypotheses as a wider one.
@@ -157,15 +155,18 @@ class Weighing:
             watch.end_stage_after(begun + share * left)
             if (beam := parts.candidates.beam(width)) is None:
                 break
-            with suppress(StageTimeError):
+            try:
                 found = [self.add(ssh_map) for ssh_map in parts.candidates.maps_of(beam)]
                 ended = width
                 if width >= BROAD:
                     self._searched = min(found, default=math.inf), beam.nats
                     # A beam without axioms would be the same if the checker refused nothing.
                     self._broken = -math.inf if beam.refuses else 0.0
-                self.keep_best()
-                parts.report()
+            except StageTimeError:
+                if not ended:
+                    parts.candidates.go_on(beam)
+            self.keep_best()
+            parts.report()
             if narrow == math.inf and parts.known.best is None and clashes():
                 watch.end_stage_after(math.inf)
                 return False
@@ -324,8 +325,7 @@ class Weighing:
     def _cost_of_others(self, ssh_map: SSHMap) -> float:
         """A lower bound on the cost of all maps that are not before this one in clingo's order.
 
-        The order compares one count after the other. So the counts of a later map are equal up to
-        some count, and greater there.
+        The order is lexicographic: counts of a later map are equal up to one that is greater.
         """
         counts, priorities = Cost.of(ssh_map), self._parts.task.theory.priorities
         least = {name: self._least.get(name, 0) for name in self._prices}
@@ -381,7 +381,8 @@ class Weighing:
     def _estimated(self, best: Rival, known: Collection[Course]) -> Iterator[Rival]:
         """Rivals that were not found. If all within some nats are, one below them breaks axioms."""
         least = best.nats + self._within if self.proven else -math.inf
-        for rival in estimated(best, self._misfit.visit, self._cost_like(best)):
+        seconds = min(max(self._parts.watch.left() + OVERTIME, LEAST_ESTIMATING), ESTIMATING)
+        for rival in estimated(best, self._misfit.visit, self._cost_like(best), seconds):
             if rival.nats >= least and (rival.dstates, rival.places) not in known:
                 yield rival
 

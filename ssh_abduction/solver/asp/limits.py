@@ -87,16 +87,14 @@ class Watch:
         self.interrupted = False
 
     def start(self) -> None:
-        self._started = time.perf_counter()
+        """Let the clock run. If it runs already, do nothing."""
+        if self._started is None:
+            self._started = time.perf_counter()
 
     def begin_anew(self) -> None:
         """Restart the clock at 0, without a reserve and without a limit for a stage."""
-        self._spent, self._next_tick, self._stage_ends, self.interrupted = (
-            0.0,
-            TICK,
-            math.inf,
-            False,
-        )
+        self._started, self._spent, self._next_tick = None, 0.0, TICK
+        self._stage_ends, self.interrupted = math.inf, False
         self.use_reserve()
         self.start()
 

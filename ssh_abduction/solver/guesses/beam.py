@@ -109,6 +109,7 @@ class Beam:
         self._dearest = DEAREST + CHANGES * theory.changed * theory.prices[0]
         self._reckoning, self._frames = Reckoning(trace), frames_of(trace)
         self.nats, self.refuses = math.inf, False
+        self._reached: list[Hypothesis] = []  # the best one after each look of the checker
         self._sights = Sights(trace, self._bare, log, misreads=theory.misread > 0)
         # For each kind of fault, what it costs at each step in nats.
         self._fault = {
@@ -139,9 +140,16 @@ class Beam:
                 return
             kept[-1] = kept[-1][:SPARE]  # saves memory
             kept.append(beam)
+            self._reached.append(beam[0])
         self.nats = float(kept[-1][0].nats)
         for found in kept[-1][: ALIKE * self._width]:
             if (ssh_map := self._map(found, len(self._trace))) is not None:
+                yield ssh_map
+
+    def partial(self) -> Iterator[SSHMap]:
+        """The maps of the first steps that `maps` had reached, the longest one first."""
+        for found in reversed(self._reached):
+            if (ssh_map := self._map(found, len(found.labels))) is not None:
                 yield ssh_map
 
     def nats_without_axioms(self) -> float:

@@ -127,15 +127,16 @@ class Sketch:
         return [cls(first, theory, homing, frames) for frames in framed for homing in (True, False)]
 
     @classmethod
-    def beyond(cls, ssh_map: SSHMap, trace: Trace, theory: Theory) -> Sketch:
+    def beyond(cls, ssh_map: SSHMap, trace: Trace, theory: Theory, homing: bool = True) -> Sketch:
         """Make a sketch that begins with a map of a trace.
 
         Args:
             ssh_map: The map. It has to satisfy all axioms.
             trace: The trace of the map.
             theory: The theory.
+            homing: As for any sketch.
         """
-        sketch = cls(trace.steps[0], theory)
+        sketch = cls(trace.steps[0], theory, homing)
         sketch._map, sketch._tree, sketch.labels = ssh_map, False, list(ssh_map.dstate_at)
         sketch._links = {(s, action): x for s, action, x in ssh_map.links}
         sketch._excused = ssh_map.excused

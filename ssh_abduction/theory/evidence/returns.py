@@ -160,10 +160,16 @@ class Returns:
             tested: All possible returns, or those that end at new steps.
             since: The first new step.
         """
-        far, other = (self._refused_among(*tested[places], places) for places in (True, False))
+        far = self._refused_among(*tested[True], True)
         known = self._pairs or NO_PAIRS
         elsewhere = Pairs.joined([known, Pairs.of(elsewhere=far)]).elsewhere
-        return Pairs.of([*other, *self._steps_of_visits(elsewhere, since)], far)
+        implied = set(self._steps_of_visits(elsewhere, since))
+        # Far fewer returns to dstates are left to test.
+        first, last = tested[False]
+        loops = zip(first.tolist(), last.tolist(), strict=True)
+        is_open = [loop not in implied for loop in loops]
+        other = self._refused_among(first[is_open], last[is_open], False)
+        return Pairs.of([*implied, *other], far)
 
     def _likely_among(self, tested: _Tested) -> int:
         """Count the returns with a p-value above one half."""
@@ -225,9 +231,7 @@ class Returns:
         return list(zip(first.tolist(), last.tolist(), strict=True))
 
     def _steps_of_visits(self, elsewhere: Earlier, since: int) -> Iterator[tuple[int, int]]:
-        """Yield the pairs of steps with the same view in visits to different places.
-
-        Steps with different views are different dstates anyway.
+        """Yield the pairs of steps in visits to different places, but for those that views tell.
 
         Args:
             elsewhere: For the first step of a visit, the first steps of earlier visits to other
@@ -237,7 +241,7 @@ class Returns:
         if not self.evidence.turns_stay:
             return
         end = dict(zip(self.arrivals, [*self.arrivals[1:], len(self.trace)], strict=True))
-        views = self.trace.views
+        views = self.trace.views if self.evidence.has_one_view else [None] * len(self.trace)
         for j, others in elsewhere.items():
             for t in range(max(j, since), end[j]):
                 yield from (
