@@ -180,12 +180,16 @@ def test_actions_that_slipped_are_numbered_over_all_drives() -> None:
 def test_a_trace_given_twice_is_noticed() -> None:
     with pytest.warns(UserWarning, match="traces 1 and 2 have the same steps"):
         together([MONDAY, MONDAY], names=["monday", "again"])
+    with pytest.warns(UserWarning, match=r"the same steps \(monday, monday\); give"):
+        joint = together([MONDAY, TUESDAY, MONDAY])
+    assert [drive.name for drive in drives_of(joint)] == ["monday", "tuesday", "monday-2"]
 
 
 def test_other_names_and_other_units_are_noticed() -> None:
     go = Trace.from_steps("ab", [{"name": "go", "kind": "travel"}], name="other")
     with pytest.warns(
-        UserWarning, match=r"traces 1 and 2 have different names .*'travel' and 'go'"
+        UserWarning,
+        match=r"traces 1 and 2 \(monday, other\) have .*'travel' and 'go'",
     ):
         together([MONDAY, go])
     millimetres = Trace.from_steps("ab", ["travel"], displacements=[(1000, 0, 0)], name="mm")

@@ -251,9 +251,14 @@ def _names(traces: Sequence[Trace], names: Iterable[str] | None) -> list[str]:
     """Return the names of all drives, or raise TraceError if two are the same."""
     if names is None:
         found: list[str] = []
+        copies: Counter[tuple[Step, ...]] = Counter()
         for trace in traces:
             drives = drives_of(trace)
-            found += [d.name for d in drives] if len(drives) > 1 else [_name(trace) or ""]
+            own = [d.name for d in drives] if len(drives) > 1 else [_name(trace) or ""]
+            copies[trace.steps] += 1
+            number = copies[trace.steps]
+            # If a trace is given twice, number its name.
+            found += [f"{n}-{number}" if n and n in found and number > 1 else n for n in own]
         found = [name or f"drive {i + 1}" for i, name in enumerate(found)]
     else:
         found = [
@@ -272,13 +277,20 @@ def _names(traces: Sequence[Trace], names: Iterable[str] | None) -> list[str]:
     return found
 
 
+def _names_of(traces: Sequence[Trace], *numbers: int) -> str:
+    """The names of some traces, in brackets; empty if one has none."""
+    names = [_name(traces[i]) for i in numbers]
+    return f" ({', '.join(map(str, names))})" if all(names) else ""
+
+
 def _warn_of_repeats(traces: Sequence[Trace]) -> None:
     """Warn if two traces have the same steps: most likely one file was given twice."""
     first: dict[tuple[Step, ...], int] = {}
     for i, trace in enumerate(traces):
         if (known := first.setdefault(trace.steps, i)) != i:
             warnings.warn(
-                f"traces {known + 1} and {i + 1} have the same steps; give each drive once",
+                f"traces {known + 1} and {i + 1} have the same steps{_names_of(traces, known, i)}; "
+                "give each drive once",
                 stacklevel=3,
             )
 
@@ -295,8 +307,9 @@ def _warn_of_other_names(traces: Sequence[Trace]) -> None:
             if not names & others:
                 told = " and ".join(brief(min(some)) for some in (others, names))
                 warnings.warn(
-                    f"action: traces {first + 1} and {i + 1} have different names for one kind of "
-                    f"action: {told}; give both one name if they are one action",
+                    f"action: traces {first + 1} and {i + 1}{_names_of(traces, first, i)} have "
+                    f"different names for one kind of action: {told}; give both one name if they "
+                    "are one action",
                     stacklevel=3,
                 )
 
@@ -308,7 +321,8 @@ def _warn_of_other_units(traces: Sequence[Trace]) -> None:
     if usual and usual[most] > UNITS * usual[least]:
         warnings.warn(
             f"displacement: the median travel of trace {least + 1} is {usual[least]:.3g} m, and "
-            f"that of trace {most + 1} is {usual[most]:.3g} m; give both in metres",
+            f"that of trace {most + 1} is {usual[most]:.3g} m{_names_of(traces, least, most)}; "
+            "give both in metres",
             stacklevel=3,
         )
 
@@ -333,7 +347,7 @@ def _check_alike(traces: Sequence[Trace], names: Sequence[str]) -> None:
             if here is not None and here != told[known]:
                 raise TraceError(
                     f"{what}: expected the same in all traces, got {told[known]} in trace "
-                    f"{known + 1} and {here} in trace {i + 1}; {mend}"
+                    f"{known + 1} and {here} in trace {i + 1}{_names_of(traces, known, i)}; {mend}"
                 )
     actions: dict[str, tuple[int, Action]] = {}
     for i, trace in enumerate(traces):
@@ -344,7 +358,7 @@ def _check_alike(traces: Sequence[Trace], names: Sequence[str]) -> None:
                 raise TraceError(
                     f"action: expected one meaning of {brief(action.name)} in all traces, got "
                     f"{brief(other_use)} in trace {first + 1} and {brief(action.to_json())} in "
-                    f"trace {i + 1}; rename one of them"
+                    f"trace {i + 1}{_names_of(traces, first, i)}; rename one of them"
                 )
 
 
