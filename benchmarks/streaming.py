@@ -2,11 +2,12 @@
 
     python benchmarks/streaming.py [KILOMETRES ...] [--seed 1]
 
-A robot drives at random through a grid of corridors, and its scans are given to `stream_visits` one
-at a time. The script prints a table in Markdown. The time is the CPU time without the simulation.
-The robot drives SPEED metres a second. Memory is the growth of the largest resident set since the
-imports, so each drive has a process of its own. The delay is in metres from the end of a visit, by
-the odometer, until it is final.
+A robot drives at random through a grid of corridors, and its scans are given to `import_live` one
+at a time. The script prints a table in Markdown. The time is the CPU time without the simulation:
+of the track with the places, of the trace with its closures, and of the views. The ratio is that of
+the time of the drive to the time of the whole import. The robot drives SPEED metres a second.
+Memory is the growth of the largest resident set since the imports, so each drive has a process of
+its own. The delay is in metres from the end of a visit, by the odometer, until it is final.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from time import process_time
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.places.importing import stream_visits
+from perception.places.importing import import_live
 from perception.readers.scans import Laser, Scan
 from simulator.laser import BEARINGS, meetings
 from simulator.odometer import Odometer
@@ -112,20 +113,24 @@ class Drive:
 def row_of(task: tuple[float, int]) -> str:
     """Measure a drive of some kilometres with a seed, and make a row of the table."""
     kilometres, seed = task
-    list(stream_visits(Drive(30, seed).scans()))  # imports
+    import_live(Drive(60, seed).scans())  # imports
     planned = Drive(1000 * kilometres, seed)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    late: list[float] = []
     start = process_time()
-    late = [
-        planned.way[planned.given] - planned.way[visit.end]
-        for visit in stream_visits(planned.scans())
-    ]
+    _, done = import_live(
+        planned.scans(),
+        show=lambda visit: late.append(planned.way[planned.given] - planned.way[visit.end]),
+    )
     seconds = process_time() - start - planned.seconds
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
     driven = planned.way[-1] / SPEED
+    places = done.seconds["places"] - planned.seconds
     return (
-        f"| {kilometres:g} | {len(planned.way)} | {len(late)} | {seconds:.0f} | {driven:.0f} | "
-        f"1/{driven / seconds:.0f} | {np.median(late):.0f}, {max(late):.0f} | {grown:.0f} |"
+        f"| {kilometres:g} | {len(planned.way)} | {len(late)} | {len(done.trace.closures)} | "
+        f"{places:.0f} + {done.seconds['trace']:.0f} + {done.seconds['views']:.0f} | "
+        f"{driven:.0f} | 1/{driven / seconds:.0f} | {np.median(late):.0f}, {max(late):.0f} | "
+        f"{grown:.0f} |"
     )
 
 
@@ -135,8 +140,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args()
     print(
-        "| km | scans | visits | CPU s | driven s | ratio | delay in m: median, largest | MiB |\n"
-        "|---|---|---|---|---|---|---|---|"
+        "| km | scans | visits | closures | CPU s: places, trace, views | driven s | ratio | "
+        "delay in m: median, largest | MiB |\n|---|---|---|---|---|---|---|---|---|"
     )
     with multiprocessing.get_context("spawn").Pool(1, maxtasksperchild=1) as pool:
         for row in pool.imap(row_of, [(kilometres, args.seed) for kilometres in args.kilometres]):

@@ -14,7 +14,7 @@ from perception.places import closures
 from perception.places.closures import Closing, find_closures, relative, uncertainty
 from perception.places.distinctive import WINDOW, find_visits
 from perception.places.following import _matched
-from perception.places.local_map import CELL, Patch
+from perception.places.local_map import CELL, PackedPatch, Patch
 from perception.places.matching import Match, Scene, Turned, match
 from perception.places.tracing import to_trace
 from perception.places.track import Track, points_turned
@@ -78,7 +78,7 @@ def test_a_wall_in_free_space_lowers_the_score() -> None:
     assert whole.score > parted.score + 0.05
 
 
-def rounds() -> tuple[RobotLog, Track, tuple[Visit, ...], list[Patch]]:
+def rounds() -> tuple[RobotLog, Track, tuple[Visit, ...], list[PackedPatch]]:
     """A robot drives twice to the end of a side corridor and back."""
     walls = [(-9, -1, 2, -1), (3, -1, 7, -1), (8.5, -1, 19, -1), (-9, 1, 4, 1), (6, 1, 19, 1)]
     walls += [(2, -2.5, 3, -2.5), (2, -2.5, 2, -1), (3, -2.5, 3, -1)]  # two niches

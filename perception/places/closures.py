@@ -15,7 +15,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from perception.places.local_map import Patch
+from perception.places.local_map import PackedPatch
 from perception.places.matching import MOST, Match, Scene, Turned, match
 from perception.places.track import Array, Track, points_turned, wrapped
 from perception.places.visits import Visit
@@ -53,7 +53,7 @@ class Closing:
 
 
 def find_closures(
-    track: Track, visits: Sequence[Visit], patches: Sequence[Patch], apart: float
+    track: Track, visits: Sequence[Visit], patches: Sequence[PackedPatch], apart: float
 ) -> list[Closing]:
     """Find the closures between the visits of a log.
 

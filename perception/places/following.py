@@ -218,6 +218,8 @@ class _Step:
         )
         if found[2] < POOR and doubt is Doubt.DOUBTFUL and (other := self._without_odometry()):
             return other
+        if found[2] < SURE and doubt is Doubt.SEAM:
+            return self._without_odometry() or nowhere
         return Followed(self.scan, *found)
 
     def _without_odometry(self) -> Followed | None:

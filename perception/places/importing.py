@@ -7,7 +7,6 @@ the local map shows what it would have seen from the middle of the place. Kuiper
 
 from __future__ import annotations
 
-import math
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -19,16 +18,16 @@ import numpy as np
 from perception.errors import ImageWarning, LogError
 from perception.places import jumps, log_checks
 from perception.places.agreement import disagreement
-from perception.places.distinctive import WIDTH, find_visits, visits_of
-from perception.places.following import follow, followed, turned_wrongly
+from perception.places.distinctive import WIDTH, find_visits
+from perception.places.following import follow, turned_wrongly
+from perception.places.live import LiveLog
 from perception.places.tracing import to_trace
 from perception.places.track import Track
-from perception.places.trust import Trust
 from perception.places.visits import Visit
 from perception.readers.scans import Damage, RobotLog, Scan
 from perception.reciprocal import ReciprocalTransformer
 from perception.views import ViewClusterer
-from ssh_abduction.data.errors import brief, named
+from ssh_abduction.data.errors import named
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.logs import log_of
 
@@ -39,10 +38,6 @@ _log = log_of("ssh_abduction.perception.places")
 SEEN = 12
 # Largest share of scans before which a track may be broken.
 MOST_BREAKS = 0.1
-# UNITS: units of odometry, and how many make a metre. STRETCH: number of scans over which odometry
-# is compared with scan matching. UNLIKE: largest relative difference of the two.
-UNITS = {"metres": 1.0, "millimetres": 1000.0, "centimetres": 100.0}
-STRETCH, UNLIKE = 80, 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,9 +92,57 @@ def import_log(
             f"{named(log.source)}: expected scans that meet walls, got {len(log)} in which no "
             "beam meets anything; look at the laser"
         )
-    # Each stage is timed. Errors repeat the notes about the track, which are the likely causes.
+    # Each stage is timed.
     with _timed(seconds, "track"):
         log, track, notes = tracked(log, tell)
+    _refuse_bad(log, track, notes)
+    with _timed(seconds, "places"):
+        visits = find_visits(log, track, width)
+    return _imported(log, track, visits, width, name, notes, seconds)
+
+
+def import_live(
+    items: Iterable[Scan | Damage],
+    width: float = WIDTH,
+    name: str | None = None,
+    tell: Callable[[str], None] = lambda note: None,
+    show: Callable[[Visit], None] = lambda visit: None,
+    source: str = "",
+) -> tuple[RobotLog, Imported]:
+    """Import a log as a trace while it is read or recorded.
+
+    Memory hardly grows: each scan leaves about 400 bytes, and each visit its local map. The trace
+    is that of `import_log` if the odometry is good. Unlike there, each step of the odometer is
+    judged by those before it only.
+
+    Args:
+        items: The scans with odometry, in order, for example those of `stream_log` or `live_log`.
+        width: Width of the robot in metres.
+        name: Name of the trace.
+        tell: Takes each note on suspicious scans and odometry as soon as it is known.
+        show: Takes each visit when it is final.
+        source: Name of the log, for errors.
+
+    Returns:
+        The log, in which hardly any scan has ranges, and the trace with what it was made from.
+
+    Raises:
+        LogError: As `import_log`, or an item is no scan.
+    """
+    seconds: dict[str, float] = {}
+    live = LiveLog(items, width, tell, source)
+    visits: list[Visit] = []
+    with _timed(seconds, "places"):
+        for visit in live.visits():
+            visits.append(visit)
+            show(visit)
+        log, track, notes = live.result()
+    _refuse_bad(log, track, notes)
+    return log, _imported(log, track, tuple(visits), width, name, notes, seconds)
+
+
+def _refuse_bad(log: RobotLog, track: Track, notes: Sequence[str]) -> None:
+    """Raise a LogError if the track shows no drive. It repeats the notes, which may say why."""
     if len(track.breaks) > MOST_BREAKS * len(log):
         raise LogError(
             f"{named(log.source)}: expected a log of one drive, got {len(log)} scans of which "
@@ -116,8 +159,18 @@ def import_log(
             f"{named(log.source)}: expected a robot that drives, got a drive of "
             f"{track.way[-1]:.1f} m; take a longer log{_besides(notes)}"
         )
-    with _timed(seconds, "places"):
-        visits = find_visits(log, track, width)
+
+
+def _imported(
+    log: RobotLog,
+    track: Track,
+    visits: tuple[Visit, ...],
+    width: float,
+    name: str | None,
+    notes: tuple[str, ...],
+    seconds: dict[str, float],
+) -> Imported:
+    """Make the trace of visits."""
     if not visits:
         raise LogError(
             f"{named(log.source)}: expected a way past junctions or turning points, got "
@@ -130,44 +183,39 @@ def import_log(
     return Imported(trace, track, width, visits, seconds, notes)
 
 
-def stream_visits(scans: Iterable[Scan | Damage], width: float = WIDTH) -> Iterator[Visit]:
+def stream_visits(
+    scans: Iterable[Scan | Damage],
+    width: float = WIDTH,
+    tell: Callable[[str], None] = lambda note: None,
+) -> Iterator[Visit]:
     """Find the distinctive places that a robot passes, while it drives.
 
     A visit is final, and yielded, when the robot is at most 125 m of trajectory beyond the last
     scan of the stay, if scans are at most 0.5 m apart. Usually this is after 30 to 40 m. At the end
-    of the scans, the other visits follow. Only the scans of the last metres are kept, so that
-    memory does not grow with the drive.
+    of the scans, the other visits follow. The first 100 scans with a motion wait until the units of
+    the odometry are recognised.
 
     The visits are those of `import_log` if the odometry is good. Unlike there, a jump of the
-    odometer is judged by the steps before it only, and neither the units nor the order of the log
-    are examined.
+    odometer is judged by the steps before it only.
 
     Args:
-        scans: The scans with odometry in metres, in order, for example those of `stream_log`.
-            Damaged parts are skipped.
+        scans: The scans with odometry, in order, for example those of `stream_log`. Damaged parts
+            are skipped.
         width: Width of the robot in metres. Narrower parts of the free space are no ways.
+        tell: Takes each note on suspicious scans and odometry as soon as it is known.
 
     Yields:
         Each visit with its local map. Scans are counted from 0.
 
     Raises:
-        LogError: The width is no positive number, or an item is no scan.
+        LogError: The width is no positive number, an item is no scan, the scans are in random
+            order, or the odometry has several sources.
 
     Example:
         >>> [visit.scan for visit in stream_visits([])]
         []
     """
-    if not (isinstance(width, int | float) and 0 < width < math.inf):
-        raise LogError(f"width: expected a positive number of metres, got {brief(width)}")
-    return visits_of(followed(_scans_of(scans), jumps.LiveJumps(), Trust()), width)
-
-
-def _scans_of(items: Iterable[Scan | Damage]) -> Iterator[Scan]:
-    for number, item in enumerate(items):
-        if isinstance(item, Scan):
-            yield item
-        elif not isinstance(item, Damage):
-            raise LogError(f"scans: expected scans, got {brief(item)} as item {number}")
+    return LiveLog(scans, width, tell).visits()
 
 
 def tracked(
@@ -194,12 +242,8 @@ def tracked(
             _log.warning("%s: %s", named(log.source), note)
             tell(note)
 
-    log_checks.refuse_shuffled(log)
-    log, alternating = jumps.keep_one_source(log)
-    log, counted = in_metres(log)
-    log, turned = log_checks.in_radians(log)
-    whole = log_checks.describe_drive(log)
-    say([*alternating, *counted, *turned, *whole])
+    log, corrected, whole = log_checks.checked(log)
+    say([*corrected, *whole])
     track = follow(log)
     say(jumps.describe_cuts(log, track, turned_wrongly(log, track)))
     # If the odometry is wrong throughout, that explains all differences between the trajectories.
@@ -207,48 +251,6 @@ def tracked(
     say([doubt] if doubt else [])
     say(log_checks.describe_track(log, track, explained=bool(whole or doubt)))
     return log, track, tuple(notes)
-
-
-def in_metres(log: RobotLog) -> tuple[RobotLog, list[str]]:
-    """Convert a log to metres if its odometry counts millimetres or centimetres.
-
-    The unit is recognised on a stretch of the log: in the right unit, the odometry there agrees
-    with scan matching. If no unit fits, the log is unchanged.
-
-    Returns:
-        The log, and a list of notes: one if the log was converted, otherwise none.
-    """
-    usual = jumps.usual_step(log)
-    if usual <= log_checks.SPARSE:
-        return log, []
-    far = np.array([scan.odometry[:2] for scan in log.scans])
-    begin = int(np.argmax(np.hypot(*np.diff(far, axis=0).T) > usual / 2))
-    stretch = replace(log, scans=log.scans[begin : begin + STRETCH])
-
-    # Relative difference between odometry in this unit and scan matching.
-    def off(unit: str) -> float:
-        tried = jumps.in_unit(stretch, UNITS[unit])
-        told, seen = np.array([scan.odometry[:2] for scan in tried.scans]), follow(tried)
-        ways = [np.hypot(*np.diff(way, axis=0).T) for way in (told, seen.poses[:, :2])]
-        return (
-            float(np.abs(ways[0] - ways[1]).sum() / max(ways[1].sum(), 1e-9))
-            if not seen.breaks
-            else math.inf
-        )
-
-    # Matching cannot correct metres that are too large to be true.
-    possible = [unit for unit in UNITS if unit != "metres" or usual <= log_checks.FAR_OFF]
-    found = min(possible, key=off)
-    if found == "metres" or off(found) > UNLIKE:
-        return log, []
-    count = UNITS[found]
-    return jumps.in_unit(log, count), [
-        (
-            "The odometry does not count metres: its usual step between two scans would be "
-            f"{usual:.0f} m. It is read as {found}, which agrees with scan matching: "
-            f"{usual / count:.2f} m a step."
-        )
-    ]
 
 
 def _besides(notes: Sequence[str]) -> str:

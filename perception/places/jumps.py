@@ -109,25 +109,6 @@ def usual_step(log: RobotLog) -> float:
     return float(np.median(far[far > 0])) if (far > 0).any() else 0.0
 
 
-def in_unit(log: RobotLog, count: float) -> RobotLog:
-    """Convert the odometry of a log to metres.
-
-    Args:
-        log: The log.
-        count: How many units of its odometry make a metre.
-    """
-    return replace(
-        log,
-        scans=tuple(
-            replace(
-                scan,
-                odometry=(scan.odometry[0] / count, scan.odometry[1] / count, scan.odometry[2]),
-            )
-            for scan in log.scans
-        ),
-    )
-
-
 def _of_source(scans: tuple[Scan, ...], members: NDArray[np.intp]) -> tuple[Scan, ...]:
     """All scans, with odometry that is inter- and extrapolated from the scans of one source.
 
@@ -224,6 +205,7 @@ class Doubt(Enum):
     """How far the odometry of a step can be trusted. The values explain it."""
 
     NONE = "as usual"
+    SEAM = "a drive seems to begin: the step is unknown unless the scan matches at its end"
     DOUBTFUL = "the step is long: it is a jump if the scan matches only near the previous pose"
     UNKNOWN = "the odometer jumped, or missed a motion"
     CARRIED = "the robot was carried while nothing was logged"
@@ -266,6 +248,8 @@ class Unknown:
         carried: Those of `unknown` to which the robot was carried while nothing was logged.
         doubtful: Scans after other long steps. Such a step is a jump if the scan matches only near
             the previous pose.
+        seams: Scans at which a second drive seems to begin. The step to them is unknown unless the
+            scan matches at its end.
         still: First and last scan of each stretch in which the odometer stands still, though the
             scans change.
     """
@@ -273,6 +257,7 @@ class Unknown:
     unknown: frozenset[int] = frozenset()
     carried: frozenset[int] = frozenset()
     doubtful: frozenset[int] = frozenset()
+    seams: frozenset[int] = frozenset()
     still: tuple[tuple[int, int], ...] = ()
 
     def doubt_of(self, scan: int) -> Doubt:
@@ -281,6 +266,8 @@ class Unknown:
             return Doubt.CARRIED
         if scan in self.unknown:
             return Doubt.UNKNOWN
+        if scan in self.seams:
+            return Doubt.SEAM
         return Doubt.DOUBTFUL if scan in self.doubtful else Doubt.NONE
 
     def without(self, standing: frozenset[int]) -> Unknown:
@@ -301,7 +288,11 @@ def unknown_steps(log: RobotLog) -> Unknown:
     carried, still = _moved_while_still(log, paused)
     moved = frozenset(k for first, last in still for k in range(first, last + 1))
     return Unknown(
-        _targets(jumped) | moved | carried | seams, carried, _targets(doubtful & ~jumped), still
+        _targets(jumped) | moved | carried,
+        carried,
+        _targets(doubtful & ~jumped),
+        seams,
+        still,
     )
 
 
@@ -366,7 +357,7 @@ def _moved_while_still(
     # Each stretch of standing still begins and ends at an edge of the mask.
     edges = np.flatnonzero(np.diff(np.concatenate([[0], still, [0]])))
     for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-        if any(_change(log.scans[begin], log.scans[k]) > MOVED for k in range(begin + 1, end + 1)):
+        if any(shows_motion(log.scans[begin], log.scans[k]) for k in range(begin + 1, end + 1)):
             found.append((begin + 1, end))
         carried |= {
             k
@@ -384,6 +375,40 @@ def stands_still(log: RobotLog) -> NDArray[np.bool_]:
     """
     poses = np.array([scan.odometry for scan in log.scans])
     return np.asarray(np.abs(np.diff(poses, axis=0)).max(axis=1) < STILL)
+
+
+class Standing:
+    """Notices whether the robot moves while its odometer stands still.
+
+    Attributes:
+        moved: Whether it did.
+    """
+
+    def __init__(self) -> None:
+        """Start before the first scan."""
+        self.moved = False
+        self._first: Scan | None = None  # of those at one pose
+
+    def add(self, scan: Scan) -> None:
+        """Add the next scan."""
+        first = self._first
+        if first is None or np.abs(np.subtract(scan.odometry, first.odometry)).max() >= STILL:
+            self._first = scan
+        else:
+            self.moved = self.moved or shows_motion(first, scan)
+
+
+def moves_unseen(log: RobotLog) -> bool:
+    """Whether the robot moves while its odometer stands still, as the scans of a log show."""
+    standing = Standing()
+    for scan in log.scans:
+        standing.add(scan)
+    return standing.moved
+
+
+def shows_motion(first: Scan, last: Scan) -> bool:
+    """Whether so many beams changed between two scans that the robot moved."""
+    return _change(first, last) > MOVED
 
 
 def _change(first: Scan, last: Scan) -> float:

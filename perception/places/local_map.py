@@ -57,6 +57,41 @@ class Patch:
         return np.asarray(cell) * CELL + self.corner
 
 
+@dataclass(frozen=True, eq=False)
+class PackedPatch:
+    """The free and the occupied cells of a patch, in a bit each.
+
+    Attributes:
+        shape: Rows and columns.
+        bits: (2, …) the packed masks.
+        corner: (x, y) centre of cell (0, 0) in metres, in the frame of the track.
+    """
+
+    shape: tuple[int, ...]
+    bits: NDArray[np.uint8]
+    corner: Array
+
+    @staticmethod
+    def of(patch: Patch) -> PackedPatch:
+        """Pack the masks of a patch."""
+        masks = np.array([patch.free.ravel(), patch.occupied.ravel()])
+        return PackedPatch(patch.free.shape, np.packbits(masks, axis=1), patch.corner)
+
+    @property
+    def free(self) -> Bools:
+        """Mask of cells that were seen to be free."""
+        return self._mask(0)
+
+    @property
+    def occupied(self) -> Bools:
+        """Mask of cells with an obstacle."""
+        return self._mask(1)
+
+    def _mask(self, number: int) -> Bools:
+        bits = np.unpackbits(self.bits[number], count=math.prod(self.shape))
+        return np.asarray(bits.view(np.bool_).reshape(self.shape))
+
+
 class Beams:
     """The cells that the beams of each recent scan passed and met, found once for each scan.
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
@@ -17,7 +16,8 @@ from perception.places import jumps
 from perception.places.following import POOR
 from perception.places.track import Array, Track, wrapped
 from perception.places.trust import Trust
-from perception.readers.scans import Pose, RobotLog, Scan
+from perception.places.units import FAR_OFF, LEAST_WAY, SIDEWAYS, SPARSE, ahead, units_of, way_of
+from perception.readers.scans import Pose, RobotLog
 from ssh_abduction.data.errors import named
 from ssh_abduction.data.odometry import between, moved
 
@@ -25,17 +25,11 @@ from ssh_abduction.data.odometry import between, moved
 # their distances differ by at most this factor. In a drive, they grow with the number of steps. If
 # two sources of odometry alternate, the lower quartile is that of one source.
 LAGS, ALIKE = (2, 4, 8), 1.3
-# Share of the way that the robot drives straight ahead by the headings of its odometry: good logs
-# have 0.95 or more, reversed logs -0.99, headings in degrees at most 0.1.
-AHEAD, SIDEWAYS, LEAST_WAY = 0.9, 0.5, 10.0
 # Good logs have matches that fail in at most 1.5 % of the scans, and matches that contradict the
 # odometer (chi-square above CONTRADICTS, three degrees of freedom) in at most 2 % of the steps.
 FAILING, OVERRIDING, CONTRADICTS = 0.05, 0.08, 25.0
 # A log is refused if more than this share of its scans fails to match.
 HOPELESS = 0.5
-# Scans that are farther apart than SPARSE metres overlap too little, and those farther apart than
-# FAR_OFF hardly overlap. Good logs have up to 1 m.
-SPARSE, FAR_OFF = 1.5, 5.0
 # The odometry over every second scan is at least 0.98 times as long in good logs.
 TO_AND_FRO = 0.8
 # A log is out of order if the times of more than this share of its scans run backwards.
@@ -76,66 +70,66 @@ def refuse_shuffled(log: RobotLog) -> None:
     )
 
 
-def in_radians(log: RobotLog) -> tuple[RobotLog, list[str]]:
-    """Convert the headings of the odometry to radians if they count degrees.
+def checked(log: RobotLog) -> tuple[RobotLog, list[str], list[str]]:
+    """Check whether a log is one drive in order, before its scans are matched.
 
-    The robot drives ahead by headings in the right unit only.
-
-    Returns:
-        The log, and a list of notes: one if the log was converted, otherwise none.
-    """
-    if _way(log) < LEAST_WAY or abs(ahead(log)) > SIDEWAYS:
-        return log, []
-    turned = replace(log, scans=tuple(_with_heading_of_degrees(scan) for scan in log.scans))
-    if ahead(turned) < AHEAD:
-        return log, []
-    return turned, [
-        "The headings of the odometry are read as degrees: by radians, the robot would drive "
-        "sideways. Write them in radians to be sure."
-    ]
-
-
-def ahead(log: RobotLog) -> float:
-    """Compute the share of the way that the robot drives in the direction of its heading.
+    Args:
+        log: The log.
 
     Returns:
-        1 for a robot that drives ahead all the way, -1 for one that drives backwards; 1 for a robot
-        that stands.
+        The log with the odometry of a single source, in metres and radians; notes on what was
+        converted; and notes on what is wrong with the whole log.
+
+    Raises:
+        LogError: The scans are in random order.
     """
-    poses = np.array([scan.odometry for scan in log.scans])
-    steps = np.diff(poses[:, :2], axis=0)
-    length = np.hypot(*steps.T)
-    if not length.any():
-        return 1.0
-    turns = (np.diff(poses[:, 2]) + math.pi) % math.tau - math.pi
-    off = np.arctan2(steps[:, 1], steps[:, 0]) - poses[:-1, 2] - turns / 2
-    return float((length * np.cos(off)).sum() / length.sum())
+    refuse_shuffled(log)
+    log, alternating = jumps.keep_one_source(log)
+    units, converted = units_of(log)
+    log = units.convert(log)
+    return log, [*alternating, *converted], describe_drive(log)
 
 
-def describe_drive(log: RobotLog) -> list[str]:
+def describe_drive(log: RobotLog, begin: int = 0, unseen: bool | None = None) -> list[str]:
     """Describe a log that is reversed, has several drives, or has scans far apart.
 
     Only the odometry, the clock and the laser are looked at, so that this can be said at once.
+
+    Args:
+        log: The scans.
+        begin: Number of the first scan.
+        unseen: Whether the robot moves while its odometer stands still; None if the ranges of the
+            scans show it.
 
     Returns:
         Notes for the user; none if nothing is wrong.
     """
     return [
         *_about_order(log),
-        *_about_odometry(log),
-        *(
-            f"{what} before scan {scan} (line or message {log.scans[scan].line}), so the file "
-            "seems to hold two drives. If they were in two buildings, cut the file there and map "
-            "each part."
-            for scan, what in jumps.seams_of(log)
-        ),
+        *_about_odometry(log, unseen),
+        *(_about_seam(log, scan, begin, what) for scan, what in jumps.seams_of(log)),
     ]
+
+
+def _about_seam(log: RobotLog, scan: int, begin: int, what: str) -> str:
+    """Describe a scan at which a second drive may begin."""
+    where = f"{what} before scan {begin + scan} (line or message {log.scans[scan].line})"
+    far = math.dist(log.scans[scan - 1].odometry[:2], log.scans[scan].odometry[:2])
+    if far <= jumps.FAR:
+        return (
+            f"{where}, while the odometry goes on. If the file holds two drives, cut it there and "
+            "map each part."
+        )
+    return (
+        f"{where}, so the file seems to hold two drives. If they were in two buildings, cut the "
+        "file there and map each part."
+    )
 
 
 def _about_order(log: RobotLog) -> list[str]:
     """Describe scans that are in reverse order, out of order, or too far apart."""
     notes = []
-    if _way(log) >= LEAST_WAY and ahead(log) < -SIDEWAYS:
+    if way_of(log) >= LEAST_WAY and ahead(log) < -SIDEWAYS:
         notes.append(
             "The robot drives backwards all the way by its odometry, so the scans are probably in "
             "reverse order. Reverse the log, or turn the headings by half a circle."
@@ -156,16 +150,16 @@ def _about_order(log: RobotLog) -> list[str]:
     return notes
 
 
-def _about_odometry(log: RobotLog) -> list[str]:
+def _about_odometry(log: RobotLog, unseen: bool | None) -> list[str]:
     """Describe odometry that is missing, of two sources, or at odds with its own headings."""
     straight, usual = ahead(log), jumps.usual_step(log)
     back_and_forth = jumps.goes_back_and_forth(log)
-    if jumps.is_missing(log):
+    if jumps.is_missing(log) and (jumps.moves_unseen(log) if unseen is None else unseen):
         missing = jumps.stands_still(log)
         return [
-            f"The odometry stands still in {missing.sum()} of {len(missing)} steps. If the "
-            "robot did not, its odometry is missing there, and the map rests on the scans "
-            "alone. Record the odometry, or name its topic (--set odom_topic)."
+            f"The odometry stands still in {missing.sum()} of {len(missing)} steps, while the "
+            "scans show that the robot moved. So the map rests on the scans alone. Record the "
+            "odometry, or name its topic (--set odom_topic)."
         ]
     if back_and_forth < TO_AND_FRO and 0 < usual <= FAR_OFF:
         return [
@@ -173,7 +167,7 @@ def _about_odometry(log: RobotLog) -> list[str]:
             f"{100 * back_and_forth:.0f} % as long as over all scans. Two programs may publish it, "
             "or the log is not in order. Stop one of them, or sort the log."
         ]
-    if _way(log) >= LEAST_WAY and abs(straight) <= SIDEWAYS and usual <= SPARSE:
+    if way_of(log) >= LEAST_WAY and abs(straight) <= SIDEWAYS and usual <= SPARSE:
         return [
             f"The robot drives ahead for {100 * straight:.0f} % of its way by the odometry. Unless "
             "it can drive sideways, its headings are wrong: write them in radians, "
@@ -242,17 +236,6 @@ def _causes(log: RobotLog) -> str:
         "put the scans into the order of the drive, and check the unit of the odometry and the "
         "direction of the beams (--fov, --set mount)"
     )
-
-
-def _way(log: RobotLog) -> float:
-    """The length of the drive by odometry, in metres."""
-    places = np.array([scan.odometry[:2] for scan in log.scans])
-    return float(np.hypot(*np.diff(places, axis=0).T).sum())
-
-
-def _with_heading_of_degrees(scan: Scan) -> Scan:
-    x, y, heading = scan.odometry
-    return replace(scan, odometry=(x, y, wrapped(math.radians(heading))))
 
 
 def _overriding(log: RobotLog, track: Track) -> float:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-from perception.places.local_map import CELL, Patch
+from perception.places.local_map import CELL, PackedPatch, Patch
 from perception.places.masks import Bools
 from perception.places.track import Array, points_turned
 
@@ -99,12 +99,13 @@ class Scene:
     _shift: Array
 
     @staticmethod
-    def of(patch: Patch, middle: Array) -> Scene:
+    def of(patch: Patch | PackedPatch, middle: Array) -> Scene:
         """Prepare a patch that is centred on a middle (x, y), in metres."""
-        size = patch.occupied.shape[0]
+        occupied = patch.occupied
+        size = len(occupied)
         axis = (np.arange(size) - size // 2) * CELL
         near = np.hypot(*np.meshgrid(axis, axis, indexing="ij")) <= REACH
-        walls, free = patch.occupied & near, patch.free & near
+        walls, free = occupied & near, patch.free & near
         far = (
             np.asarray(ndimage.distance_transform_edt(~walls)) * CELL if walls.any() else near * 9.0
         )

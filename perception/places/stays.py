@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from perception.places.local_map import LocalMaps
+from perception.places.local_map import LocalMaps, PackedPatch
 from perception.places.recent import Recent
 from perception.places.visits import MERGED, Visit, Way, apart
 
@@ -95,7 +95,7 @@ class Stays:
             else:
                 yield from [self._staying] if self._staying else []
                 patch = self._maps.around(visit.scan, visit.middle, self._half)
-                self._staying = replace(visit, patch=patch)
+                self._staying = replace(visit, patch=PackedPatch.of(patch))
             self._left = self._recent.way(visit.end)
         if self._staying and (horizon is None or self._recent.way(self._done) > self._left + STAY):
             yield self._staying

@@ -16,7 +16,7 @@ import numpy as np
 
 from perception.places.closures import NOISE, Closing, find_closures, relative, uncertainty
 from perception.places.distinctive import WINDOW
-from perception.places.local_map import CELL, Patch
+from perception.places.local_map import CELL, PackedPatch
 from perception.places.track import Array, Track, wrapped
 from perception.places.visits import Visit, apart
 from perception.readers.scans import Pose, RobotLog
@@ -59,7 +59,7 @@ def to_trace(
     """
     steps: list[Step] = []
     last: tuple[Visit, Pose] | None = None
-    patches: list[Patch] = []
+    patches: list[PackedPatch] = []
     arrivals: list[tuple[int, float]] = []  # the first step of each visit, and its heading
     for number, visit in enumerate(visits):
         if (patch := visit.patch) is None:
@@ -127,7 +127,7 @@ def _step(
     track: Track,
     visit: Visit,
     pose: Pose,
-    patch: Patch,
+    patch: PackedPatch,
     last: tuple[Visit, Pose] | None,
     number: int,
 ) -> Step:
@@ -186,9 +186,10 @@ def _star(visit: Visit, heading: float) -> tuple[Gateway, ...]:
     )
 
 
-def _image(patch: Patch, middle: Array, heading: float) -> Array:
+def _image(patch: PackedPatch, middle: Array, heading: float) -> Array:
     """The ranges that a laser in the middle of a place would measure: (181,), metres."""
-    far = np.arange(0.0, min(patch.free.shape) * CELL / 2, CELL / 2)
+    mask = patch.free
+    far = np.arange(0.0, min(mask.shape) * CELL / 2, CELL / 2)
     angles = heading + BEAMS
     cells = np.rint(
         (
@@ -198,9 +199,9 @@ def _image(patch: Patch, middle: Array, heading: float) -> Array:
         )
         / CELL
     ).astype(int)
-    inside = ((cells >= 0) & (cells < patch.free.shape)).all(axis=2)
-    cells = np.clip(cells, 0, np.array(patch.free.shape) - 1)
-    free = patch.free[cells[..., 0], cells[..., 1]] & inside
+    inside = ((cells >= 0) & (cells < mask.shape)).all(axis=2)
+    cells = np.clip(cells, 0, np.array(mask.shape) - 1)
+    free = mask[cells[..., 0], cells[..., 1]] & inside
     # The middle itself counts as free.
     free[:, : round(2 * CELL / (CELL / 2))] = True
     return np.asarray(np.where(free.all(axis=1), far[-1], far[np.argmin(free, axis=1)]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from perception.places.local_map import Patch
+from perception.places.local_map import PackedPatch
 from perception.places.track import Array
 
 # Two ways out whose bearings differ by less than this, in radians, are one.
@@ -52,7 +52,7 @@ class Visit:
     arrived: int | None = None
     left: int | None = None
     support: float = 1.0
-    patch: Patch | None = None
+    patch: PackedPatch | None = None
 
     def later(self, scans: int) -> Visit:
         """Copy the visit, with its indices of scans increased by `scans`."""

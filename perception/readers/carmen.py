@@ -37,6 +37,7 @@ TRUEPOS lines, which CARMEN's simulator writes, give the true pose of the robot.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -55,7 +56,7 @@ from perception.readers.carmen_survey import (
     survey_of,
     without_codes,
 )
-from perception.readers.lines import lines
+from perception.readers.lines import LONGEST_LINE, lines
 from perception.readers.messages import (
     EDGES,
     KINDS,
@@ -78,6 +79,7 @@ from ssh_abduction.data.odometry import Pose, between, moved
 CORRECTED = 0.05
 # Lines of CARMEN that are ignored.
 OTHERS = (b"SYNC", b"RLASER", b"ROBOTLASER2", b"RAWLASER2", *(kind.encode() for kind in KINDS))
+VERTEX = re.compile(rb"^(VERTEX2|VERTEX_SE2)\b", re.MULTILINE)
 # With these numbers of beams, a FLASER line covers half a circle by convention. They are those of a
 # SICK with steps of 2, 1, 1/2 and 1/4 degree, with or without the last beam.
 HALF_A_CIRCLE = (90, 91, 180, 181, 360, 361, 720, 721)
@@ -94,7 +96,23 @@ def looks_like(head: bytes) -> bool:
     return LINE_OF_A_LOG.search(head) is not None
 
 
-def read(file: IO[bytes], source: str, format: str | None) -> Reading:
+def head_of(file: IO[bytes], scans: int) -> bytes:
+    """Read the first lines of a log, up to a number of scans.
+
+    Args:
+        file: The log.
+        scans: The number.
+    """
+    head: list[bytes] = []
+    while scans and (line := file.readline(LONGEST_LINE)):
+        head.append(line)
+        scans -= line.startswith(tuple(kind.encode() for kind in KINDS))
+    return b"".join(head)
+
+
+def read(
+    file: IO[bytes], source: str, format: str | None, surveyed: IO[bytes] | None = None
+) -> Reading:
     """Survey a log in lines, so that its scans can be read.
 
     Args:
@@ -102,6 +120,7 @@ def read(file: IO[bytes], source: str, format: str | None) -> Reading:
         source: Name of the log, for errors.
         format: `carmen` ignores vertices and edges; `g2o` requires vertices; None reads what is
             there.
+        surveyed: The part of the log that is surveyed; None for all of it.
 
     Returns:
         Notes on what was found, and the scans, which are read when they are iterated over.
@@ -109,7 +128,7 @@ def read(file: IO[bytes], source: str, format: str | None) -> Reading:
     Raises:
         LogError: The log holds no scan, or no odometry.
     """
-    found = survey_of(file, source, format != "carmen")
+    found = survey_of(surveyed or file, source, format != "carmen")
     if format == "g2o" and not found.graph.vertices:
         raise LogError(
             f"{source}: expected vertices in lines VERTEX2 or VERTEX_SE2, got none; leave the "

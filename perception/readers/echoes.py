@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,6 +27,7 @@ from ssh_abduction.data.errors import brief, is_finite
 from ssh_abduction.data.odometry import Pose, between
 
 Array = NDArray[np.float64]
+_Key = tuple[float, float, Pose]
 Bools = NDArray[np.bool_]
 
 # Meaning of a beam without a measurement: nothing is near, or nothing is known.
@@ -160,28 +161,55 @@ def interpret_log(scans: Sequence[Scan], told: Told) -> tuple[tuple[Scan, ...], 
     Raises:
         LogError: The user gives one mount, but the scans come from several lasers.
     """
+    interpret, notes = interpreter_of(scans, told)
+    return tuple(map(interpret, scans)), notes
+
+
+def interpreter_of(
+    scans: Sequence[Scan], told: Told
+) -> tuple[Callable[[Scan], Scan], tuple[str, ...]]:
+    """Find out from some scans what the ranges of a log mean.
+
+    Args:
+        scans: The scans, with ranges as the driver wrote them.
+        told: What the user says about the laser. The survey finds the rest.
+
+    Returns:
+        A function that interprets a scan of the same lasers, also a later one; and notes on what
+        was found. A scan of another laser is interpreted as by `interpret_scan`.
+
+    Raises:
+        LogError: The user gives one mount, but the scans come from several lasers.
+    """
     lasers = len({scan.laser.mount for scan in scans})
     if told.mount is not None and lasers > 1:
         raise LogError(
             f"mount: expected the scans of one laser, got those of {lasers}; leave it out "
             "(--set mount), or read the topic of one laser (--set scan_topic)"
         )
-    placed = [told.placed(scan) for scan in scans]
     # A log may have several lasers. The number of beams of a laser may change from scan to scan.
-    groups: dict[tuple[float, float, Pose], list[int]] = defaultdict(list)
-    for i, scan in enumerate(placed):
-        groups[scan.laser.reach, scan.laser.nearest, scan.laser.mount].append(i)
-    meanings: dict[int, Meaning] = {}
+    groups: dict[_Key, list[Scan]] = defaultdict(list)
+    for scan in map(told.placed, scans):
+        groups[_key(scan)].append(scan)
+    meanings: dict[_Key, Meaning] = {}
     notes: list[str] = []
-    for members in groups.values():
-        kept = moving(placed[i] for i in members)
+    for key, members in groups.items():
+        kept = moving(members)
         some = np.unique(np.linspace(0, len(kept) - 1, min(len(kept), MOST_SURVEYED)).astype(int))
-        meaning, said = _survey([kept[i] for i in some], told)
-        meanings |= dict.fromkeys(members, meaning)
+        meanings[key], said = _survey([kept[i] for i in some], told)
         notes += said
-    return tuple(_measured(scan, meanings[i]) for i, scan in enumerate(placed)), tuple(
-        dict.fromkeys(notes)
-    )
+
+    def interpret(scan: Scan) -> Scan:
+        placed = told.placed(scan)
+        usual = Meaning(told.reach(placed.laser.reach), told.free)
+        return _measured(placed, meanings.get(_key(placed), usual))
+
+    return interpret, tuple(dict.fromkeys(notes))
+
+
+def _key(scan: Scan) -> _Key:
+    """What tells a laser from others."""
+    return scan.laser.reach, scan.laser.nearest, scan.laser.mount
 
 
 def interpret_scan(scan: Scan, told: Told) -> Scan:

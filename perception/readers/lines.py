@@ -10,6 +10,7 @@ import bz2
 import errno
 import gzip
 import importlib
+import io
 import lzma
 import os
 import shutil
@@ -106,6 +107,42 @@ def is_full(error: BaseException) -> bool:
         getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT)
         or type(error).__name__ == "FullError"
     )
+
+
+class Piped:
+    """A stream whose first bytes were read already and can be read again.
+
+    Args:
+        head: The first bytes.
+        rest: The stream after them.
+    """
+
+    def __init__(self, head: bytes, rest: IO[bytes]) -> None:
+        """Start at the first byte."""
+        self._head, self._rest = io.BytesIO(head), rest
+
+    def seek(self, offset: int) -> int:
+        """Go to one of the first bytes, before any later one was read."""
+        return self._head.seek(offset)
+
+    def read(self, size: int = -1) -> bytes:
+        """Read bytes, at most `size`; less only at the end of the first bytes or of the stream."""
+        return self._head.read(size) or self._rest.read(size)
+
+    def readline(self, size: int = -1) -> bytes:
+        """Read a line, at most `size` bytes. The first bytes end with a line."""
+        return self._head.readline(size) or self._rest.readline(size)
+
+
+def piped(stream: IO[bytes], source: str) -> IO[bytes]:
+    """Read a pipe from its beginning, unpacking it if necessary.
+
+    Args:
+        stream: The pipe.
+        source: Name of the pipe, for errors.
+    """
+    first = stream.read(max(map(len, PACKERS)))
+    return unpacked(cast(IO[bytes], Piped(first, stream)), source)
 
 
 def packer(file: IO[bytes]) -> str | None:

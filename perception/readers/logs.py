@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import io
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import chain, islice
 from pathlib import Path
-from typing import IO
+from typing import IO, cast
 
 from perception.errors import LogError
 from perception.readers import bag_files, bag_topics, bags, carmen
-from perception.readers.echoes import Told, interpret_log, interpret_scan
-from perception.readers.lines import LONGEST_LINE, lines, opened
+from perception.readers.echoes import Told, interpret_log, interpret_scan, interpreter_of
+from perception.readers.lines import LONGEST_LINE, Piped, lines, opened, piped
 from perception.readers.scans import Damage, Reading, RobotLog, Scan
 from ssh_abduction.data.errors import brief, named
 from ssh_abduction.data.odometry import Pose
@@ -32,6 +34,8 @@ BAGS = {
 FORMATS = {**LINES, **BAGS}
 # Number of first bytes that show a file's format.
 HEAD = 2**16
+# Number of first scans of a pipe that show what its poses and ranges mean.
+SURVEYED = 200
 
 
 def read_log(
@@ -83,14 +87,12 @@ def read_log(
             f"damaged, first: {damaged[0].what if damaged else 'none'}"
         )
     meant, found_out = interpret_log(scans, told)
-    # If the user gave a setting, nothing was assumed for it.
-    assumed = (note for option, note in reading.assumed.items() if getattr(told, option) is None)
     log = RobotLog(
         meant,
         tuple(damaged),
         reading.format,
         os.fspath(path),
-        (*reading.notes, *assumed, *found_out),
+        (*reading.notes, *_assumed(reading, told), *found_out),
     )
     for warning in log.warnings:
         _log.warning("%s: %s", named(path), warning)
@@ -121,6 +123,59 @@ def stream_log(
     with _reading(path, format, scan_topic, odom_topic) as reading:
         for item in reading.items:
             yield interpret_scan(item, told) if isinstance(item, Scan) else item
+
+
+def live_log(
+    stream: IO[bytes],
+    source: str = "-",
+    *,
+    fov: float | None = None,
+    mount: Pose | None = None,
+    no_return: float | None = None,
+    zero_is: str | None = None,
+    tell: Callable[[str], None] = lambda note: None,
+) -> Iterator[Scan | Damage]:
+    """Read the scans of a log of CARMEN from a pipe, while they are written.
+
+    The first SURVEYED scans wait until they show what the poses and ranges of the log mean. The
+    arguments from `fov` to `zero_is` are those of `read_log`.
+
+    Args:
+        stream: The pipe, packed or not.
+        source: Its name, for errors.
+        fov: Degrees from the first beam to the last.
+        mount: Position of the laser on the robot.
+        no_return: Metres from which a range means that nothing came back.
+        zero_is: Meaning of ranges that are no measurement.
+        tell: Takes each note on what the reader assumed or found out.
+
+    Yields:
+        Scans, and `Damage` for the parts that were skipped.
+
+    Raises:
+        LogError: The pipe has no lines of CARMEN, or vertices, whose edges may come later.
+    """
+    told = Told(fov, mount, no_return, zero_is)
+    text = piped(stream, named(source))
+    head = carmen.head_of(text, SURVEYED)
+    if not carmen.looks_like(head) or carmen.VERTEX.search(head):
+        raise LogError(
+            f"{named(source)}: expected lines of CARMEN, got another log; save it to a file, and "
+            "read that"
+        )
+    file = cast(IO[bytes], Piped(head, text))
+    reading = carmen.read(file, named(source), "carmen", surveyed=io.BytesIO(head))
+    first = list(islice(reading.items, SURVEYED))
+    interpret, found_out = interpreter_of([one for one in first if isinstance(one, Scan)], told)
+    for note in (*reading.notes, *_assumed(reading, told), *found_out):
+        tell(note)
+    for item in chain(first, reading.items):
+        yield interpret(item) if isinstance(item, Scan) else item
+
+
+def _assumed(reading: Reading, told: Told) -> list[str]:
+    """Notes on what the reader assumed. If the user gave a setting, nothing was assumed for it."""
+    return [note for option, note in reading.assumed.items() if getattr(told, option) is None]
 
 
 @contextmanager

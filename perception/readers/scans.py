@@ -61,7 +61,7 @@ class Laser:
         return self.first + self.step * np.arange(self.beams, dtype=np.float64)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class Scan:
     """One scan, with the pose of the robot.
 

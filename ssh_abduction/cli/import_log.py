@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import sys
+from collections.abc import Callable
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +16,8 @@ from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import AbductionError, named
 
 if TYPE_CHECKING:
+    from perception.places.importing import Imported
+    from perception.places.visits import Visit
     from perception.readers.scans import RobotLog
 
 
@@ -40,7 +45,8 @@ def add_parser(verbs: Verbs) -> None:
         "log",
         help=(
             "a CARMEN log, a g2o-style log with scans, a ROS 1 bag, a ROS 2 bag or MCAP; may be "
-            "compressed by gzip, bzip2, xz or zstd"
+            "compressed by gzip, bzip2, xz or zstd. '-' reads lines of CARMEN from standard input, "
+            "in flat memory, and shows each place when it is final"
         ),
     )
     add_output(parser)
@@ -157,21 +163,14 @@ def _told(field: str, text: str) -> Any:
 
 
 def run(options: argparse.Namespace) -> int:
-    from perception.places.importing import import_log
     from ssh_abduction.cli.outcome import warn
 
-    if options.log == "-":
-        raise AbductionError("-: expected the file of a log, got standard input; save it to a file")
     if options.output != "-" and not Path(options.output).absolute().parent.is_dir():
         raise AbductionError(
             f"{named(options.output)}: cannot write the trace: its folder is not there; make it "
             "first"
         )
-    log = read(options.log, options)
-    warn(log.warnings)
-    done = import_log(
-        log, options.width or WIDTH, named_after(options.log), lambda note: warn([note])
-    )
+    log, done = (_live if options.log == "-" else _whole)(options, lambda note: warn([note]))
     said = (
         f"{counted(len(log), 'scans')}, {done.track.way[-1]:.0f} m: "
         f"{counted(len(done.visits), 'visits')} to distinctive places; "
@@ -179,6 +178,45 @@ def run(options: argparse.Namespace) -> int:
     )
     write(done.trace, options.output, said)
     return 0
+
+
+def _whole(options: argparse.Namespace, tell: Callable[[str], None]) -> tuple[RobotLog, Imported]:
+    """Import the log in a file."""
+    from perception.places.importing import import_log
+
+    log = read(options.log, options)
+    for warning in log.warnings:
+        tell(warning)
+    return log, import_log(log, options.width or WIDTH, named_after(options.log), tell)
+
+
+def _live(options: argparse.Namespace, tell: Callable[[str], None]) -> tuple[RobotLog, Imported]:
+    """Import the log on standard input while it comes, and show each visit when it is final."""
+    from perception.places.importing import import_live
+    from perception.readers.logs import live_log
+
+    if options.format not in (None, "carmen") or options.scan_topic or options.odom_topic:
+        raise AbductionError(
+            "-: expected lines of CARMEN on standard input, got another format or a topic; save "
+            "the log to a file, and name that"
+        )
+    asked = {name: getattr(options, name) for name in ("fov", "mount", "no_return", "zero_is")}
+    items = live_log(sys.stdin.buffer, **asked, tell=tell)
+    numbers = count()
+
+    def show(visit: Visit) -> None:
+        x, y = visit.middle
+        print(
+            f"visit {next(numbers)}, scans {visit.begin} to {visit.end}: a place at "
+            f"({x:.1f}, {y:.1f}) m with {counted(len(visit.ways), 'ways')}",
+            file=sys.stderr if options.output == "-" else sys.stdout,
+            flush=True,
+        )
+
+    log, done = import_live(items, options.width or WIDTH, None, tell, show, "-")
+    for warning in log.warnings:
+        tell(warning)
+    return log, done
 
 
 def named_after(path: str) -> str:

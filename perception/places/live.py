@@ -1,0 +1,150 @@
+"""Imports a log while it is read or recorded.
+
+The scans pass through one at a time. What stays of them is the track, the visits with their local
+maps, and about 300 bytes a scan for the checks at the end.
+"""
+
+from __future__ import annotations
+
+import math
+from array import array
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+
+import numpy as np
+
+from perception.errors import LogError
+from perception.places import jumps, log_checks
+from perception.places.agreement import disagreement
+from perception.places.distinctive import WIDTH, visits_of
+from perception.places.following import Followed, followed, turned_wrongly
+from perception.places.track import Track
+from perception.places.trust import Trust
+from perception.places.visits import Visit
+from perception.places.watching import Teller, watched, without_ranges
+from perception.readers.scans import Damage, RobotLog, Scan
+from ssh_abduction.data.errors import brief, named
+
+# The track is compared with the odometry over the first so many scans.
+COMPARED = 400
+# The ranges of the scans beside the first so many poor matches are kept, for the checks at the end.
+MOST_POOR = 200
+# The first cuts of the track are told at once, the others at the end.
+SAID = 3
+
+
+class LiveLog:
+    """The track and the visits of a drive, found while its scans come.
+
+    Args:
+        items: The scans with odometry, in order. Damaged parts are skipped.
+        width: Width of the robot in metres. Narrower parts of the free space are no ways.
+        tell: Takes each note on suspicious scans as soon as it is known.
+        source: Name of the log.
+
+    Raises:
+        LogError: The width is no positive number.
+    """
+
+    def __init__(
+        self,
+        items: Iterable[Scan | Damage],
+        width: float = WIDTH,
+        tell: Callable[[str], None] = lambda note: None,
+        source: str = "",
+    ) -> None:
+        """Start before the first scan."""
+        if not (isinstance(width, int | float) and 0 < width < math.inf):
+            raise LogError(f"width: expected a positive number of metres, got {brief(width)}")
+        self._items, self._width, self._source = items, width, source
+        self._tell = Teller(tell)
+        self._damaged: list[Damage] = []
+        self._scans: list[Scan] = []
+        self._begun: list[Scan] = []  # the first COMPARED scans, with their ranges
+        self._latest: deque[Scan] = deque(maxlen=log_checks.BESIDE + 1)
+        self._poor = self._wanted = 0  # poor matches so far, and scans to keep after the last one
+        self._rows = array("d")  # pose, covariance and share of each scan
+        self._cuts: list[int] = []
+        self._breaks: list[int] = []
+
+    def visits(self) -> Iterator[Visit]:
+        """Yield each visit with its local map, in order, when it is final."""
+        return visits_of(self._followed(), self._width)
+
+    def result(self) -> tuple[RobotLog, Track, tuple[str, ...]]:
+        """Return the log when all visits were yielded.
+
+        Returns:
+            The log, in which hardly any scan has ranges; its track; and notes on suspicious scans
+            and odometry.
+
+        Raises:
+            LogError: There is no scan.
+        """
+        log, track = self._log, self._track
+        if not len(log):
+            raise LogError(f"{named(self._source)}: expected scans, got none; record the laser")
+        explained = bool(self._tell.notes)
+        self._tell(jumps.describe_cuts(log, track, turned_wrongly(log, track)))
+        self._tell(log_checks.describe_track(log, track, explained))
+        return log, track, tuple(self._tell.notes)
+
+    def _followed(self) -> Iterator[Followed]:
+        """Follow the robot, and keep what is needed of each scan."""
+        scans = watched(self._scans_of(), self._tell, self._source)
+        for one in followed(scans, jumps.LiveJumps(), Trust()):
+            self._keep(one)
+            if len(self._scans) == COMPARED:
+                self._compare()
+            yield one
+        if len(self._scans) < COMPARED:
+            self._compare()
+
+    def _scans_of(self) -> Iterator[Scan]:
+        for number, item in enumerate(self._items):
+            if isinstance(item, Scan):
+                yield item
+            elif isinstance(item, Damage):
+                self._damaged.append(item)
+            else:
+                raise LogError(f"scans: expected scans, got {brief(item)} as item {number}")
+
+    def _keep(self, one: Followed) -> None:
+        """Keep a scan with its pose, and its ranges only if a check needs them."""
+        number = len(self._scans)
+        self._scans.append(without_ranges(one.scan))
+        self._rows.extend((*one.pose, *one.covariance.ravel(), one.share))
+        if number < COMPARED:
+            self._begun.append(one.scan)
+        self._latest.append(one.scan)
+        if one.share < log_checks.POORLY and self._poor < MOST_POOR:
+            self._poor, self._wanted = self._poor + 1, log_checks.BESIDE
+            self._scans[-len(self._latest) :] = self._latest
+        elif self._wanted:
+            self._scans[-1], self._wanted = one.scan, self._wanted - 1
+        self._cuts += [number] if one.cut else []
+        self._breaks += [number] if one.broken else []
+        if one.cut and len(self._cuts) <= SAID:
+            self._tell(jumps.describe_cuts(self._log, self._track, []))
+
+    def _compare(self) -> None:
+        """Compare the track with the odometry over the first scans, and forget their ranges."""
+        if len(self._begun) > 1 and not self._tell.notes:
+            note = disagreement(RobotLog(tuple(self._begun), source=self._source), self._track)
+            self._tell([note] if note else [])
+        self._begun.clear()
+
+    @property
+    def _log(self) -> RobotLog:
+        return RobotLog(tuple(self._scans), tuple(self._damaged), source=self._source)
+
+    @property
+    def _track(self) -> Track:
+        rows = np.array(self._rows).reshape(-1, 13)
+        return Track(
+            rows[:, :3],
+            rows[:, 3:12].reshape(-1, 3, 3),
+            rows[:, 12],
+            tuple(self._cuts),
+            tuple(self._breaks),
+        )

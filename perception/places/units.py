@@ -1,0 +1,134 @@
+"""Recognises the units of the odometry of a log, and converts it to metres and radians."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from perception.places import jumps
+from perception.places.following import follow
+from perception.places.track import wrapped
+from perception.readers.scans import RobotLog, Scan
+
+# Units of odometry, and how many make a metre.
+UNITS = {"metres": 1.0, "millimetres": 1000.0, "centimetres": 100.0}
+# STRETCH: number of scans over which odometry is compared with scan matching. UNLIKE: largest
+# relative difference of the two.
+STRETCH, UNLIKE = 80, 0.25
+# Scans that are farther apart than SPARSE metres overlap too little, and those farther apart than
+# FAR_OFF hardly overlap. Good logs have up to 1 m.
+SPARSE, FAR_OFF = 1.5, 5.0
+# Share of the way that the robot drives straight ahead by the headings of its odometry: good logs
+# have 0.95 or more, reversed logs -0.99, headings in degrees at most 0.1. It is judged from
+# LEAST_WAY metres on.
+AHEAD, SIDEWAYS, LEAST_WAY = 0.9, 0.5, 10.0
+
+
+@dataclass(frozen=True)
+class Units:
+    """The units of odometry.
+
+    Attributes:
+        count: How many units of length make a metre.
+        degrees: Whether headings are in degrees.
+    """
+
+    count: float = 1.0
+    degrees: bool = False
+
+    def converted(self, scan: Scan) -> Scan:
+        """Copy a scan, with its odometry in metres and radians."""
+        if self == Units():
+            return scan
+        x, y, heading = scan.odometry
+        heading = wrapped(math.radians(heading)) if self.degrees else heading
+        return replace(scan, odometry=(x / self.count, y / self.count, heading))
+
+    def convert(self, log: RobotLog) -> RobotLog:
+        """Copy a log, with its odometry in metres and radians."""
+        return log if self == Units() else replace(log, scans=tuple(map(self.converted, log.scans)))
+
+
+def units_of(log: RobotLog) -> tuple[Units, list[str]]:
+    """Recognise the units of the odometry of a log.
+
+    Returns:
+        The units, and notes: one for each unit that is not a metre or radian.
+    """
+    count, counted = _length(log)
+    log = Units(count).convert(log)
+    degrees = way_of(log) >= LEAST_WAY and abs(ahead(log)) <= SIDEWAYS
+    # The robot drives ahead by headings in the right unit only.
+    degrees = degrees and ahead(Units(degrees=True).convert(log)) >= AHEAD
+    turned = [
+        "The headings of the odometry are read as degrees: by radians, the robot would drive "
+        "sideways. Write them in radians to be sure."
+    ]
+    return Units(count, degrees), [*counted, *(turned if degrees else [])]
+
+
+def _length(log: RobotLog) -> tuple[float, list[str]]:
+    """Recognise the unit of length.
+
+    It is recognised on a stretch of the log: in the right unit, the odometry there agrees with scan
+    matching.
+
+    Returns:
+        How many units make a metre, 1 if no unit fits, and a list of at most one note.
+    """
+    usual = jumps.usual_step(log)
+    if usual <= SPARSE:
+        return 1.0, []
+    far = np.array([scan.odometry[:2] for scan in log.scans])
+    begin = int(np.argmax(np.hypot(*np.diff(far, axis=0).T) > usual / 2))
+    stretch = replace(log, scans=log.scans[begin : begin + STRETCH])
+
+    # Relative difference between odometry in this unit and scan matching.
+    def off(unit: str) -> float:
+        tried = Units(UNITS[unit]).convert(stretch)
+        told, seen = np.array([scan.odometry[:2] for scan in tried.scans]), follow(tried)
+        ways = [np.hypot(*np.diff(way, axis=0).T) for way in (told, seen.poses[:, :2])]
+        return (
+            float(np.abs(ways[0] - ways[1]).sum() / max(ways[1].sum(), 1e-9))
+            if not seen.breaks
+            else math.inf
+        )
+
+    # Matching cannot correct metres that are too large to be true.
+    possible = [unit for unit in UNITS if unit != "metres" or usual <= FAR_OFF]
+    found = min(possible, key=off)
+    if found == "metres" or off(found) > UNLIKE:
+        return 1.0, []
+    count = UNITS[found]
+    return count, [
+        (
+            "The odometry does not count metres: its usual step between two scans would be "
+            f"{usual:.0f} m. It is read as {found}, which agrees with scan matching: "
+            f"{usual / count:.2f} m a step."
+        )
+    ]
+
+
+def ahead(log: RobotLog) -> float:
+    """Compute the share of the way that the robot drives in the direction of its heading.
+
+    Returns:
+        1 for a robot that drives ahead all the way, -1 for one that drives backwards; 1 for a robot
+        that stands.
+    """
+    poses = np.array([scan.odometry for scan in log.scans])
+    steps = np.diff(poses[:, :2], axis=0)
+    length = np.hypot(*steps.T)
+    if not length.any():
+        return 1.0
+    turns = (np.diff(poses[:, 2]) + math.pi) % math.tau - math.pi
+    off = np.arctan2(steps[:, 1], steps[:, 0]) - poses[:-1, 2] - turns / 2
+    return float((length * np.cos(off)).sum() / length.sum())
+
+
+def way_of(log: RobotLog) -> float:
+    """Compute the length of the drive by odometry, in metres."""
+    places = np.array([scan.odometry[:2] for scan in log.scans])
+    return float(np.hypot(*np.diff(places, axis=0).T).sum())

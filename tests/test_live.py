@@ -1,0 +1,184 @@
+"""A log is imported while it comes: the same trace as from a file, and the same warnings."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import random
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from coarse import every_second_beam, hall
+from test_log_checks import backwards, in_degrees, of_two_clocks, with_poses
+
+from perception.errors import LogError
+from perception.places.importing import import_live, import_log, stream_visits
+from perception.places.watching import LOOKS
+from perception.readers.logs import SURVEYED, live_log, read_log
+from perception.readers.scans import RobotLog, Scan
+from perception.readers.writers import write_carmen
+from simulator.tours import record
+from simulator.world import World
+from ssh_abduction.cli import main
+from ssh_abduction.cli.simulate import scans_of
+from ssh_abduction.data.trace import Trace
+
+Scans = Sequence[Scan]
+
+
+@pytest.fixture(scope="module")
+def scans() -> tuple[Scan, ...]:
+    """A drive of a tour through a hall, a scan of 90 beams every half metre."""
+    return every_second_beam(scans_of(record(World.named("taylor-hall"), every=0.5)))[:240]
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The log of a drive out of a side corridor of a hall and back."""
+    path = tmp_path_factory.mktemp("logs") / "drive.log"
+    write_carmen(path, [replace(scan, corrected=None) for scan in hall()[:80]])
+    return path
+
+
+def given(monkeypatch: pytest.MonkeyPatch, data: bytes) -> None:
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(data)))
+
+
+@pytest.mark.parametrize("pack", [bytes, gzip.compress])
+def test_import_of_a_pipe_shows_each_place_and_writes_the_trace_of_the_file(
+    pack: Callable[[bytes], bytes],
+    drive: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    given(monkeypatch, pack(drive.read_bytes()))
+    assert main(["import", "-", "-o", str(tmp_path / "live.jsonl")]) == 0
+    *shown, _ = capsys.readouterr().out.splitlines()
+    done = import_log(read_log(drive))
+    assert len(shown) == len(done.visits) >= 3
+    assert all(f"visit {k}, scans {done.visits[k].begin} to" in shown[k] for k in range(len(shown)))
+    live = Trace.load(tmp_path / "live.jsonl")
+    assert live.steps == done.trace.steps
+    assert live.closures == done.trace.closures
+
+
+def test_a_trace_on_standard_output_is_alone_there(
+    drive: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given(monkeypatch, drive.read_bytes())
+    assert main(["import", "-", "-o", "-"]) == 0
+    out, err = capsys.readouterr()
+    assert all(line.startswith("{") for line in out.splitlines())
+    assert len(out.splitlines()) > 3
+    assert "visit 0, scans" in err
+
+
+@pytest.mark.parametrize(
+    ("data", "options", "told"),
+    [
+        (b"VERTEX2 0 0 0 0\nROBOTLASER1 0\n", [], "expected lines of CARMEN, got another log"),
+        (b"nothing\n", [], "expected lines of CARMEN, got another log"),
+        (b"", [], "expected lines of CARMEN, got another log"),
+        (b"", ["--format", "mcap"], "got another format or a topic"),
+    ],
+)
+def test_a_pipe_has_lines_of_carmen(
+    data: bytes,
+    options: list[str],
+    told: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    given(monkeypatch, data)
+    assert main(["import", "-", *options, "-o", "-"]) == 1
+    assert told in capsys.readouterr().err
+
+
+def test_a_pipe_is_read_as_it_comes(drive: Path) -> None:
+    """The first scan is there long before the end of the pipe."""
+    lines = drive.read_bytes().splitlines(keepends=True) * 20
+    read = 0
+
+    class Slow(io.BytesIO):
+        def readline(self, size: int | None = -1) -> bytes:
+            nonlocal read
+            read += 1
+            return super().readline(size)
+
+    first = next(live_log(Slow(b"".join(lines))))
+    assert isinstance(first, Scan)
+    assert 2 * SURVEYED <= read < len(lines) / 2
+
+
+def notes_of(scans: Scans) -> str:
+    said: list[str] = []
+    for _ in stream_visits(scans, tell=said.append):
+        pass
+    assert len(said) == len(set(said))
+    return "\n".join(said)
+
+
+def mirrored(scans: Scans) -> Scans:
+    return [replace(scan, ranges=scan.ranges[::-1]) for scan in scans]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (backwards, "drives backwards all the way"),
+        (in_degrees, "headings of the odometry are read as degrees"),
+        (lambda scans: with_poses(scans, lambda x, y, h: (100 * x, 100 * y, h)), "as centimetres"),
+        (of_two_clocks, "The clock starts anew before scan 150"),
+        (mirrored, "the laser hangs upside down"),
+    ],
+)
+def test_a_stream_is_checked_as_a_log_is(
+    change: Callable[[Scans], Scans], told: str, scans: tuple[Scan, ...]
+) -> None:
+    assert told in notes_of(change(scans))
+
+
+@pytest.mark.slow
+def test_a_good_stream_is_not_doubted(scans: tuple[Scan, ...]) -> None:
+    assert not notes_of(scans)
+    # A robot that stands for a while is not doubted, either.
+    assert not notes_of([scans[0]] * (LOOKS[0] + 50) + list(scans[:60]))
+
+
+def test_shuffled_scans_end_a_stream_before_they_are_matched(scans: tuple[Scan, ...]) -> None:
+    mixed = random.Random(1).sample(scans, len(scans))
+    with pytest.raises(LogError, match="in random order"):
+        next(stream_visits(mixed))
+
+
+def test_odometry_of_two_sources_ends_a_stream(scans: tuple[Scan, ...]) -> None:
+    two = [
+        replace(scan, odometry=(scan.odometry[0] + 30 * (i % 2), *scan.odometry[1:]))
+        for i, scan in enumerate(scans)
+    ]
+    with pytest.raises(LogError, match="odometry of one source"):
+        next(stream_visits(two))
+
+
+def test_a_clock_that_starts_anew_does_not_cut_a_drive_whose_scans_match(
+    scans: tuple[Scan, ...],
+) -> None:
+    some = [
+        replace(scan, time=(scan.time or 0.0) - (1e4 if i > 40 else 0))
+        for i, scan in enumerate(scans[:80])
+    ]
+    done = import_log(RobotLog(tuple(some)))
+    assert done.track.cuts == ()
+    (note,) = [note for note in done.notes if "clock" in note]
+    assert "while the odometry goes on" in note
+    assert not [note for note in done.notes if "jumps" in note]
+
+
+def test_a_pipe_without_a_drive_says_so() -> None:
+    with pytest.raises(LogError, match="expected scans, got none"):
+        import_live([])
