@@ -24,8 +24,9 @@ from ssh_abduction.solver import check_rules
 from ssh_abduction.theory.settle import displacement_of, settle
 from ssh_abduction.theory.theory import Theory
 
-# Stretches of so many steps are tried one by one. That takes about 15 ms for each.
-SHORT = (1, 2)
+# Stretches of so many steps are tried first. They overlap by a step, so that each action is in one.
+# A stretch takes about 30 ms. Shorter ones take 13 ms, and 16 steps take 120 ms.
+STRETCH = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,9 +90,9 @@ def explain(
 ) -> Explanation | None:
     """Explain why a trace has no map.
 
-    Short stretches are tried first. If they have maps, steps are dropped from the end and then from
-    the start, as long as the rest has no map. Then axioms are dropped one by one, until all that
-    are left are needed for the clash.
+    Stretches of a few steps are tried first, and then the whole trace. Steps are dropped from the
+    end and then from the start of what has no map, as long as the rest has none. Then axioms are
+    dropped one by one, until all that are left are needed for the clash.
 
     Args:
         trace: The trace, with views.
@@ -119,23 +120,16 @@ def explain(
     def has_no_map(first: int, end: int) -> bool:
         return not Axioms(Piece.of(problem, range(first, end)), stop).consistent()
 
-    stretch = next(
-        (
-            (first, first + length)
-            for length in SHORT
-            for first in range(len(trace) - length + 1)
-            if has_no_map(first, first + length)
-        ),
-        None,
-    )
-    if stretch is None:
-        # drop steps from the end, then from the start
-        end = shortest(len(trace), lambda n: has_no_map(0, n))
-        if end is None:
-            return None
-        length = shortest(end, lambda n: has_no_map(end - n, end)) or end
-        stretch = end - length, end
-    first, last = stretch[0], stretch[1] - 1
+    begins = range(0, max(len(trace) - 1, 1), STRETCH - 1)
+    stretches = ((begin, min(begin + STRETCH, len(trace))) for begin in begins)
+    begin, before = next((s for s in stretches if has_no_map(*s)), (0, len(trace)))
+    # Drop steps from the end, then from the start.
+    length = shortest(before - begin, lambda n: has_no_map(begin, begin + n))
+    if length is None:
+        return None
+    end = begin + length
+    first = end - (shortest(length, lambda n: has_no_map(end - n, end)) or length)
+    last = end - 1
     clashes: dict[str, list[int]] = {}
     axioms = Axioms(Piece.of(problem, range(first, last + 1)), stop, relaxed=True)
     clash = axioms.smallest_clash()
