@@ -63,13 +63,33 @@ def counts_of(trace: Trace, ssh_map: SSHMap | None, poses: Array) -> dict[str, A
     scans = [int(trace.steps[t].extra["scan"]) for t in starts]
     radii = [float(trace.steps[t].extra.get("radius", DISC)) for t in starts]
     places = [_place(ssh_map, t) for t in starts]
-    edges = edges_of(ssh_map, starts)
+    return counted(poses, middles, scans, radii, places, edges_of(ssh_map, starts))
+
+
+def counted(
+    poses: Array,
+    middles: Array,
+    scans: Sequence[int],
+    radii: Sequence[float],
+    places: Sequence[Hashable],
+    edges: Sequence[Hashable],
+) -> dict[str, Any]:
+    """Count pairs, as `counts_of` does, for visits to the nodes of any graph.
+
+    Args:
+        poses: (n, 3) true pose of each scan: metres and radians.
+        middles: (v, 2) true middle of the place of each visit in metres.
+        scans: Index of the scan of each visit.
+        radii: Radius of the disc of the place of each visit, in metres.
+        places: Name of the place of each visit; None if unknown.
+        edges: Name of the edge of each travel between two visits; None if unknown.
+    """
     courses = [
         course_of(poses[begin : end + 1, :2], middles[k : k + 2], radii[k : k + 2])
         for k, (begin, end) in enumerate(pairwise(scans))
     ]
     return {
-        "visits": len(starts),
+        "visits": len(scans),
         "visit_pairs": _visit_pairs(middles, places),
         "travel_pairs": _travel_pairs(courses, edges),
         "partings": _noticed(partings(poses[:, :2]), middles),
@@ -114,21 +134,38 @@ def edges_of(ssh_map: SSHMap | None, starts: Sequence[int]) -> list[Hashable]:
     Returns:
         The name of the edge of each travel; None if the map has no places.
     """
+    places = [_place(ssh_map, t) for t in starts]
+    if ssh_map is None or None in places:
+        return [None] * (len(starts) - 1)
+    if ssh_map.fit is None or not ssh_map.fit.poses:
+        paths = [ssh_map.dstates[ssh_map.dstate_at[after - 1]].path for after in starts[1:]]
+        return [
+            (*sorted(ends), path)  # type: ignore[type-var]
+            for ends, path in zip(pairwise(places), paths, strict=True)
+        ]
+    poses, labels = ssh_map.fit.poses, ssh_map.dstate_at
+    bearings = [
+        (poses[labels[after - 1]].heading, poses[labels[after]].heading + math.pi)
+        for after in starts[1:]
+    ]
+    return edges_between(places, bearings)
+
+
+def edges_between(
+    places: Sequence[Hashable], bearings: Sequence[tuple[float, float]]
+) -> list[Hashable]:
+    """Name the edge of each travel by the gateways at its ends.
+
+    Args:
+        places: The place of each visit.
+        bearings: For each travel, the directions in radians from its first place along its
+            beginning, and from its last place back along its end.
+    """
     edges: list[Hashable] = []
-    gateways: dict[int, list[float]] = defaultdict(list)
-    for after in starts[1:]:
-        here, there = _place(ssh_map, after - 1), _place(ssh_map, after)
-        if ssh_map is None or here is None or there is None:
-            edges.append(None)
-        elif ssh_map.fit is None or not ssh_map.fit.poses:
-            path = ssh_map.dstates[ssh_map.dstate_at[after - 1]].path
-            edges.append((*sorted([here, there]), path))
-        else:
-            poses = ssh_map.fit.poses
-            ahead = poses[ssh_map.dstate_at[after - 1]].heading
-            behind = poses[ssh_map.dstate_at[after]].heading + math.pi
-            ends = [(here, _named(gateways[here], ahead)), (there, _named(gateways[there], behind))]
-            edges.append(tuple(sorted(ends)))
+    gateways: dict[Hashable, list[float]] = defaultdict(list)
+    for (here, there), (ahead, behind) in zip(pairwise(places), bearings, strict=True):
+        ends = [(here, _named(gateways[here], ahead)), (there, _named(gateways[there], behind))]
+        edges.append(tuple(sorted(ends)))  # type: ignore[type-var]
     return edges
 
 
@@ -141,7 +178,7 @@ def _named(known: list[float], bearing: float) -> int:
     return apart.index(min(apart))
 
 
-def _visit_pairs(middles: Array, places: Sequence[int | None]) -> dict[str, int]:
+def _visit_pairs(middles: Array, places: Sequence[Hashable]) -> dict[str, int]:
     joined = right = true = found = 0
     for i, j in combinations(range(len(middles)), 2):
         far = math.dist(middles[i], middles[j])

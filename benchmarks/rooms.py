@@ -39,7 +39,7 @@ def untold(
     """
     starts = [t for t in range(len(trace)) if t == 0 or trace.actions[t - 1].kind != "turn"]
     scans = [int(trace.steps[t].extra["scan"]) for t in starts]
-    places = [ssh_map.dstates[ssh_map.labels[t]].place for t in starts]
+    places = [ssh_map.dstates[ssh_map.dstate_at[t]].place for t in starts]
     edges = edges_of(ssh_map, starts)
     passed = [
         frozenset(rooms[begin : end + 1]) - {rooms[begin], rooms[end]}

@@ -13,6 +13,7 @@ import networkx as nx
 import numpy as np
 import pytest
 import rooms
+import waypoints
 from skeleton import CELL, _chains, _pixels, _prune, _with_doors, poses_of, skeleton_of
 from visited import (
     ACES_COLUMNS,
@@ -346,3 +347,20 @@ def test_rooms_and_doors_need_places_or_edges_of_their_own(
 ) -> None:
     told = rooms.untold(*corridor_map(places, paths, drive), doors)
     assert told == {"rooms": missing, "doors": confused}
+
+
+def test_waypoints_fill_rooms_and_no_edge_crosses_a_wall() -> None:
+    """Two rooms of 4 x 4 m with a wall between them, and no door."""
+    free = np.zeros((45, 95), bool)
+    free[2:42, 2:42] = free[2:42, 52:92] = True
+    cells = [(10, 10)]
+    cells += waypoints._in_free_space(free, cells)
+    graph = waypoints._triangulated(free, cells)
+    rows, columns = np.nonzero(free)
+    far = np.hypot(rows[:, None] - [r for r, _ in cells], columns[:, None] - [c for _, c in cells])
+    assert far.min(axis=1).max() * CELL < waypoints.FREE
+    assert sorted(len(piece) for piece in nx.connected_components(graph)) == sorted(
+        sum(side(c) for _, c in cells) for side in (lambda c: c < 45, lambda c: c > 45)
+    )
+    merged = waypoints._merged([(0, 0), (0, 1), (0, 2), (0, 4)])
+    assert merged == [(0, 0), (0, 4)]
