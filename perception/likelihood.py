@@ -113,17 +113,6 @@ class ImageLikelihood:
         dimensions = min(beams, max(1.0, 2 * within**2 / variance)) if variance else beams
         return cls(recogniser, nearest.classes_, within, max(spread, within), centre, dimensions)
 
-    def log_likelihoods(self, images: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Compute the log densities of images at each known place and for a new appearance.
-
-        Args:
-            images: (n, d) images as the recogniser takes them.
-
-        Returns:
-            log p(o|x) for each image and each of `classes`, (n, c), and log p(o|novel), (n,).
-        """
-        return self._of_features(self._features(images))
-
     def ratios(self, images: ArrayLike) -> Iterator[NDArray[np.float64]]:
         """Compute how much likelier each image is at a known place than at an unknown one.
 

@@ -38,16 +38,20 @@ def takes_all(task: Task) -> bool:
 
 def new_engine(task: Task) -> Engine:
     """Make the engine for the theory and the length of the trace. It has no steps yet."""
-    if may_name(task):
-        # Imported here, as loading numpy takes longer than solving a short trace.
-        from ssh_abduction.solver.engines.causal import CausalEngine
+    # Engines are imported here, one at a time, as loading them and numpy takes longer than solving
+    # a short trace.
+    if may_name(task) and row("named dstates with faults").holds_for(task.theory):
         from ssh_abduction.solver.engines.faulty import FaultyEngine
+
+        return FaultyEngine(task)
+    if may_name(task) and not task.theory.has_faults:
+        if task.theory.level == "causal":
+            from ssh_abduction.solver.engines.causal import CausalEngine
+
+            return CausalEngine(task)
         from ssh_abduction.solver.engines.framed import FramedEngine
 
-        if row("named dstates with faults").holds_for(task.theory):
-            return FaultyEngine(task)
-        if not task.theory.has_faults:
-            return CausalEngine(task) if task.theory.level == "causal" else FramedEngine(task)
+        return FramedEngine(task)
     return step_engine(task)
 
 

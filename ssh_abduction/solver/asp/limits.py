@@ -91,13 +91,6 @@ class Watch:
         if self._started is None:
             self._started = time.perf_counter()
 
-    def begin_anew(self) -> None:
-        """Restart the clock at 0, without a reserve and without a limit for a stage."""
-        self._started, self._spent, self._next_tick = None, 0.0, TICK
-        self._stage_ends, self.interrupted = math.inf, False
-        self.use_reserve()
-        self.start()
-
     @property
     def has_reserve(self) -> bool:
         """Whether the last part of the time limit is still reserved for finding any map."""
