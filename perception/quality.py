@@ -40,9 +40,9 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 from sklearn.metrics import homogeneity_score
 from sklearn.utils import check_array
-from threadpoolctl import threadpool_limits
 
 from perception.errors import PerceptionError, equal_length
+from ssh_abduction.runtime.threads import one_thread
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.intp]
@@ -322,7 +322,7 @@ class _Cells:
         search = _Search(self.images, components[self.order])
         pairs = np.argsort(self.bounds, kind="stable")
         # The products are small: threads would wait for each other longer than they work.
-        with threadpool_limits(1, user_api="blas"):
+        with one_thread("blas"):
             while len(pairs):
                 # Skip a pair of cells if its bound is not below the best edge of any component with
                 # images in these cells.

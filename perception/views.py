@@ -25,7 +25,6 @@ from sklearn.mixture import BayesianGaussianMixture, GaussianMixture
 from sklearn.neighbors import KNeighborsClassifier
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted, validate_data
-from threadpoolctl import threadpool_limits
 
 from perception.clusterings import Predictor, Tried, labels_of, single, smallest_good, to_neighbour
 from perception.confidence import NOISE, confidence
@@ -33,6 +32,7 @@ from perception.errors import ImageWarning, PerceptionError, equal_length
 from perception.quality import cluster_quality, sample_indices, spanning_tree, trimmed_quality
 from ssh_abduction.data.checks import a_whole_number
 from ssh_abduction.data.errors import brief, is_finite
+from ssh_abduction.runtime.threads import one_thread
 
 # Up to this many images, k-means makes all of its starts on all images. Of more images, it makes
 # the starts on a random sample of this size, to limit the time.
@@ -280,7 +280,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         """Fit k-means to all images, from the best of several starts."""
         # Rounds are short: on shared cores, two threads would wait for each other longer than they
         # work.
-        with threadpool_limits(1):
+        with one_thread():
             if len(images) > MANY:
                 sample = np.random.default_rng(seed).choice(len(images), MANY, replace=False)
                 # The sample may have fewer different images than k while all images have enough.

@@ -27,7 +27,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from brute_geometry import Geometry
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import Odometry
@@ -879,7 +879,7 @@ def _closures_agree(
 ) -> bool:
     """freedom  3 where the labels are dstates, 2 where they are places"""
     odometry = trace.odometry or Odometry()
-    most = chi2.isf(theory.reject / max(theory.returns, 1), freedom)
+    most = chdtri(freedom, theory.reject / max(theory.returns, 1))
     for closure in trace.closures:
         if labels[closure.first] != labels[closure.last]:
             continue

@@ -13,7 +13,7 @@ from functools import cache
 from itertools import combinations
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.trace import Trace
@@ -129,7 +129,7 @@ class Geometry:
         share = self.theory.reject / 2 if self.theory.joint > 1 else self.theory.reject
         tests = math.comb(self.theory.returns, len(returns))
         freedom = sum(f for *_, f in returns)
-        most = chi2.isf(share / max(tests, 1), freedom)
+        most = chdtri(freedom, share / max(tests, 1))
         least = math.inf
         for bend, unlikely in self.bends:
             loops = [self.loop(i, j, bend) for i, j, _ in returns]

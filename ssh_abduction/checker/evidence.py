@@ -110,14 +110,14 @@ def _p_value(match: Closure, odometry: Odometry, freedom: int) -> float:
         freedom: 2 to compare positions, 3 to compare poses.
     """
     import numpy as np
-    from scipy.stats import chi2
+    from scipy.special import chdtrc  # scipy.stats has the same, and loads for half a second
 
     spreads = np.array([odometry.offset, odometry.offset, odometry.facing])
     total = np.array(match.covariance) + np.diag(2 * spreads * spreads)
     x, y, turned = match.displacement
     off = np.array([x, y, math.remainder(turned, math.tau)])[:freedom]
     square = off @ np.linalg.inv(total[:freedom, :freedom]) @ off
-    return float(chi2.sf(square, freedom))
+    return float(chdtrc(freedom, square))
 
 
 def planar(m: Reading) -> Found:

@@ -1,4 +1,4 @@
-"""Support for running programs: start and exit, time limits, the log, and deprecated names.
+"""Support for running programs: start and exit, time limits, the log, threads, deprecated names.
 
 This module imports nothing, because `__main__` loads `program` before any other module.
 """

@@ -24,6 +24,7 @@ from ssh_abduction.data.words import counted
 from ssh_abduction.runtime.clock import each_heeding, heeding
 from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.runtime.logs import log_of
+from ssh_abduction.runtime.threads import one_thread
 from ssh_abduction.solver.answer import Answer
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError, Stop
 from ssh_abduction.solver.asp.rules import check_rules
@@ -294,15 +295,13 @@ class Search:
 
     def _weigh(self, weighing: Weighing) -> None:
         """Find the maps of least cost: guess some, find some minimal map by counting, and prove."""
-        from threadpoolctl import threadpool_limits
-
         watch = self._parts.watch
 
         def maps_of(trace: Trace, theory: Theory) -> tuple[tuple[SSHMap, ...], bool]:
             return self._solve_mended(trace, theory, 1, watch.left())
 
         # The matrices are small: threads of BLAS would mostly wait for each other.
-        with threadpool_limits(1, user_api="blas"):
+        with one_thread("blas"):
             if not weighing.guess(lambda: two_steps_clash(self.trace, self.theory, maps_of)):
                 self._parts.known.status = Status.UNSATISFIABLE
                 return
