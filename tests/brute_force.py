@@ -221,13 +221,14 @@ def _as_asserted(labels: Labels, places: tuple[int, ...] | None, theory: Theory)
     that the trace has."""
     there = [
         [(i, j) for i, j in pairs if j < len(labels)]
-        for pairs in (theory.same, theory.different, theory.elsewhere)
+        for pairs in (theory.same, theory.different, theory.elsewhere, theory.same_place)
     ]
-    same, different, elsewhere = there
+    same, different, elsewhere, same_place = there
     return (
         all(labels[i] == labels[j] for i, j in same)
         and all(labels[i] != labels[j] for i, j in different + elsewhere)
         and (places is None or all(places[labels[i]] != places[labels[j]] for i, j in elsewhere))
+        and (places is None or all(places[labels[i]] == places[labels[j]] for i, j in same_place))
     )
 
 

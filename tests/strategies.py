@@ -33,7 +33,7 @@ STARS = ((1, 1, 1, 1), (1, 0, 1, 0), (1, 1, 0, 0), (1, 0, 0, 0), (1, 1, 1, 0))
 
 
 FOREIGN = ("without", "rules")  # what the checker cannot judge maps by
-PAIRS = ("same", "different", "elsewhere")
+PAIRS = ("same", "different", "elsewhere", "same_place")
 # Axioms that may be left out: the map can't show what holds without these, as a dstate of a map has
 # one place and one course.
 LEFT_OUT = sorted(
@@ -228,6 +228,7 @@ def choices_of(field: str, trace: Trace) -> st.SearchStrategy[Any]:
         "same": _seldom(_pairs(len(trace))),
         "different": _pairs(len(trace)),
         "elsewhere": _pairs(len(trace)),
+        "same_place": _seldom(_pairs(len(trace))),
     }[field]
 
 
@@ -250,6 +251,7 @@ def theories(draw: st.DrawFn, trace: Trace, fixed: Collection[str] = ()) -> Theo
             "boundary": "none",
             "star": draw(st.sampled_from(["none", "alike"] if trace.has_stars else ["none"])),
             "prefer": draw(st.sampled_from([("dstates",), ()])),
+            "same_place": (),
         }
         rules = [
             rules

@@ -163,7 +163,7 @@ RIGHT: dict[str, set[str]] = {
     "Theory.rules": {"empty text", *EMPTY},
     "Theory.of_steps.first": {"huge"},
     "Theory.of_steps.length": {"huge"},
-    **{f"Theory.{pairs}": EMPTY for pairs in ("same", "different", "elsewhere")},
+    **{f"Theory.{pairs}": EMPTY for pairs in ("same", "different", "elsewhere", "same_place")},
     **{f"Theory.{price}": {"3.5"} for price in ("misread", "slipped", "jumped", "changed")},
     **{f"{written}.save.path": {"nonsense"} for written in ("Page", "Solution", "SSHMap", "Trace")},
     "Trace.at.step": {"huge"},

@@ -8,12 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from ssh_abduction import Theory, Trace, export_map, route, solve
+from ssh_abduction import Theory, Trace, check, export_map, route, solve
 from ssh_abduction.cli import main
 from ssh_abduction.data import (
     Corrections,
     MapError,
     SSHMap,
+    TheoryError,
     drives_of,
     load_corrections,
     save_corrections,
@@ -352,3 +353,27 @@ def test_pairs_of_steps_are_those_of_a_theory() -> None:
     twice = solve(JOINT, Theory(elsewhere=[(0, 5)]), corrections=said)
     assert twice.theory.elsewhere == ((0, 5),)
     assert drives_of(JOINT)[1].fingerprint is None
+
+
+def test_steps_said_to_be_at_one_place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    trace = Trace.from_steps("abcd", ["travel", "right", "travel"], name="walk")
+    theory = Theory(boundary="none", prefer=("dstates",))
+    every = solve(trace, theory, max_maps=None).maps
+    together_there = [m for m in every if m.place_of(0) == m.place_of(3)]
+    assert 0 < len(together_there) < len(every)
+    said = Corrections(fingerprints_of(trace)).with_pair("same_place", "walk:0", "walk:3")
+    found = solve(trace, theory, corrections=said, max_maps=None)
+    assert found.theory.same_place == ((0, 3),)
+    assert set(found.maps) == set(together_there)
+    apart = next(m for m in every if m not in together_there)
+    assert [v.axiom for v in check(trace, apart, found.theory)] == ["asserted"]
+    with pytest.raises(TheoryError, match="same_place: expected a topological theory"):
+        Theory.causal().replace(same_place=[(0, 1)])
+    trace.save(tmp_path / "walk.jsonl")
+    names = [str(tmp_path / name) for name in ("walk.jsonl", "maps.json")]
+    solving_it = ["solve", names[0], "--set", "boundary=none", "-o", names[1]]
+    assert main(solving_it) == 0
+    assert main(["correct", str(tmp_path), "--same-place", "walk:0,walk:3"]) == 0
+    assert main(solving_it) == 0
+    assert "obeying 1 sentence" in capsys.readouterr().err
+    assert main([*solving_it, "--same-place", "0,3"]) == 0

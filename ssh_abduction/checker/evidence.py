@@ -37,6 +37,7 @@ def asserted(m: Reading) -> Found:
         ("one dstate", theory.same),
         ("different dstates", theory.different),
         ("at different places", theory.elsewhere),
+        ("at one place", theory.same_place),
     ]
     for said, (i, j) in (
         (said, pair) for said, pairs in told for pair in pairs if max(pair) < len(labels)
@@ -49,7 +50,13 @@ def asserted(m: Reading) -> Found:
                 [i, j],
                 f"Steps {i} and {j} are dstates {here} and {there}, but are said to be one dstate.",
             )
-        elif said != "one dstate" and here == there:
+        elif said == "at one place" and (len(places) > 1 or None in places):
+            yield (
+                [i, j],
+                f"Steps {i} and {j} are at places {m.states[here].place} and "
+                f"{m.states[there].place}, but are said to be {said}.",
+            )
+        elif said in ("different dstates", "at different places") and here == there:
             yield [i, j], f"Steps {i} and {j} are one dstate, {here}, but are said to be {said}."
         elif said == "at different places" and len(places) == 1 and None not in places:
             yield (

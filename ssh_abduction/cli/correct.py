@@ -14,6 +14,7 @@ HELPS = {
     "same": "steps I and J, such as monday:12,tuesday:3, are one dstate; may be given again",
     "different": "steps I and J are different dstates; may be given again",
     "elsewhere": "steps I and J are at different places; may be given again",
+    "same_place": "steps I and J are at one place; may be given again",
     "open": "a gateway is open, named as with --closed; may be given again",
     "closed": (
         "a gateway is closed: a place and a direction on the drawn map, such as 'p4 north', or a "
@@ -31,7 +32,9 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_argument("maps", help="file that solve -o wrote, or a folder with maps.json")
     for name, words in HELPS.items():
         metavar = "I,J" if name in PAIRS else "GATEWAY"
-        parser.add_argument(f"--{name}", action="append", metavar=metavar, help=words)
+        parser.add_argument(
+            f"--{name.replace('_', '-')}", action="append", metavar=metavar, help=words
+        )
     parser.add_argument(
         "--name",
         action="append",
@@ -73,6 +76,7 @@ def _pair(standing: Standing, kind: str, pair: str) -> tuple[str, str]:
     steps = [standing.step(step.strip()) for step in pair.split(",")]
     if len(steps) != 2 or steps[0] == steps[1]:
         raise MapError(
-            f"--{kind}: expected two steps such as monday:12,tuesday:3, got {brief(pair)}; name two"
+            f"--{kind.replace('_', '-')}: expected two steps such as monday:12,tuesday:3, got "
+            f"{brief(pair)}; name two"
         )
     return steps[0], steps[1]

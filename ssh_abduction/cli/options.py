@@ -61,9 +61,10 @@ def add_theory(parser: Parser, default: str = "topological") -> None:
         ("same", "are one dstate"),
         ("different", "are different dstates"),
         ("elsewhere", "are at different places"),
+        ("same_place", "are at one place"),
     ):
         group.add_argument(
-            f"--{name}",
+            f"--{name.replace('_', '-')}",
             action="append",
             metavar="I,J",
             help=(
@@ -299,7 +300,8 @@ def flags_of(theory: Theory, trace: Trace | None = None) -> list[str]:
         if field.name == "rules":
             flags += [part for rules in value for part in ("--rules", rules.name)]
         elif field.name in ASSERTIONS:
-            flags += [part for i, j in value for part in (f"--{field.name}", f"{i},{j}")]
+            flag = f"--{field.name.replace('_', '-')}"
+            flags += [part for i, j in value for part in (flag, f"{i},{j}")]
         else:
             text = ",".join(value) if isinstance(value, tuple) else str(value)
             if isinstance(value, bool):

@@ -36,7 +36,7 @@ from ssh_abduction.data.trace import Trace, checked_trace
 
 FORMAT, VERSION = "ssh-corrections", 1
 # The kinds of pairs of steps, which are fields of a theory.
-PAIRS = ("same", "different", "elsewhere")
+PAIRS = ("same", "different", "elsewhere", "same_place")
 # The directions of gateways by name, in degrees clockwise from ahead.
 DIRECTIONS = {"ahead": 0.0, "right": 90.0, "back": 180.0, "left": 270.0}
 
@@ -63,10 +63,10 @@ class Naming:
 
 @dataclass(frozen=True, slots=True)
 class Said:
-    """Two steps that a person says are one dstate, different dstates, or at different places.
+    """Two steps that a person says are one dstate or at one place, or are different ones.
 
     Attributes:
-        kind: "same", "different" or "elsewhere".
+        kind: "same", "different", "elsewhere" or "same_place".
         steps: The two steps, such as ("monday:12", "tuesday:3").
         note: A remark of the person; it has no effect.
     """
@@ -147,10 +147,10 @@ class Corrections:
         return replace(self, names=(*kept, Naming(_a_name(name), kind, _a_step("step", step))))
 
     def with_pair(self, kind: str, first: str, second: str) -> Corrections:
-        """Say that two steps are one dstate, different dstates, or at different places.
+        """Say that two steps are one dstate or at one place, or that they are different ones.
 
         Args:
-            kind: "same", "different" or "elsewhere".
+            kind: "same", "different", "elsewhere" or "same_place".
             first: A step, such as "monday:12".
             second: Another step.
 
@@ -244,12 +244,12 @@ class Corrections:
         )
 
     def assertions(self, trace: Trace) -> dict[str, tuple[tuple[int, int], ...]]:
-        """Convert the pairs of steps to the fields same, different and elsewhere of a theory.
+        """Convert the pairs of steps to the fields of a theory that assert them.
 
         Pairs of other drives are left out.
 
         Returns:
-            For same, different and elsewhere: the pairs, by the numbers of the steps.
+            For each field, such as "same": the pairs, by the numbers of the steps.
 
         Raises:
             MapError: A sentence names a drive that neither the trace nor these corrections list,

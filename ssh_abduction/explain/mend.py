@@ -58,8 +58,8 @@ class Mend:
 
     Attributes:
         step: The step of the observation; the later step of an asserted pair.
-        kind: "view", "star", "action" or "displacement"; "same", "different" or "elsewhere" for an
-            asserted pair.
+        kind: "view", "star", "action" or "displacement"; "same", "different", "elsewhere" or
+            "same_place" for an asserted pair.
         seen: The value in the trace, in words.
         instead: A value, in words, with which there is a map; None if the observation is dropped.
         proven: Whether the whole changed trace is known to have a map, not only the stretch that

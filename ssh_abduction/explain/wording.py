@@ -157,7 +157,7 @@ class Words:
                 self._trace,
                 steps[i],
                 steps[j],
-                self._piece.theory.replace(same=(), different=(), elsewhere=()),
+                self._piece.theory.replace(same=(), different=(), elsewhere=(), same_place=()),
             )
         ):
             return f"{sentence}; {apart}"

@@ -16,7 +16,8 @@ from ssh_abduction.theory.theory import Theory, checked_theory
 def obeyed(corrections: Corrections, trace: Trace, theory: Theory) -> tuple[Trace, Theory]:
     """Return the trace and the theory that obey the corrections of a person.
 
-    Pairs of steps are added to the fields same, different and elsewhere of the theory. Gateways
+    Pairs of steps are added to the fields same, different, elsewhere and same_place of the theory.
+    Gateways
     that are open or closed change the stars of their steps.
 
     Args:

@@ -4,8 +4,8 @@ The solver does not see the old drives, but the standing map: a *digest* of it, 
 which each link of the map occurs once. Axioms are about links and observations, so a map of the
 digest and the new drive is a map of all drives. Steps of the digest at different dstates or places
 are asserted to be different. If the best maps also keep its equal steps equal, they are the best
-of all maps that keep the standing one. If not, the readable encodings get rules that keep them
-equal, as far as the traces are short enough.
+of all maps that keep the standing one. If not, they are asserted to be equal, as far as the traces
+are short enough.
 
 >>> from ssh_abduction import Trace, solve
 >>> monday = Trace.from_steps("abcd", ["travel", "around", "travel"], name="monday")
@@ -36,18 +36,9 @@ from ssh_abduction.solver.obeying import obeyed, with_names
 from ssh_abduction.solver.recorded import Support
 from ssh_abduction.solver.result import Solution
 from ssh_abduction.solver.values import Level, Status
-from ssh_abduction.theory.rules import Rules
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory, checked_theory
-
-# The rules that keep equal steps of the standing map equal. Each theory has the first one.
-_KEEPS_DSTATES = """\
-% @axiom(standing) The standing map is kept.
-#program step(t).
-violation(standing,t) :- stands(I,t), not same(I,t).
-"""
-_KEEPS_PLACES = "violation(standing,t) :- beside(I,t), at(I,P), not at(t,P).\n"
 
 
 @dataclass(frozen=True)
@@ -141,7 +132,7 @@ def solve_onto(
     found = solving.solve(part, pinned)
     kept = tuple(m for m in found.maps if _keeps(m, digest, ssh_map))
     if not kept and found.status is not Status.UNSATISFIABLE:
-        found, kept = _with_rules(part, pinned, digest, ssh_map, found, solving)
+        found, kept = _with_assertions(part, pinned, digest, ssh_map, found, solving)
     if not kept:
         raise _contradiction(old, trace, ssh_map, digest, found)
     assert found.cost is not None
@@ -249,6 +240,7 @@ def _pinned(theory: Theory, digest: Digest, ssh_map: SSHMap, old: Trace, *, join
         same=tuple(same),
         different=(*moved(theory.different), *apart),
         elsewhere=(*moved(theory.elsewhere), *elsewhere),
+        same_place=tuple(moved(theory.same_place)),
     )
 
 
@@ -279,7 +271,7 @@ def _broken(
     return sorted(split | merged), sorted(places)
 
 
-def _with_rules(
+def _with_assertions(
     part: Trace,
     pinned: Theory,
     digest: Digest,
@@ -287,17 +279,20 @@ def _with_rules(
     found: Solution,
     solving: Solving,
 ) -> tuple[Solution, tuple[SSHMap, ...]]:
-    """Solve again with rules that keep the standing map, if the trace is short enough."""
+    """Solve again and assert what is one in the standing map, if the trace is short enough."""
     if len(part) > READABLE:
         return found, ()
-    pairs = list(combinations(range(len(digest.labels)), 2))
-    place = [ssh_map.dstates[s].place for s in digest.labels]
-    text = "#program base.\n#defined stands/2. #defined beside/2.\n"
-    text += "".join(f"stands({i},{j}).\n" for i, j in pairs if digest.labels[i] == digest.labels[j])
-    text += "".join(f"beside({i},{j}).\n" for i, j in pairs if place[i] == place[j] is not None)
-    text += _KEEPS_DSTATES + (_KEEPS_PLACES if pinned.level == "topological" else "")
-    rules = Rules("standing.lp", text)
-    again = solving.solve(part, pinned.replace(rules=(*pinned.rules, rules)))
+    first: dict[int, int] = {}
+    first_at: dict[int, int] = {}
+    same, same_place = list(pinned.same), list(pinned.same_place)
+    for t, s in enumerate(digest.labels):
+        place = ssh_map.dstates[s].place
+        if first.setdefault(s, t) != t:
+            same.append((first[s], t))
+        elif place is not None and first_at.setdefault(place, t) != t:
+            same_place.append((first_at[place], t))
+    stands = pinned.replace(same=tuple(same), same_place=tuple(same_place))
+    again = solving.solve(part, stands)
     if again.status is Status.UNSATISFIABLE:
         return found, ()
     return again, tuple(m for m in again.maps if _keeps(m, digest, ssh_map))
@@ -318,7 +313,7 @@ def _settled(found: Theory, theory: Theory) -> Theory:
         same=theory.same,
         different=theory.different,
         elsewhere=theory.elsewhere,
-        rules=theory.rules,
+        same_place=theory.same_place,
     )
 
 

@@ -200,8 +200,7 @@ class Weighing:
         may_be_wrong = range(1, len(parts.task.trace)) if parts.task.theory.jumped else ()
         self._base = self._misfit.of_returns([], may_be_wrong) / 2  # of every map
         task = replace(parts.task, speedups=replace(parts.task.speedups, prefixes=False))
-        judging = _Judging(task.problem, self)
-        engine = _engine(task, parts)
+        judging, engine = _Judging(task.problem, self), _engine(task, parts)
         engine.grow(len(task.trace))
         prefixes = Prefixes(task, Known(task.theory), judging, engine, 1, parts.report)
         last = prefixes.minimise()

@@ -55,9 +55,30 @@ EXCUSED = {
     "changed": {"star_pattern", "star_frame"},
 }
 DEAREST = 1000.0  # the most dstates that a fault may cost
+# The fields that are covered by the axioms of a theory. Speed-ups must name any other field that
+# they respect, such as one that is added later.
+SPOKEN_FOR = {
+    "level",
+    *CHOICES,
+    "symmetric_sides",
+    "next_place",
+    "all_on_paths",
+    "planar",
+    "prefer",
+    "without",
+    "rules",
+    "reject",
+    "joint",
+    "returns",
+    "weigh",
+    "prices",
+    "same",
+    "different",
+    "elsewhere",
+}
 MOST_JOINT = 2  # the most returns that may be tested together
 MOST_STEPS = 2**31  # the numbers of steps are below this: clingo's numbers have 32 bits
-ASSERTIONS = ("same", "different", "elsewhere")
+ASSERTIONS = ("same", "different", "elsewhere", "same_place")
 FAULTS = ("misread", "misseen", "slipped", "jumped", "changed")
 CAUSAL = "Theory.causal() (--theory causal)"  # for error messages
 
@@ -98,6 +119,11 @@ def normalise(theory: Theory) -> None:
                 f"prefer: expected dstates with level=causal, got {', '.join(theory.prefer)}; "
                 f"take {CAUSAL}"
             )
+    if theory.level == "causal" and theory.same_place:
+        raise TheoryError(
+            "same_place: expected a topological theory, as causal maps have no places, got "
+            "level=causal; say which steps are one dstate (same, --same)"
+        )
     if "auto" in theory.prefer and theory.prefer != AUTO:
         raise TheoryError(
             f"prefer: expected auto alone, got {', '.join(theory.prefer)}; name the counts, or "
@@ -267,7 +293,7 @@ def _pairs(field: str, value: Any) -> tuple[Pair, ...]:
     """
     if isinstance(value, _Checked):
         return value
-    mend = f"write {field}=[(3, 12)] (--{field} 3,12)"
+    mend = f"write {field}=[(3, 12)] (--{field.replace('_', '-')} 3,12)"
     if isinstance(value, str):
         value = [value]
     if not isinstance(value, Iterable) or isinstance(value, Mapping | bytes):

@@ -28,11 +28,11 @@ from ssh_abduction.theory.fields import (
     ASSERTIONS,
     AUTO,
     CAUSAL,
-    CHOICES,
     EXCUSED,
     FAULTS,
     PREFERRED,
     PRICES,
+    SPOKEN_FOR,
     WITH_DISPLACEMENTS,
     Count,
     Pair,
@@ -46,25 +46,6 @@ from ssh_abduction.theory.rules import Rules
 # confident view may be wrong.
 LEAST_SURE, MOST_SURE = 0.1, 5.0
 LARGEST_TOML = 2**20  # bytes
-# The fields that are covered by the axioms of a theory. Speed-ups must name any other field that
-# they respect, such as one that is added later.
-SPOKEN_FOR = {
-    "level",
-    *CHOICES,
-    "symmetric_sides",
-    "next_place",
-    "all_on_paths",
-    "planar",
-    "prefer",
-    "without",
-    "rules",
-    "reject",
-    "joint",
-    "returns",
-    "weigh",
-    "prices",
-    *ASSERTIONS,
-}
 # The fields that the trace decides, not the user.
 SETTLED = ("returns", "unknown_views", "several_drives", "lifts")
 
@@ -119,6 +100,7 @@ class Theory:
         same: Pairs of steps known to be one dstate.
         different: Pairs of steps known to be different dstates.
         elsewhere: Pairs of steps known to be at different places.
+        same_place: Pairs of steps known to be at one place. Fast engines do not know them.
         weigh: How to compare maps. count: by the counts in `prefer`. cost: by their cost in nats,
             which is the prices of what they have, plus half of the chi-square of their misfit to
             the displacements. auto: cost if displacements are used and the theory allows it.
@@ -144,6 +126,7 @@ class Theory:
     same: tuple[Pair, ...] = ()
     different: tuple[Pair, ...] = ()
     elsewhere: tuple[Pair, ...] = ()
+    same_place: tuple[Pair, ...] = ()
     misread: float = 0.0
     slipped: float = 0.0
     jumped: float = 0.0
@@ -375,7 +358,7 @@ class Theory:
             raise TraceError(f"{where}: {error}, or take {choice('star', 'none')}") from None
 
     def check_steps(self, trace: Trace) -> None:
-        """Check that the trace has all steps in the fields `same`, `different` and `elsewhere`.
+        """Check that the trace has all steps that the user asserts something about.
 
         Raises:
             TheoryError: A step is missing.
@@ -384,15 +367,16 @@ class Theory:
         for name in ASSERTIONS:
             for pair in getattr(self, name):
                 if max(pair) >= len(trace):
+                    flag = f"--{name.replace('_', '-')}"
                     raise TheoryError(
-                        f"{name} (--{name}): expected steps from 0 to {len(trace) - 1}, got "
+                        f"{name} ({flag}): expected steps from 0 to {len(trace) - 1}, got "
                         f"{pair[0]},{pair[1]}"
                     )
 
     def of_steps(self, first: int, length: int) -> Theory:
         """Return this theory for a part of the trace.
 
-        The pairs of steps in `same`, `different` and `elsewhere` are renumbered. Pairs with a step
+        The pairs of steps that the user asserts are renumbered. Pairs with a step
         outside of the part are dropped.
 
         Args:

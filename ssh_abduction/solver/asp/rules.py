@@ -24,7 +24,7 @@ from ssh_abduction.theory.rules import Rules
 from ssh_abduction.theory.theory import Theory
 
 # The predicates of the facts of a trace, which are added step by step.
-OF_STEPS = {"view", "act", "kind", "turns", "open", "excluded", "elsewhere", "one"}
+OF_STEPS = {"view", "act", "kind", "turns", "open", "excluded", "elsewhere", "one", "together"}
 READABLE = {"axiom", "path", "prefer", "defeasible"}  # the predicates of a theory's facts
 # The program parts that are grounded, with the number of their parameters.
 PARTS = {"base": 0, "step": 1, "check": 1}

@@ -43,7 +43,7 @@ from ssh_abduction.solver.guesses.reckoning import (
     Reckoning,
     first_pose,
 )
-from ssh_abduction.solver.guesses.sights import Sights
+from ssh_abduction.solver.guesses.sights import DEAREST, Sights
 from ssh_abduction.solver.steps.faults import with_changes, with_faults
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import Problem
@@ -57,10 +57,6 @@ WIDER = 2
 LOST, ALIKE = 32, 4
 # Of the beams at earlier looks, this many hypotheses are kept.
 SPARE = 2
-# An extension that costs this many nats more than the best one of its hypothesis is not made.
-DEAREST = 20.0
-# So many gateways of one place may have changed between drives. An extension may cost this more.
-CHANGES = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,12 +97,11 @@ class Beam:
         self._bare = theory.without_faults().replace(
             displacement="none", weigh="count", changed=theory.changed
         )
-        self._has_places = theory.level == "topological"
-        self._stays = self._has_places and "turn_stays" in theory.hard
-        self._leaves = self._has_places and "travel_leaves" in theory.hard
+        has_places = theory.level == "topological"
+        self._stays = has_places and "turn_stays" in theory.hard
+        self._leaves = has_places and "travel_leaves" in theory.hard
         # The prices of a dstate and of a place.
-        self._prices = theory.prices[0], theory.prices[1] if self._has_places else 0.0
-        self._dearest = DEAREST + CHANGES * theory.changed * theory.prices[0]
+        self._prices = theory.prices[0], theory.prices[1] if has_places else 0.0
         self._reckoning, self._frames = Reckoning(trace), frames_of(trace)
         self.nats, self.refuses = math.inf, False
         self._reached: list[Hypothesis] = []  # the best one after each look of the checker
@@ -207,7 +202,7 @@ class Beam:
                 continue
             count[pieces.joins] += 1
             if self._frames and not pieces.is_loose:
-                dearest = min(dearest, option.nats + self._dearest)
+                dearest = min(dearest, option.nats + self._sights.dearest)
             yield child
 
     def _extended(self, beam: list[Hypothesis], end: int) -> list[Hypothesis]:
@@ -386,7 +381,7 @@ class Beam:
             if square / 2 > DEAREST and not stays:
                 continue
             changes = 0.0 if stays else self._sights.changes(moved, place, t)
-            if self._has_places:
+            if self._bare.level == "topological":
                 nats = moved.nats + changes + dstate + square / 2
                 options.append(_Extension(nats, place, None, near))
             for s, p in enumerate(moved.places):
@@ -399,7 +394,7 @@ class Beam:
         return [
             option
             for option in options
-            if option.nats <= least + self._dearest and self._is_allowed(option, t)
+            if option.nats <= least + self._sights.dearest and self._is_allowed(option, t)
         ]
 
     def _near(

@@ -16,6 +16,11 @@ from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.theory import Theory
 
+# An extension that costs this many nats more than the best one of its hypothesis is not made.
+DEAREST = 20.0
+# So many gateways of one place may have changed between drives. An extension may cost this more.
+CHANGES = 2
+
 
 class Sights:
     """What each step of a trace shows.
@@ -25,6 +30,7 @@ class Sights:
             drives, this is its view only.
         shown: What each step shows of its place in any direction: its star, or nothing.
         drive: The number of the drive of each step.
+        dearest: An extension that costs this many nats more than the best one is not made.
     """
 
     def __init__(self, trace: Trace, theory: Theory, log: Log, *, misreads: bool) -> None:
@@ -41,6 +47,7 @@ class Sights:
         self.shown = [_shown(step, theory.star) for step in trace.steps]
         self.drive = [bisect_right(starts, t) for t in range(len(trace))]
         self._misreads, self._price = misreads, theory.prices[0] * theory.changed
+        self.dearest = DEAREST + CHANGES * self._price
 
     def changes(self, found: Hypothesis, place: int, t: int) -> float:
         """What the gateways that changed cost, in nats, if step t is at a place; inf for never."""

@@ -1,4 +1,4 @@
-"""What a person asserts: that two steps are one dstate, different dstates, or different places."""
+"""What a person asserts of two steps: that they are one dstate or place, or different ones."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Asserted:
-    """Evidence from the fields `same`, `different` and `elsewhere` of a theory.
+    """Evidence from the fields `same`, `different`, `elsewhere` and `same_place` of a theory.
 
     Pairs with a step that the trace does not have yet are ignored.
     """
@@ -24,10 +24,11 @@ class Asserted:
     name: ClassVar[str] = "asserted"
     axiom: ClassVar[str] = "asserted"
     said: Pairs
+    together: tuple[tuple[int, int], ...] = ()
 
     @classmethod
     def of(cls, theory: Theory) -> Asserted:
-        return cls(theory.asserted)
+        return cls(theory.asserted, theory.same_place)
 
     def remembering(self, known: Asserted) -> Asserted:
         return self
@@ -36,7 +37,8 @@ class Asserted:
         return self.said
 
     def facts(self, trace: Trace, start: int, stop: int) -> str:
-        return ""
+        said = [(i, t) for i, t in self.together if start <= t < stop]
+        return "\n".join(f"together({i},{t})." for i, t in said)
 
     def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
         return None
