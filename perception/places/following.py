@@ -216,10 +216,11 @@ class _Step:
         found = _matched(
             self.points, self.normals, self.recent, self.last, self.onward, prior, most
         )
-        if found[2] < POOR and doubt is Doubt.DOUBTFUL and (other := self._without_odometry()):
-            return other
-        if found[2] < SURE and doubt is Doubt.SEAM:
-            return self._without_odometry() or nowhere
+        if found[2] < POOR and doubt in (Doubt.DOUBTFUL, Doubt.SEAM):
+            if other := self._without_odometry():
+                return other
+            if doubt is Doubt.SEAM:
+                return nowhere
         return Followed(self.scan, *found)
 
     def _without_odometry(self) -> Followed | None:
