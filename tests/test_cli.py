@@ -194,7 +194,7 @@ def test_a_map_without_proof(tmp_path: Path, capsys: pytest.CaptureFixture[str])
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals")
 def test_ctrl_c_prints_what_is_known(tmp_path: Path) -> None:
-    path = saved(rectangle(20), tmp_path)
+    path = saved(rectangle(12), tmp_path)
     flags = [
         "--set",
         "boundary=none",

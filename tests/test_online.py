@@ -164,8 +164,8 @@ def test_a_bound_is_known_where_more_maps_of_a_known_cost_are_asked_for() -> Non
     ids=["causal", "dstates", "paths"],
 )
 def test_circuits_are_replayed(theory: Theory) -> None:
-    mapper, answers = follow(rectangle(800), theory)
-    assert answers[-1].maps == solve(rectangle(800), theory).maps
+    mapper, answers = follow(rectangle(200), theory)
+    assert answers[-1].maps == solve(rectangle(200), theory).maps
     assert all(a.status is Status.OPTIMAL and a.complete for a in answers)
     assert mapper.searches < 12
     assert mapper.solution.effort.prefix < 16

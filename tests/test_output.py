@@ -402,13 +402,12 @@ SCRIPT = "-c import~sys;from~ssh_abduction.__main__~import~run;sys.exit(run())"
             ("-m ssh_abduction", module)
             for module in (
                 "ssh_abduction.cli",
-                "argparse",
                 "clingo",
                 "numpy.linalg",
                 "sklearn.base",
             )
         ),
-        *((SCRIPT, module) for module in ("ssh_abduction.cli", "ssh_abduction.cli.train", "numpy")),
+        *((SCRIPT, module) for module in ("ssh_abduction.cli", "numpy")),
     ],
 )
 def test_ctrl_c_while_modules_load_is_quiet(program: str, module: str, tmp_path: Path) -> None:

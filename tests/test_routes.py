@@ -252,7 +252,7 @@ def maze(seed: int, side: int = 4, steps: int = 150) -> SSHMap:
     return with_regions(found.renumbered(), trace)
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(3))
 def test_a_coarse_route_agrees_with_the_fine_one(seed: int) -> None:
     ssh_map = maze(seed)
     assert ssh_map.regions

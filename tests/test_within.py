@@ -8,7 +8,6 @@ import json
 from typing import Any
 from unittest.mock import patch
 
-import aces
 import pytest
 from brute_force import key, minimal_maps, near_minimal_maps
 from hypothesis import given, settings
@@ -103,15 +102,16 @@ def test_the_true_map_of_the_real_route_is_within_three_dstates() -> None:
 def test_without_an_order_behind_dstates_all_maps_of_so_few_dstates_are_listed() -> None:
     """Then the levels are what clingo counts of maps with dstates, at most one more than the
     least."""
-    solution = solve(Trace.load(ACES3), Theory(prefer=("dstates",)), max_maps=None, within=1)
-    assert [(level.cost.dstates, level.count) for level in solution.levels] == [(19, 68), (20, 158)]
+    route = Trace.load(ACES3)[:16]
+    solution = solve(route, Theory(prefer=("dstates",)), max_maps=None, within=1)
+    assert [(level.cost.dstates, level.count) for level in solution.levels] == [(12, 3), (13, 4)]
 
 
-@pytest.mark.parametrize(("maps", "levels"), [(7, [4, 1, 2]), (11, [4, 1, 6])])
+@pytest.mark.parametrize(("maps", "levels"), [(7, [2, 3, 2]), (11, [2, 3, 6])])
 def test_maps_come_in_the_order_of_their_cost_up_to_as_many_as_are_asked_for(
     maps: int, levels: list[int]
 ) -> None:
-    solution = aces.solution(max_maps=maps, within=3)
+    solution = solve(Trace.load(ACES3)[:16], max_maps=maps, within=3)
     assert [level.count for level in solution.levels] == levels
     assert solution.complete == (maps == 11)
     assert solution.stopped == (None if maps == 11 else "maps limit")
@@ -130,7 +130,7 @@ def test_near_minimal_maps_of_a_longer_trace_are_those_that_a_rule_for_their_num
     """
     trace = Trace.load(EXAMPLE).prefix(30)
     if theory.star == "frame":
-        trace = Trace.load(ACES3)
+        trace = Trace.load(ACES3)[:16]
     solution = solve(trace, theory, within=1, max_maps=None)
     assert solution.complete
     least, more = solution.levels
