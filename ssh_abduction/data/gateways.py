@@ -53,6 +53,10 @@ class Sight:
     first: bool
     onward: tuple[int, ...] = ()
 
+    def __hash__(self) -> int:
+        """Hash few fields. Sights are often hashed, and few of a map share these."""
+        return hash((self.step, self.dstate.id))
+
 
 Turns = Mapping[tuple[Sight, Sight], Collection[Action]]
 _Turned = tuple[Frame, int]  # what a sight sees, and the shift of its slots
@@ -244,6 +248,28 @@ def fit(
         For each sight, its frame (which gateways exist) and its shift (how many slots to add, so
         that gateways have the same slots as in the first sight); None if nothing fits.
     """
+    made = tuple(
+        (a, b, frozenset(actions)) for a in sights for b in sights if (actions := turns.get((a, b)))
+    )
+    return _fitted(tuple(sights), made, frozenset(axioms), as_shown)
+
+
+@lru_cache(maxsize=2**12)
+def _fitted(
+    sights: tuple[Sight, ...],
+    made: tuple[tuple[Sight, Sight, frozenset[Action]], ...],
+    axioms: frozenset[str],
+    as_shown: bool,
+) -> list[_Turned] | None:
+    """Do what `fit` does. Maps of growing prefixes have many places in common.
+
+    Args:
+        sights: The sights at one place.
+        made: Pairs of these sights, and the turns that lead from the first to the second.
+        axioms: Names of the axioms that hold.
+        as_shown: Whether the headings that the dstates have must fit, too.
+    """
+    turns = {(a, b): actions for a, b, actions in made}
 
     def extended(chosen: list[_Turned]) -> list[_Turned] | None:
         if len(chosen) == len(sights):
@@ -413,6 +439,7 @@ def _turns_so(action: Action, before: Frame, found: frozenset[int]) -> bool:
     return any(2 * SPREAD < side < 180 - 2 * SPREAD for side in sides)
 
 
+@lru_cache(maxsize=2**14)
 def _ways(first: Frame, then: Frame, shift: int, found: frozenset[int]) -> tuple[bool, bool]:
     """Return two flags: may the robot face the same way in both sights, and opposite ways?
 
@@ -444,6 +471,7 @@ def _leads(frame: Frame, towards: int) -> bool:
     )
 
 
+@lru_cache(maxsize=2**12)
 def _passes(frame: Frame) -> tuple[int, int] | None:
     """Return the slots of two gateways that are declared opposite, one ahead and one behind.
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import combinations
 from math import ceil
 from typing import Any, TypeAlias
@@ -165,18 +166,7 @@ class Star:
     @property
     def frames(self) -> tuple[Frame, ...]:
         """All frames that the place may have: each unobserved gateway may exist or not."""
-        unknown = [k for k, gateway in enumerate(self.gateways) if not gateway.open]
-        left_out = (
-            set(some)
-            for count in range(len(unknown), -1, -1)
-            for some in combinations(unknown, count)
-        )
-        return tuple(
-            dict.fromkeys(
-                self._frame([k for k in range(len(self.gateways)) if k not in some])
-                for some in left_out
-            )
-        )
+        return _frames_of(self)
 
     @property
     def too_near(self) -> tuple[float, float] | None:
@@ -187,7 +177,7 @@ class Star:
                 return a.bearing, b.bearing
         return None
 
-    def _frame(self, kept: list[int]) -> Frame:
+    def frame(self, kept: list[int]) -> Frame:
         """Make a frame of the gateways with these indices."""
         clockwise = sorted(
             kept, key=lambda k: (self.gateways[k].bearing + self.gateways[k].spread) % 360
@@ -200,6 +190,17 @@ class Star:
             tuple(ceil(g.spread + abs(g.bearing - round(g.bearing))) for g in gateways),
             tuple(None if g.opposite is None else slot.get(g.opposite) for g in gateways),
         )
+
+
+@lru_cache(maxsize=2**12)
+def _frames_of(star: Star) -> tuple[Frame, ...]:
+    """The frames of a star, see `Star.frames`."""
+    unknown = [k for k, gateway in enumerate(star.gateways) if not gateway.open]
+    left_out = (
+        set(some) for count in range(len(unknown), -1, -1) for some in combinations(unknown, count)
+    )
+    every = range(len(star.gateways))
+    return tuple(dict.fromkeys(star.frame([k for k in every if k not in o]) for o in left_out))
 
 
 def is_four(entries: Sequence[Entry]) -> bool:

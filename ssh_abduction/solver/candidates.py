@@ -38,7 +38,7 @@ FRAMING, UNMAPPED = 30.0, 2.0
 SKETCH_SHARE = 0.4
 # The sketch that succeeds most often may take this many seconds even if less time is left.
 # Otherwise a slow machine finds no map.
-SUREST = 1.5
+SUREST = 1.0
 # The width of a broad beam of hypotheses. A beam is made of at most LONGEST steps: its time grows
 # with the cube of their number.
 BROAD, LONGEST = 4, 2000
@@ -57,6 +57,7 @@ class Candidates:
             judging,
             report,
         )
+        self._beams: dict[int, Beam] = {}  # by their widths
         # A snapshot waits for a sketch under way instead of making another one.
         self._sketching = threading.Lock()
 
@@ -74,6 +75,8 @@ class Candidates:
         There is none without the speed-up `greedy`, or if the trace is long. If it has neither
         displacements nor stars at any angles, `guesses/tree.py` makes better maps.
 
+        A beam that did not end goes on when it is asked for maps again.
+
         Args:
             width: The number of hypotheses.
         """
@@ -87,7 +90,9 @@ class Candidates:
             return None
         from ssh_abduction.solver.guesses.beam import Beam  # loads numpy
 
-        return Beam(self._task.problem, self._task.log, width)
+        if width not in self._beams:
+            self._beams[width] = Beam(self._task.problem, self._task.log, width)
+        return self._beams[width]
 
     def maps_of(self, beam: Beam) -> Iterator[SSHMap]:
         """The maps that a beam finds, the best one first."""

@@ -104,7 +104,7 @@ class Beam:
         self._prices = theory.prices[0], theory.prices[1] if has_places else 0.0
         self._reckoning, self._frames = Reckoning(trace), frames_of(trace)
         self.nats, self.refuses = math.inf, False
-        self._reached: list[Hypothesis] = []  # the best one after each look of the checker
+        self._kept: list[list[Hypothesis]] = []  # the beams after each look of the checker
         self._sights = Sights(trace, self._bare, log, misreads=theory.misread > 0)
         # For each kind of fault, what it costs at each step in nats.
         self._fault = {
@@ -116,10 +116,11 @@ class Beam:
     def maps(self) -> Iterator[SSHMap]:
         """The maps of the hypotheses of the whole trace that agree with the axioms, by their cost.
 
-        If no hypothesis is left, go back, and for some steps let the robot return to a place only
+        If an earlier call was ended by an exception, such as that of a time limit, go on there. If
+        no hypothesis is left, go back, and for some steps let the robot return to a place only
         if it has to. If that is not enough, go back twice as far.
         """
-        kept = [[self._first()]]  # the beams after each look of the checker
+        kept = self._kept = self._kept or [[self._first()]]
         while (done := len(kept[-1][0].labels)) < len(self._trace):
             end = min(done + CHECKED_EVERY, len(self._trace))
             beam = self._extended(kept[-1], end)
@@ -135,7 +136,7 @@ class Beam:
                 return
             kept[-1] = kept[-1][:SPARE]  # saves memory
             kept.append(beam)
-            self._reached.append(beam[0])
+        self._kept = kept[-1:]
         self.nats = float(kept[-1][0].nats)
         for found in kept[-1][: ALIKE * self._width]:
             if (ssh_map := self._map(found, len(self._trace))) is not None:
@@ -143,7 +144,7 @@ class Beam:
 
     def partial(self) -> Iterator[SSHMap]:
         """The maps of the first steps that `maps` had reached, the longest one first."""
-        for found in reversed(self._reached):
+        for found in [beam[0] for beam in reversed(self._kept)]:
             if (ssh_map := self._map(found, len(found.labels))) is not None:
                 yield ssh_map
 
