@@ -159,6 +159,11 @@ def test_few_names_and_few_steps_at_first_change_no_answer(data: st.DataObject) 
     )
     with (
         patch.multiple(faulty, FEW=data.draw(st.sampled_from([2, 9])), AT_FIRST=2, PLACES=1),
+        patch.multiple(
+            faulty,
+            GUESSED=data.draw(st.sampled_from([3, 10])),
+            ASKED_FIRST=data.draw(st.sampled_from([0.0, 3.0])),
+        ),
         patch.multiple(faulty_control, AROUND=0, NAMES=1, MORE_NAMES=1),
         patch.object(choosing, "FEW_STEPS", 0),
     ):

@@ -10,8 +10,9 @@ A Viterbi pass chooses the further steps (Viterbi 1967). It explains the whole t
 that clingo found, with the cheapest faults. Clingo gets the steps at fault and those around them.
 The explanation is also a map of the whole trace, so it may be the new incumbent.
 
-The first maps are guessed (`guesses/robust.py`), and clingo is only asked for cheaper ones. The
-bound of a long trace comes from its blocks (`engines/blocks.py`).
+The first maps of a long trace are guessed (`guesses/robust.py`), and clingo is only asked for
+cheaper ones. Its bound comes from its blocks (`engines/blocks.py`). For a short trace clingo is
+asked first, and maps are guessed if it does not end soon.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from itertools import chain
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.facts import answer_maps, faulty_lp
+from ssh_abduction.solver.asp.limits import StageTimeError
 from ssh_abduction.solver.engines.base import Found, Task
 from ssh_abduction.solver.engines.blocks import Blocks
 from ssh_abduction.solver.engines.faulty_control import LONG, FaultyAnswer, FaultyControl
@@ -30,6 +32,11 @@ from ssh_abduction.solver.guesses.robust import Explained, Explainer, Machine, r
 from ssh_abduction.theory.evidence import Equality
 
 FEW = 80  # make no guess for a trace of at most this many steps, as clingo is fast
+GUESSED = 1000  # guess maps of a trace with at least this many steps before clingo is asked
+# Guess maps of a shorter trace if clingo has not ended after this many seconds, or after this share
+# of the time left.
+ASKED_FIRST = 3.0
+ASKED_FIRST_SHARE = 0.2
 AT_FIRST = 1000  # clingo gets this many first steps at the beginning
 PLACES = 12  # after a Viterbi pass, clingo gets the steps around at most this many faults
 SPARE = 3  # names of each view beyond those of the best guess; with 1, answers use the rests
@@ -97,7 +104,7 @@ class FaultyEngine:
 
     def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
         best = self._best = self._known = None
-        for found in chain(self._guessed(), self._asked()):
+        for found in chain(self._asked_first(), self._guessed(), self._asked()):
             if best is None or self._cost_of(found) < best:
                 best = self._best = self._cost_of(found)
                 self._known = found.map
@@ -105,12 +112,34 @@ class FaultyEngine:
                 if best <= (self.bound or 0):
                     return
 
+    def _guesses(self) -> bool:
+        """Whether to guess maps: clingo solves the shortest traces at once."""
+        return self.size > FEW and not self._task.log.pairs.one and bool(self._price)
+
+    def _asked_first(self) -> Iterator[Found]:
+        """Yield maps of a short trace that clingo finds soon, before maps are guessed."""
+        watch = self._task.watch
+        ends = watch.stage_ends
+        if self.size >= GUESSED or not self._guesses():
+            return
+        began, left = watch.elapsed(), watch.left()
+        watch.end_stage_after(min(ends, began + min(ASKED_FIRST, ASKED_FIRST_SHARE * left)))
+        try:
+            yield from self._asked()
+        except StageTimeError:
+            self._control.forget()
+            if watch.elapsed() > ends:
+                raise
+        finally:
+            watch.end_stage_after(ends)
+
     def _guessed(self) -> Iterator[Found]:
         """Yield guessed maps of the whole trace, each cheaper than the one before.
 
-        Clingo gets as many names as the best guess has dstates, and the steps around its faults.
+        There are none if the best map is proven minimal. Clingo gets as many names as the best
+        guess has dstates, and the steps around its faults.
         """
-        if self.size <= FEW or self._task.log.pairs.one or not self._price:
+        if not self._guesses() or (self._best is not None and self._best <= (self.bound or 0)):
             return
         watch = self._task.watch
         began, may_take = watch.elapsed(), min(GUESSING, GUESSING_SHARE * watch.left())

@@ -145,6 +145,10 @@ class FaultyControl:
                 control.ground([(f"forbidden_{number}", [])])
             told.forbidden = len(self.forbidden)
 
+    def forget(self) -> None:
+        """Make a new control for the next question, as clingo was stopped and may lack rules."""
+        self._told = _Told({}, set())
+
     def _begin(self) -> None:
         """Make a control with the present names, but without steps."""
         self._told = _Told(dict(self.names), set(self.full))
