@@ -386,14 +386,14 @@ def rotations(first: Frame, then: Frame, shift: int) -> frozenset[int]:
         a, b = first.opposite[j], then.opposite[k]
         if a is not None and b is not None and (a, b) not in pairs:
             return frozenset()
-    return frozenset(
-        r
-        for r in range(360)
-        if all(
-            _between(first.bearings[j], then.bearings[k] + r) <= first.spreads[j] + then.spreads[k]
-            for j, k in pairs
-        )
-    )
+    found: Collection[int] = range(360)
+    for j, k in pairs:
+        centre, most = first.bearings[j] - then.bearings[k], first.spreads[j] + then.spreads[k]
+        arc = {(centre + off) % 360 for off in range(-most, most + 1)}
+        found = arc.intersection(found)
+        if not found:
+            break
+    return frozenset(found)
 
 
 def _between(a: float, b: float) -> float:
