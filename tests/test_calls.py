@@ -120,6 +120,8 @@ RIGHT_BY_NAME: dict[str, set[str]] = {
     "turned": {"3.5", "huge"},
 }
 RIGHT: dict[str, set[str]] = {
+    "stream_visits.scans": {"dict", *EMPTY},
+    "stream_visits.width": {"3.5", "huge"},
     "Step.of.view": {"None", "-1", "empty text", "nonsense", "folder"},
     "Action.of.value": {"nonsense", "folder"},
     "Action.that_slipped.step": {"huge"},
@@ -441,6 +443,7 @@ def good(call: str, parameter: inspect.Parameter) -> Any:
         "compare.maps": solution,
         "next_experiment.maps": solution,
         "route.maps": solution,
+        "stream_visits.scans": [],
         "find_backbone.solution": solution,
         "view_page.source": solution,
     }

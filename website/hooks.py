@@ -92,6 +92,7 @@ THEMES: dict[str, tuple[str, ...]] = {
         "page.Page",
         "perception.views.ViewClusterer",
         "perception.recognition.recogniser",
+        "perception.places.importing.stream_visits",
         "simulator.tours.simulate",
         "simulator.world.World",
         "simulator.panorama.Camera",

@@ -6,7 +6,6 @@ maps, and about 300 bytes a scan for the checks at the end.
 
 from __future__ import annotations
 
-import math
 from array import array
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -23,7 +22,7 @@ from perception.places.trust import Trust
 from perception.places.visits import Visit
 from perception.places.watching import Teller, watched, without_ranges
 from perception.readers.scans import Damage, RobotLog, Scan
-from ssh_abduction.data.errors import brief, named
+from ssh_abduction.data.errors import brief, is_finite, named
 
 # The track is compared with the odometry over the first so many scans.
 COMPARED = 400
@@ -43,7 +42,8 @@ class LiveLog:
         source: Name of the log.
 
     Raises:
-        LogError: The width is no positive number.
+        LogError: The width is no positive number, the items are no iterable, or `tell` is no
+            function.
     """
 
     def __init__(
@@ -54,8 +54,12 @@ class LiveLog:
         source: str = "",
     ) -> None:
         """Start before the first scan."""
-        if not (isinstance(width, int | float) and 0 < width < math.inf):
+        if not (is_finite(width) and width > 0):
             raise LogError(f"width: expected a positive number of metres, got {brief(width)}")
+        if not isinstance(items, Iterable) or isinstance(items, str | bytes):
+            raise LogError(f"scans: expected scans, got {brief(items)}; pass those of stream_log")
+        if not callable(tell):
+            raise LogError(f"tell: expected a function that takes a text, got {brief(tell)}")
         self._items, self._width, self._source = items, width, source
         self._tell = Teller(tell)
         self._damaged: list[Damage] = []

@@ -156,6 +156,8 @@ def live_log(
         LogError: The pipe has no lines of CARMEN, or vertices, whose edges may come later.
     """
     told = Told(fov, mount, no_return, zero_is)
+    if not hasattr(stream, "readline"):
+        raise LogError(f"stream: expected a stream of bytes, got {brief(stream)}; open a file")
     text = piped(stream, named(source))
     head = carmen.head_of(text, SURVEYED)
     if not carmen.looks_like(head) or carmen.VERTEX.search(head):
