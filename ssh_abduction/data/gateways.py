@@ -251,29 +251,32 @@ def fit(
     made = tuple(
         (a, b, frozenset(actions)) for a in sights for b in sights if (actions := turns.get((a, b)))
     )
-    return _fitted(tuple(sights), made, frozenset(axioms), as_shown)
+    headings = tuple(sight.dstate.heading for sight in sights) if as_shown else None
+    found = _fitted(tuple(sights), headings, made, frozenset(axioms))
+    return None if found is None else list(found)
 
 
 @lru_cache(maxsize=2**12)
 def _fitted(
     sights: tuple[Sight, ...],
+    headings: tuple[int | None, ...] | None,
     made: tuple[tuple[Sight, Sight, frozenset[Action]], ...],
     axioms: frozenset[str],
-    as_shown: bool,
-) -> list[_Turned] | None:
+) -> tuple[_Turned, ...] | None:
     """Do what `fit` does. Maps of growing prefixes have many places in common.
 
     Args:
         sights: The sights at one place.
+        headings: The headings of their dstates, which have to fit; None if they need not. Dstates
+            that differ only in their heading are equal, so it is an argument of its own.
         made: Pairs of these sights, and the turns that lead from the first to the second.
         axioms: Names of the axioms that hold.
-        as_shown: Whether the headings that the dstates have must fit, too.
     """
     turns = {(a, b): actions for a, b, actions in made}
 
-    def extended(chosen: list[_Turned]) -> list[_Turned] | None:
+    def extended(chosen: list[_Turned]) -> tuple[_Turned, ...] | None:
         if len(chosen) == len(sights):
-            return chosen
+            return tuple(chosen)
         sight = sights[len(chosen)]
         for frame in sight.star.frames:
             if "gateway_end" in axioms and not all(
@@ -286,7 +289,7 @@ def _fitted(
                 here = (frame, shift)
                 before = zip([*sights[: len(chosen)], sight], [*chosen, here], strict=True)
                 if all(
-                    _allowed(other, turned, sight, here, turns, axioms, as_shown)
+                    _allowed(other, turned, sight, here, turns, axioms, headings is not None)
                     for other, turned in before
                 ):
                     read = extended([*chosen, here])
