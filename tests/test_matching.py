@@ -128,8 +128,8 @@ def test_no_closure_leads_across_a_cut() -> None:
 
 def test_a_trace_has_the_closures_of_its_visits() -> None:
     log, track, visits, patches = rounds()
-    trace = to_trace(log, track, visits)
     expected = find_closures(track, visits, patches, 2 * WINDOW)
+    trace = to_trace(log, track, visits, expected)
     assert len(trace.closures) == len(expected) > 0
     for closure, closing in zip(trace.closures, expected, strict=True):
         steps = [trace.steps[step] for step in (closure.first, closure.last)]

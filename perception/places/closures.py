@@ -160,7 +160,7 @@ class _Gates:
         self._way = track.way[self._scans]
         self._middles = np.array([visit.middle for visit in visits]).reshape(-1, 2)
         drifts = BEND * np.arange(-BENDS, BENDS + 1)
-        self._poses = np.array([_drifted(self._middles, self._way, drift) for drift in drifts])
+        self._poses = np.array([drifted(self._middles, self._way, drift) for drift in drifts])
 
     def earlier(self, last: int) -> range:
         """The earlier visits far enough before a visit, without a cut of the track between.
@@ -227,7 +227,7 @@ class _Corrected:
         return sorted(kept.tolist())
 
 
-def _drifted(middles: Array, way: Array, drift: float) -> Array:
+def drifted(middles: Array, way: Array, drift: float) -> Array:
     """The middles of visits, if the heading of the track drifts steadily.
 
     Args:

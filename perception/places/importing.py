@@ -18,7 +18,9 @@ import numpy as np
 from perception.errors import ImageWarning, LogError
 from perception.places import jumps, log_checks
 from perception.places.agreement import disagreement
-from perception.places.distinctive import WIDTH, find_visits
+from perception.places.calibration import calibrated
+from perception.places.closures import find_closures
+from perception.places.distinctive import WIDTH, WINDOW, find_visits
 from perception.places.following import follow, turned_wrongly
 from perception.places.live import LiveLog
 from perception.places.tracing import to_trace
@@ -177,7 +179,10 @@ def _imported(
             f"{track.way[-1]:.0f} m without any; take a longer log{_besides(notes)}"
         )
     with _timed(seconds, "trace"):
-        trace = to_trace(log, track, visits, name)
+        patches = [visit.patch for visit in visits if visit.patch]
+        closings = find_closures(track, visits, patches, 2 * WINDOW)
+        track = calibrated(track, visits, closings)
+        trace = to_trace(log, track, visits, closings, name)
     with _timed(seconds, "views"):
         trace = with_views(trace)
     return Imported(trace, track, width, visits, seconds, notes)

@@ -14,8 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from perception.places.closures import NOISE, Closing, find_closures, relative, uncertainty
-from perception.places.distinctive import WINDOW
+from perception.places.closures import NOISE, Closing, relative, uncertainty
 from perception.places.local_map import CELL, PackedPatch
 from perception.places.track import Array, Track, wrapped
 from perception.places.visits import Visit, apart
@@ -43,7 +42,11 @@ BEAMS = np.radians(np.arange(-90.0, 91.0))
 
 
 def to_trace(
-    log: RobotLog, track: Track, visits: Sequence[Visit], name: str | None = None
+    log: RobotLog,
+    track: Track,
+    visits: Sequence[Visit],
+    closings: Sequence[Closing] = (),
+    name: str | None = None,
 ) -> Trace:
     """Make the trace of a log, without views.
 
@@ -51,6 +54,7 @@ def to_trace(
         log: The scans.
         track: Their poses.
         visits: The visits, in order.
+        closings: The closures between them.
         name: Name of the trace.
 
     Returns:
@@ -59,7 +63,6 @@ def to_trace(
     """
     steps: list[Step] = []
     last: tuple[Visit, Pose] | None = None
-    patches: list[PackedPatch] = []
     arrivals: list[tuple[int, float]] = []  # the first step of each visit, and its heading
     for number, visit in enumerate(visits):
         if (patch := visit.patch) is None:
@@ -68,7 +71,6 @@ def to_trace(
                 "those of find_visits or stream_visits"
             )
         headings = _headings(visit, track)
-        patches.append(patch)
         arrivals.append((len(steps), headings[0]))
         for heading in headings:
             pose = (float(visit.middle[0]), float(visit.middle[1]), heading)
@@ -85,10 +87,7 @@ def to_trace(
         name=name,
         odometry=Odometry(scale=SCALE, bend=DRIFT, offset=MIDDLE, facing=DIRECTION),
         extra={"beams": {"first": -90, "step": 1}},
-        closures=tuple(
-            closure_of(found, arrivals)
-            for found in find_closures(track, visits, patches, 2 * WINDOW)
-        ),
+        closures=tuple(closure_of(found, arrivals) for found in closings),
     )
 
 
