@@ -18,6 +18,7 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main
 from ssh_abduction.data import Odometry, TraceError
 from ssh_abduction.explain.no_map import explain, why_apart
+from ssh_abduction.robot_logs.log_maps import BARE
 from ssh_abduction.solver import Status
 from ssh_abduction.theory.evidence import evidence_of, pairs_of
 from ssh_abduction.theory.pairs import pairs_in
@@ -85,6 +86,15 @@ def test_two_returns_that_cannot_both_be() -> None:
     assert explanation.sentences == (said,)
     assert explanation.to_dict()["sentences"] == [said]
     assert explain(trace, theory.replace(joint=1)) is None
+
+
+def test_in_maps_of_logs_two_returns_that_fit_badly_together_have_a_price() -> None:
+    """Errors of logs have heavy tails."""
+    trace, theory = uneven(), BARE.replace(same_place=[(1, 9), (3, 11)])
+    assert solve(trace, theory.replace(joint=2)).status is Status.UNSATISFIABLE
+    ssh_map = solve(trace, theory).maps[0]
+    assert ssh_map.place_of(1) == ssh_map.place_of(9)
+    assert ssh_map.place_of(3) == ssh_map.place_of(11)
 
 
 def test_explanations_are_smallest_where_returns_are_refused_together() -> None:
