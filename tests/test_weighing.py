@@ -330,6 +330,19 @@ def test_an_excess_misfit_makes_the_best_map_less_sure() -> None:
         Weighed.from_dict(read, {**less.to_dict(), "excess": 0.5}, 3)
 
 
+def test_costs_in_doubt_make_no_map_sure() -> None:
+    rivals = (Rival(10.0, (0, 1, 0), (0, 1, 0)),)
+    sure = Weighed(10.0, 0.0, rivals, True, 0.0)
+    doubted = replace(sure, doubt="the track is unreliable")
+    assert sure.confidence > 0.99
+    assert doubted.confidence == 0.0
+    assert doubted.sentence == "no probability is given, as the track is unreliable"
+    read = FieldReader("here")
+    assert Weighed.from_dict(read, doubted.to_dict(), 3) == doubted
+    with pytest.raises(MapError, match=r"weighed.doubt: expected a text, got 3"):
+        Weighed.from_dict(read, {**doubted.to_dict(), "doubt": 3}, 3)
+
+
 def test_a_robot_that_drives_counts() -> None:
     with pytest.raises(TheoryError, match="weigh: expected count while a robot drives"):
         OnlineMapper("a", Theory(weigh="cost"))

@@ -65,6 +65,11 @@ class Imported:
     notes: tuple[str, ...] = ()
     starts: tuple[int, ...] = ()
 
+    @property
+    def is_reliable(self) -> bool:
+        """Whether scans match, and agree with the odometry, as in good logs."""
+        return not any(log_checks.UNRELIABLE in note for note in self.notes)
+
 
 def import_log(
     log: RobotLog,

@@ -30,6 +30,8 @@ LAGS, ALIKE = (2, 4, 8), 1.3
 FAILING, OVERRIDING, CONTRADICTS = 0.05, 0.08, 25.0
 # A log is refused if more than this share of its scans fails to match.
 HOPELESS = 0.5
+# The beginning of the note on a track that is unreliable.
+UNRELIABLE = "The track is unreliable"
 # The odometry over every second scan is at least 0.98 times as long in good logs.
 TO_AND_FRO = 0.8
 # A log is out of order if the times of more than this share of its scans run backwards.
@@ -191,7 +193,7 @@ def describe_track(log: RobotLog, track: Track, explained: bool) -> list[str]:
     notes = []
     if failing > FAILING or overriding > OVERRIDING:
         notes.append(
-            f"The track is unreliable: scan matching fails in {100 * failing:.0f} % of the scans, "
+            f"{UNRELIABLE}: scan matching fails in {100 * failing:.0f} % of the scans, "
             f"and contradicts the odometry in {100 * overriding:.0f} % of the steps, where good "
             "logs have 2 % at most. It is "
             f"{track.way[-1]:.0f} m long. The map may be wrong."

@@ -144,7 +144,7 @@ def _joins(listing: Listing) -> list[tuple[int, int, float | None]]:
 
     Each is two steps and the probability of their join; None if the join rests on minimality alone.
     """
-    if listing.weighed is None:
+    if listing.weighed is None or listing.weighed.doubt:
         return [(join.first, join.second, None) for join in listing.by_minimality[:JOINS]]
     doubted = [join for join in listing.weighed.joins if join[2] < DOUBTED]
     return [(first, second, round(share, 2)) for first, second, share in doubted[:JOINS]]

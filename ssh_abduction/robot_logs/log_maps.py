@@ -355,6 +355,7 @@ def map_log(
         ended = INTERRUPTED if interrupted else how_it_ended(solution, allowed)
         told = (*notes, ended) if ended else notes
         solution = solution if corrections is None else with_names(corrections, solution, trace)
+        solution = solution if imported.is_reliable else _doubted(solution)
         return LogMap(
             log, imported, solution, tuple(climbed), dict(seconds), allowed, told, interrupted
         )
@@ -386,6 +387,14 @@ def map_log(
         )
         seconds["ladder"] = round(time.process_time() - begin, 3)
     return outcome(solution, mapping.interrupted)
+
+
+def _doubted(solution: Solution) -> Solution:
+    """Return a solution without a confidence, as its log does not show how the robot moved."""
+    if solution.weighed is None:
+        return solution
+    weighed = replace(solution.weighed, doubt="the track is unreliable")
+    return replace(solution, support=replace(solution.support, weighed=weighed))
 
 
 def _imported(

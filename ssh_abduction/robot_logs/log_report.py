@@ -67,7 +67,9 @@ def report(
         figure(log, imported, solution),
         *_drives(imported, solution, run),
         "<h2>What each kind of evidence is worth</h2>" + _ladder(rungs) if rungs else "",
-        "<h2>Doubtful joins</h2>" + _doubts(solution) if solution.weighed else "",
+        "<h2>Doubtful joins</h2>" + _doubts(solution)
+        if solution.weighed and not solution.weighed.doubt
+        else "",
         "<h2>Rival maps</h2>" + _paragraph(solution.summary or "There is no other minimal map.")
         if solution.maps
         else "",

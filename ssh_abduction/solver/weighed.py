@@ -65,6 +65,7 @@ class Weighed:
             best map, -inf if none was sought.
         excess: How many times as large the misfit is as the standard deviations say. Probabilities
             divide costs by it.
+        doubt: Why the costs cannot be trusted, such as "the track is unreliable"; None if they can.
     """
 
     bound: float
@@ -73,6 +74,7 @@ class Weighed:
     searched: bool = False
     broken: float = -math.inf
     excess: float = 1.0
+    doubt: str | None = None
 
     @property
     def nats(self) -> float:
@@ -96,8 +98,10 @@ class Weighed:
 
         If it is neither proven to be the best nor `searched`, a map at the bound counts as one
         more rival. Then the confidence is small, as such a map may cost much less. A map that
-        breaks axioms is a rival, too, at a price.
+        breaks axioms is a rival, too, at a price. If the costs are in `doubt`, it is 0.
         """
+        if self.doubt is not None:
+            return 0.0
         is_likely = self.proven or self.searched
         unknown = 0.0 if is_likely else math.exp(min(self.nats - self.bound, MOST))
         broken = math.exp(min((self.broken - BROKEN) / self.excess, MOST))
@@ -138,6 +142,8 @@ class Weighed:
     @property
     def sentence(self) -> str:
         """How probable the best map is, and which of its joins is least sure, in words."""
+        if self.doubt is not None:
+            return f"no probability is given, as {self.doubt}"
         told = (
             f"the best map has probability {_percent(self.confidence)}"
             if self.proven or self.searched
@@ -164,6 +170,7 @@ class Weighed:
             "searched": self.searched,
             **({"broken": round(self.broken, 6)} if math.isfinite(self.broken) else {}),
             **({"excess": round(self.excess, 6)} if self.excess > 1 else {}),
+            **({} if self.doubt is None else {"doubt": self.doubt}),
             "confidence": round(self.confidence, 6),
             "rivals": [rival.to_dict() for rival in self.rivals],
         }
@@ -192,7 +199,10 @@ class Weighed:
         excess = _number(read, record, "excess", "weighed") if "excess" in record else 1.0
         if excess < 1:
             raise read.wrong("weighed.excess", "a number of at least 1", excess)
-        return cls(bound, within, rivals, record.get("searched") is True, broken, excess)
+        doubt = record.get("doubt")
+        if doubt is not None and not isinstance(doubt, str):
+            raise read.wrong("weighed.doubt", "a text", doubt)
+        return cls(bound, within, rivals, record.get("searched") is True, broken, excess, doubt)
 
 
 def _percent(probability: float) -> str:
