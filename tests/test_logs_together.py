@@ -85,6 +85,7 @@ def test_joint_logs_number_scans_and_visits_over_all_drives(
         )
 
 
+@pytest.mark.slow
 def test_closures_between_drives_are_right(
     joint: tuple[RobotLog, Imported, list[Imported]], halves: tuple[RobotLog, RobotLog]
 ) -> None:
@@ -157,6 +158,7 @@ def test_a_run_of_the_same_logs_is_done(folder: Path, capsys: pytest.CaptureFixt
     assert digest(logs) != digest(logs[::-1])
 
 
+@pytest.mark.slow
 def test_maps_of_logs_obey_what_a_person_says(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -73,7 +73,7 @@ def test_a_place_lists_its_sides_and_regions() -> None:
 def test_how_many_minimal_maps_have_a_side() -> None:
     trace = Trace.load(ACES3)
     maps = solve(trace).maps
-    for place in maps[0].places:
+    for place in maps[0].places[::4]:
         for found in explain_place(trace, place).sides:
             step = next(t for t, s in enumerate(maps[0].labels) if maps[0].place_of(t) == place)
             along = next(
