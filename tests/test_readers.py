@@ -134,9 +134,9 @@ def test_a_log_is_read_as_it_was_written(tmp_path: Path, name: str, noise: float
     assert not log.damaged
     assert len(log) == len(scans)
     assert all(map(agree, log.scans, scans))
-    assert [scan.ranges.tolist() for scan in log.scans] == [
-        s.ranges.tolist() for s in stream_log(tmp_path / name) if isinstance(s, Scan)
-    ] or True
+    streamed = [s for s in stream_log(tmp_path / name) if isinstance(s, Scan)]
+    assert len(streamed) == len(scans)
+    assert all(map(agree, streamed, scans))
 
 
 @pytest.mark.parametrize("name", ["drive.log", *BAGS])
