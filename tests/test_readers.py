@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import importlib
+import io
 import math
 import os
 import sys
@@ -18,7 +19,7 @@ import pytest
 
 from perception.errors import LogError
 from perception.readers.lines import LONGEST_LINE
-from perception.readers.logs import FORMATS, read_log, stream_log
+from perception.readers.logs import FORMATS, live_log, read_log, stream_log
 from perception.readers.scans import Damage, Laser, Pose, RobotLog, Scan
 from perception.readers.writers import write_bag, write_carmen
 from ssh_abduction.data.errors import TraceError
@@ -740,6 +741,28 @@ def test_what_is_no_log_is_one_clear_error(tmp_path: Path, what: str) -> None:
     assert "\n" not in str(caught.value)
     if what in ("empty", "blank", "a trace", "binary", "gzip of nothing"):
         assert all(name in str(caught.value) for name in FORMATS)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"path": 3}, "path: expected the path of a file, .* got 3"),
+        ({"scan_topic": 4}, "scan_topic: expected topics, got 4; name topics of the bag"),
+        ({"scan_topic": ["scan", 4]}, r"scan_topic\[1\]: expected a text, got 4"),
+        ({"odom_topic": 4}, "odom_topic: expected a text, got 4"),
+    ],
+)
+def test_arguments_of_other_types_are_refused(wrong: dict[str, Any], said: str) -> None:
+    arguments = {"path": "drive.mcap", **wrong}
+    with pytest.raises(LogError, match=said):
+        read_log(**arguments)
+    with pytest.raises(LogError, match=said):
+        next(stream_log(**arguments))
+
+
+def test_a_stream_of_text_is_no_pipe() -> None:
+    with pytest.raises(LogError, match="stream: expected a stream of bytes"):
+        next(live_log(io.StringIO("FLASER 1 2\n")))  # type: ignore[arg-type]
 
 
 def test_paths_and_formats_that_cannot_be(tmp_path: Path) -> None:

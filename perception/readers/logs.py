@@ -15,6 +15,7 @@ from perception.readers import bag_files, bag_topics, bags, carmen
 from perception.readers.echoes import Told, interpret_log, interpret_scan, interpreter_of
 from perception.readers.lines import LONGEST_LINE, Piped, lines, opened, piped
 from perception.readers.scans import Damage, Reading, RobotLog, Scan
+from ssh_abduction.data.checks import a_list, a_path, a_text
 from ssh_abduction.data.errors import brief, named
 from ssh_abduction.data.odometry import Pose
 from ssh_abduction.runtime.logs import log_of
@@ -156,7 +157,7 @@ def live_log(
         LogError: The pipe has no lines of CARMEN, or vertices, whose edges may come later.
     """
     told = Told(fov, mount, no_return, zero_is)
-    if not hasattr(stream, "readline"):
+    if not hasattr(stream, "readline") or isinstance(stream, io.TextIOBase):
         raise LogError(f"stream: expected a stream of bytes, got {brief(stream)}; open a file")
     text = piped(stream, named(source))
     head = carmen.head_of(text, SURVEYED)
@@ -188,7 +189,15 @@ def _reading(
     odom_topic: str | None,
 ) -> Iterator[Reading]:
     """Open and survey a log of any format. Raises LogError."""
-    topics = [scan_topic] if isinstance(scan_topic, str) else list(scan_topic or ())
+    path = a_path("path", path, LogError)
+    given = [scan_topic] if isinstance(scan_topic, str) else scan_topic or ()
+    mend = "name topics of the bag"
+    topics = [
+        a_text(f"scan_topic[{i}]", topic, LogError, mend=mend)
+        for i, topic in enumerate(a_list("scan_topic", given, LogError, what="topics", mend=mend))
+    ]
+    if odom_topic is not None:
+        a_text("odom_topic", odom_topic, LogError, mend=mend)
     if format is not None and format not in FORMATS:
         raise LogError(f"format: expected one of {', '.join(FORMATS)}, got {brief(format)}")
     if _is_folder(path):
