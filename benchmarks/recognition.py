@@ -69,7 +69,7 @@ def recognised(
 def localised(done: LogMap, asked: Trace) -> dict[str, int]:
     """Count the steps of another drive where a localiser is sure, and where it is right."""
     ssh_map, trace = done.solution.maps[0], done.imported.trace
-    labels, poses, others = np.array(ssh_map.labels), poses_of(trace), poses_of(asked)
+    labels, poses, others = np.array(ssh_map.dstate_at), poses_of(trace), poses_of(asked)
     localiser = Localiser(ssh_map, done.recogniser(), trace=trace)
     counts = dict.fromkeys(("steps", "located", "located and right"), 0)
     for belief, pose in zip(localiser.beliefs(asked), others, strict=True):
@@ -110,7 +110,7 @@ def main() -> None:
     else:
         second = read(options.second)
     done = map_log(first, time_limit=options.time_limit, with_ladder=False)
-    labels = np.array(done.solution.maps[0].labels)
+    labels = np.array(done.solution.maps[0].dstate_at)
     cost = done.solution.cost
     print(f"{cost.places} places, {cost.dstates} dstates; {done.solution.status.value}")
     print("| learnt images | images at learnt dstates | recognised |\n|---|---|---|")
