@@ -1,7 +1,7 @@
 """Imports a log while it is read or recorded.
 
 The scans pass through one at a time. What stays of them is the track, the visits with their local
-maps, and about 300 bytes a scan for the checks at the end.
+maps, and about 400 bytes a scan for the checks at the end.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from ssh_abduction.data.errors import brief, is_finite, named
 COMPARED = 400
 # The ranges of the scans beside the first so many poor matches are kept, for the checks at the end.
 MOST_POOR = 200
-# The first cuts of the track are told at once, the others at the end.
+# The notes on so many cuts of the track come at once, those on the others at the end.
 SAID = 3
 
 
