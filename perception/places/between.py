@@ -18,6 +18,7 @@ from perception.places.closures import KEPT, TURN, Closing, is_reliable
 from perception.places.importing import Imported
 from perception.places.matching import Scene, Turned, match
 from perception.places.track import Array, points_turned
+from perception.places.visits import patches_of
 
 # Two matches agree if the middle of the visit of one is where the other one says, within NEAR
 # metres and DRIFT metres for each metre between the two visits, and if their rotations differ by
@@ -29,7 +30,10 @@ TURNS = [k * TURN for k in range(round(math.tau / TURN))]
 
 def scenes_of(part: Imported) -> list[Scene]:
     """Prepare the local map of each visit of a drive for matching."""
-    return [Scene.of(visit.patch, visit.middle) for visit in part.visits if visit.patch is not None]
+    patches = patches_of(part.visits)
+    return [
+        Scene.of(patch, visit.middle) for visit, patch in zip(part.visits, patches, strict=True)
+    ]
 
 
 def closures_between(

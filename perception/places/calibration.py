@@ -14,8 +14,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from perception.places.closures import GATE, INFLATED, Closing, drifted, uncertainty
-from perception.places.track import Array, Track
+from perception.places.closures import (
+    DRIFTS,
+    GATE,
+    INFLATED,
+    Closing,
+    drifted,
+    errors_of,
+    seen_from,
+    uncertainty,
+)
+from perception.places.tracing import DRIFT
+from perception.places.track import Track
 from perception.places.visits import Visit
 
 # Standard deviations of the error of a closure, in metres and radians (docs/measurements/logs.md).
@@ -24,9 +34,6 @@ ERROR = (0.05, 0.05, math.radians(0.5))
 # closures do not change the covariances much.
 FACTORS = 2.0 ** np.arange(-7, 5, 0.5)
 CHANGE = 0.5
-# The drifts that are tried, in radians a metre, and their standard deviation.
-DRIFTS = np.linspace(-0.002, 0.002, 21)
-DRIFT = 0.001
 # The share of closures that are wrong, and the logarithm of the volume of their errors: those that
 # closures may have at all, if the covariance is 1. It is that of a ball.
 WRONG = 0.02
@@ -50,6 +57,8 @@ def factor_of(track: Track, visits: Sequence[Visit], closings: Sequence[Closing]
         return 1.0
     scans = [visit.scan for visit in visits]
     middles = np.array([visit.middle for visit in visits])
+    first, last = [c.first for c in closings], [c.last for c in closings]
+    matches = np.array([(*c.match.shift, c.match.turn) for c in closings])
     spreads = np.array(
         [uncertainty(track, scans[c.first], scans[c.last], middles[c.last]) for c in closings]
     )
@@ -58,21 +67,11 @@ def factor_of(track: Track, visits: Sequence[Visit], closings: Sequence[Closing]
     wrong = math.log(WRONG) - VOLUME - np.linalg.slogdet(spreads + np.diag(ERROR) ** 2)[1] / 2
     best = np.full(len(FACTORS), -np.inf)
     for drift in DRIFTS:
-        off = _errors(drifted(middles, track.way[scans], drift), closings)
+        poses = drifted(middles, track.way[scans], drift)
+        off = errors_of(seen_from(poses[first], poses[last]), matches)
         squares = np.einsum("ni,fnij,nj->fn", off, inverse, off)
         right = math.log(1 - WRONG) - (squares + size) / 2
         fits = np.logaddexp(right, wrong).sum(axis=1) - (drift / DRIFT) ** 2 / 2
         best = np.maximum(best, fits)
     best -= (np.log(FACTORS) / CHANGE) ** 2 / 2
     return float(FACTORS[best.argmax()])
-
-
-def _errors(poses: Array, closings: Sequence[Closing]) -> Array:
-    """Compute how far the later visit of each closure is off: (n, 3) metres and radians."""
-    first, last = poses[[c.first for c in closings]], poses[[c.last for c in closings]]
-    cos, sin = np.cos(first[:, 2]), np.sin(first[:, 2])
-    x, y = (last - first)[:, :2].T
-    there = np.stack([cos * x + sin * y, cos * y - sin * x, (last - first)[:, 2]], axis=1)
-    off = there - np.array([(*c.match.shift, c.match.turn) for c in closings])
-    off[:, 2] = (off[:, 2] + math.pi) % math.tau - math.pi
-    return np.asarray(off)

@@ -28,6 +28,8 @@ NOISE = (0.1, 0.1, math.radians(1))
 # BENDS times it, in radians a metre. A match may be off by a chi-square of GATE (3 degrees of
 # freedom).
 INFLATED, BEND, BENDS, GATE = 10.0, 2e-4, 10, 20.0
+# The drifts of the heading that are tried, in radians a metre.
+DRIFTS = BEND * np.arange(-BENDS, BENDS + 1)
 # Rotations are tried in steps of TURN radians, from the least to the largest that the track allows
 # within SIGMAS standard deviations.
 TURN, SIGMAS = math.radians(6), 3.0
@@ -138,8 +140,7 @@ class _Gate:
 
     def allows(self, found: Match) -> bool:
         """Whether a match agrees with the track for some drift."""
-        off = self.poses - (*found.shift, found.turn)
-        off[:, 2] = (off[:, 2] + math.pi) % math.tau - math.pi
+        off = errors_of(self.poses, np.array([*found.shift, found.turn]))
         inverse = np.linalg.inv(self.covariance + np.diag(NOISE) ** 2)
         return bool(np.einsum("di,ij,dj->d", off, inverse, off).min() < GATE)
 
@@ -159,8 +160,7 @@ class _Gates:
         self._scans = [visit.scan for visit in visits]
         self._way = track.way[self._scans]
         self._middles = np.array([visit.middle for visit in visits]).reshape(-1, 2)
-        drifts = BEND * np.arange(-BENDS, BENDS + 1)
-        self._poses = np.array([drifted(self._middles, self._way, drift) for drift in drifts])
+        self._poses = np.array([drifted(self._middles, self._way, drift) for drift in DRIFTS])
 
     def earlier(self, last: int) -> range:
         """The earlier visits far enough before a visit, without a cut of the track between.
@@ -176,12 +176,8 @@ class _Gates:
         """The earlier visits of some that may be near a visit, each with what the track says."""
         if not some:
             return []
-        # The pose by the axes of each earlier visit, for each drift: (drifts, visits, 3).
-        turn = self._poses[:, some, 2]
-        cos, sin = np.cos(turn), np.sin(turn)
-        x, y = np.moveaxis(self._poses[:, last, None, :2] - self._poses[:, some, :2], 2, 0)
-        turned = self._poses[:, last, None, 2] - turn
-        there = np.stack([cos * x + sin * y, cos * y - sin * x, turned], axis=2)
+        # By the axes of each earlier visit, for each drift: (drifts, visits, 3).
+        there = seen_from(self._poses[:, some], self._poses[:, last, None])
         end = self._middles[last]
         spreads = [
             INFLATED * uncertainty(self._track, self._scans[k], self._scans[last], end)
@@ -225,6 +221,20 @@ class _Corrected:
         far = np.hypot(*(self._places[some.start : some.stop] - self._places[visit]).T)
         kept = np.argsort(far, kind="stable")[:MATCHES] + some.start
         return sorted(kept.tolist())
+
+
+def seen_from(first: Array, last: Array) -> Array:
+    """Compute poses by the axes of other poses: both (..., 3), x, y and rotation of the axes."""
+    cos, sin = np.cos(first[..., 2]), np.sin(first[..., 2])
+    x, y, turned = np.moveaxis(last - first, -1, 0)
+    return np.stack([cos * x + sin * y, cos * y - sin * x, turned], axis=-1)
+
+
+def errors_of(poses: Array, matches: Array) -> Array:
+    """Compute how far poses are off from what matches say: (..., 3) metres and radians."""
+    off = poses - matches
+    off[..., 2] = (off[..., 2] + math.pi) % math.tau - math.pi
+    return off
 
 
 def drifted(middles: Array, way: Array, drift: float) -> Array:

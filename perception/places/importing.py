@@ -25,7 +25,7 @@ from perception.places.following import follow, turned_wrongly
 from perception.places.live import LiveLog
 from perception.places.tracing import to_trace
 from perception.places.track import Track
-from perception.places.visits import Visit
+from perception.places.visits import Visit, patches_of
 from perception.readers.scans import Damage, RobotLog, Scan
 from perception.reciprocal import ReciprocalTransformer
 from perception.views import ViewClusterer
@@ -184,8 +184,7 @@ def _imported(
             f"{track.way[-1]:.0f} m without any; take a longer log{_besides(notes)}"
         )
     with _timed(seconds, "trace"):
-        patches = [visit.patch for visit in visits if visit.patch]
-        closings = find_closures(track, visits, patches, 2 * WINDOW)
+        closings = find_closures(track, visits, patches_of(visits), 2 * WINDOW)
         track = calibrated(track, visits, closings)
         trace = to_trace(log, track, visits, closings, name)
     with _timed(seconds, "views"):

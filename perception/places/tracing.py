@@ -17,7 +17,7 @@ import numpy as np
 from perception.places.closures import NOISE, Closing, relative, uncertainty
 from perception.places.local_map import CELL, PackedPatch
 from perception.places.track import Array, Track, wrapped
-from perception.places.visits import Visit, apart
+from perception.places.visits import Visit, apart, patches_of
 from perception.readers.scans import Pose, RobotLog
 from ssh_abduction.data.closure import Closure
 from ssh_abduction.data.odometry import Covariance, Odometry, between, moved
@@ -64,12 +64,7 @@ def to_trace(
     steps: list[Step] = []
     last: tuple[Visit, Pose] | None = None
     arrivals: list[tuple[int, float]] = []  # the first step of each visit, and its heading
-    for number, visit in enumerate(visits):
-        if (patch := visit.patch) is None:
-            raise ValueError(
-                f"visits: expected visits with their local maps, got none for visit {number}; take "
-                "those of find_visits or stream_visits"
-            )
+    for number, (visit, patch) in enumerate(zip(visits, patches_of(visits), strict=True)):
         headings = _headings(visit, track)
         arrivals.append((len(steps), headings[0]))
         for heading in headings:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from perception.places.local_map import PackedPatch
@@ -57,6 +58,22 @@ class Visit:
     def later(self, scans: int) -> Visit:
         """Copy the visit, with its indices of scans increased by `scans`."""
         return replace(self, scan=self.scan + scans, begin=self.begin + scans, end=self.end + scans)
+
+
+def patches_of(visits: Sequence[Visit]) -> list[PackedPatch]:
+    """Return the local map of each visit.
+
+    Raises:
+        ValueError: A visit has none.
+    """
+    found = [visit.patch for visit in visits if visit.patch is not None]
+    if len(found) < len(visits):
+        number = next(i for i, visit in enumerate(visits) if visit.patch is None)
+        raise ValueError(
+            f"visits: expected visits with their local maps, got none for visit {number}; take "
+            "those of find_visits or stream_visits"
+        )
+    return found
 
 
 def apart(a: float, b: float) -> float:
