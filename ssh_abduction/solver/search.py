@@ -232,10 +232,11 @@ class Search:
 
     def _given(self, ranking: Ranking | None) -> Iterator[SSHMap]:
         """Yield the maps, those of one cost in the order of `ranking`; None keeps their order."""
+        starts = starts_of(self.trace)
         for cost, level in groupby(self._found(), key=lambda priced: priced[1]):
             maps = (ssh_map for ssh_map, _ in level)
             for ssh_map in ranking.ranked(maps, self.over) if ranking else maps:
-                told = _told(ssh_map, self.trace)
+                told = _told(ssh_map, self.trace, starts)
                 self._answer.take_down(told, cost)
                 yield told
 
@@ -420,11 +421,12 @@ class Search:
             known.status = Status.FEASIBLE
         known.stopped = stopped
         # clingo cannot say how large its program is while another thread is in it.
-        maps = () if best is None else (_told(best, self.trace),)
+        maps = () if best is None else (_told(best, self.trace, starts_of(self.trace)),)
         solution = self._answer.solution(maps, Grounding(0, 0))
         return replace(solution, complete=known.status is Status.UNSATISFIABLE)
 
 
-def _told(ssh_map: SSHMap, trace: Trace) -> SSHMap:
-    """Return a map with the drives and floors that the trace tells of."""
-    return replace(with_floors(ssh_map, trace), starts=starts_of(trace))
+def _told(ssh_map: SSHMap, trace: Trace, starts: tuple[int, ...]) -> SSHMap:
+    """Return a map with the floors of its trace, and the steps at which drives start."""
+    told = with_floors(ssh_map, trace)
+    return replace(told, starts=starts) if starts else told
