@@ -114,9 +114,10 @@ def doubtful_joins(solution: Solution) -> list[tuple[int, int, float]]:
     """List the joins of the first map whose probability is less than SURE, least first.
 
     Returns:
-        The two steps of each join, and its probability.
+        The two steps of each join, and its probability; none if the costs are in doubt.
     """
-    joins = solution.weighed.joins if solution.weighed else ()
+    weighed = solution.weighed
+    joins = weighed.joins if weighed and not weighed.doubt else ()
     return sorted((join for join in joins if join[2] < SURE), key=lambda join: join[2])
 
 
