@@ -94,7 +94,7 @@ def _with_edges(
 
 
 def _confused(edges: Sequence[Hashable], crossed: Sequence[frozenset[str]]) -> list[str]:
-    """Pairs of doors, each of which was passed without the other on one edge."""
+    """Pairs of doors on one edge, if one travel passed only one, and another only the other."""
     on: dict[Hashable, set[frozenset[str]]] = defaultdict(set)
     for edge, doors in zip(edges, crossed, strict=True):
         on[edge].add(doors)

@@ -331,7 +331,7 @@ def corridor_map(places: str, paths: str, drive: str) -> tuple[Trace, SSHMap, li
         ("hahh", "ppr", "HAHbH", {3: "1", 6: "1", 9: "2", 12: "2"}, [], []),
         # The same, but another travel on this edge went to no room: B is not told apart.
         ("hhh", "rr", "HbHH", {3: "2", 6: "2"}, ["B"], []),
-        # Into rooms B and C on one edge: neither is told apart, and doors 2 and 3 are confused.
+        # Into rooms B and C on one edge: the map tells neither, and confuses doors 2 and 3.
         ("hhh", "rr", "HbHcH", {3: "2", 6: "2", 9: "3", 12: "3"}, ["B", "C"], ["2 and 3"]),
         # One place for rooms A and B.
         ("haha", "pqr", "HAHB", {3: "1", 6: "1", 9: "2"}, ["B"], []),
