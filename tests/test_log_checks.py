@@ -126,3 +126,5 @@ def test_a_log_whose_scans_do_not_match_is_refused(
     monkeypatch.setattr(log_checks, "SPARSE", 1e9)
     mirrored = [replace(scan, ranges=scan.ranges[::-1].copy()) for scan in scans]
     assert "contradicts the odometry in" in notes_of(mirrored)
+    drives = [RobotLog(tuple(some), source="drive") for some in (scans, mirrored)]
+    assert [tracked(drive)[1].is_reliable for drive in drives] == [True, False]

@@ -285,9 +285,8 @@ def test_a_log_has_a_twentieth_of_its_drive_to_be_mapped_in_less_what_the_import
 def test_a_map_on_an_unreliable_track_has_no_probability(
     hall: Path, monkeypatch: pytest.MonkeyPatch, is_reliable: bool
 ) -> None:
-    note = "The track is unreliable: scan matching fails in 18 % of the scans."
     imported = import_log(read_log(hall))
-    imported = imported if is_reliable else replace(imported, notes=(note,))
+    imported = replace(imported, track=replace(imported.track, is_reliable=is_reliable))
     monkeypatch.setattr(log_maps, "import_log", lambda *_: imported)
     solution = map_log(read_log(hall), time_limit=5, max_maps=1, with_ladder=False).solution
     said = "no probability is given, as the track is unreliable" in solution.sureness

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -83,6 +84,9 @@ def test_joint_logs_number_scans_and_visits_over_all_drives(
         np.testing.assert_allclose(
             moved(tuple(robot), step.extra["seen"])[:2], visit.middle, atol=1e-3
         )
+    doubted = replace(parts[0], track=replace(parts[0].track, is_reliable=False))
+    assert imported.track.is_reliable
+    assert not join_logs(halves, [doubted, parts[1]])[1].track.is_reliable
 
 
 @pytest.mark.slow

@@ -65,11 +65,6 @@ class Imported:
     notes: tuple[str, ...] = ()
     starts: tuple[int, ...] = ()
 
-    @property
-    def is_reliable(self) -> bool:
-        """Whether scans match, and agree with the odometry, as in good logs."""
-        return not any(log_checks.UNRELIABLE in note for note in self.notes)
-
 
 def import_log(
     log: RobotLog,
@@ -258,7 +253,8 @@ def tracked(
     # If the odometry is wrong throughout, that explains all differences between the trajectories.
     doubt = None if whole else disagreement(log, track)
     say([doubt] if doubt else [])
-    say(log_checks.describe_track(log, track, explained=bool(whole or doubt)))
+    track, doubts = log_checks.judged(log, track, explained=bool(whole or doubt))
+    say(doubts)
     return log, track, tuple(notes)
 
 

@@ -90,7 +90,8 @@ class LiveLog:
             raise LogError(f"{named(self._source)}: expected scans, got none; record the laser")
         explained = bool(self._tell.notes)
         self._tell(jumps.describe_cuts(log, track, turned_wrongly(log, track)))
-        self._tell(log_checks.describe_track(log, track, explained))
+        track, doubts = log_checks.judged(log, track, explained)
+        self._tell(doubts)
         return log, track, tuple(self._tell.notes)
 
     def _followed(self) -> Iterator[Followed]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -30,8 +31,6 @@ LAGS, ALIKE = (2, 4, 8), 1.3
 FAILING, OVERRIDING, CONTRADICTS = 0.05, 0.08, 25.0
 # A log is refused if more than this share of its scans fails to match.
 HOPELESS = 0.5
-# The beginning of the note on a track that is unreliable.
-UNRELIABLE = "The track is unreliable"
 # The odometry over every second scan is at least 0.98 times as long in good logs.
 TO_AND_FRO = 0.8
 # A log is out of order if the times of more than this share of its scans run backwards.
@@ -178,8 +177,8 @@ def _about_odometry(log: RobotLog, unseen: bool | None) -> list[str]:
     return []
 
 
-def describe_track(log: RobotLog, track: Track, explained: bool) -> list[str]:
-    """Describe a track that rests on poor matches, contradicts itself, or never returns.
+def judged(log: RobotLog, track: Track, explained: bool) -> tuple[Track, list[str]]:
+    """Judge whether a track rests on poor matches, contradicts itself, or never returns.
 
     Args:
         log: The scans with odometry.
@@ -187,13 +186,15 @@ def describe_track(log: RobotLog, track: Track, explained: bool) -> list[str]:
         explained: Whether another note says what is wrong, so that this one need not guess.
 
     Returns:
-        Notes for the user; none if nothing is wrong.
+        The track, which is marked if it is unreliable; and notes for the user, none if nothing is
+        wrong.
     """
     failing, overriding = share_failing(track), _overriding(log, track)
+    is_reliable = failing <= FAILING and overriding <= OVERRIDING
     notes = []
-    if failing > FAILING or overriding > OVERRIDING:
+    if not is_reliable:
         notes.append(
-            f"{UNRELIABLE}: scan matching fails in {100 * failing:.0f} % of the scans, "
+            f"The track is unreliable: scan matching fails in {100 * failing:.0f} % of the scans, "
             f"and contradicts the odometry in {100 * overriding:.0f} % of the steps, where good "
             "logs have 2 % at most. It is "
             f"{track.way[-1]:.0f} m long. The map may be wrong."
@@ -213,7 +214,7 @@ def describe_track(log: RobotLog, track: Track, explained: bool) -> list[str]:
             "confirms the map, and no loop is closed. Drive each corridor twice, or end where the "
             "drive began."
         )
-    return notes
+    return replace(track, is_reliable=is_reliable), notes
 
 
 def share_failing(track: Track) -> float:

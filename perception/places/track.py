@@ -30,6 +30,8 @@ class Track:
             displacement crosses a cut.
         breaks: Those of `cuts` after which the robot may be anywhere, because the scan shows
             nothing that was seen before. Neither a path nor a place crosses a break.
+        is_reliable: Whether scans match, and agree with the odometry, as in good logs. True if
+            nothing was judged.
     """
 
     poses: Array
@@ -37,6 +39,7 @@ class Track:
     shares: Array = field(default_factory=lambda: np.ones(0))
     cuts: tuple[int, ...] = ()
     breaks: tuple[int, ...] = ()
+    is_reliable: bool = True
 
     @cached_property
     def way(self) -> Array:

@@ -355,7 +355,7 @@ def map_log(
         ended = INTERRUPTED if interrupted else how_it_ended(solution, allowed)
         told = (*notes, ended) if ended else notes
         solution = solution if corrections is None else with_names(corrections, solution, trace)
-        solution = solution if imported.is_reliable else _doubted(solution)
+        solution = solution if imported.track.is_reliable else _doubted(solution)
         return LogMap(
             log, imported, solution, tuple(climbed), dict(seconds), allowed, told, interrupted
         )
