@@ -13,15 +13,15 @@ The guess is close to the truth if the robot came to most places often. It prove
 >>> guess.sure.tolist()
 [True, True, True]
 
-A map is a hidden Markov model. Its states are the ways in which a robot can stand at a place
-(`Placing` in the glossary). An action in a state leads to one state, so each row of the matrix of
-transitions has a single entry of 1. At first the rows are uncertain (a Dirichlet prior of small
-weight) and have little influence; it grows as the temperature falls. A sweep draws the states of
-stretches of visits anew, given the visits before and after the stretch and the transitions of the
-last draw: forward filtering, backward sampling (Scott 2002, "Bayesian methods for hidden Markov
-models"). Stars, and visits that are apart from pinned ones, rule out states from the start. No
-axiom says that travels are reversible, but each travel counts as if the way back had been seen,
-too.
+A map is a hidden Markov model. A state of the model is a *placing* of a visit: its place, and the
+slot of the place that is slot 0 of the visit. An action in a state leads to one state, so each row
+of the true matrix of transitions has a single entry of 1. At first the rows are uncertain (a
+Dirichlet prior of small weight) and have little influence. Their influence grows as the temperature
+falls. A sweep draws new states for stretches of visits, given the visits before and after the
+stretch and the transitions of the last draw. This is forward filtering, backward sampling (Scott
+2002, "Bayesian methods for hidden Markov models"). Stars rule out some states of a visit from the
+start, and so do pinned visits from which the visit is apart. No axiom says that travels are
+reversible. Still, each travel is counted in both directions.
 
 Places have names, as dstates have in `engines/causal.py`. Pairwise distinct visits are pinned to
 places of their own. Each kind of place has spare names. There have to be many spare names: with too
@@ -72,7 +72,7 @@ ENTRIES = 60_000_000
 # Nor if the table of transitions (states x actions x states) has more entries than this. It is
 # built for each sweep, with some 20 bytes an entry: 40 MB.
 TABLE = 2_000_000
-# No further attempt begins after this many seconds. Careful attempts first try each factor of MORE.
+# A rough guess takes the best attempt so far after this many seconds.
 SECONDS = 10.0
 _Kind = TypeVar("_Kind")
 
@@ -91,7 +91,10 @@ class Guess:
     sure: NDArray[np.bool_]
 
     def labels(self, chart: FramedChart) -> list[int]:
-        """The dstate of each node of the chart, as a number; -1 if the guess is not sure."""
+        """Return a label for each node: 4 times its place, plus the slot there that it faces.
+
+        The label is -1 if the guess is not sure of the visit of the node.
+        """
         states, sure = self.states.tolist(), self.sure.tolist()
         return [
             states[visit] - states[visit] % 4 + (states[visit] + slot) % 4 if sure[visit] else -1
@@ -99,7 +102,7 @@ class Guess:
         ]
 
     def loosened(self, chart: FramedChart, travels: int) -> Guess:
-        """The same guess, but not sure of visits near a contradiction.
+        """Return the same guess, but not sure of visits near a contradiction.
 
         A contradiction is a travel that leads from one state of a place to several places.
 
@@ -125,11 +128,15 @@ class Guess:
 
 
 def annealed(chart: FramedChart, check: Callable[[], None] = lambda: None) -> Guess:
-    """Guess the states of all visits roughly: the first good guess, or the best after SECONDS.
+    """Guess the states of all visits roughly.
 
     Args:
         chart: The chart of the visits.
-        check: Called now and then; may raise.
+        check: Called now and then; may raise to stop.
+
+    Returns:
+        The first guess in which at most one in FEW travels is bad. If none comes within SECONDS,
+        the guess with the fewest bad travels.
     """
     found: dict[int, Guess] = {}
     began = time.perf_counter()
@@ -143,13 +150,13 @@ def annealed(chart: FramedChart, check: Callable[[], None] = lambda: None) -> Gu
 def attempts(
     chart: FramedChart, check: Callable[[], None] = lambda: None, *, rough: bool = False
 ) -> Iterator[tuple[int, Guess]]:
-    """Yield guesses without end: pairs of a number of bad travels and the guess.
+    """Yield guesses without end, each with the number of its bad travels.
 
     A travel is bad if it leads elsewhere than most travels with the same state and action.
 
     Args:
         chart: The chart of the visits.
-        check: Called now and then; may raise.
+        check: Called now and then; may raise to stop.
         rough: Whether to use fewer names and sweeps, which suffices for places visited often.
     """
     leaves = list(chart.leaves.values())
@@ -169,14 +176,13 @@ def annealed_steps(
 ) -> Iterator[list[int]]:
     """Yield better and better guesses at the dstates of all steps; -1 if a guess is not sure.
 
-    There are none if they would take too much memory.
+    Yield none if the transitions would take too much memory.
 
     Args:
         chart: The chart of the steps.
-        clique: Steps that are pairwise distinct.
-        may_be: For each step, the numbers of the steps of the clique that it may be one dstate
-            with.
-        check: Called now and then; may raise.
+        clique: Steps that are pairwise distinct. Clique step number K is pinned to dstate K.
+        may_be: For each step, the dstates of the clique that it may be at.
+        check: Called now and then; may raise to stop.
     """
     options = _step_options(chart, clique, may_be)
     leaves = [(0, action) for _, action, _ in chart.links]
@@ -190,10 +196,19 @@ def annealed_steps(
 
 
 def _options(chart: FramedChart, spares: int, visits_each: int) -> States:
-    """The possible states of each visit, as visits x states, padded with -1."""
+    """List the possible states of each visit.
+
+    Args:
+        chart: The chart of the visits.
+        spares: The least number of spare names of each kind of place.
+        visits_each: A kind with many visits gets about one name for this many visits.
+
+    Returns:
+        An array with a row for each visit, padded with -1.
+    """
     misfits = chart.misfits
-    # The star of each visit in a frame whose slot r is slot 0 of the visit. The least of these four
-    # stars is the kind of the visit.
+    # turned[visit][r] is the star of the visit in a frame whose slot r is slot 0 of the visit. The
+    # least of these four stars is the kind of the visit.
     turned = [
         [tuple(star[(slot - r) % 4] for slot in range(4)) for r in range(4)] for star in chart.stars
     ]
@@ -216,9 +231,13 @@ def _options(chart: FramedChart, spares: int, visits_each: int) -> States:
 
 
 def _step_options(chart: Chart, clique: Sequence[int], may_be: Sequence[Sequence[int]]) -> States:
-    """The possible states of each step, as steps x states, padded with -1.
+    """List the possible states of each step, if each step is a visit.
 
-    They are those of the clique, and the spare ones of its view.
+    A step of the clique has only its own state. Any other step also has the spare names of its
+    view. Arguments are as for `annealed_steps`.
+
+    Returns:
+        An array with a row for each step, padded with -1.
     """
     pinned = set(clique)
     spare = _spare(chart.seen, clique, SPARES, ROUGH_VISITS)
@@ -233,7 +252,14 @@ def _step_options(chart: Chart, clique: Sequence[int], may_be: Sequence[Sequence
 def _spare(
     kinds: Sequence[_Kind], pinned: Sequence[int], spares: int, visits_each: int
 ) -> dict[_Kind, range]:
-    """The spare names of each kind of place. The names of pinned visits come before them."""
+    """Return the spare names of each kind of place. Pinned visits have the names before them.
+
+    Args:
+        kinds: The kind of the place of each visit.
+        pinned: Visits that are pairwise distinct.
+        spares: The least number of spare names of a kind.
+        visits_each: A kind gets one more name for each further group of this many visits.
+    """
     named = Counter(kinds[visit] for visit in pinned)
     spare: dict[_Kind, range] = {}
     names = len(pinned)
@@ -244,7 +270,7 @@ def _spare(
 
 
 def _padded(options: Sequence[Sequence[int]]) -> States:
-    """Rows of different lengths as an array, padded with -1."""
+    """Make an array of rows of different lengths, padded with -1."""
     padded = np.full((len(options), max(map(len, options))), -1)
     for visit, states in enumerate(options):
         padded[visit, : len(states)] = states

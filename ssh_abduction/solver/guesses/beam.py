@@ -2,19 +2,19 @@
 
 A *hypothesis* says at which dstate and place each step so far is. It has the joint Gaussian
 distribution of the positions of its places, the headings of its dstates, and the errors that all
-displacements share. It costs the prices of its dstates and places, and half of the chi-square of
-its returns, as a map does (`solver/weighing.py`).
+displacements share. Its cost in nats is the prices of its dstates and places, plus half of the
+chi-square of its returns, as for a map (`solver/weighing.py`).
 
-Each drive, and each stretch after a lift, begins a piece with a frame of its own (`pieces.py`). It
-may join others at any step.
+Each drive, and each stretch after a lift, begins a *piece* with a frame of its own (`pieces.py`).
+At any step, this piece may be joined to others.
 
-A closure says how a step lies relative to an earlier one. It moves the poses of a hypothesis when
-the later step comes, and its misfit adds to the cost.
+A closure says how a step lies relative to an earlier one. At the later step, the closure corrects
+the poses of a hypothesis, and its misfit adds to the cost.
 
 Each step extends each hypothesis in all ways that cost little: the robot is at a known dstate, at a
 new dstate of a known place, or at a new place. If faults are allowed, the action may have slipped,
 the displacement may be wrong, and the view may be misread, each at its price. The *beam* is the
-hypotheses of least cost. The checker looks at them every few steps. So a hypothesis that breaks an
+hypotheses of least cost. The checker checks them every few steps. So a hypothesis that breaks an
 axiom does not crowd out others for long.
 
 The cost of a hypothesis is close to the cost of its map, and not equal to it (`reckoning.py`).
@@ -48,14 +48,14 @@ from ssh_abduction.solver.steps.faults import with_changes, with_faults
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import Problem
 
-# The checker looks at the beam after this many steps.
+# The checker checks the beam after each CHECKED_EVERY steps.
 CHECKED_EVERY = 8
-# If no hypothesis is left, look for this many times as many.
+# If no hypothesis is left, search again with a beam that is this many times as wide.
 WIDER = 2
 # With several drives or floors, it is open how they are joined. So keep LOST times as many
-# hypotheses, but at most ALIKE that join them alike.
+# hypotheses, but at most ALIKE that join them in the same way.
 LOST, ALIKE = 32, 4
-# Of the beams at earlier looks, this many hypotheses are kept.
+# Of each earlier checked beam, keep this many hypotheses.
 SPARE = 2
 
 
@@ -64,10 +64,11 @@ class _Extension:
     """A way to extend a hypothesis by a step.
 
     Attributes:
-        nats: The cost of the longer hypothesis.
-        place: The known place; None if it is new.
-        dstate: The known dstate; None if it is new.
-        of: The hypothesis. Its means end with the pose after the last move.
+        nats: The cost of the extended hypothesis.
+        place: The known place at which the new step is; None for a new place.
+        dstate: The known dstate at which the new step is; None for a new dstate.
+        of: The hypothesis to extend. Its robot has moved already: the last three entries of its
+            means are the pose at the new step.
     """
 
     nats: float
@@ -85,12 +86,12 @@ class Beam:
     """
 
     def __init__(self, problem: Problem, log: Log, width: int) -> None:
-        """Search nothing yet.
+        """Prepare the search. `maps` does it.
 
         Args:
-            problem: A trace and a theory.
+            problem: The trace, the theory and the evidence.
             log: The trace as integers.
-            width: How many hypotheses are kept.
+            width: The number of hypotheses in the beam.
         """
         trace, theory = problem.trace, problem.theory
         self._trace, self._log, self._width, self._problem = trace, log, width, problem
@@ -104,7 +105,7 @@ class Beam:
         self._prices = theory.prices[0], theory.prices[1] if has_places else 0.0
         self._reckoning, self._frames = Reckoning(trace), frames_of(trace)
         self.nats, self.refuses = math.inf, False
-        self._kept: list[list[Hypothesis]] = []  # the beams after each look of the checker
+        self._kept: list[list[Hypothesis]] = []  # the beam after each check
         self._sights = Sights(trace, self._bare, log, misreads=theory.misread > 0)
         # For each kind of fault, what it costs at each step in nats.
         self._fault = {
@@ -114,11 +115,12 @@ class Beam:
         }
 
     def maps(self) -> Iterator[SSHMap]:
-        """The maps of the hypotheses of the whole trace that agree with the axioms, by their cost.
+        """Yield the maps of the hypotheses of the whole trace that satisfy the axioms, by cost.
 
-        If an earlier call was ended by an exception, such as that of a time limit, go on there. If
-        no hypothesis is left, go back, and for some steps let the robot return to a place only
-        if it has to. If that is not enough, go back twice as far.
+        If an exception ended an earlier call, such as that of a time limit, go on from there. If no
+        hypothesis is left after some steps, go back to an earlier beam and check each hypothesis at
+        each step. If that does not help, extend this beam again with new dstates and places for
+        free. Then go back twice as far.
         """
         kept = self._kept = self._kept or [[self._first()]]
         while (done := len(kept[-1][0].labels)) < len(self._trace):
@@ -143,16 +145,16 @@ class Beam:
                 yield ssh_map
 
     def partial(self) -> Iterator[SSHMap]:
-        """The maps of the first steps that `maps` had reached, the longest one first."""
+        """Yield maps of the first steps, as far as `maps` had come, the longest one first."""
         for found in [beam[0] for beam in reversed(self._kept)]:
             if (ssh_map := self._map(found, len(found.labels))) is not None:
                 yield ssh_map
 
     def nats_without_axioms(self) -> float:
-        """The cost of the best hypothesis if the checker does not look; inf if none is left.
+        """Return the cost of the best hypothesis without the checker; inf if none is left.
 
-        Actions still lead to one dstate, and stars at one place still agree. Where no hypothesis is
-        left otherwise, the checker looks at each step.
+        The search itself still lets each action at a dstate lead to one dstate, and stars at one
+        place agree. Only if no hypothesis is left, the checker checks each step.
         """
         beam = [self._first()]
         while beam and (done := len(beam[0].labels)) < len(self._trace):
@@ -165,7 +167,7 @@ class Beam:
         return float(beam[0].nats) if beam else math.inf
 
     def _onward(self, beam: list[Hypothesis], end: int) -> list[Hypothesis]:
-        """Extend a beam to a number of steps. Nothing is checked."""
+        """Extend a beam to its first `end` steps, without the checker."""
         for t in range(len(beam[0].labels), end):
             beam = list(self._best(self._options_of(beam, t, joins=True), t, self._width))
         return beam
@@ -173,17 +175,18 @@ class Beam:
     def _best(
         self, options: Sequence[_Extension], t: int, width: int, checked: bool = False
     ) -> Iterator[Hypothesis]:
-        """The first `width` hypotheses that options make.
+        """Yield the hypotheses to keep: the first `width` that the options make.
 
-        With several drives or floors, the first hypotheses for each choice of how they are joined:
-        at most ALIKE, and LOST times as many in all. Those that leave one loose come on top. They
-        cost more until they join it to others. Of the others, none is DEAREST dearer than the best.
+        With several drives or floors, keep at most ALIKE hypotheses that join them in the same way,
+        and LOST times as many in all. Drop those that cost `Sights.dearest` more than the best.
+        These two limits do not apply to a hypothesis whose present piece is not joined yet
+        (`Pieces.is_loose`), as it costs more until it is joined.
 
         Args:
-            options: Ways to extend the beam by step t, by their cost.
+            options: Ways to extend the beam by step t, sorted by cost.
             t: The step.
-            width: How many hypotheses are kept.
-            checked: Whether the checker looks at each.
+            width: The number of hypotheses to keep.
+            checked: Whether to drop hypotheses that the checker refuses.
         """
         most, dearest = width, math.inf
         if self._frames:
@@ -207,7 +210,7 @@ class Beam:
             yield child
 
     def _extended(self, beam: list[Hypothesis], end: int) -> list[Hypothesis]:
-        """Extend a beam to a number of steps, and check it then."""
+        """Extend a beam to its first `end` steps. Keep the hypotheses that the checker accepts."""
         begun = len(beam[0].labels)
         longer = self._onward(beam, end)
         valid = [found for found in longer if self._map(found, begun) is not None]
@@ -215,7 +218,11 @@ class Beam:
         return self._settled(valid)
 
     def _settled(self, beam: list[Hypothesis]) -> list[Hypothesis]:
-        """Compute the poses and costs of hypotheses with one frame anew, and sort them."""
+        """Fit the poses of hypotheses anew, compute their costs by these, and sort them by cost.
+
+        Do this only for one frame, and only if the robot is off the poses of its dstates. Otherwise
+        return the beam as it is.
+        """
         if not self._reckoning.is_off or self._frames:
             return beam
         settled = []
@@ -234,13 +241,13 @@ class Beam:
         return price
 
     def _checked(self, beam: list[Hypothesis], end: int, joins: bool = True) -> list[Hypothesis]:
-        """Extend a beam to a number of steps, and check each hypothesis at each step.
+        """Extend a beam to its first `end` steps, and check each hypothesis at each step.
 
         Args:
             beam: The beam.
             end: The number of steps.
-            joins: Whether a new dstate or place costs its price. If not, the robot returns to a
-                place only if it has to.
+            joins: Whether new dstates and places cost their prices, so that returns are cheaper. If
+                False, they are free, and the robot returns to a place only if it has to.
         """
         for t in range(len(beam[0].labels) if beam else end, end):
             options = self._options_of(beam, t, joins)
@@ -248,6 +255,7 @@ class Beam:
         return self._settled(beam)
 
     def _first(self) -> Hypothesis:
+        """Make the hypothesis of the first step: one dstate at one place."""
         mean, covariance = first_pose()
         nowhere = Hypothesis([], [], [], {}, [], [], [], [], mean, covariance, self._prices[0])
         n, met = len(mean) - 3, self._reckoning.met(nowhere, 0, None, None)
@@ -265,11 +273,11 @@ class Beam:
         )
 
     def _map(self, found: Hypothesis, since: int) -> SSHMap | None:
-        """The map of a hypothesis if it agrees with the axioms and the evidence.
+        """Make the map of a hypothesis; None if it contradicts the axioms or the evidence.
 
         Args:
             found: The hypothesis.
-            since: How many of its first steps were checked already.
+            since: The number of its first steps that were checked against the evidence already.
         """
         look_at_clock()
         steps = len(found.labels)
@@ -291,12 +299,12 @@ class Beam:
         return None if next(violations(whole, ssh_map, theory), None) else ssh_map
 
     def _believed(self, found: Hypothesis) -> Trace:
-        """The steps of a hypothesis, without the displacements that it treats as wrong."""
+        """Return the trace of a hypothesis, without the displacements that it treats as wrong."""
         wrong = [t for t, kind in found.faults if kind == "jumped"]
         return self._trace.prefix(len(found.labels)).without_displacements_at(wrong)
 
     def _mended(self, found: Hypothesis) -> Trace:
-        """The steps of a hypothesis, with its faults corrected."""
+        """Return the trace of a hypothesis, with the faults of the hypothesis corrected."""
         trace = self._believed(found)
         if not self._fault:
             return trace
@@ -313,11 +321,11 @@ class Beam:
         return replace(trace, steps=tuple(steps))
 
     def _doubt(self, t: int) -> float:
-        """What it costs to treat the observation of a step as misread, in nats."""
+        """Return the cost in nats of treating the view of step t as misread; inf if forbidden."""
         return self._fault["misread"][t] if "misread" in self._fault else math.inf
 
     def _misread(self, found: Hypothesis, dstate: int, t: int) -> float:
-        """What faults of views cost more, in nats, if the last step is at a dstate."""
+        """Return by how many nats the cost of misread views grows if step t is at a dstate."""
         seen, number, doubt = found.seen[dstate], self._sights.seen[t], self._doubt(t)
         if math.isinf(doubt):
             return 0.0 if number in seen else math.inf
@@ -325,7 +333,7 @@ class Beam:
         return _nats_of_misread(after) - _nats_of_misread(seen)
 
     def _options_of(self, beam: Sequence[Hypothesis], t: int, joins: bool) -> list[_Extension]:
-        """The ways to extend the hypotheses of a beam by step t, by their cost."""
+        """List the ways to extend the hypotheses of a beam by step t, sorted by cost."""
         look_at_clock()
         options = [
             option
@@ -336,7 +344,7 @@ class Beam:
         return sorted(options, key=lambda option: option.nats)
 
     def _moves(self, found: Hypothesis, t: int) -> Iterator[Hypothesis]:
-        """A hypothesis after the move to step t, with and without a fault of the move."""
+        """Yield a hypothesis after the move to step t, without and with a fault of the move."""
         moved = self._reckoning.moved(found, t)
         yield moved
         if "slipped" in self._fault and t not in self._frames:
@@ -348,7 +356,7 @@ class Beam:
             yield replace(moved, faults=faults, nats=moved.nats + price)
 
     def _options(self, moved: Hypothesis, t: int, joins: bool) -> list[_Extension]:
-        """The ways to extend a hypothesis by step t that cost little."""
+        """List the cheap ways to extend a hypothesis whose robot has moved to step t."""
         here, action = moved.labels[-1], self._log.actions[t - 1]
         slips = _slips(moved, t)
         known = None if slips else moved.links.get((here, action))
@@ -401,10 +409,11 @@ class Beam:
     def _near(
         self, moved: Hypothesis, t: int, places: Sequence[int]
     ) -> Iterator[tuple[int, float, Hypothesis]]:
-        """The chi-square if the robot is at each of some places at step t.
+        """For each of some places, compute how well the pose of the robot fits it at step t.
 
         Yields:
-            The place, the chi-square, and the hypothesis, turned to fit the place.
+            The place, the chi-square, and the hypothesis. If the place is in another piece, the
+            piece of the robot is turned to fit it.
         """
         own = [place for place in places if moved.pieces.of_place[place] == moved.pieces.here]
         squares = self._reckoning.squares(moved, t, own).tolist() if own else []
@@ -415,7 +424,7 @@ class Beam:
                 yield place, float(self._reckoning.squares(turned, t, [place])[0]), turned
 
     def _is_allowed(self, option: _Extension, t: int) -> bool:
-        """Whether no pair of steps that evidence excludes becomes one dstate or place."""
+        """Whether the option agrees with the evidence about pairs of steps."""
         labels, places = option.of.labels, option.of.places
         if option.dstate is not None:
             return self._log.pairs.allow(t, [*labels, option.dstate], places)
@@ -423,7 +432,7 @@ class Beam:
         return self._log.pairs.allow(t, [*labels, len(places)], [*places, place])
 
     def _child(self, option: _Extension, t: int) -> Hypothesis:
-        """Make an extended hypothesis."""
+        """Make the hypothesis that an option leads to, with its pose at step t."""
         moved = option.of
         n = len(moved.mean) - 3
         position, heading, places, seen = moved.position, moved.heading, moved.places, moved.seen
@@ -473,15 +482,15 @@ class Beam:
 
 
 def _slips(moved: Hypothesis, t: int) -> bool:
-    """Whether the action that leads to step t, the last one, slipped."""
+    """Whether the hypothesis says that the action to step t, the newest step, slipped."""
     return moved.faults[-1:] == ((t - 1, "slipped"),)
 
 
 def _nats_of_misread(seen: dict[int, float]) -> float:
-    """What it costs that a dstate shows only one of the observations made there."""
+    """Return the cost of misread views at a dstate, in nats. The dearest observation is right."""
     return sum(seen.values()) - max(seen.values())
 
 
 def _shown(seen: dict[int, float]) -> int:
-    """The observation that a dstate shows: the one that is dearest to treat as misread."""
+    """Return the right observation of a dstate: the one that is dearest to treat as misread."""
     return max(seen, key=lambda number: seen[number])

@@ -19,8 +19,8 @@ from ssh_abduction.solver.steps.apart import Matrix
 from ssh_abduction.solver.steps.chart import Link, numbered
 
 # The demands on the merge of a step with a known dstate, from strict to lenient. The first number
-# is the least lead of its evidence over that of the next best merge of the step. The second number
-# is how many known dstates may fit the step at most. The last demand allows practically any merge.
+# is by how much its evidence has to exceed that of the next best merge of the step. The second
+# number is how many known dstates may fit the step at most. The last demand allows almost anything.
 DEMANDS = (
     (10, 1),
     (5, 1),
@@ -35,7 +35,8 @@ DEMANDS = (
     (0, 2),
     (0, 1000),
 )
-# The same leads for merges of two known dstates, when a map is thinned.
+# By how much the evidence for a merge of two known dstates has to exceed that of the next best
+# merge, when a map is thinned. The numbers are tried in this order.
 THINNED = 10, 5, 3, 0
 
 # The fields of Classes that merges change.
@@ -49,8 +50,8 @@ Merge: TypeAlias = tuple[int, int]
 class Classes:
     """Classes of steps that are taken to be one dstate.
 
-    Some classes are *known* dstates. All other classes are to be merged with these, or become known
-    dstates.
+    Some classes are *known* dstates. Each other class is later merged with one of these, or becomes
+    a known dstate.
 
     Attributes:
         root: For each step, the step that represents its class.
@@ -70,7 +71,8 @@ class Classes:
             apart: The pairs of steps that are apart, as a matrix of steps x steps.
             links: Triples (step, action, step).
             check: Called now and then; may raise to stop.
-            nodes: If the steps are dstates of a map: the number of nodes at each. None for 1 each.
+            nodes: If the "steps" are dstates of a map: the number of nodes at each. None for 1
+                each.
         """
         steps = len(apart)
         self._nodes = nodes
@@ -106,7 +108,7 @@ class Classes:
                 self.merge(first[label], node)
 
     def labels(self) -> list[int]:
-        """Return the class of each step. Classes are numbered in the order of their first steps."""
+        """Return the number of the class of each step. The order of first steps numbers them."""
         return numbered(self.root.tolist())
 
     def settle_all(self) -> None:
@@ -143,13 +145,14 @@ class Classes:
         return np.flatnonzero(~self.known[self.root])
 
     def settle(self, evidence: int, rivals: int) -> None:
-        """Merge each other class with its best known dstate, if the evidence is clear enough.
+        """Merge each class that is not known with its best known dstate, if that is clear enough.
 
-        A class that fits no known dstate becomes known. Classes that fit the fewest come first.
+        A class that fits no known dstate becomes known. The classes that fit the fewest known
+        dstates come first.
 
         Args:
-            evidence: By how much the evidence has to exceed that for the next best dstate.
-            rivals: How many known dstates may fit the class at most.
+            evidence: By how much the evidence for the best dstate has to exceed that for the next.
+            rivals: A class that fits more known dstates than this is left as it is.
         """
         steps = self.unsettled()
         fitting = (~self._apart[np.flatnonzero(self.known)][:, steps]).sum(axis=0)
@@ -178,12 +181,12 @@ class Classes:
             self.make((ranked[0][1] if ranked else root, root))
 
     def thin(self, evidence: int) -> None:
-        """Merge each known dstate with its best other one, if the evidence is clear enough.
+        """Merge each known dstate with another one, if the evidence for it is clear enough.
 
         Dstates with the fewest nodes come first.
 
         Args:
-            evidence: By how much the evidence has to exceed that for the next best dstate.
+            evidence: By how much the evidence for the best dstate has to exceed that for the next.
         """
         nodes = np.bincount(self.root, self._nodes)
         for root in sorted(np.flatnonzero(self.known).tolist(), key=lambda root: nodes[root]):
@@ -196,11 +199,7 @@ class Classes:
                     self.make((ranked[0][1], root))
 
     def _fitting(self, root: int) -> list[int]:
-        """List the known dstates from which no step of a class is apart.
-
-        Args:
-            root: The root of the class.
-        """
+        """List the known dstates from which no step of the class of a root is apart."""
         known = np.flatnonzero(self.known)
         fits: list[int] = known[
             ~self._apart[np.ix_(known, self._members[root])].any(axis=1)
@@ -210,7 +209,7 @@ class Classes:
     def _ranked(
         self, root: int, fits: Sequence[int], *, forced: bool = False
     ) -> list[tuple[int, int]]:
-        """Find the dstates that a class can be merged with, and the evidence for each.
+        """Try to merge a class with each of some dstates, and rank these by the evidence.
 
         Args:
             root: The root of the class.
@@ -218,7 +217,7 @@ class Classes:
             forced: Whether two known dstates may be merged.
 
         Returns:
-            Pairs (evidence, dstate), those with most evidence first.
+            Pairs (evidence, dstate) of the merges that are possible, most evidence first.
         """
         found = []
         for dstate in fits:
@@ -238,7 +237,7 @@ class Classes:
 
         Returns:
             The evidence. None if this would merge steps that are apart, or two known dstates
-            without `forced`; then nothing is changed.
+            without `forced`. Then nothing has changed.
         """
         self._undo = []
         work = [(a, b)]
@@ -298,7 +297,7 @@ class Classes:
         self._undo = []
 
     def restore(self, before: Snapshot, merges: Iterable[Merge]) -> None:
-        """Go back to a snapshot, and then make these merges."""
+        """Go back to a snapshot, and then make some merges."""
         root, known, apart, members, leads = before
         self.root, self.known, self._apart, self._members, self._leads = (
             root.copy(),

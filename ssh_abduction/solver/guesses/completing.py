@@ -10,9 +10,9 @@
 [(0, 1)]
 
 Two dstates are on one path only if the axioms say so: a travel or a turn around links them, or they
-face opposite ways at one place. So the map has as many paths as it can have. If it is not
-consistent, hardly any map with these dstates and places is. The order of a path is an order of its
-travels.
+face opposite ways at one place. So the map has as many paths as possible. If this map contradicts
+the axioms, most other maps with these dstates and places do, too. The places of a path are sorted
+by its travels.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ def completed(
         facing: The heading of each dstate in radians, counterclockwise. Only star=frame uses it.
 
     Returns:
-        The map; None if an action leads to two dstates, or a path would be a circle or run both
-        ways.
+        The map. None if an action leads from one dstate to two dstates, if a path would be a
+        circle, if a dstate would face both directions of its path, or if the stars fit no frames.
     """
     links: dict[tuple[int, str], int] = {}
     for here, action, there in zip(labels, trace.actions, labels[1:], strict=False):
@@ -85,7 +85,13 @@ def completed(
 def _on(
     ssh_map: SSHMap, courses: Mapping[int, _Course], headings: Mapping[int, int] | None = None
 ) -> SSHMap:
-    """The map with the courses and headings of its dstates."""
+    """Add the courses and headings of dstates to a map.
+
+    Args:
+        ssh_map: The map.
+        courses: The path and direction of each dstate that is on a path.
+        headings: The heading of each dstate, as a slot; None if no dstate has one.
+    """
     dstates = []
     for s in ssh_map.dstates:
         path, direction = courses.get(s.id, (None, None))
@@ -97,7 +103,12 @@ def _on(
 def _facing(
     ssh_map: SSHMap, trace: Trace, theory: Theory, facing: Sequence[float]
 ) -> Facing | None:
-    """How the dstates face, if places have frames; None if no frame fits what was seen."""
+    """Find which way each dstate faces at its place, by the stars or by its heading in radians.
+
+    Returns:
+        The slots and the pairs of dstates that face opposite ways; empty for a theory without
+        frames. None if no frame fits the stars.
+    """
     if theory.star == "gateways":
         return gateways.facing(trace, ssh_map, theory.axioms)
     found = Facing({}, [], [])
@@ -117,13 +128,17 @@ def _facing(
 def _courses(
     ssh_map: SSHMap, trace: Trace, theory: Theory, opposite: Sequence[tuple[int, int]]
 ) -> dict[int, _Course] | None:
-    """The path and direction of each dstate that is on a path; None if a path runs both ways.
+    """Find the paths: follow travels, turns around and opposite dstates from each dstate.
 
     Args:
         ssh_map: The map without paths.
         trace: The trace.
         theory: The theory.
-        opposite: Pairs of dstates that face opposite ways.
+        opposite: Pairs of dstates that face opposite ways at one place.
+
+    Returns:
+        The path and direction of each dstate that is on a path; None if some dstate would face both
+        directions of its path.
     """
     actions = {action.name: action for action in trace.actions}
     travels = [(s, x) for s, name, x in ssh_map.links if actions[name].kind == "travel"]
@@ -163,13 +178,17 @@ def _orders(
     courses: Mapping[int, _Course],
     ends: Sequence[tuple[int, int]],
 ) -> tuple[MapPath, ...] | None:
-    """The paths with the orders of their places; None if a path is a circle.
+    """Sort the places of each path by its travels, and put the ends of paths first or last.
 
     Args:
         ssh_map: The map without paths.
         trace: The trace.
         courses: The path and direction of each dstate that is on a path.
-        ends: Pairs of a dstate and a direction, 0 (ahead) or 180 (behind), in which its path ends.
+        ends: Pairs (dstate, direction): the path of the dstate ends ahead of it (0) or behind it
+            (180).
+
+    Returns:
+        The paths with their places in order; None if a path would be a circle.
     """
     kinds = {action.name: action.kind for action in trace.actions}
     before: dict[int, dict[int, set[int]]] = defaultdict(dict)

@@ -8,16 +8,16 @@
 >>> followed(Log(trace, Theory.causal()), [0, 1, 2, 0])
 [0, 1, 2, 0, 1, 2, 0, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1]
 
-The trace is walked along the links of the map. An unknown action must lead to a dstate with the
-next observation. Of these dstates, the walk takes the one that predicts the following steps
-longest, if it leads the others clearly and its prediction does not end in a contradiction. If there
-is none, the robot is lost until its observations and actions locate it: Markov localisation with
-beliefs that are sets. Links that one walk leaves open may be found by the next, as the map has
-grown by then. Links that stay open lead to new dstates in the end.
+A *walk* follows the trace along the links of the map. If an action has no link, it must lead to a
+dstate with the next observation. Each such dstate predicts some of the following steps. The walk
+takes the dstate that predicts clearly more steps than the others, if its prediction does not end in
+a contradiction. If there is none, the robot is lost until some dstate predicts enough steps. The
+map grows with each walk, so the next walk may find links that this one did not find. In the end,
+the remaining unknown links lead to new dstates.
 
-A link may therefore be wrong, and so may the given map. Then the trace contradicts it sooner or
-later. The walk forgets the dstate where this happens, and more of the dstates before it if that
-does not help. The result may have dstates that could be one; `guesses/merging.py` merges them.
+A link that a walk adds may be wrong, and so may the given map. Then the trace contradicts it sooner
+or later. The walk forgets the dstate where this happens. If that does not help, it also forgets
+dstates before it. The result may have dstates that could be one. `guesses/merging.py` merges them.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ SETTLED = 10
 FOUND = 20
 # In both cases it has to predict this many steps more than any other dstate.
 AHEAD = 2
-# Give the map up after this many walks. After half of them, open links lead to new dstates.
+# Give the map up after this many walks. After half of them, unknown links lead to new dstates.
 WALKS = 100
 # Also give the map up when the number of dstates has grown by this factor.
 MANY = 10
@@ -47,15 +47,16 @@ _Link: TypeAlias = tuple[int, int]  # dstate, action
 def followed(
     log: Log, labels: Sequence[int], check: Callable[[], None] = lambda: None
 ) -> list[int] | None:
-    """Find labels of all steps of a trace, in a map near that of its first steps.
+    """Label all steps of a trace by extending, and if need be correcting, a map of its first steps.
 
     Args:
         log: The trace.
         labels: The dstate of each of the first steps in a map, numbered from 0.
-        check: Called now and then; may raise.
+        check: Called now and then; may raise to stop.
 
     Returns:
-        The labels; None if the trace contradicts too much of the given map.
+        The dstate of each step. None if there are still contradictions after WALKS walks, or the
+        map has become too large.
     """
     known = _Map(log, labels, check)
     may_be_lost, furthest, back = True, 0, 1
@@ -76,10 +77,10 @@ def followed(
 
 
 class _Map:
-    """A map that grows by links and dstates.
+    """A causal map, to which walks along the trace add links and dstates.
 
     Attributes:
-        leads: Where actions lead, by dstate and action.
+        leads: For each (dstate, action) with a link, the dstate that it leads to.
     """
 
     def __init__(self, log: Log, labels: Sequence[int], check: Callable[[], None]) -> None:
@@ -98,11 +99,14 @@ class _Map:
         return len(self._shows) > self._most
 
     def walked(self, *, may_be_lost: bool) -> list[int]:
-        """Labels of the steps up to the first that contradicts the map. Adds links to the map.
+        """Follow the trace along the links of the map, and add the links that are found.
 
         Args:
-            may_be_lost: If it is unclear where the robot is, whether the label is -1, or else a new
-                dstate.
+            may_be_lost: What to do if it is unclear where the robot is. True: label the step -1.
+                False: add a new dstate to the map.
+
+        Returns:
+            The labels of the steps before the first one that contradicts the map.
         """
         labels: list[int] = []
         for t, seen in enumerate(self._seen):
@@ -136,23 +140,23 @@ class _Map:
             self._start = None
 
     def _new(self, seen: int) -> int:
-        """Add a dstate with this observation."""
+        """Add a dstate with an observation, and return it."""
         dstate = len(self._shows)
         self._shows[dstate] = seen
         self._like.setdefault(seen, []).append(dstate)
         return dstate
 
     def _predicting(self, step: int, least: int, link: _Link | None = None) -> int | None:
-        """The dstate at a step that predicts the following steps longest.
+        """Find the dstate at a step that predicts the most of the following steps.
 
         Args:
             step: The step.
-            least: The least number of steps that it has to predict.
-            link: An unknown link, taken to lead to each dstate that is tried.
+            least: The least number of steps that the dstate has to predict.
+            link: The unknown link to this step. Each try assumes that it leads to the dstate.
 
         Returns:
-            The dstate; None if it does not predict AHEAD steps more than any other, or is
-            contradicted at the end of its prediction.
+            The dstate. None if it predicts too few steps, if it does not predict AHEAD steps more
+            than any other, or if a contradiction ends its prediction.
         """
         self._check()
         # Keep the two longest predictions, to compare them in the end.
@@ -174,7 +178,12 @@ class _Map:
         )
 
     def _predicted(self, dstate: int, step: int) -> tuple[int, bool]:
-        """How many steps a dstate predicts from a step on, and whether it ends contradicted."""
+        """Follow the links from a dstate at a step.
+
+        Returns:
+            How many steps the dstate predicts (at most LOOKED), and whether a contradiction ends
+            the prediction. Otherwise an unknown link or the end of the trace does.
+        """
         for t in range(step + 1, min(step + LOOKED, len(self._seen))):
             there = self.leads.get((dstate, self._actions[t - 1]))
             if there is None:

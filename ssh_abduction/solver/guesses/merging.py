@@ -18,8 +18,9 @@ and steps that fit several known dstates if the evidence for one of them is clea
 step that fits no known dstate becomes one.
 
 A guess is completed in the same way. First, nodes with one label in the guess are merged if they
-can be one dstate. They become known dstates. After merges, a caller may add pairs of nodes that are
-apart, or one, because of these merges. A merge that led to a contradiction is then undone.
+can be one dstate. They become known dstates. After merges, a caller that knows further axioms may
+say which nodes are apart, or one dstate, because of these merges. If the caller finds a
+contradiction instead, the merge that led to it is undone.
 
 A map is thinned in the same way. The dstates with the fewest nodes are merged first, each with the
 dstate for which there is most evidence, while the result is still a map.
@@ -43,9 +44,9 @@ from ssh_abduction.solver.guesses.classes import Classes, Merge, Snapshot
 from ssh_abduction.solver.steps.apart import Matrix
 from ssh_abduction.solver.steps.chart import Chart, Link, numbered
 
-# Give up a guess after this many merges that contradicted the caller.
+# Give up a guess after this many merges that the caller contradicted.
 TAKEN_BACK = 20
-# Stop thinning after this many merges that contradicted the caller. With 40, maps had at most 1 %
+# Stop thinning after this many merges that the caller contradicted. With 40, maps had at most 1 %
 # fewer dstates, and thinning took twice as long.
 THIN_ENOUGH = 5
 
@@ -114,10 +115,10 @@ def merged_as_told(
         links: Triples (node, action, node).
         guess: The label of each node, -1 if it is unknown.
         tell: Called after merges, with the labels of all nodes and the nodes that are not yet at a
-            known dstate. Returns which nodes are apart (a matrix) and which are one (pairs), or
-            None if the labels contradict the axioms.
-        fits: Called with the same arguments. Returns only whether the labels may hold, and is
-            faster.
+            known dstate. Returns which nodes are apart (a matrix) and which are one dstate (pairs),
+            or None if the labels contradict the axioms.
+        fits: A faster form of `tell`, with the same arguments. Returns only whether the labels
+            agree with the axioms.
         check: Called now and then; may raise to stop.
 
     Returns:
@@ -202,7 +203,7 @@ def thinned_map(
         links: Triples (dstate, action, dstate).
         visits: The number of nodes at each dstate.
         check: Called now and then; may raise to stop.
-        excluded: Pairs of dstates that are not one.
+        excluded: Pairs of dstates that must not be merged.
 
     Returns:
         For each dstate, the dstate that now represents it; itself if it was not merged.
@@ -230,7 +231,7 @@ def _apart_in_map(
     Args:
         seen: The view of each dstate.
         links: Triples (dstate, action, dstate).
-        excluded: Pairs of dstates that are not one.
+        excluded: Pairs of dstates that must not be merged.
         check: Called now and then; may raise to stop.
 
     Returns:
@@ -265,7 +266,7 @@ def _from_guess(
 
 
 class _Contradicted(Exception):  # noqa: N818 - not an error
-    """The guess contradicts the axioms of the caller, or too many merges do."""
+    """The guess contradicts the axioms of the caller, or too many merges were undone."""
 
 
 class _ToldClasses(Classes):
@@ -301,14 +302,16 @@ class _ToldClasses(Classes):
         return advanced
 
     def _take_back_first_wrong(self, before: Snapshot, made: Sequence[Merge]) -> None:
-        """Undo merges from the first one on that contradicts the caller, and separate its classes.
+        """Undo the first merge that contradicts the caller and all later ones.
+
+        The two classes of that first merge are marked as apart.
 
         Args:
             before: The classes before the merges.
             made: The merges, in order.
 
         Raises:
-            _Contradicted: The merge only made a class known, or too many merges were undone.
+            _Contradicted: That merge only made a class known, or too many merges were undone.
         """
 
         def fits(merges: int) -> bool:

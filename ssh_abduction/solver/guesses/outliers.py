@@ -1,13 +1,14 @@
 """Finds displacements that are outliers, from labels that are nearly right.
 
 A displacement is how the robot moved between two steps, by its odometry. When the robot comes back
-to a dstate or a place, the displacements in between have to add up to nothing, within their
-covariance. Each such return votes on all displacements in between. Its vote is a log likelihood
-ratio: that one of them is wrong, against that none is, given the residual of the loop. A wrong
-displacement is off by about FAR metres and turns the robot arbitrarily.
+to a dstate or a place, the displacements in between have to add up to zero, within their
+covariance. Each such return gives a vote to all displacements in between. The vote is the log
+likelihood ratio of two hypotheses, given the residual of the loop: that one of these displacements
+is wrong, against that none is. A wrong displacement is off by about FAR metres and has an arbitrary
+turn.
 
-The displacement with the most votes is taken to be wrong. Returns across it vote no more. This is
-repeated while some displacement has enough votes.
+The displacement with the most votes is taken to be wrong. The returns that gave it votes are then
+dropped. This is repeated while some displacement has enough votes.
 
 The result is a guess. Returns by wrong labels also vote, so each vote is limited. A map has to pay
 for each displacement that it treats as wrong.
@@ -75,7 +76,9 @@ def wrong_displacements(
 
 
 def _returns(sites: Sequence[int | None]) -> Iterator[tuple[int, int]]:
-    """Yield pairs of steps at one site, a dstate or a place, with only other sites in between.
+    """Yield the returns: pairs of steps at one site, with only other sites in between.
+
+    A site is a dstate or a place. Steps that follow each other are no return.
 
     Args:
         sites: The site of each step; None if it is unknown.
@@ -97,8 +100,11 @@ def _votes(loops: Loops, pairs: Sequence[tuple[int, int]], with_heading: bool) -
     Args:
         loops: The displacements of the trace.
         pairs: The first and last step of each return.
-        with_heading: Whether the robot comes back to a dstate, so that headings have to agree. If
-            False, it comes back to a place.
+        with_heading: True if the robot comes back to a dstate, so that headings have to agree.
+            False if it comes back to a place.
+
+    Returns:
+        A vote for each return, in nats.
     """
     if not pairs:
         return []

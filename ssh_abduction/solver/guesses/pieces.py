@@ -1,12 +1,13 @@
 """The pieces of a hypothesis about several drives, and how they are turned when they are joined.
 
 A *piece* is a part of a hypothesis whose poses are in one frame. Each drive begins a new piece, and
-so does each stretch after a lift. If it comes to a dstate of another piece, the heading there fixes
-the two frames to each other. If the two pieces have only a place in common, this place is a
-*hinge*: the drive may have any heading. The next place that the two pieces have in common decides.
+so does each stretch after a lift. If the robot comes to a dstate of another piece, the heading
+there fixes the two frames to each other. If the two pieces have only a place in common, this place
+is a *hinge*: the new piece can still turn around it. The next place that the two pieces have in
+common decides by how much it is turned.
 
-The equations of a hypothesis are linear in the neighbourhood of the means (`reckoning.py`). So
-before two pieces are joined, the means of one are turned until they agree with the other.
+The equations of a hypothesis are linear only near the means (`reckoning.py`). So before two pieces
+are joined, the means of one are turned until they agree with the other.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from ssh_abduction.solver.guesses.reckoning import Hypothesis
 
-# Two positions that are less than this many metres apart have no direction.
+# The direction from one position to another is too uncertain to use if they are closer than this
+# many metres.
 NEAR = 1.0
 
 
@@ -31,10 +33,10 @@ class Pieces:
         here: The piece that the robot is in.
         of_place: The piece of each place.
         of_heading: The piece of the heading of each dstate.
-        hinges: For a piece that has only a place in common with others: the index of the x of this
-            place in the means.
-        joins: How pieces were joined: a piece, and the place and perhaps the dstate of another
-            piece that it came to.
+        hinges: For each piece that has only a place in common with others: the index of the x of
+            this place in the means.
+        joins: How pieces were joined: triples of a piece, and the place and dstate of another piece
+            that the robot came to. The dstate is None if only the place was known.
     """
 
     here: int = 0
@@ -45,7 +47,7 @@ class Pieces:
 
     @property
     def is_loose(self) -> bool:
-        """Whether the piece of the robot has nothing in common with others yet."""
+        """Whether the piece that the robot is in is not joined to any other piece yet."""
         return self.here > 0 and all(piece != self.here for piece, _, _ in self.joins)
 
     def grown(self, place: bool, dstate: bool) -> Pieces:
@@ -70,13 +72,17 @@ class Pieces:
 def fitted(found: Hypothesis, place: int, dstate: int | None = None) -> Hypothesis:
     """Turn the piece of the robot, so that its last pose fits a place or dstate of another piece.
 
-    The last three entries of the means are the pose. If the place is in the piece of the robot,
-    nothing changes.
+    The last three entries of the means are the pose. If only the position is known, the first place
+    becomes the hinge, and the second one decides by how much to turn. Nothing is turned if the
+    place is in the piece of the robot already.
 
     Args:
         found: The hypothesis.
         place: The place.
         dstate: A dstate of this place; None to fit the position only.
+
+    Returns:
+        The hypothesis with the piece turned, and joined to the other piece.
     """
     pieces = found.pieces
     other = pieces.of_place[place] if dstate is None else pieces.of_heading[dstate]
@@ -99,10 +105,11 @@ def fitted(found: Hypothesis, place: int, dstate: int | None = None) -> Hypothes
 
 
 def closed(found: Hypothesis, dstate: int, turn: float) -> Hypothesis:
-    """Turn the piece of the robot, and join it with that of a dstate, as a closure says.
+    """Turn the piece of the robot, and join it to the piece of a dstate, as a closure says.
 
-    Without this, a closure could not be linear: the piece may have any heading. If the dstate is in
-    the piece of the robot, nothing changes.
+    This comes before the update by the closure, which is linear in the heading of the piece and so
+    needs a heading that is nearly right. If the dstate is in the piece of the robot, nothing
+    changes.
 
     Args:
         found: The hypothesis.
@@ -120,11 +127,11 @@ def closed(found: Hypothesis, dstate: int, turn: float) -> Hypothesis:
 
 
 def _turned(found: Hypothesis, angle: float, centre: int) -> Hypothesis:
-    """Turn the poses of the piece of the robot.
+    """Turn all poses of the piece of the robot about a centre, with their covariance.
 
     Args:
         found: The hypothesis.
-        angle: The angle in radians.
+        angle: The angle in radians, counterclockwise.
         centre: The index of the x of the centre in the means.
     """
     n, pieces = len(found.mean) - 3, found.pieces

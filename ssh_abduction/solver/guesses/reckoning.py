@@ -1,7 +1,7 @@
 """The Gaussian distribution of poses in a hypothesis about dstates and places (`beam.py`).
 
-The equations are linear in the neighbourhood of the means. So the chi-square of a hypothesis is
-close to that of its map, and not equal to it.
+The equations are linear only near the means. So the chi-square of a hypothesis is close to that of
+its map, but not equal to it.
 
 Reference:
     Smith, Self & Cheeseman 1990, "Estimating uncertain spatial relationships in robotics".
@@ -28,33 +28,36 @@ from ssh_abduction.solver.guesses.pieces import Pieces, closed
 
 Array: TypeAlias = NDArray[np.float64]
 
-# Added to variances, in square metres and square radians, so that no matrix is singular.
+# This is added to variances, in square metres and square radians, so that no matrix is singular.
 BLUR = 1e-6
 # The standard deviations, in metres and radians, of a move without a displacement.
 UNKNOWN = (1e3, 1e3, 3.0)
-# The first entries of the means: how wrong the scale and the drift are, in standard deviations.
+# The indices of the first entries of the means: the errors of the scale and of the drift of the
+# odometry, in standard deviations.
 SCALE, BEND = 0, 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hypothesis:
-    """What a robot may have visited.
+    """A hypothesis about the dstate and place of each step so far, with its poses and its cost.
 
     Attributes:
         labels: The dstate of each step so far.
         places: The place of each dstate.
-        seen: For each dstate, what it costs to treat each observation there as misread.
-        links: For each dstate and action, the dstate that it leads to.
-        sights: For each place, what its first step shows of it: of the last drive there, if
-            gateways may change between drives.
-        drives: For each place, the drive of this step.
+        seen: For each dstate, the observations there, each with the cost in nats of treating it as
+            misread at all its steps.
+        links: For each (dstate, action) with a link, the dstate that it leads to.
+        sights: For each place, what the first step there shows of it, as `Sights.shown`. If
+            gateways may change between drives, that is the first step of the last drive there.
+        drives: For each place, the drive of that step.
         position: For each place, the index of its x in the means; y is the next one.
         heading: For each dstate, the index of its heading in the means.
-        mean: The means in metres, radians and standard deviations. The last three are the pose of
-            the robot.
-        covariance: Their covariance.
+        mean: The means, in metres, radians and standard deviations. First the errors of scale and
+            drift, then positions and headings, and last the pose of the robot (x, y, heading).
+        covariance: The covariance of these.
         nats: The cost.
-        faults: The steps at which an action slipped or a displacement is wrong, and which.
+        faults: Pairs (step, kind): the steps at which an action "slipped" or a displacement
+            "jumped".
         pieces: Which poses are in one frame.
     """
 
@@ -74,10 +77,11 @@ class Hypothesis:
 
 
 class Reckoning:
-    """The moves of a trace, and how they change the poses of a hypothesis.
+    """Updates the poses of hypotheses by the displacements and closures of a trace.
 
     Attributes:
-        is_off: Whether the robot is off the poses of its dstates.
+        is_off: Whether the odometry says that the robot may be some way off the poses of its
+            dstates (`spreads_of`).
     """
 
     def __init__(self, trace: Trace) -> None:
@@ -94,12 +98,15 @@ class Reckoning:
         self._spreads = spreads + BLUR
 
     def moved(self, found: Hypothesis, t: int, believes: bool = True) -> Hypothesis:
-        """Move the robot of a hypothesis to step t. The robot is the last pose of the means.
+        """Move the robot of a hypothesis to step t, and use the closures that end there.
 
         Args:
-            found: The hypothesis of the steps before.
+            found: The hypothesis about the steps before t.
             t: The step.
-            believes: Whether the displacement of the step is used.
+            believes: Whether to use the displacement to the step. If False, the move is unknown.
+
+        Returns:
+            The hypothesis. The last three entries of its means are the pose at step t.
         """
         displacement = self._trace.steps[t].displacement if believes else None
         mean, n = found.mean, len(found.mean)
@@ -136,9 +143,14 @@ class Reckoning:
         return moved
 
     def _closed(self, moved: Hypothesis, closure: Closure) -> Hypothesis:
-        """Update a hypothesis by a closure that leads to its robot.
+        """Update a hypothesis by a closure between an earlier step and the present one.
 
-        The pose of the robot at the earlier step is not kept. The dstate there stands for it.
+        The pose of the robot at the earlier step is not kept, so the pose of its dstate stands for
+        it.
+
+        Returns:
+            The hypothesis with new means and covariance. Its cost includes the misfit of the
+            closure.
         """
         noise = np.array(closure.covariance) + np.diag(self._spreads[closure.first])
         mean, n = moved.mean, len(moved.mean) - 3
@@ -165,14 +177,13 @@ class Reckoning:
         )
 
     def settled(self, found: Hypothesis, trace: Trace) -> tuple[float, Hypothesis]:
-        """Fit the poses of a hypothesis anew, as the equations are linear only near the means.
+        """Fit all poses of a hypothesis anew, as the equations are linear only near the means.
 
-        This is done only if the robot is off the poses of its dstates. Then errors of the heading
-        are large.
+        Callers do this only if `is_off`, as errors of the heading are large then.
 
         Args:
             found: The hypothesis.
-            trace: Its steps, without displacements that it treats as wrong.
+            trace: The trace of its steps, without the displacements that it treats as wrong.
 
         Returns:
             The chi-square, and the hypothesis with new means and covariances.
@@ -200,7 +211,17 @@ class Reckoning:
     def squares(
         self, moved: Hypothesis, t: int, places: Sequence[int], dstate: int | None = None
     ) -> Array:
-        """The chi-square if the robot is at each of some places at step t, or at a dstate."""
+        """Compute the chi-square of the robot being at each of some places at step t.
+
+        Args:
+            moved: The hypothesis, with its robot moved to step t.
+            t: The step.
+            places: The places.
+            dstate: A dstate at these places. If given, the heading of the robot has to fit, too.
+
+        Returns:
+            The chi-square for each place.
+        """
         at = np.array([moved.position[p] for p in places])
         rows, last = np.stack([at, at + 1], 1), np.arange(-3, -1)
         if dstate is not None:
@@ -222,13 +243,19 @@ class Reckoning:
     def met(
         self, moved: Hypothesis, t: int, position: int | None, heading: int | None
     ) -> tuple[Array, Array]:
-        """The means and the covariance if the robot is at some position and heading at step t.
+        """Condition the poses on the robot being at a place, and perhaps at a dstate, at step t.
+
+        A new place or dstate gets the position or heading of the robot.
 
         Args:
             moved: The hypothesis, with its robot moved to step t.
             t: The step.
-            position: The index of the known position; None to add a new one before the robot.
-            heading: The index of the known heading; None to add a new one behind the position.
+            position: The index in the means of the x of a known place; None for a new place.
+            heading: The index in the means of the heading of a known dstate; None for a new dstate.
+
+        Returns:
+            The means and the covariance. New entries, x and y before the heading, come just before
+            the pose of the robot.
         """
         n = len(moved.mean) - 3
         old = [] if position is None else [position, position + 1]
@@ -249,7 +276,18 @@ class Reckoning:
 def _conditioned(
     mean: Array, covariance: Array, first: Sequence[int], second: Sequence[int], spreads: Array
 ) -> tuple[Array, Array]:
-    """Condition a Gaussian on equalities of entries, with some variances. The third is an angle."""
+    """Condition a Gaussian on the equality of some entries with others, up to some variance.
+
+    Args:
+        mean: The means.
+        covariance: Their covariance.
+        first: The indices of entries: x and y, and perhaps a heading.
+        second: The indices of the entries that should be equal to them.
+        spreads: The variance of each difference, in square metres and square radians.
+
+    Returns:
+        The new means and covariance.
+    """
     off = mean[first] - mean[second]
     off[2:] -= math.tau * np.round(off[2:] / math.tau)
     across = covariance[:, first] - covariance[:, second]
@@ -260,7 +298,7 @@ def _conditioned(
 
 
 def first_pose() -> tuple[Array, Array]:
-    """The means and the covariance before the first step, with the robot at the origin."""
+    """Return the means and the covariance before the first step, with the robot at the origin."""
     mean, covariance = np.zeros(5), np.zeros((5, 5))
     covariance[[SCALE, BEND], [SCALE, BEND]] = 1.0
     return mean, covariance

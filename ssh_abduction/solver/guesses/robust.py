@@ -1,14 +1,14 @@
 """Finds small maps of the causal theory with faults, without a search and without a proof.
 
-A hidden Markov model is trained on the trace (Baum, Petrie, Soules, Weiss 1970). Each state shows
-one view, and several states show the same view (cloned hidden Markov models: George et al. 2021).
-There are small probabilities that a view is misread and that an action slips. The most probable
-states give labels, the dstate of each step.
+A hidden Markov model is trained on the trace by EM (Baum, Petrie, Soules, Weiss 1970). Each state
+shows one view, and several states show the same view (cloned hidden Markov models: George et al.
+2021). There are small probabilities that a view is misread and that an action slips. The most
+probable state of each step is its first label, that is, its dstate.
 
 A map is then read off the labels: a dstate shows the majority view of its steps, and an action
 leads where it leads most often. A Viterbi pass (Viterbi 1967) finds new labels with the cheapest
-faults for this map. Both are repeated while the cost falls. In between, dstates are merged if they
-can be one. A dstate is dropped if it costs more than the faults without it.
+faults for this map. These two steps are repeated while the cost falls. In between, dstates are
+merged if they can be one. A dstate is dropped if it costs more than the faults without it.
 
 >>> seen = [t % 4 for t in range(60)]
 >>> seen[30] = 0
@@ -32,8 +32,8 @@ from numpy.typing import NDArray
 from ssh_abduction.solver.guesses.merging import thinned_map
 from ssh_abduction.solver.steps.chart import Link, numbered
 
-# The number of states of each view, for each start of EM. More states than needed lead to better
-# optima.
+# The number of states of each view, for each start of EM. With more states than needed, EM finds
+# better optima.
 CLONES = (4, 10, 16, 10, 16, 10, 16, 10)
 AGREE = 2  # stop after this many starts that reach the cheapest map
 ROUNDS = 100  # the most EM steps of a start
@@ -68,17 +68,18 @@ class Machine:
         return frozenset(action for _, action in self.goes)
 
     def folded(self, s: int, x: int) -> tuple[int, list[int]]:
-        """Merge two dstates, the dstates that the same action leads to from both, and so on.
+        """Try to merge two dstates, the dstates that the same action leads to from both, and so on.
 
-        Dstates with different views are not merged, but count as a contradiction.
+        Dstates with different views are not merged, but count as a contradiction. The machine stays
+        as it is.
 
         Args:
             s: A dstate.
             x: Another dstate.
 
         Returns:
-            The net cost, contradictions minus dstates saved, by which callers rank merges; and the
-            new label of each dstate.
+            The number of contradictions minus the number of dstates saved, and the new label of
+            each dstate. Callers try merges with the least number first.
         """
         root = list(range(len(self.shows)))
         members = {dstate: [dstate] for dstate in root}
@@ -105,7 +106,7 @@ class Machine:
         return contradicted - merges, root
 
     def without(self, dropped: int) -> Machine:
-        """Make a machine without one dstate and its links. Higher numbers drop by one."""
+        """Make a machine without one dstate and its links. Larger numbers of dstates drop by 1."""
         number = {s: s - (s > dropped) for s in range(len(self.shows)) if s != dropped}
         goes = {
             (number[s], a): number[x]
@@ -160,7 +161,7 @@ class Explainer:
     def explained(self, machine: Machine) -> Explained:
         """Find the labels with the cheapest faults for a machine, by a Viterbi pass.
 
-        An action without a link may lead anywhere.
+        An action without a link may lead to any dstate.
         """
         steps, count = len(self.seen), len(machine.shows)
         slip, misread = (
@@ -180,8 +181,8 @@ class Explainer:
             if t % 500 == 0:
                 self.check()
             action = self.actions[t - 1]
-            # A dstate is reached by a slip from the cheapest dstate, from the cheapest dstate
-            # without a link for this action, or by a link.
+            # There are three ways to reach a dstate: by a slip from the cheapest dstate, from the
+            # cheapest dstate without a link for this action, or by a link.
             cheapest = int(spent.argmin())
             now = np.full(count, spent[cheapest] + slip[t - 1])
             came[t] = cheapest
@@ -204,7 +205,7 @@ class Explainer:
         return self._told(machine, labels)
 
     def completed(self, machine: Machine) -> Explained:
-        """Add the links that a machine lacks for the trace, and explain the trace by the result.
+        """Add links to a machine until no step of the trace lacks one, and explain the trace by it.
 
         An action without a link gets one to the dstate that follows most often in the labels.
         """
@@ -245,8 +246,8 @@ class Explainer:
     def refined(self, labels: Sequence[int]) -> Explained:
         """Find a cheap explanation near these labels, by local search.
 
-        Make a machine from the labels and explain the trace by it again, while the cost falls. Then
-        try machines with merged dstates, or without a rarely visited one.
+        Make a machine from the labels, explain the trace by it, and repeat this while the cost
+        falls. Then try machines in which dstates are merged, or a rarely visited one is dropped.
 
         Args:
             labels: The dstate of each step.
@@ -259,7 +260,7 @@ class Explainer:
             best = better
 
     def _near(self, best: Explained) -> Iterator[Explained]:
-        """Yield explanations by machines like a given one, with dstates merged or dropped."""
+        """Yield explanations by machines in which dstates of the best one are merged or dropped."""
         # First merge all dstates that can be one. Then drop rare dstates, one at a time. Then merge
         # pairs of dstates with few contradictions.
         machine = self.read_off(best.labels)
@@ -292,10 +293,10 @@ class Explainer:
         return best
 
     def _told(self, machine: Machine, labels: Sequence[int]) -> Explained:
-        """Find the faults and the cost of given labels, as an explanation.
+        """Make the explanation that given labels are: find their faults, and add up the cost.
 
         Args:
-            machine: The machine, with all dstates of the labels.
+            machine: The machine. Its dstates include all labels.
             labels: The dstate of each step.
         """
         # A step is at fault if its view, or where its action leads, differs from the machine.
@@ -325,7 +326,7 @@ class Explainer:
 def robust_maps(explainer: Explainer, seed: int = 0) -> Iterator[Explained | None]:
     """Yield explanations of a trace, each cheaper than the one before.
 
-    There is an item for each start of EM. It is None if that start led to no cheaper explanation.
+    Yield one item for each start of EM: None if that start led to no cheaper explanation.
 
     Args:
         explainer: The trace and the costs of faults.
@@ -424,10 +425,13 @@ class _Model:
         return labels[::-1]
 
     def _normal(self, counts: Floats) -> Floats:
-        """Turn counts into transition probabilities, and mix in the probability of a slip.
+        """Turn counts into transition probabilities. A slip leads to each state equally often.
 
         Args:
             counts: Counts of transitions, with the shape (actions, from states, to states).
+
+        Returns:
+            The probabilities, in the same shape.
         """
         chances: Floats = counts / counts.sum(axis=2, keepdims=True)
         slipping: Floats = (1 - self._slip) * chances + self._slip / counts.shape[2]

@@ -1,6 +1,8 @@
 """Draw the states of visits by annealing: a blocked Gibbs sampler of a hidden Markov model.
 
-`guesses/annealing.py` says what states are, and which are possible for each visit.
+A state is a number for the placing of a visit: with right angles 4 times its place, plus the slot
+of the place that is slot 0 of the visit. `guesses/annealing.py` says which states are possible for
+each visit.
 """
 
 from __future__ import annotations
@@ -19,27 +21,27 @@ WEIGHT = 0.002
 STATES = 60
 # The power of probabilities in the last sweep of a stage, just below that of the model, 1.
 COLD = 0.95
-# Then LAST sweeps follow with the power QUENCHED, which make the result nearly deterministic.
+# Then come LAST sweeps with the power QUENCHED. They make the result nearly deterministic.
 LAST, QUENCHED = 50, 4.0
-# The visits of a stretch, which are drawn together. All stretches are drawn side by side, given the
-# visits at their ends.
+# The number of visits in a stretch. They are drawn together. All stretches are drawn at the same
+# time, given the visits at their ends.
 STRETCH = 20
-# The likely states that a visit is drawn from. With 8, chosen twice as often, twice as many sweeps
-# are needed.
+# Each visit is drawn from this many likely states. With 8 states that were chosen twice as often,
+# twice as many sweeps were needed.
 LIKELY = 16
-# The sweeps after which likely states are chosen again.
+# The likely states are chosen again after this many sweeps.
 ROUND = 50
 
 States: TypeAlias = NDArray[np.int_]
 
 
 class _Transitions:
-    """How often actions led from state to state in the last draw.
+    """Counts how often actions led from state to state in the last draw.
 
     The table of transitions has a row for each state and action, and a column for each state.
 
     Attributes:
-        counts: The table.
+        counts: The table: how often the action of the row led to the state of the column.
         totals: The sum of each row.
     """
 
@@ -50,7 +52,8 @@ class _Transitions:
 
         Args:
             leaves: The slot and action at which each visit but the last ends.
-            ways: The states of a place. With 4, states 2 and 3 face opposite to 0 and 1.
+            ways: The number of states per place, 4 or 1. With 4, states 2 and 3 face opposite to 0
+                and 1.
             states: The number of states.
             labels: The state of each visit.
         """
@@ -67,11 +70,16 @@ class _Transitions:
         self._counted, self.counts, self.totals = self._tallied(labels)
 
     def count(self, labels: States) -> None:
-        """Count the transitions of another draw."""
+        """Count the transitions of a new draw instead."""
         self._counted, self.counts, self.totals = self._tallied(labels)
 
     def rows(self, states: States, visits: States) -> States:
-        """The rows of the table for visits that are in these states."""
+        """Return the row of the table for the last step of each of some visits.
+
+        Args:
+            states: The states of the visits, in a shape that broadcasts with `visits`.
+            visits: The visits.
+        """
         turned = (states + self._slot[visits]) % self._ways
         rows: States = (states - states % self._ways + turned) * self._actions + self._action[
             visits
@@ -79,14 +87,15 @@ class _Transitions:
         return rows
 
     def entries(self, states: States) -> States:
-        """The entries of the table from the states of each visit to those of the next.
+        """Find where the table has the transitions from each visit to the next one.
 
         Args:
-            states: Visits x states, padded with -1. Padding gets the last row or column, where
-                nothing is likely.
+            states: The possible states of each visit, an array of visits x states, padded with -1.
+                Padding gets an extra last row or column of the table, where all probabilities are
+                0.
 
         Returns:
-            Visits but the last x states x states of the next visit.
+            Indices for `likely`: visits without the last x states x states of the next visit.
         """
         rows = self.rows(states[:-1], self._visits[:, None])
         rows[states[:-1] < 0] = self._states * self._actions
@@ -95,7 +104,15 @@ class _Transitions:
         return entries
 
     def likely(self, entries: States, power: float) -> NDArray[np.float32]:
-        """The probabilities of these entries, by the counts and the prior, to a power."""
+        """Compute the probabilities of transitions from the counts and the prior.
+
+        Args:
+            entries: The transitions, as `entries` returns them.
+            power: The power to which the probabilities are raised.
+
+        Returns:
+            The probabilities, in the shape of `entries`.
+        """
         shape = self._states * self._actions + 1, self._states + 1
         totals = self.totals + np.float32(STATES * WEIGHT)
         table = np.zeros(shape, dtype=np.float32)
@@ -107,9 +124,13 @@ class _Transitions:
         return table.ravel()[entries]
 
     def _tallied(self, labels: States) -> tuple[States, NDArray[np.float32], NDArray[np.float32]]:
-        """The transitions of a draw as entries of the table, the table, and its row sums.
+        """Count the transitions of a draw. With 4 states per place, also count them backwards.
 
-        The ways back of travels also count.
+        Args:
+            labels: The state of each visit.
+
+        Returns:
+            Each transition as an index into the flat table, the table, and the sums of its rows.
         """
         here, there = labels[:-1], labels[1:]
         rows = self.rows(here, self._visits)
@@ -130,9 +151,9 @@ class _Choice:
     """The states that visits are drawn from during a round of sweeps.
 
     Attributes:
-        states: Visits x states, padded with -1.
-        entries: The entries of the table of transitions for these states.
-        drawn: The column of the last drawn state of each visit.
+        states: The states that each visit is drawn from: visits x states, padded with -1.
+        entries: The entries of the table of transitions for these states (`_Transitions.entries`).
+        drawn: For each visit, the column of `states` with its last drawn state.
     """
 
     states: States
@@ -171,12 +192,12 @@ class Sampler:
         self._transitions = _Transitions(leaves, ways, states, self.labels)
 
     def anneal(self, first: float, sweeps: int, check: Callable[[], None]) -> None:
-        """Anneal the states.
+        """Draw the states again and again, with rising power of probabilities.
 
         Args:
             first: The power of probabilities in the first sweep. It rises to COLD.
-            sweeps: The number of sweeps, before LAST sweeps with the power QUENCHED.
-            check: Called before each sweep; may raise.
+            sweeps: The number of sweeps, before LAST more sweeps with the power QUENCHED.
+            check: Called before each sweep; may raise to stop.
         """
         for sweep in range(sweeps + LAST):
             check()
@@ -186,7 +207,7 @@ class Sampler:
             self._sweep(choice, power)
 
     def sure(self) -> NDArray[np.bool_]:
-        """Whether the actions to and from each visit lead where such actions mostly lead."""
+        """Say for each visit whether the actions to and from it lead where they lead most often."""
         counts = self._transitions.counts
         rows = self._transitions.rows(self.labels[:-1], self._visits[:-1])
         odd = counts[rows, self.labels[1:]] < counts[rows].max(axis=1)
@@ -196,7 +217,7 @@ class Sampler:
         return sure
 
     def failed(self) -> int:
-        """The number of travels that lead elsewhere than most with the same state and action."""
+        """Count the travels that lead elsewhere than most with the same state and action."""
         return int((self._transitions.totals - self._transitions.counts.max(axis=1)).sum())
 
     def _choose(self, power: float) -> _Choice:
@@ -229,7 +250,12 @@ class Sampler:
         return _Choice(states, self._transitions.entries(states), drawn)
 
     def _sweep(self, choice: _Choice, power: float) -> None:
-        """Draw the states of all visits, stretch by stretch."""
+        """Draw the states of all visits from a choice, all stretches at the same time.
+
+        Args:
+            choice: The states to draw from. Its field `drawn` is updated.
+            power: The power of probabilities.
+        """
         likely = self._transitions.likely(choice.entries, power)
         starts, lengths = self._stretches(int(self._random.integers(STRETCH)))
         ahead = self._filtered(choice.states, likely, choice.drawn, starts, lengths)
@@ -249,7 +275,14 @@ class Sampler:
         self._transitions.count(self.labels)
 
     def _stretches(self, first: int) -> tuple[States, States]:
-        """The first visits and the lengths of stretches, if the second starts at `first`."""
+        """Divide the visits into stretches of STRETCH visits.
+
+        Args:
+            first: The first visit of the second stretch; with 0, of the first stretch.
+
+        Returns:
+            The first visit of each stretch, and its number of visits.
+        """
         starts = np.unique(np.append(0, np.arange(first, len(self._visits), STRETCH)))
         return starts, np.diff(np.append(starts, len(self._visits)))
 
@@ -261,10 +294,20 @@ class Sampler:
         starts: States,
         lengths: States,
     ) -> NDArray[np.float32]:
-        """Forward messages: the probability of each state of each visit, as visits x states.
+        """Compute the forward messages: the probability of each state of each visit.
 
-        They are conditioned on the visits before it in its stretch, and on the last draw of the
-        visit before the stretch.
+        It is given the visits before it in its stretch, and the last draw of the visit before the
+        stretch.
+
+        Args:
+            states: The possible states: visits x states, padded with -1.
+            likely: The probabilities of transitions between these states.
+            drawn: For each visit, the column of its last drawn state.
+            starts: The first visit of each stretch.
+            lengths: The number of visits of each stretch.
+
+        Returns:
+            The messages: visits x states. Each row adds up to 1.
         """
         ahead = (states >= 0).astype(np.float32)
         for i in range(int(lengths.max())):

@@ -1,4 +1,4 @@
-"""What steps show of their dstates and places, and what it costs that gateways changed."""
+"""Says what each step shows of its dstate and place, and what a change of gateways costs."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.theory import Theory
 
-# An extension that costs this many nats more than the best one of its hypothesis is not made.
+# Do not extend a hypothesis in a way that costs this many nats more than its cheapest extension.
 DEAREST = 20.0
-# So many gateways of one place may have changed between drives. An extension may cost this more.
+# If gateways may change between drives, an extension may also cost the price of this many changes.
 CHANGES = 2
 
 
@@ -26,21 +26,23 @@ class Sights:
     """What each step of a trace shows.
 
     Attributes:
-        seen: What each step shows of its dstate, as a number. If gateways may change between
-            drives, this is its view only.
-        shown: What each step shows of its place in any direction: its star, or nothing.
+        seen: What each step shows of its dstate, as a number: its observation, or only its view if
+            gateways may change between drives.
+        shown: What each step shows of its place, whichever way it faces: its star, or None without
+            stars. A star of four openings is turned to a normal form.
         drive: The number of the drive of each step.
-        dearest: An extension that costs this many nats more than the best one is not made.
+        dearest: Do not extend a hypothesis in a way that costs this many nats more than its
+            cheapest extension.
     """
 
     def __init__(self, trace: Trace, theory: Theory, log: Log, *, misreads: bool) -> None:
-        """Look at each step once.
+        """Read the views and stars of all steps.
 
         Args:
             trace: The trace.
-            theory: The theory. Its field `changed` is the price of a change in dstates.
+            theory: The theory. Its field `changed` is the price of a changed gateway, in dstates.
             log: The trace as integers.
-            misreads: Whether a star may be wrong. Then all places agree with all steps.
+            misreads: Whether stars may be wrong. Then any step may be at any place.
         """
         starts = starts_of(trace)
         self.seen = numbered(trace.views) if theory.changed else log.seen
@@ -50,7 +52,13 @@ class Sights:
         self.dearest = DEAREST + CHANGES * self._price
 
     def changes(self, found: Hypothesis, place: int, t: int) -> float:
-        """What the gateways that changed cost, in nats, if step t is at a place; inf for never."""
+        """Return the cost in nats of changed gateways if step t is at a place; inf if it cannot be.
+
+        Args:
+            found: The hypothesis, which says what was seen at the place before.
+            place: The place.
+            t: The step.
+        """
         sight, own = found.sights[place], self.shown[t]
         if self._misreads or _agree(sight, own):
             return 0.0
@@ -61,6 +69,7 @@ class Sights:
 
 
 def _shown(step: Step, star: str) -> Star | tuple[bool, ...] | None:
+    """Return the star of a step in a form that all steps at its place share; None without stars."""
     if star == "gateways":
         return step.gateways or Star(())
     seen = step.openings if star in ("pattern", "frame") else None
@@ -68,7 +77,7 @@ def _shown(step: Step, star: str) -> Star | tuple[bool, ...] | None:
 
 
 def _agree(first: Star | tuple[bool, ...] | None, second: Star | tuple[bool, ...] | None) -> bool:
-    """Whether two sights may be of one place."""
+    """Whether two steps that show these stars may be at one place."""
     if isinstance(first, Star) and isinstance(second, Star):
         return _may_fit(first, second)
     return first == second

@@ -11,10 +11,11 @@
 >>> sketch.map().labels
 (0, 1, 2, 3, 0)
 
-Such a map is a *sketch*, and it is a tree of paths. A travel leads to a new place, or back along
-its path to the place that the robot came from. So two paths share at most one place. The places on
-a branch lie on no path that the branch leaves. Therefore the axioms of order and sides hold. Within
-a place, the axioms of turns, courses and headings determine which dstates are one.
+Such a map is a *sketch*, and its paths make a tree. A travel leads to a new place, or back along
+its path to the place that the robot came from. So two paths share at most one place. If a path
+branches off from another one, the places of the branch are not on that other path. Therefore the
+axioms of order and sides hold. Within a place, the axioms of turns, courses and headings determine
+which dstates are one.
 
 If a travel comes back to a place, but the step there contradicts what was seen there, the travel
 leads to a new place instead. If a later step contradicts a known dstate, the sketch fails. A sketch
@@ -25,8 +26,8 @@ A sketch may have frames, numbered directions at each place, even if the theory 
 adds axioms.
 
 A sketch may also begin with a map of some steps, and grow like a tree from there. New dstates lie
-on new paths, or on one known path, and contradict nothing. Three cases are exceptions, and the
-sketch does not know whether it is consistent then:
+on new paths, or on one known path, and contradict nothing. In three cases the sketch does not know
+whether it is still consistent:
 
 - A turn is the first one that shows how two known paths cross. That has to fit all their places.
 - Without frames, a turn leads from a dstate to itself. Then the dstate can be on no path.
@@ -85,8 +86,8 @@ class Sketch:
 
     Attributes:
         labels: The dstate of each step.
-        certain: Whether the map is known to be consistent. If it is False, the caller has to check
-            the map, and may then set it to True.
+        certain: Whether the map is known to be consistent. If not, the caller has to check the map.
+            If the map is consistent, the caller may then set `certain` to True.
     """
 
     def __init__(
@@ -134,7 +135,7 @@ class Sketch:
             ssh_map: The map. It has to satisfy all axioms.
             trace: The trace of the map.
             theory: The theory.
-            homing: As for any sketch.
+            homing: Whether a travel may lead back to the place that the robot came from.
         """
         sketch = cls(trace.steps[0], theory, homing)
         sketch._map, sketch._tree, sketch.labels = ssh_map, False, list(ssh_map.dstate_at)
@@ -171,7 +172,8 @@ class Sketch:
         """Add an action and the step after it.
 
         Returns:
-            False if they contradict the sketch. Then it cannot be used any more.
+            True if the sketch has grown. False if the action or the step contradicts it; then the
+            sketch cannot be used any more.
         """
         here = self.labels[-1]
         there = self._links.get((here, action.name))
@@ -194,7 +196,7 @@ class Sketch:
         return self._map
 
     def _untried(self, here: int, action: Action, step: Step) -> int:
-        """Decide where an action leads that has no link yet, and return the dstate there."""
+        """Decide where an action without a link leads, and return the dstate there."""
         if self._theory.level == "causal":
             return self._new(step, 0, 0)
         if action.leaves_paths:
@@ -204,7 +206,7 @@ class Sketch:
         return self._turn(here, action, step)
 
     def _turn(self, here: int, action: Action, step: Step) -> int:
-        """Decide where a turn leads that has no link yet, and return the dstate there."""
+        """Decide where a turn without a link leads, and return the dstate there."""
         s = self._states[here]
         around = action.turn == "around"
         heading = (s.heading + QUARTERS[action.turn]) % 4
@@ -243,7 +245,7 @@ class Sketch:
                     self._set_course(x, s.path, -s.direction)
 
     def _travel(self, here: int, step: Step) -> int:
-        """Decide where a travel leads that has no link yet, and return the dstate there."""
+        """Decide where a travel without a link leads, and return the dstate there."""
         path, direction = self._find_course(here)
         place, order = self._states[here].place, self._orders[path]
         position = order.index(place)
@@ -261,15 +263,16 @@ class Sketch:
         return there
 
     def _known_ahead(self, place: int, path: int, direction: int, step: Step) -> int | None:
-        """Return the dstate at which a travel ends if it leads to a known place.
-
-        None if the step contradicts what was seen at that place.
+        """Return the dstate at which a travel to a known place ends.
 
         Args:
             place: The place.
             path: The path of the travel.
             direction: The direction along the path.
             step: The step after the travel.
+
+        Returns:
+            The dstate; None if the step contradicts what was seen at the place.
         """
         there = self._along.get((place, path, direction))
         heading = 0
@@ -360,11 +363,7 @@ class Sketch:
             raise _Contradiction
 
     def _made(self, labels: tuple[int, ...]) -> SSHMap:
-        """Build the map.
-
-        Args:
-            labels: The dstate of each step.
-        """
+        """Build the map of all steps, with the dstate of each step as `labels`."""
         links = tuple(sorted((s, action, x) for (s, action), x in self._links.items()))
         if self._theory.level == "causal":
             return SSHMap(

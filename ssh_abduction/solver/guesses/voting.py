@@ -1,8 +1,9 @@
 """Finds wrong views and stars by merging visits to groups, in which the majority is right.
 
 A star is the openings that are seen at a step. A visit is the steps between two travels. This is
-for places with frames, so the directions at a place are numbered: the slots. A place is a group of
-visits, each turned by some quarters (right angles).
+for places with frames: the directions at a place, its slots, are numbered. A group of visits stands
+for a place. Each visit of the group is turned by some quarters (right angles), so that its slots
+become those of the place.
 
 A group costs its dstates, plus the cost of each view and star that differs from the majority of its
 steps. Groups are merged while that lowers the total cost, those with the largest gain first. If two
@@ -35,7 +36,8 @@ from ssh_abduction.theory.theory import Theory
 MOST_PAIRS = 60_000
 DSTATE = 10  # cost of a dstate, in tenths
 
-# A visit or a group, and a number of quarters: its slot K is slot K + quarters of the place.
+# A visit or a group, and a number of quarters: slot K of the visit or group is slot K + quarters of
+# the place.
 _Turned = tuple[int, int]
 
 
@@ -44,9 +46,9 @@ class _Visit:
     """The steps between two travels.
 
     Attributes:
-        steps: The steps, each with the slot that it faces. The robot faces slot 0 when it arrives.
-        leaves: The slot at which the visit ends and the name of the action that ends it; None for
-            the last visit of a drive, and if that action slipped.
+        steps: Pairs (step, slot that it faces). The robot faces slot 0 when it arrives.
+        leaves: The slot that the robot faces at the end of the visit, and the name of the action
+            that ends it. None for the last visit of a drive, and if that action slipped.
     """
 
     steps: tuple[tuple[int, int], ...]
@@ -58,7 +60,8 @@ class _Group:
 
     Attributes:
         members: For each visit, the quarters by which it is turned.
-        views: For each slot and view, the cost of treating it as wrong at all steps that show it.
+        views: For each slot and view, the cost of treating the view as wrong at all steps that show
+            it there, in tenths of dstates.
         stars: The same cost for each star, as seen from slot 0.
         cost: The cost of the dstates and of all outvoted views and stars, in tenths of dstates.
     """
@@ -77,7 +80,7 @@ class _Group:
         """Make the union of groups.
 
         Args:
-            parts: Each group, and the further quarters by which to turn its visits.
+            parts: Pairs of a group, and the quarters by which to turn its visits further.
         """
         members: dict[int, int] = {}
         views: dict[int, Counter[View]] = {}
@@ -147,7 +150,7 @@ class Merging:
                 gain, joined = self._gain(*pair)
                 if gain <= 0:
                     continue
-                # The gain may have dropped since the pair was put into the queue.
+                # Merges may have lowered the gain since the pair was put into the queue.
                 if waiting and gain < -waiting[0][0]:
                     heapq.heappush(waiting, (-gain, pair))
                     continue
@@ -192,6 +195,7 @@ class Merging:
         return self._groups[self._group_of[visit]].members[visit]
 
     def _of_visit(self, number: int) -> _Group:
+        """Make the group that consists of one visit."""
         views: dict[int, Counter[View]] = {}
         stars: Counter[Openings] = Counter()
         for t, slot in self.visits[number].steps:
@@ -212,8 +216,8 @@ class Merging:
             pairs: Pairs of steps that evidence says are different.
 
         Returns:
-            An array (4, visits, visits). Element [R, I, J] says that I and J cannot be at one place
-            with slot K of I at slot K + R of J.
+            An array (4, visits, visits). Element [R, I, J] says that visits I and J cannot be at
+            one place such that slot K of I is slot K + R of J.
         """
         count = len(self.visits)
         misfits = np.zeros((4, count, count), dtype=bool)
@@ -250,7 +254,7 @@ class Merging:
         return list(zip(some[first].tolist(), some[second].tolist(), turns.tolist(), strict=True))
 
     def _beside(self, visit: int, other: int, turn: int) -> list[_Turned]:
-        """Find how to turn the group of another visit so that it joins the group of this visit.
+        """Find how to turn the group of another visit before it is merged with that of this visit.
 
         Args:
             visit: This visit.
@@ -278,10 +282,11 @@ class Merging:
             turn: Slot K of the first visit shall be slot K + turn of the second.
 
         Returns:
-            The gain in tenths of dstates, and a list for each merge of the groups to merge, with
+            The gain in tenths of dstates; and for each merge a list of the groups to merge, with
             their quarters. Zero and an empty list if the groups cannot be one place.
         """
-        # For each group, all groups that become one place with it, and the quarters of each.
+        # For each group, the groups that become one place with it, and how many quarters to turn
+        # each of them.
         together: dict[int, dict[int, int]] = {}
         work = [(first, second, turn)]
         while work:
@@ -314,7 +319,7 @@ class Merging:
     def _follow(
         self, mine: Mapping[int, int], its: Mapping[int, int], shift: int
     ) -> list[tuple[int, int, int]]:
-        """List the visits to merge next, as the same action leads to them from the same slot.
+        """List the pairs of visits to merge next: one action leads to both from the same slot.
 
         Args:
             mine: Groups that become one place, with their quarters.
@@ -328,13 +333,23 @@ class Merging:
         return [(leads[key], there, 0) for key, there in self._leads(its, shift) if key in leads]
 
     def _leads(self, parts: Mapping[int, int], shift: int) -> Iterator[tuple[tuple[int, str], int]]:
+        """Yield where actions lead from a place: pairs ((slot, action), next visit).
+
+        Args:
+            parts: The groups that become this place, with their quarters.
+            shift: Further quarters by which all of them are turned.
+        """
         for x, t in parts.items():
             for visit, turn in self._groups[x].members.items():
                 if (leaves := self.visits[visit].leaves) is not None:
                     yield ((leaves[0] + turn + t + shift) % 4, leaves[1]), visit + 1
 
     def _merge(self, parts: Sequence[_Turned]) -> None:
-        """Merge groups, each with the quarters by which it is turned, into the first of them."""
+        """Merge groups into the first of them.
+
+        Args:
+            parts: Pairs of a group and the quarters by which to turn it.
+        """
         (kept, by), *others = parts
         whole = _Group.joined([(self._groups[x], (t - by) % 4) for x, t in parts])
         for x, t in others:
@@ -362,7 +377,7 @@ def _visits(trace: Trace) -> Iterator[_Visit]:
 
 
 def _outvoted(votes: Counter[Any]) -> int:
-    """Return the sum of all votes but those for the winner."""
+    """Return the sum of the votes for all options except the winner."""
     return sum(votes.values()) - max(votes.values())
 
 
@@ -372,6 +387,6 @@ def _winner(votes: Counter[Any]) -> Any:
 
 
 def _turned(star: Openings, quarters: int) -> Openings:
-    """Return a star as seen from a heading that is some quarters further to the left."""
+    """Turn a star clockwise by some quarters: opening K becomes opening K + quarters."""
     ahead, right, back, left = (star[(k - quarters) % 4] for k in range(4))
     return ahead, right, back, left
