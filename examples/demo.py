@@ -46,7 +46,7 @@ def main() -> None:
     main_of_the_shell(
         ["simulate", "doors", "--format", "carmen", "--set", "every=0.5", "-o", str(log)]
     )
-    main_of_the_shell(["map", str(log), "-o", str(folder / "house"), "--again"])
+    main_of_the_shell(["map", str(log), "-o", str(folder / "house"), "--set", "again=true"])
     print(f"look at {folder / 'house' / 'report.html'}")
 
 

@@ -47,9 +47,9 @@ INTERRUPTED = 130  # the exit code after Ctrl-C
 THEORIES = {
     "as it suits": [],
     "stars and sides": ["--theory", "topological"],
-    "no stars": ["--theory", "topological", "--star", "none"],
+    "no stars": ["--theory", "topological", "--set", "star=none"],
     "no sides": ["--theory", "topological", "--set", "boundary=none"],
-    "no stars, no sides": ["--star", "none", "--set", "boundary=none"],
+    "no stars, no sides": ["--set", "star=none", "--set", "boundary=none"],
     "planar": ["--set", "planar=true"],
     "next place": ["--set", "next_place=true"],
     "one return at a time": ["--set", "joint=1"],

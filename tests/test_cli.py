@@ -110,8 +110,8 @@ def test_every_field_of_a_theory_is_a_flag(
         *(
             "--set",
             "all_on_paths=false",
-            "--star",
-            "pattern",
+            "--set",
+            "star=pattern",
             "--set",
             "prefer=places,excuses",
             "--set",

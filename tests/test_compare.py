@@ -524,7 +524,7 @@ def test_causal_maps_and_maps_with_faults() -> None:
 def test_larger_maps_are_told_from_minimal_ones(
     file_of: Callable[..., Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = file_of(ACES3, "-n", "0", "--within", "3")
+    path = file_of(ACES3, "-n", "0", "--set", "within=3")
     assert main(["compare", str(path)]) == 0
     printed = capsys.readouterr().out
     assert printed.startswith("4 minimal maps, and 7 larger ones: ")

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 
 import pytest
 
 import ssh_abduction
 from ssh_abduction import OnlineMapper, Theory, Trace, solve
-from ssh_abduction.cli import main
+from ssh_abduction.cli import main, parser
 
 ACES = str(Path(__file__).parent.parent / "examples" / "aces3-route.jsonl")
 TRACE = Trace.from_steps("aba", ["travel", "travel"])
@@ -56,6 +57,44 @@ def test_old_flags_work(
     said = capsys.readouterr()
     assert said.out.splitlines()[1:] == expected
     assert f"is deprecated; write {' '.join(new[2:])}" in said.err
+
+
+@pytest.mark.parametrize(
+    ("verb", "old", "new"),
+    [
+        ("solve", "--star=frame", "star=frame"),
+        ("solve", "--misread 1.5", "misread=1.5"),
+        ("check maps.json", "--slipped 3", "slipped=3"),
+        ("facts", "--rules a.lp", "rules=a.lp"),
+        ("solve", "--within 2", "within=2"),
+        ("solve --together", "--joint-trace all.jsonl", "joint_trace=all.jsonl"),
+        ("map -o out", "--again", "again=true"),
+        ("map -o out", "--fov -180", "fov=-180"),
+        ("export --to svg", "--level places", "level=places"),
+        ("export --to nav2", "--hide-undecided", "hide_undecided=true"),
+        ("evaluate maps.json", "--relations near.txt", "relations=near.txt"),
+        ("simulate -o drive.jsonl", "--images panoramas", "images=panoramas"),
+    ],
+)
+def test_flags_that_are_settings_now_mean_the_same(verb: str, old: str, new: str) -> None:
+    before = parser().parse_args([*verb.split(), "file", *old.split()])
+    after = parser().parse_args([*verb.split(), "file", "--set", new])
+    (note,) = vars(before).pop("notes")
+    assert vars(after).pop("notes") == ()
+    assert before == after
+    assert note.endswith(f"is deprecated; write --set {new}")
+
+
+def test_the_flags_are_few() -> None:
+    flags = {
+        name
+        for each in (parser(), *parser().verbs.values())
+        for action in each._actions
+        if action.help != argparse.SUPPRESS
+        for name in action.option_strings
+        if name.startswith("--")
+    }
+    assert len(flags) <= 50, sorted(flags)
 
 
 def test_maps_of_version_0_1_0_are_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

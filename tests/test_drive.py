@@ -555,8 +555,8 @@ def test_a_bag_says_what_its_odometry_is_worth(tmp_path: Path) -> None:
             "stars=false: expected none beside --format",
         ),
         (
-            ["triangle", "--format", "carmen", "--images", "panoramas"],
-            "--images panoramas: expected none beside --format",
+            ["triangle", "--format", "carmen", "--set", "images=panoramas"],
+            "images=panoramas: expected none beside --format",
         ),
         (
             ["triangle", "--format", "carmen", "--set", "hours=7,19"],

@@ -233,13 +233,15 @@ def test_a_wrong_field_of_view_is_said_with_the_likely_one(
 ) -> None:
     """The true one is 180 degrees."""
     said = doubt(tuple(Told(fov=fov).placed(scan) for scan in coarse))
-    (about,) = map(float, re.findall(rf"cover about (\d+) degrees, not {fov:.0f} \(--fov\)", said))
+    (about,) = map(
+        float, re.findall(rf"cover about (\d+) degrees, not {fov:.0f} \(--set fov\)", said)
+    )
     assert about == pytest.approx(180, abs=5)
     assert re.search(r"\d+ m by scans, \d+ m by odometry; turns by scans are \d\.\d\d times", said)
 
 
 def test_a_laser_that_hangs_upside_down_is_said(coarse: tuple[Scan, ...]) -> None:
-    assert "--fov 180" in doubt(tuple(Told(fov=-180).placed(scan) for scan in coarse))
+    assert "--set fov=180" in doubt(tuple(Told(fov=-180).placed(scan) for scan in coarse))
 
 
 @pytest.mark.parametrize("angle", [-90.0, 60.0])
@@ -289,8 +291,8 @@ def test_both_verbs_show_all_notes_and_take_the_same_options(
                 verb,
                 str(path),
                 *out,
-                "--fov",
-                "180",
+                "--set",
+                "fov=180",
                 "--set",
                 "no_return=5",
                 "--set=mount=0,0,0",
@@ -321,17 +323,17 @@ def test_a_field_of_view_that_a_log_does_not_say_is_noted(
         ]
         path.write_text("\n".join(lines) + "\n")
         for told, here in ({}, is_noted), ({"fov": 150.0}, False):
-            assert any("--fov" in note for note in read_log(path, **told).notes) == here  # type: ignore[arg-type]
+            assert any("--set fov" in note for note in read_log(path, **told).notes) == here  # type: ignore[arg-type]
     assert read_log(path, fov=90).scans[0].laser.step * 150 == pytest.approx(math.pi / 2)
     write_carmen(path, drive)
-    assert not any("--fov" in note for note in read_log(path).notes)
+    assert not any("--set fov" in note for note in read_log(path).notes)
 
 
 @pytest.mark.parametrize(
     "words",
     [
-        ["--fov", "0"],
-        ["--fov", "x"],
+        ["--set", "fov=0"],
+        ["--set", "fov=x"],
         ["--set", "mount=1,2"],
         ["--set", "no_return=-1"],
         ["--set", "zero_is=wall"],

@@ -231,7 +231,10 @@ def test_nodes_at_one_position_are_told(
 ) -> None:
     file = f"{tmp_path}/map.json"
     (square if theory == "topological" else causal_pair()).save(file)
-    assert main(["export", file, "--to", to, *([] if level is None else ["--level", level])]) == 0
+    assert (
+        main(["export", file, "--to", to, *([] if level is None else ["--set", f"level={level}"])])
+        == 0
+    )
     said = capsys.readouterr().err
     assert re.search(doubt, said) if doubt else said == ""
 
@@ -375,9 +378,9 @@ def test_undecided_places_are_hidden_and_their_roads_joined(
     assert costs[0, 2] == costs[2, 0] == pytest.approx(20, abs=0.1)
     assert costs[2, 3] == pytest.approx(10, abs=0.1)
     square.save(file := f"{tmp_path}/map.json")
-    assert main(["export", file, "--to", "tmap2", "--hide-undecided"]) == 0
+    assert main(["export", file, "--to", "tmap2", "--set", "hide_undecided=true"]) == 0
     assert len(checked_tmap2(capsys.readouterr().out)["nodes"]) == 3
-    assert main(["export", file, "--to", "svg", "--hide-undecided"]) == 1
+    assert main(["export", file, "--to", "svg", "--set", "hide_undecided=true"]) == 1
     assert "expected nav2 or tmap2 with places, got svg" in capsys.readouterr().err
     assert len(square.places) == 4
 

@@ -348,12 +348,25 @@ def test_in_the_shell(
     monkeypatch.chdir(tmp_path)
     RECTANGLE.save("trace.jsonl")
     assert (
-        main(["solve", "trace.jsonl", "--theory", "causal", "--misread", "1.5", "--slipped", "3"])
+        main(
+            [
+                "solve",
+                "trace.jsonl",
+                "--theory",
+                "causal",
+                "--set",
+                "misread=1.5",
+                "--set",
+                "slipped=3",
+            ]
+        )
         == 0
     )
     said = capsys.readouterr().out
     assert "4 dstates, and the view at step 9 is misread: v0, expected v1" in said
-    assert main(["solve", "trace.jsonl", "--theory", "causal", "--misread", "1.5", "--json"]) == 0
+    assert (
+        main(["solve", "trace.jsonl", "--theory", "causal", "--set", "misread=1.5", "--json"]) == 0
+    )
     text = capsys.readouterr().out
     Path("maps.json").write_text(text)
     answer = json.loads(text)
@@ -490,7 +503,7 @@ def test_the_front_in_the_shell(
     monkeypatch.chdir(tmp_path)
     RECTANGLE.save("trace.jsonl")
     assert (
-        main(["solve", "trace.jsonl", "--front", "2", "--theory", "causal", "--misread", "1.5"])
+        main(["solve", "trace.jsonl", "--front", "2", "--theory", "causal", "--set", "misread=1.5"])
         == 0
     )
     said = capsys.readouterr().out
@@ -503,7 +516,18 @@ def test_the_front_in_the_shell(
     assert main(["solve", "trace.jsonl", "--front", "2", "--theory", "topological"]) == 1
     assert "expected a causal theory" in capsys.readouterr().err
     assert (
-        main(["solve", "trace.jsonl", "--theory", "causal", "--misread", "1.5", "--within", "1"])
+        main(
+            [
+                "solve",
+                "trace.jsonl",
+                "--theory",
+                "causal",
+                "--set",
+                "misread=1.5",
+                "--set",
+                "within=1",
+            ]
+        )
         == 1
     )
     assert "within: expected 0 where faults are allowed" in capsys.readouterr().err

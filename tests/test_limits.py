@@ -150,7 +150,7 @@ def test_rules_of_ones_own_that_are_too_large_end_with_the_limit(
         "ssh_abduction",
         "solve",
         str(noisy),
-        f"--rules={rules}",
+        f"--set=rules={rules}",
         "--time-limit=0.3",
         "--json",
     ]

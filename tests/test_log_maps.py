@@ -221,10 +221,10 @@ def test_a_run_is_done_once_and_bad_logs_do_not_stop_the_others(
     [
         ([], "none", "none"),
         (["--theory", "topological"], "auto", "strict"),
-        (["--star", "auto", "--set", "boundary=strict"], "auto", "strict"),
-        (["--star", "auto"], "auto", "none"),
-        (["--misread", "1.5"], "none", "none"),
-        (["--theory", "topological", "--star", "none"], "none", "strict"),
+        (["--set", "star=auto", "--set", "boundary=strict"], "auto", "strict"),
+        (["--set", "star=auto"], "auto", "none"),
+        (["--set", "misread=1.5"], "none", "none"),
+        (["--theory", "topological", "--set", "star=none"], "none", "strict"),
         (["--set", "level=causal"], "none", "none"),
     ],
 )

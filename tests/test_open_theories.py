@@ -458,7 +458,7 @@ def test_characters_that_end_clingo_are_refused(
     solve(Trace.from_steps("aa", ["travel"])).maps[0].save(tmp_path / "map.json")
     known = str(tmp_path / "map.json")
     for verb, *maps in (["solve"], ["explain"], ["ladder"], ["next", known], ["check", known]):
-        assert main([verb, str(trace), *maps, "--rules", str(path)]) == 1
+        assert main([verb, str(trace), *maps, "--set", f"rules={path}"]) == 1
         assert re.search(message, capsys.readouterr().err)
     with pytest.raises(TheoryError, match=message):
         Theory.causal().replace(rules=[path])

@@ -152,7 +152,7 @@ def test_no_name_is_no_file(words: str, capsys: pytest.CaptureFixture[str]) -> N
         "train x y -o=--",
         "learning-curve x y --set folds=--",
         "show x --map=--",
-        "solve x --rules=--",
+        "solve x --set=rules=--",
         "check x y --set prefer=--",
     ],
 )

@@ -261,7 +261,7 @@ def test_panoramas_in_the_shell(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     drive = (
-        "simulate notched-rectangle --tours 2 --images panoramas --set textures=repeated --set "
+        "simulate notched-rectangle --tours 2 --set images=panoramas --set textures=repeated --set "
         "paint_seed=5 --set hours=8,18 --set stars=false"
     )
     assert main([*drive.split(), "-o", "run.jsonl"]) == 0
@@ -288,14 +288,14 @@ def test_panoramas_in_the_shell(
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ("--set hours=7,19", "hours: expected --images panoramas beside it"),
-        ("--set textures=unique", "textures: expected --images panoramas beside it"),
+        ("--set hours=7,19", "hours: expected --set images=panoramas beside it"),
+        ("--set textures=unique", "textures: expected --set images=panoramas beside it"),
         (
-            "--images panoramas --set hours=noon",
+            "--set images=panoramas --set hours=noon",
             "hours: expected two hours with a comma between them, as 7,19, got 'noon'",
         ),
         (
-            "--images panoramas --set hours=7,nan",
+            "--set images=panoramas --set hours=7,nan",
             "camera.hours: expected a number from 0 to 24, got nan",
         ),
     ],

@@ -316,7 +316,14 @@ def test_steps_are_named_by_their_drives(
         trace.save(tmp_path / f"{trace.name}.jsonl")
     files = [str(tmp_path / f"{name}.jsonl") for name in ("monday", "tuesday")]
     joint = str(tmp_path / "joint.jsonl")
-    options = ["--together", "--joint-trace", joint, "--json", "--different", "monday:1,tuesday:0"]
+    options = [
+        "--together",
+        "--set",
+        f"joint_trace={joint}",
+        "--json",
+        "--different",
+        "monday:1,tuesday:0",
+    ]
     assert main(["solve", *files, *options]) == 0
     assert json.loads(capsys.readouterr().out)["theory"]["different"] == [[1, 4]]
     assert main(["explain", joint, "monday:1", "tuesday:0", "--json"]) == 0
@@ -328,8 +335,8 @@ def test_steps_are_named_by_their_drives(
     ):
         assert main(["explain", joint, "0", name]) == 1
         assert said in capsys.readouterr().err
-    assert main(["solve", files[0], "--joint-trace", joint]) == 1
-    assert "--joint-trace: expected --together" in capsys.readouterr().err
+    assert main(["solve", files[0], "--set", f"joint_trace={joint}"]) == 1
+    assert "joint_trace: expected --together" in capsys.readouterr().err
 
 
 # Mazes that the beam was not made for: those of seeds 20 to 23 were looked at.

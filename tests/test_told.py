@@ -200,7 +200,7 @@ def test_a_view_cannot_steer_the_terminal_by_the_log(
         ("localse maps.json x", "localise"),
         ("solve trace.jsonl --tme-limit 5", "--time-limit"),
         ("solve trace.jsonl --tme-limit=5", "--time-limit"),
-        ("solve trace.jsonl --star gateway", "gateways"),
+        ("solve trace.jsonl --set star=gateway", "gateways"),
         ("export maps.json --to grapml", "graphml"),
         ("completion bsh", "bash"),
     ],
@@ -214,7 +214,8 @@ def test_what_was_perhaps_meant_is_named(
 
 
 @pytest.mark.parametrize(
-    "words", ["frobnicate", "solve trace.jsonl --xyzzy", "solve a b --star \x1b[2J", "check a b c"]
+    "words",
+    ["frobnicate", "solve trace.jsonl --xyzzy", "solve a b --set star=\x1b[2J", "check a b c"],
 )
 def test_what_is_near_nothing_is_no_question(
     words: str, capsys: pytest.CaptureFixture[str]
@@ -242,7 +243,7 @@ def test_completions_know_every_verb_and_its_options(
     [
         ("sol", ["solve"]),
         ("solve --time", ["--time-limit"]),
-        ("solve --star f", ["frame"]),
+        ("route --by m", ["metres"]),
         ("solve exa", ["example.jsonl"]),
     ],
 )

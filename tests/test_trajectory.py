@@ -291,8 +291,8 @@ def test_a_trajectory_is_no_file_of_relations(
                 [
                     "evaluate",
                     *(str(tmp_path / name) for name in ("map.json", "trace.jsonl")),
-                    "--relations",
-                    str(tmp_path / "relations"),
+                    "--set",
+                    f"relations={tmp_path / 'relations'}",
                 ]
             )
             == 1

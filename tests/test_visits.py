@@ -197,8 +197,8 @@ def test_relations_judge_where_poses_are_missing(
         "evaluate",
         str(tmp_path / "map.json"),
         str(tmp_path / "trace.jsonl"),
-        "--relations",
-        str(tmp_path / "relations"),
+        "--set",
+        f"relations={tmp_path / 'relations'}",
     ]
     assert main([*arguments, "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {"count": 1, "relations": found.to_dict()}
@@ -236,8 +236,8 @@ def test_relations_of_another_log_are_noticed(
             [
                 "evaluate",
                 *(str(tmp_path / name) for name in ("map.json", "trace.jsonl")),
-                "--relations",
-                str(tmp_path / "relations"),
+                "--set",
+                f"relations={tmp_path / 'relations'}",
             ]
         )
         == 0

@@ -168,16 +168,16 @@ def test_more_dstates_than_steps_are_not_asked_for() -> None:
 @pytest.mark.parametrize("within", [-1, 1.5, True, "2", None])
 def test_a_wrong_within_is_an_error(within: object) -> None:
     with pytest.raises(
-        SolverError, match=r"within \(--within\): expected a whole number, 0 or more, got"
+        SolverError, match=r"within \(--set within=K\): expected a whole number, 0 or more, got"
     ):
         solve(Trace.from_steps("a", []), within=within)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
 def near() -> dict[str, Any]:
-    """What `solve --within 3 --json` prints of the real route."""
+    """What `solve --set within=3 --json` prints of the real route."""
     with contextlib.redirect_stdout(io.StringIO()) as printed:
-        assert main(["solve", ACES3, "--within", "3", "--json"]) == 0
+        assert main(["solve", ACES3, "--set", "within=3", "--json"]) == 0
     return dict(json.loads(printed.getvalue()))
 
 

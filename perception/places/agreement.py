@@ -160,13 +160,13 @@ def disagreement(log: RobotLog, track: Track) -> str | None:
         differences.append(f"turns by scans are {found.turning:.2f} times those by odometry")
         if found.turning < 0:
             causes.append(
-                f"the laser hangs upside down (--fov {-math.copysign(fov, laser.step):.0f})"
+                f"the laser hangs upside down (--set fov={-math.copysign(fov, laser.step):.0f})"
             )
             covers = None
         elif covers is None and fov / found.turning <= 360:
             covers = fov / found.turning
     if covers is not None:
-        causes.append(f"its beams cover about {covers:.0f} degrees, not {fov:.0f} (--fov)")
+        causes.append(f"its beams cover about {covers:.0f} degrees, not {fov:.0f} (--set fov)")
     if found.is_askew:
         degrees, side = abs(math.degrees(found.angle)), "left" if found.angle > 0 else "right"
         differences.append(
@@ -186,7 +186,7 @@ def disagreement(log: RobotLog, track: Track) -> str | None:
                 "zero_is)"
             ),
             "the laser sits or looks elsewhere on the robot (--set mount)",
-            "its field of view is another (--fov)",
+            "its field of view is another (--set fov)",
         ]
     causes.append("the odometer jumps, slips or is out of scale")
     if found.parted:

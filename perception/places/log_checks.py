@@ -237,7 +237,7 @@ def _causes(log: RobotLog) -> str:
         )
     return (
         "put the scans into the order of the drive, and check the unit of the odometry and the "
-        "direction of the beams (--fov, --set mount)"
+        "direction of the beams (--set fov, --set mount)"
     )
 
 

@@ -169,7 +169,7 @@ def read(
     if kind == "FLASER" and "fov" not in found.parameters and survey.beams not in HALF_A_CIRCLE:
         assumed["fov"] = (
             f"The log does not say how wide the laser looks: its {survey.beams} beams are "
-            "taken to cover 180 degrees. If they cover more or less, say so: --fov DEGREES."
+            "taken to cover 180 degrees. If they cover more or less, say so: --set fov=DEGREES."
         )
     items = _scans(file, source, _Odometer(found, meaning, is_corrected), kind, mount, reach)
     return Reading("g2o" if found.graph.vertices else "carmen", tuple(notes), items, assumed)

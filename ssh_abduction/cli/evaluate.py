@@ -63,13 +63,13 @@ def add_parser(verbs: Verbs) -> None:
         type=float,
         metavar="METRES",
     )
-    parser.add_argument(
-        "--relations",
-        metavar="FILE",
-        help=(
+    parser.add_setting(
+        "relations",
+        (
             "also judge by hand-checked relative poses in this file: lines of time1 time2 x y z "
             "roll pitch yaw"
         ),
+        metavar="FILE",
     )
     parser.add_argument(
         "--truth",

@@ -6,6 +6,7 @@ import argparse
 import sys
 
 from ssh_abduction.cli.options import Verbs, add_map
+from ssh_abduction.cli.parsing import true_or_false
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.trace import Trace
 
@@ -28,25 +29,9 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_argument("--to", required=True, choices=FORMATS, help="the format to write")
     add_map(parser)
     parser.add_argument(
-        "--level",
-        choices=("places", "dstates"),
-        help=(
-            "what a node is: a place or a dstate (default: places for nav2 and tmap2 if the map "
-            "has places, else dstates)"
-        ),
-    )
-    parser.add_argument(
         "--trace",
         metavar="TRACE",
         help=("the trace that was mapped; its turns give a better layout of a map without poses"),
-    )
-    parser.add_argument(
-        "--hide-undecided",
-        action="store_true",
-        help=(
-            "leave out the places where the robot always went on, between the same two neighbours "
-            "(nav2 and tmap2 only)"
-        ),
     )
     parser.add_argument(
         "-o",
@@ -54,6 +39,24 @@ def add_parser(verbs: Verbs) -> None:
         default="-",
         metavar="FILE",
         help="file to write (default: standard output)",
+    )
+    parser.add_setting(
+        "level",
+        (
+            "what a node is: a place or a dstate (default: places for nav2 and tmap2 if the map "
+            "has places, else dstates)"
+        ),
+        choices=("places", "dstates"),
+    )
+    parser.add_setting(
+        "hide_undecided",
+        (
+            "whether to leave out the places where the robot always went on, between the same two "
+            "neighbours (nav2 and tmap2 only; default: false)"
+        ),
+        default=False,
+        type=true_or_false,
+        metavar="true|false",
     )
     parser.add_setting(
         "name",

@@ -61,15 +61,6 @@ def add_reading(parser: Parser) -> None:
         "--format", choices=FORMATS, help="format of the log (default: guessed from its content)"
     )
     group.add_argument(
-        "--fov",
-        type=partial(_told, "fov"),
-        metavar="DEGREES",
-        help=(
-            "the angle from the first to the last beam of the laser; negative for a laser mounted "
-            "upside down (default: from the log, else 180)"
-        ),
-    )
-    group.add_argument(
         "--width",
         type=metres,
         metavar="METRES",
@@ -77,6 +68,15 @@ def add_reading(parser: Parser) -> None:
             "width of the robot. Narrower parts of the free space are no ways for it (default: "
             f"{WIDTH:g})"
         ),
+    )
+    parser.add_setting(
+        "fov",
+        (
+            "the angle from the first to the last beam of the laser; negative for a laser mounted "
+            "upside down (default: from the log, else 180)"
+        ),
+        type=partial(_told, "fov"),
+        metavar="DEGREES",
     )
     parser.add_setting(
         "scan_topic",

@@ -65,8 +65,12 @@ def add_parser(verbs: Verbs) -> None:
         type=true_or_false,
         metavar="true|false",
     )
-    parser.add_argument(
-        "--again", action="store_true", help="also map logs that are already mapped"
+    parser.add_setting(
+        "again",
+        "whether to map also logs that are already mapped (default: false)",
+        default=False,
+        type=true_or_false,
+        metavar="true|false",
     )
     many = parser.add_argument_group("many logs")
     many.add_argument(

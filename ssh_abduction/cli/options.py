@@ -21,9 +21,10 @@ from ssh_abduction.theory.fields import ASSERTIONS, CHOICES
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import PRESETS, SETTLED, Theory
 
-# The fields of a theory that have their own option. All other fields are settings (--set).
-PRICES = ("misread", "slipped")
-FLAGS = ("star", *PRICES, "rules", *ASSERTIONS)
+RULES = (
+    "a file of your own rules for clingo, written with the predicates of the encodings; may be "
+    "given again"
+)
 
 Verbs = Any  # the return type of argparse's add_subparsers is private
 
@@ -36,25 +37,13 @@ def add_theory(parser: Parser, default: str = "topological") -> None:
         default: The words of the help for the theory that is used if the user names none.
     """
     group = parser.add_argument_group("theory", "A preset or a file, with single choices changed")
-    said = helps()
+    said = {**helps(), "rules": RULES}
     group.add_argument(
         "--theory",
         metavar="PRESET|FILE",
         help=(
             f"a preset: {', '.join(PRESETS)}; or a .toml file with fields of a theory; or a file "
             f"of maps, to use their theory (default: {default})"
-        ),
-    )
-    group.add_argument("--star", choices=CHOICES["star"], help=said["star"])
-    for name in PRICES:
-        group.add_argument(f"--{name}", type=float, metavar="DSTATES", help=said[name])
-    group.add_argument(
-        "--rules",
-        action="append",
-        metavar="FILE",
-        help=(
-            "add a file of your own rules for clingo, written with the predicates of the "
-            "encodings; may be given again"
         ),
     )
     for name, text in (
@@ -73,10 +62,12 @@ def add_theory(parser: Parser, default: str = "topological") -> None:
             ),
         )
     for field in fields(Theory):
-        if field.name in FLAGS or field.name in SETTLED:
+        if field.name in ASSERTIONS or field.name in SETTLED:
             continue
         details: dict[str, Any] = {"metavar": "NAMES"}
-        if field.name in CHOICES:
+        if field.name == "rules":
+            details = {"metavar": "FILE", "many": True}
+        elif field.name in CHOICES:
             details = {"choices": CHOICES[field.name]}
         elif isinstance(field.default, bool):
             details = {"type": true_or_false, "metavar": "true|false"}
@@ -298,7 +289,7 @@ def flags_of(theory: Theory, trace: Trace | None = None) -> list[str]:
         if value == getattr(default, field.name) or field.name in ("level", *SETTLED):
             continue
         if field.name == "rules":
-            flags += [part for rules in value for part in ("--rules", rules.name)]
+            flags += [part for rules in value for part in ("--set", f"rules={rules.name}")]
         elif field.name in ASSERTIONS:
             flag = f"--{field.name.replace('_', '-')}"
             flags += [part for i, j in value for part in (flag, f"{i},{j}")]
@@ -308,8 +299,7 @@ def flags_of(theory: Theory, trace: Trace | None = None) -> list[str]:
                 text = text.lower()
             elif isinstance(value, float):
                 text = f"{value:g}"
-            own = [f"--{field.name}", text]
-            flags += own if field.name in FLAGS else ["--set", f"{field.name}={text}"]
+            flags += ["--set", f"{field.name}={text}"]
     return flags
 
 

@@ -65,7 +65,8 @@ class Setting:
         """Convert text to a value. Raise argparse.ArgumentTypeError if it is wrong."""
         if self.choices and text not in self.choices:
             expected = " or ".join(filter(None, (", ".join(self.choices[:-1]), self.choices[-1])))
-            raise argparse.ArgumentTypeError(f"expected {expected}, got {text!r}")
+            hint = _meant(text, self.choices)
+            raise argparse.ArgumentTypeError(f"expected {expected}, got {text!r}{hint}")
         try:
             return self.type(text)
         except ValueError:

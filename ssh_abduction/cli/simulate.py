@@ -80,16 +80,14 @@ def add_parser(verbs: Verbs) -> None:
             "separated by commas"
         ),
     )
-    parser.add_argument(
-        "--images",
-        choices=("ranges", "panoramas"),
-        default="ranges",
-        help=(
-            "log laser ranges, or panoramas of a 360-degree camera, which are written to an .npz "
-            "file beside the trace (default: ranges)"
-        ),
-    )
     for name, text, default, details in (
+        (
+            "images",
+            "log laser ranges, or panoramas of a 360-degree camera, which are written to an .npz "
+            "file beside the trace (default: ranges)",
+            "ranges",
+            {"choices": ("ranges", "panoramas")},
+        ),
         ("stars", "whether to log the openings seen at each place (default: true)", True, FLAG),
         (
             "every",
@@ -197,7 +195,7 @@ def _drive(options: argparse.Namespace) -> Drive:
     from simulator.world import World
 
     for name, given in (
-        ("--images panoramas", options.images != "ranges"),
+        ("images=panoramas", options.images != "ranges"),
         ("textures", options.textures is not None),
         ("paint_seed", options.paint_seed is not None),
         ("hours", options.hours is not None),
@@ -286,7 +284,7 @@ def _camera(options: argparse.Namespace) -> Camera | None:
         for name in ("textures", "paint_seed", "hours"):
             if getattr(options, name) is not None:
                 raise AbductionError(
-                    f"--{name.replace('_', '-')}: expected --images panoramas beside it, as "
+                    f"--{name.replace('_', '-')}: expected --set images=panoramas beside it, as "
                     "ranges show no light; add that"
                 )
         return None

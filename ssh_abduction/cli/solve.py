@@ -76,11 +76,6 @@ def add_parser(verbs: Verbs) -> None:
         metavar="K",
         help="list at most K maps; 0 for all (default: 100)",
     )
-    more = (
-        "also list maps with up to K dstates more than the minimum; for each number of dstates, "
-        "only the best maps (default: 0)"
-    )
-    parser.add_argument("--within", type=int, default=0, metavar="K", help=more)
     parser.add_argument(
         "--json",
         action="store_true",
@@ -93,11 +88,6 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.add_argument(
         "-o", "--output", metavar="FILE", help="also write the solution to this file, as JSON"
-    )
-    parser.add_argument(
-        "--joint-trace",
-        metavar="TRACE",
-        help="with --together: also write the joint trace to this file",
     )
     parser.add_argument(
         "--onto",
@@ -117,7 +107,7 @@ def add_parser(verbs: Verbs) -> None:
     )
     front = (
         "report the fewest dstates of a map with at most 0, 1, … K faults (steps treated as "
-        "wrong), by the causal theory; with --misread or --slipped, only faults of these kinds. "
+        "wrong), by the causal theory; with misread or slipped set, only faults of these kinds. "
         "The knee is the number of faults after which further ones save much fewer dstates"
     )
     parser.add_argument("--front", type=int, metavar="K", help=front)
@@ -155,6 +145,21 @@ def add_parser(verbs: Verbs) -> None:
     )
     add_theory(parser)
     parser.add_setting(
+        "within",
+        (
+            "also list maps with up to K dstates more than the minimum; for each number of "
+            "dstates, only the best maps (default: 0)"
+        ),
+        default=0,
+        type=int,
+        metavar="K",
+    )
+    parser.add_setting(
+        "joint_trace",
+        "with --together: also write the joint trace to this file",
+        metavar="FILE",
+    )
+    parser.add_setting(
         "without_speedups",
         f"speed-ups to turn off, separated by commas: {', '.join(SPEEDUPS)}",
         default="",
@@ -189,7 +194,7 @@ def run(options: argparse.Namespace) -> int:
         return batch.run(options)
     if options.joint_trace is not None and not options.together:
         raise AbductionError(
-            "--joint-trace: expected --together, got one trace; add it, or leave it out"
+            "joint_trace: expected --together, got one trace; add it, or leave it out"
         )
     trace = _joint(options.traces) if options.together else Trace.load(options.traces[0])
     if options.joint_trace is not None:

@@ -148,7 +148,8 @@ class Step:
             raise TraceError(
                 f"star: expected bearings that fall into different quarters (ahead, right, back, "
                 f"left), each near its middle and observed, got {brief(star_to_json(star))}; merge "
-                f"the openings that share a quarter, or take star=gateways (solve --star gateways)"
+                "the openings that share a quarter, or take star=gateways (solve --set "
+                "star=gateways)"
             )
         return openings
 

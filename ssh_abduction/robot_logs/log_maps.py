@@ -262,7 +262,7 @@ def how_it_ended(solution: Solution, allowed: float) -> str | None:
     """
     if solution.status is Status.UNSATISFIABLE:
         return (
-            "No map satisfies the axioms. Let some steps be wrong (--misread 4), or ask why: "
+            "No map satisfies the axioms. Let some steps be wrong (--set misread=4), or ask why: "
             "ssh-abduction explain trace.jsonl."
         )
     if solution.stopped != "time limit" or solution.status is Status.OPTIMAL:

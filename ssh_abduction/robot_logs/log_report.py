@@ -184,7 +184,9 @@ def _faults(solution: Solution) -> str:
     if not faults:
         allowed = solution.theory.misread or solution.theory.slipped or solution.theory.jumped
         return _paragraph(
-            "Nothing." if allowed else "Nothing: the theory allows no faults (--misread 4 would)."
+            "Nothing."
+            if allowed
+            else "Nothing: the theory allows no faults (--set misread=4 would)."
         )
     return _table(
         ("step", "what", "seen", "cost"), [(f.step, f.kind, f.seen, f.cost) for f in faults]

@@ -134,7 +134,7 @@ def fault_front(
         )
     if theory.rules or theory.without or theory.prefer not in (("dstates",), ("auto",)):
         raise TheoryError(
-            "front: expected the causal axioms alone, fewest dstates first; leave out --rules, "
+            "front: expected the causal axioms alone, fewest dstates first; leave out rules, "
             "--set without and --set prefer"
         )
     if not is_whole(most) or not 0 <= most <= 1000:

@@ -37,8 +37,8 @@ class Limits:
         a_count_of_maps(self.max_maps, SolverError)
         if not is_whole(self.within) or self.within < 0:
             raise SolverError(
-                f"within (--within): expected a whole number, 0 or more, got {brief(self.within)};"
-                " say how much more than the least a map may cost"
+                "within (--set within=K): expected a whole number, 0 or more, got "
+                f"{brief(self.within)}; say how much more than the least a map may cost"
             )
         check_limit("time_limit (--time-limit)", "seconds", self.time_limit)
         check_limit("memory_limit (--memory-limit)", "MiB", self.memory_limit)

@@ -141,9 +141,8 @@ def normalise(theory: Theory) -> None:
 
 
 def choice(name: str, value: str) -> str:
-    """Say how to set a field in Python and in the shell, such as "star=none (--star none)"."""
-    flag = f"--{name} {value}" if name == "star" else f"--set {name}={value}"
-    return f"{name}={value} ({flag})"
+    """Say how to set a field in Python and in the shell, such as "star=none (--set star=none)"."""
+    return f"{name}={value} (--set {name}={value})"
 
 
 def _check_weigh(theory: Theory) -> None:

@@ -117,7 +117,7 @@ class Rules:
             reason = (getattr(error, "strerror", None) or error) if is_text else "no text in UTF-8"
             mend = "check the path" if is_text else "save it as UTF-8"
             raise TheoryError(
-                f"rules: {brief(str(value))} cannot be read: {reason}; {mend} (--rules)"
+                f"rules: {brief(str(value))} cannot be read: {reason}; {mend} (--set rules=FILE)"
             ) from None
         return cls(str(value), text)
 

@@ -113,7 +113,7 @@ def settle(trace: Trace, theory: Theory | None = None, known: Problem | None = N
     if settled.lifts and settled.slipped:
         raise TheoryError(
             "slipped: expected no actions that slip where a trace has lifts, as they could lead to "
-            f"other floors, got {settled.slipped:g}; leave it out (--slipped 0)"
+            f"other floors, got {settled.slipped:g}; leave it out (--set slipped=0)"
         )
     if settled.changed and star != "frame":
         raise TheoryError(

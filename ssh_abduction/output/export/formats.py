@@ -158,7 +158,7 @@ def doubts(
         )
     if together := roads.together:
         mend = (
-            "export places (export --level places)"
+            "export places (export --set level=places)"
             if ssh_map.places
             else "solve with places (solve --theory topological)"
         )

@@ -85,7 +85,7 @@ def _check(rules: Rules, others: tuple[Rules, ...], files: tuple[str, ...]) -> N
         if begin.filename != TEXT:
             raise TheoryError(
                 f"{rules.name}: expected rules, got #include of {begin.filename}; "
-                "give that file, too (--rules may be given again)"
+                "give that file, too (--set rules=FILE may be given again)"
             )
         if statement.ast_type not in ALLOWED:
             raise TheoryError(
