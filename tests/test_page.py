@@ -657,4 +657,14 @@ def test_the_page_of_a_joint_map_shows_its_drives(browser: Any, tmp_path: Path) 
     assert page["seen"].text.endswith("this drive ends")
     page["between"].find_element("tag name", "button").click()
     assert page["verdict"].text.startswith("Steps monday:2 and <b>tuesday</b>:0: one dstate")
+    values = "return [$('first').value, $('later').value]"
+    assert browser.execute_script(values) == ["monday:2", "<b>tuesday</b>:0"]
+    # A step is written by its drive, and told by it.
+    write = "$('later').value = arguments[0]; $('later').dispatchEvent(new Event('change'))"
+    browser.execute_script(write, "<b>tuesday</b>:1")
+    assert page["verdict"].text.startswith("Steps monday:2 and <b>tuesday</b>:1: different")
+    browser.execute_script(write, "<b>tuesday</b>:2")
+    assert page["verdict"].text == "There is no step <b>tuesday</b>:2: steps are 0 to 4."
+    told = browser.execute_script("return stretches([1, 2, 3, 4])")
+    assert told == "steps monday:1–2, <b>tuesday</b>:0–1"
     assert page.complaints == []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 from collections.abc import Hashable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +19,16 @@ from strategies import theories, traces
 from test_property import agree, checker_rejects_foreign_maps
 from together import of_mazes, of_worlds, report_of_beams
 
-from ssh_abduction import Localiser, OnlineMapper, Solution, SSHMap, Theory, Trace, solve
+from ssh_abduction import (
+    Localiser,
+    OnlineMapper,
+    Solution,
+    SSHMap,
+    Theory,
+    Trace,
+    explain_pair,
+    solve,
+)
 from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.misfit import misfit
 from ssh_abduction.cli import main
@@ -32,8 +42,9 @@ from ssh_abduction.data import (
     together,
 )
 from ssh_abduction.data.closure import Closure
-from ssh_abduction.data.drives import fingerprints_of, sentence_of
-from ssh_abduction.rivals import Listing, joins_of_drives
+from ssh_abduction.data.drives import fingerprints_of, named_steps, sentence_of
+from ssh_abduction.explain import explain_trace
+from ssh_abduction.rivals import Listing, compare, difference, joins_of_drives
 from ssh_abduction.solver import choosing, prefixes
 from ssh_abduction.solver.fit import Poses
 from ssh_abduction.solver.guesses.beam import Beam
@@ -199,9 +210,11 @@ def test_other_names_and_other_units_are_noticed() -> None:
 
 def test_the_first_step_of_a_drive_has_no_displacement_and_a_new_name() -> None:
     start = Action("tuesday", "start")
-    with pytest.raises(TraceError, match="step 1: displacement: expected none on the first step"):
+    with pytest.raises(
+        TraceError, match="step tuesday:0: displacement: expected none on the first"
+    ):
         Trace.from_steps("ab", [start], displacements=[(1, 0, 0)])
-    with pytest.raises(TraceError, match="step 1: action: expected a new name for this drive"):
+    with pytest.raises(TraceError, match="step tuesday:0: action: expected a new name for"):
         Trace.from_steps("aba", [start, start])
 
 
@@ -397,3 +410,46 @@ def test_a_closure_between_drives_says_which_places_they_share(at: int, ahead: f
     for ssh_map in (guess, solve(joint).maps[0]):
         assert [ssh_map.place_of(t) for t in range(6)] == [0, 1, 2, 3, *expected]
         assert check(joint, ssh_map) == ()
+
+
+# Two drives of four steps. Nothing tells whether the second one starts where the first one ends.
+THERE = Trace.from_steps("abcd", ["travel", "around", "travel"], name="monday")
+BACK = Trace.from_steps("dcba", ["around", "travel", "around"], name="tuesday")
+
+
+def test_words_name_steps_by_their_drives(tmp_path: Path) -> None:
+    joint, solution = together([THERE, BACK]), solve([THERE, BACK])
+    said = "the dstates of steps tuesday:0 and tuesday:3 differ; the places of steps tuesday:0–3"
+    assert said in solution.summary
+    assert solution.sureness.endswith("separates these places: steps monday:3 and tuesday:0")
+    solution.save(tmp_path / "maps.json")
+    loaded = Solution.load(tmp_path / "maps.json")
+    assert (loaded.summary, loaded.sureness) == (solution.summary, solution.sureness)
+    pair = explain_pair(joint, 1, 6)
+    assert "steps monday:1 and tuesday:2 are different dstates" in str(pair)
+    assert "the action of step tuesday:2 is 'around'" in str(pair)
+    assert json.loads(json.dumps(pair.to_dict()))["steps"] == [1, 6]
+    wrong = replace(solution.maps[0], dstate_at=(*range(4), 3, 4, 0, 6))
+    assert {str(t) for v in check(joint, wrong) for t in v.steps} >= {"monday:0", "tuesday:2"}
+    (seen,) = (v for v in check(joint, wrong) if v.axiom == "functional_view")
+    assert seen.message.endswith("like 'a' at step monday:0 and like 'b' at step tuesday:2.")
+    clash = explain_trace(joint, Theory(same=[(0, 4)]))
+    assert "in steps monday:0 to tuesday:0 these clash" in str(clash)
+    assert "without the assertion about steps monday:0 and tuesday:0" in str(clash)
+    assert joint.at(6) == "step tuesday:2"
+
+
+def test_compare_names_steps_by_their_drives() -> None:
+    found = compare(solve([THERE, BACK], Theory.causal(), within=1))
+    said = "step tuesday:0 is at the dstate of step monday:3"
+    assert said in [str(question) for question in found.deciding]
+    maps = solve([THERE, BACK]).maps
+    told = difference(maps[0], maps[1], drives=drives_of(together([THERE, BACK]))).lines
+    assert told[1].startswith("dstates: the first map groups steps monday:3 and tuesday:0; the")
+
+
+def test_a_step_of_a_drive_is_a_number_that_can_be_pickled() -> None:
+    steps = named_steps(drives_of(together([THERE, BACK])), 8)
+    assert steps == tuple(range(8))
+    assert [*map(str, pickle.loads(pickle.dumps(steps)))][3:5] == ["monday:3", "tuesday:0"]
+    assert named_steps(drives_of(THERE), 4) == range(4)

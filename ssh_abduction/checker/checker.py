@@ -126,7 +126,7 @@ def violations(trace: Trace, ssh_map: SSHMap, theory: Theory) -> Iterator[Violat
     for name, test in checks:
         look_at_clock()
         for steps, message in test(reading):
-            yield Violation(name, tuple(sorted(set(steps))), message)
+            yield Violation(name, tuple(map(reading.named, sorted(set(steps)))), message)
 
 
 def unchecked(theory: Theory) -> tuple[str, ...]:

@@ -78,7 +78,7 @@ def _gateways(name: str, m: Reading) -> Found:
     for clash in m.once(_clashes_of):
         if name not in clash.axioms:
             continue
-        steps = ", ".join(map(str, clash.steps))
+        steps = ", ".join(str(m.steps[t]) for t in clash.steps)
         if clash.axioms == ("gateway_end",):
             yield (
                 clash.steps,

@@ -10,7 +10,7 @@ from ssh_abduction.checker.moves import Move, heading_of
 from ssh_abduction.checker.planarity import Edges
 from ssh_abduction.checker.reading import Check, Found, Reading
 from ssh_abduction.checker.stars import stars_of
-from ssh_abduction.data.closure import Closure
+from ssh_abduction.data.closure import Closure, told
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.star import Star
 
@@ -18,7 +18,7 @@ from ssh_abduction.data.star import Star
 def one_star(m: Reading) -> Found:
     """Check that all stars seen at a dstate show the same gateways, in the same directions."""
     seen: dict[int, dict[Star, int]] = {}
-    for t, (label, step) in enumerate(zip(m.map.dstate_at, m.trace.steps, strict=False)):
+    for t, label, step in zip(m.steps, m.map.dstate_at, m.trace.steps, strict=False):
         stars, star = seen.setdefault(label, {}), step.gateways or Star(())
         for other, i in stars.items() if star not in stars else ():
             if not _may_show_the_same(other, star):
@@ -40,7 +40,10 @@ def asserted(m: Reading) -> Found:
         ("at one place", theory.same_place),
     ]
     for said, (i, j) in (
-        (said, pair) for said, pairs in told for pair in pairs if max(pair) < len(labels)
+        (said, [m.steps[t] for t in pair])
+        for said, pairs in told
+        for pair in pairs
+        if max(pair) < len(labels)
     ):
         # only steps that the map labels are compared
         here, there = labels[i], labels[j]
@@ -75,7 +78,8 @@ def one_pose(m: Reading) -> Found:
     )
     for refused in refused_returns(trusted, m.map, m.theory):
         said = " and ".join(
-            f"steps {i} and {j} are at one {'place' if freedom == 2 else 'dstate'}"
+            f"steps {m.steps[i]} and {m.steps[j]} are at one "
+            f"{'place' if freedom == 2 else 'dstate'}"
             for i, j, freedom in refused.returns
         )
         steps = [t for i, j, _ in refused.returns for t in (i, j)]
@@ -93,6 +97,7 @@ def closure(m: Reading) -> Found:
         i, j = match.first, match.last
         if j >= len(labels):
             continue
+        named = m.steps[i], m.steps[j]
         here, there = (m.states.get(labels[step]) for step in (i, j))
         for freedom, kind, is_one in (
             (3, "dstate", labels[i] == labels[j]),
@@ -103,7 +108,8 @@ def closure(m: Reading) -> Found:
             ):
                 yield (
                     [i, j],
-                    f"Steps {i} and {j} are at one {kind}, but {match} and a turn of "
+                    f"Steps {named[0]} and {named[1]} are at one {kind}, but "
+                    f"{told(match, *named)} and a turn of "
                     f"{math.degrees(match.displacement[2]):.0f} degrees.",
                 )
 

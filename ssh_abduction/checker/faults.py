@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from ssh_abduction.checker.reading import Found, Reading
 from ssh_abduction.checker.stars import changes
 from ssh_abduction.data.maps import Fault
@@ -15,7 +17,7 @@ def faults_are_allowed(m: Reading) -> Found:
     """
     steps, named = m.trace.steps, set[tuple[str, int, int | None]]()
     for fault in m.map.faults:
-        i, kind = fault.step, fault.kind
+        i, kind = m.named(fault.step), fault.kind
         if what := _what_is_wrong(m, fault):
             yield [i] if 0 <= i < len(steps) else [], what
         elif (kind, i, fault.gateway) in named:
@@ -55,6 +57,7 @@ def _what_is_wrong(m: Reading, fault: Fault) -> str | None:
     Returns:
         The sentence; None if nothing is wrong.
     """
+    fault = replace(fault, step=m.named(fault.step))
     i, kind = fault.step, fault.kind
     without_stars = kind == "misseen" and m.theory.star not in ("pattern", "frame")
     if not _is_allowed(m, kind) or without_stars:

@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from ssh_abduction.data.drives import drives_of, named_steps
 from ssh_abduction.data.maps import SSHMap, check_of_trace, checked_map
 from ssh_abduction.data.trace import Action, Trace, checked_trace
 from ssh_abduction.data.words import counted
@@ -194,7 +195,8 @@ class _Joining:
         last_at: dict[int | None, int] = {}  # the last step of the last visit to each place
         tried = set[tuple[int, str]]()  # the actions done at dstates
         entry = 0  # the first step of this visit
-        for t, label in enumerate(labels):
+        steps = named_steps(drives_of(self.trace), len(self.trace))
+        for t, label in zip(steps, labels, strict=False):
             entry = entry if self._stays(t) else t
             action = self.led[t]
             link = (labels[t - 1], action.name) if action else None

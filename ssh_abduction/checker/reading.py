@@ -9,6 +9,7 @@ from typing import Any, TypeAlias, TypeVar
 
 from ssh_abduction.checker.moves import Course, Move, course_of
 from ssh_abduction.checker.order import Order
+from ssh_abduction.data.drives import drives_of, named_steps
 from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.star import Openings
 from ssh_abduction.data.trace import Trace, View
@@ -30,6 +31,7 @@ class Reading:
         trace: The trace.
         map: The map.
         theory: The theory.
+        steps: The numbers of all steps. In words, those of several drives have names of drives.
         axioms: Names of the axioms that hold.
         records: For each id, the dstates of the map with this id. A malformed map may have several.
         first: The first step of each label.
@@ -42,6 +44,7 @@ class Reading:
 
     def __init__(self, trace: Trace, ssh_map: SSHMap, theory: Theory) -> None:
         self.trace, self.map, self.theory = trace, ssh_map, theory
+        self.steps = named_steps(drives_of(trace), len(trace))
         self.axioms = frozenset(theory.axioms)
         self.records: dict[int, list[DState]] = defaultdict(list)
         for s in ssh_map.dstates:
@@ -57,7 +60,7 @@ class Reading:
         labels, with_stars = self.map.dstate_at, self.theory.star in ("pattern", "frame")
         # whether the theory allows these faults is checked elsewhere
         doubted = {(fault.kind, fault.step) for fault in self.map.faults}
-        for i, (label, step) in enumerate(zip(labels, self.trace.steps, strict=False)):
+        for i, label, step in zip(self.steps, labels, self.trace.steps, strict=False):
             self.first.setdefault(label, i)
             if ("misread", i) not in doubted and step.view is not None:
                 self.views.setdefault((label, step.view), i)
@@ -70,6 +73,10 @@ class Reading:
                 and ("slipped", i) not in doubted
             ):
                 self.links.setdefault((label, step.action.name, labels[i + 1]), i)
+
+    def named(self, step: int) -> int:
+        """Return a step, with the name of its drive in words; unchanged if there is no such one."""
+        return self.steps[step] if 0 <= step < len(self.steps) else step
 
     def once(self, compute: Callable[[Reading], _T]) -> _T:
         """Return `compute(self)`. Later calls with the same function return the stored value."""

@@ -66,7 +66,7 @@ def gateways_by_drive(m: Reading) -> Iterator[tuple[int, str, list[tuple[Opening
     """
     seen: dict[tuple[int, int], list[tuple[Openings, int]]] = {}
     names = [m.trace.drive or m.trace.name or ALONE]
-    for i, (label, step) in enumerate(zip(m.map.dstate_at, m.trace.steps, strict=False)):
+    for i, label, step in zip(m.steps, m.map.dstate_at, m.trace.steps, strict=False):
         s = m.states.get(label)
         if s and s.place is not None and step.openings and (k := heading_of(s)) is not None:
             here = seen.setdefault((s.place, len(names)), [])

@@ -84,7 +84,7 @@ def run(options: argparse.Namespace) -> int:
         listing.check_same_trace(there)
         i, j = listing.number(options.diff[0]), there.number(options.diff[1])
         names = f"map {i + 1}", f"map {j + 1}" + (f" of {printable(other.source)}" if other else "")
-        between = difference(listing.maps[i], there.maps[j], names)
+        between = difference(listing.maps[i], there.maps[j], names, drives=listing.drives)
         print(json_line({**told, **between.to_dict()}) if options.json else between)
         return 0
     found = compare(listing, other)

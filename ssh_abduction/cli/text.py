@@ -9,6 +9,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
+from ssh_abduction.data.drives import drives_of, named_steps
 from ssh_abduction.data.errors import printable
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
@@ -191,7 +192,8 @@ def describe_backbone(backbone: Backbone, trace: Trace) -> str:
     dstate, or at one place, in some maps only.
     """
     steps: dict[int, list[int]] = {}
-    for t, number in enumerate(backbone.dstates.always):
+    names = named_steps(drives_of(trace), len(trace))
+    for t, number in zip(names, backbone.dstates.always, strict=True):
         steps.setdefault(number, []).append(t)
     rows = [
         [
@@ -217,7 +219,7 @@ def describe_backbone(backbone: Backbone, trace: Trace) -> str:
     ):
         if pairs:
             more = f", and {len(pairs) - SHOWN_PAIRS} more" if len(pairs) > SHOWN_PAIRS else ""
-            told = ", ".join(f"{i} and {j}" for i, j in pairs[:SHOWN_PAIRS])
+            told = ", ".join(f"{names[i]} and {names[j]}" for i, j in pairs[:SHOWN_PAIRS])
             parts.append(f"  {sort} in some of them: the steps {told}{more}")
     return "\n".join(parts)
 

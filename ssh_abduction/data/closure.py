@@ -63,9 +63,7 @@ class Closure:
             object.__setattr__(self, name, value)
 
     def __str__(self) -> str:
-        offset = math.hypot(*self.displacement[:2])
-        steps = f"the local maps of steps {self.first} and {self.last}"
-        return f"{steps} match with an offset of {offset:.2f} m"
+        return told(self, self.first, self.last)
 
     @classmethod
     def of(cls, value: Any) -> Closure:
@@ -95,6 +93,18 @@ class Closure:
             "displacement": list(self.displacement),
             "covariance": [list(row) for row in self.covariance],
         }
+
+
+def told(closure: Closure, first: int, last: int) -> str:
+    """Say how well the local maps of two steps match.
+
+    Args:
+        closure: The closure.
+        first: What to call the earlier step.
+        last: What to call the later step.
+    """
+    offset = math.hypot(*closure.displacement[:2])
+    return f"the local maps of steps {first} and {last} match with an offset of {offset:.2f} m"
 
 
 def parse_closures(value: Any) -> tuple[Closure, ...]:

@@ -65,6 +65,45 @@ class Drive:
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 
+class DriveStep(int):
+    """The number of a step in a joint trace. In words it is the step of its drive.
+
+    >>> step = DriveStep(14, "tuesday", 9)
+    >>> f"step {step}", step + 1
+    ('step tuesday:5', 15)
+
+    Attributes:
+        drive: The name of the drive.
+        first: The number of its first step.
+    """
+
+    def __new__(cls, number: int, drive: str = "", first: int = 0) -> DriveStep:
+        step = super().__new__(cls, number)
+        step.drive, step.first = drive, first
+        return step
+
+    drive: str
+    first: int
+
+    def __str__(self) -> str:
+        return f"{self.drive}:{self - self.first}"
+
+    def __format__(self, form: str) -> str:
+        return format(str(self), form)
+
+
+def named_steps(drives: Sequence[Drive], steps: int) -> Sequence[int]:
+    """Return the numbers of all steps. In words, those of several drives have names of drives.
+
+    Args:
+        drives: The drives of a trace; empty if they are unknown.
+        steps: The number of its steps.
+    """
+    if len(drives) < 2:
+        return range(steps)
+    return tuple(DriveStep(t, d.name, d.first) for d in drives for t in range(d.first, d.stop))
+
+
 def starts_of(trace: Trace) -> tuple[int, ...]:
     """List the steps, besides step 0, at which a drive starts."""
     return tuple(t for t, action in enumerate(checked_trace(trace).actions, 1) if action.starts)
@@ -151,6 +190,14 @@ def step_name(drives: Sequence[Drive], step: int) -> str:
     """Return the name of a step, such as "tuesday:14". This inverts `step_of`."""
     drive = next(drive for drive in drives if step < drive.stop)
     return f"{drive.name}:{step - drive.first}"
+
+
+def with_named_faults(ssh_map: SSHMap, drives: Sequence[Drive]) -> SSHMap:
+    """Return a map whose faults name steps by their drives, if there are several drives."""
+    if not ssh_map.faults or len(drives) < 2:
+        return ssh_map
+    steps = named_steps(drives, len(ssh_map.dstate_at))
+    return replace(ssh_map, faults=tuple(replace(f, step=steps[f.step]) for f in ssh_map.faults))
 
 
 def joined_drives(drives: Sequence[Drive], ssh_map: SSHMap) -> tuple[tuple[str, ...], ...]:

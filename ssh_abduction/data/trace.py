@@ -253,7 +253,14 @@ class Trace:
     def at(self, step: int) -> str:
         """Return the name of a step in messages: file and line, or the number of the step."""
         a_whole_number("step", step, TraceError)
-        return f"{named(self.source)}:{step + 2}" if self.source else f"step {step}"
+        if self.source:
+            return f"{named(self.source)}:{step + 2}"
+        starts = [(t, action.name) for t, action in enumerate(self.actions, 1) if action.starts]
+        if not starts:
+            return f"step {step}"
+        drives = [(0, self.drive or self.name or "drive 1"), *starts]
+        first, drive = next(found for found in reversed(drives) if found[0] <= step)
+        return f"step {drive}:{step - first}"
 
     @classmethod
     def from_steps(

@@ -97,7 +97,7 @@ class Axioms:
             relaxed: Whether each axiom can be switched on or off at each step. Otherwise all hold.
         """
         trace, theory = piece.trace, piece.theory
-        self._trace, self._theory, self._first = trace, theory, piece.steps[0]
+        self._trace, self._theory, self._names = trace, theory, piece.steps
         self._problem = piece.problem
         self._evidence = piece.problem.evidence
         self._stop = stop
@@ -426,14 +426,14 @@ class Axioms:
                 refusal: Refusal | None = frozenset([clearest])
                 found = (
                     returns.excess(clearest),
-                    returns.why_apart(clearest.first, clearest.second, self._first) or "",
+                    returns.why_apart(clearest.first, clearest.second, self._names) or "",
                 )
             else:
                 refusal = next(
                     filter(None, (self._refused_together(displacement, answer, t) for t in steps)),
                     None,
                 )
-                found = 0.0, returns.why_not_both(refusal or (), self._first)
+                found = 0.0, returns.why_not_both(refusal or (), self._names)
             if refusal is None:
                 break
             said[_last_step(refusal)].append(found)

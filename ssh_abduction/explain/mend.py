@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
+from ssh_abduction.data.drives import drives_of, named_steps
 from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.trace import STANDARD_ACTIONS, Action, Step, Trace, View
 from ssh_abduction.explain.axioms import Axioms
@@ -227,7 +228,8 @@ class TraceQuestion(Question[TraceExplanation]):
             changed theory.
         """
         trace, theory = self.trace, self.theory
-        for t in stretch:
+        names = named_steps(drives_of(trace), len(trace))
+        for t in names[stretch.start : stretch.stop]:
             step = trace.steps[t]
             yield t, "view", repr(step.view), self._with_views(t)
             if step.star is not None and theory.star != "none":
@@ -249,7 +251,8 @@ class TraceQuestion(Question[TraceExplanation]):
                     left = theory.replace(
                         **{name: tuple(other for other in pairs if other != pair)}
                     )
-                    yield pair[1], name, f"{pair[0]} and {pair[1]}", [(None, trace, left)]
+                    first, second = (names[t] for t in pair)
+                    yield second, name, f"{first} and {second}", [(None, trace, left)]
 
     def _with_views(self, t: int) -> Iterator[tuple[str, Trace, Theory]]:
         step = self.trace.steps[t]

@@ -131,15 +131,16 @@ def explain(
     first = end - (shortest(length, lambda n: has_no_map(end - n, end)) or length)
     last = end - 1
     clashes: dict[str, list[int]] = {}
-    axioms = Axioms(Piece.of(problem, range(first, last + 1)), stop, relaxed=True)
+    piece = Piece.of(problem, range(first, last + 1))
+    axioms = Axioms(piece, stop, relaxed=True)
     clash = axioms.smallest_clash()
     for axiom, step in clash:
-        clashes.setdefault(axiom, []).append(first + step)
+        clashes.setdefault(axiom, []).append(piece.steps[step])
     order = theory.axioms
     found = tuple(
         Clash(name, tuple(sorted(clashes[name]))) for name in sorted(clashes, key=order.index)
     )
-    return Explanation(first, last, found, axioms.sentences(clash))
+    return Explanation(piece.steps[0], piece.steps[-1], found, axioms.sentences(clash))
 
 
 def why_apart(trace: Trace, first: int, second: int, theory: Theory | None = None) -> str | None:

@@ -20,6 +20,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from ssh_abduction.data.checks import a_count_of_maps
+from ssh_abduction.data.closure import told
+from ssh_abduction.data.drives import drives_of, named_steps
 from ssh_abduction.data.errors import SolverError, TraceError, brief, is_whole
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
@@ -123,7 +125,8 @@ class PairQuestion(Question[PairExplanation]):
                 )
         if first == second:
             raise TraceError(f"step: expected two steps, got {first} twice; take another one")
-        self.first, self.second = int(min(first, second)), int(max(first, second))
+        names = named_steps(drives_of(trace), len(trace))
+        self.first, self.second = names[min(first, second)], names[max(first, second)]
         self._maps = max_maps
         self._sides = {True: Side(), False: Side()}
         self._minimal = {True: False, False: False}  # whether the side has a minimal map
@@ -169,7 +172,7 @@ class PairQuestion(Question[PairExplanation]):
         loop = f"the loop of {closing.way:.0f} m closes {closing.size:.1f} m off"
         pair = self.first, self.second
         match = next((c for c in self.trace.closures if (c.first, c.last) == pair), None)
-        return loop if match is None else f"{loop}, and {match}"
+        return loop if match is None else f"{loop}, and {told(match, *pair)}"
 
     def _verdict(self) -> Verdict:
         one, two = self._sides[True], self._sides[False]

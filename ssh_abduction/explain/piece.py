@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from ssh_abduction.data.closure import closures_among
+from ssh_abduction.data.drives import drives_of, named_steps
 from ssh_abduction.data.trace import Action, Step, Trace
 from ssh_abduction.theory.fields import ASSERTIONS
 from ssh_abduction.theory.settle import Problem, displacement_of
@@ -22,7 +23,8 @@ class Piece:
     Attributes:
         problem: A trace of these steps, numbered from 0, and the theory, with asserted pairs
             renumbered. Where steps are left out, the action and the displacement are unknown.
-        steps: The steps by their numbers in the whole trace, ascending.
+        steps: The steps by their numbers in the whole trace, ascending. In words, those of several
+            drives have names of drives.
         facts: Clingo facts: the pairs of steps that displacements rule out as one dstate or at one
             place. Empty if no steps are left out between the first and the last.
     """
@@ -56,6 +58,7 @@ class Piece:
             if k and steps[k - 1] != t - 1 and step.displacement is not None:
                 step = replace(step, displacement=None, covariance=None)
             kept.append(step)
+        names = named_steps(drives_of(trace), len(trace))
         number = {t: k for k, t in enumerate(steps)}
         pairs = {
             name: tuple(
@@ -72,7 +75,7 @@ class Piece:
                 replace(trace, steps=tuple(kept), closures=closures_among(trace.closures, steps)),
                 theory.replace(**pairs),
             ),
-            tuple(steps),
+            tuple(names[t] for t in steps),
             facts_across,
         )
 

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 
 import clingo
 
+from ssh_abduction.data.closure import told
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.no_map import why_apart
 from ssh_abduction.explain.piece import Piece
@@ -151,7 +152,7 @@ class Words:
         if axiom == "closure":
             ends = steps[i], steps[j]
             found = [c for c in self._trace.closures if (c.first, c.last) == ends]
-            return "; ".join([sentence, *map(str, found)])
+            return "; ".join([sentence, *(told(match, *ends) for match in found)])
         if axiom == "one_pose" and (
             apart := why_apart(
                 self._trace,
@@ -173,4 +174,4 @@ def that_path(sentence: str) -> str:
         seen.add(match[0])
         return "that path" if again and len(seen) == 1 else match[0]
 
-    return re.sub(r"the path that steps \d+ and \d+ define", name, sentence)
+    return re.sub(r"the path that steps .+? and .+? define", name, sentence)

@@ -287,10 +287,12 @@ def compare(maps: Maps, other: Maps | None = None) -> Comparison:
     listing_there = None if other is None else Listing.of(other)
     if listing_there:
         listing.check_same_trace(listing_there)
-    table = Table(listing.maps)
+    table = Table(listing.maps, listing.drives)
     # the backbone has more information than the listed maps only if the list is not complete
-    listed = replace(table.shared(), proven=listing.complete is True)
-    shared = listing.backbone if listing.backbone and listing.complete is False else listed
+    listed = replace(table.shared(), proven=listing.complete is True, drives=listing.drives)
+    shared = listed
+    if listing.backbone and listing.complete is False:
+        shared = replace(listing.backbone, drives=listing.drives)
     _check_backbone(shared, listed, listing)
     asked = questions_of(
         table, listing.maps, same_places=bool(listed.places and not listed.places.sometimes)
@@ -389,7 +391,8 @@ def _others(here: Listing, there: Listing) -> Others:
     both = {i: number.get(ssh_map.renumbered()) for i, ssh_map in enumerate(here.maps, 1)}
     pairs = tuple((i, j) for i, j in both.items() if j)
     shared = {here.maps[i - 1].renumbered() for i, _ in pairs}
-    best = difference(here.maps[0], there.maps[0], ("map 1", f"map 1 of {there.source}"))
+    names = "map 1", f"map 1 of {there.source}"
+    best = difference(here.maps[0], there.maps[0], names, drives=here.drives)
     only_there = tuple(
         j for j, ssh_map in enumerate(there.maps, 1) if ssh_map.renumbered() not in shared
     )

@@ -20,7 +20,8 @@ from typing import Any, TypeAlias
 
 import networkx as nx
 
-from ssh_abduction.data.checks import a_list, a_text
+from ssh_abduction.data.checks import a_list, a_text, all_instances
+from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.errors import MapError, brief, printable
 from ssh_abduction.data.maps import Fault, SSHMap, checked_map
 from ssh_abduction.rivals.sides import Beside, only_in
@@ -173,7 +174,11 @@ class Difference:
 
 
 def difference(
-    first: SSHMap, other: SSHMap, names: tuple[str, str] = ("the first map", "the other one")
+    first: SSHMap,
+    other: SSHMap,
+    names: tuple[str, str] = ("the first map", "the other one"),
+    *,
+    drives: Sequence[Drive] = (),
 ) -> Difference:
     """Find what differs between two maps of one trace.
 
@@ -181,6 +186,7 @@ def difference(
         first: A map.
         other: Another map.
         names: What to call the two maps in words.
+        drives: The drives of the trace, which name steps in words; empty if they are unknown.
 
     Returns:
         The difference. Its `same` is True if the maps are the same up to renaming.
@@ -202,7 +208,13 @@ def difference(
             f"{len(other.dstate_at)}"
         )
     first, other = first.renumbered(), other.renumbered()
-    table = Table([first, other])
+    named = all_instances("drives", drives, Drive, MapError, mend="take those of a solution")
+    if named and named[-1].stop != len(first.dstate_at):
+        raise MapError(
+            f"drives: expected drives of {len(first.dstate_at)} steps, as the maps have, got "
+            f"{named[-1].stop}; take those of the solution"
+        )
+    table = Table([first, other], named)
     changes: list[Change] = []
     for sort in table.ones:
         found = list(_changes(table, sort))
@@ -220,7 +232,7 @@ def difference(
                 if moved.isdisjoint(t for group in (*change.first, *change.other) for t in group)
             ]
         changes += found
-    links = (_named_links(first), _named_links(other))
+    links = (_named_links(first, table.steps), _named_links(other, table.steps))
     unmoved = _unmoved(first, other)
     only = [
         tuple(sorted(k for k in mine - theirs if k[0] in unmoved and k[2] in unmoved))
@@ -239,7 +251,7 @@ def difference(
         faults=(faults[0], faults[1]),
         chi2=(first.fit.chi2, other.fit.chi2) if first.fit and other.fit else None,
         has_places=(bool(first.places), bool(other.places)),
-        sides=only_in(first, other),
+        sides=only_in(first, other, table.steps),
     )
 
 
@@ -268,10 +280,10 @@ def _groups(classes: Sequence[int], ones: Sequence[int]) -> list[list[int]]:
     return list(groups.values())
 
 
-def _named_links(ssh_map: SSHMap) -> set[Link]:
+def _named_links(ssh_map: SSHMap, steps: Sequence[int]) -> set[Link]:
     """Return the links of a map. Each dstate is named by its first step."""
     first: dict[int, int] = {}
-    for t, label in enumerate(ssh_map.dstate_at):
+    for t, label in zip(steps, ssh_map.dstate_at, strict=True):
         first.setdefault(label, t)
     return {
         (first[s], action, first[x]) for s, action, x in ssh_map.links if s in first and x in first

@@ -19,7 +19,7 @@ from typing import Any, TypeAlias
 from ssh_abduction.checker.joins import Join, sentence_of
 from ssh_abduction.data.checks import a_flag, a_path, a_text, an_instance
 from ssh_abduction.data.corrections_file import named_beside
-from ssh_abduction.data.drives import Drive
+from ssh_abduction.data.drives import Drive, with_named_faults
 from ssh_abduction.data.errors import MapError, brief, is_whole, named
 from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.data.map_file import read_json
@@ -209,19 +209,20 @@ class Listing:
         is_optimal = status == Status.OPTIMAL.value
         listed = complete or (minimal < len(maps)) if is_optimal else complete
         read, steps = FieldReader(where), len(maps[0].dstate_at) if maps else 0
+        drives = drives_in(read, told if maps else {}, steps)
         weighed = None
         if maps and told.get("weighed"):
-            weighed = Weighed.from_dict(read, told["weighed"], steps)
+            weighed = Weighed.from_dict(read, told["weighed"], steps, drives)
         listing = cls(
-            maps,
+            tuple(with_named_faults(ssh_map, drives) for ssh_map in maps),
             minimal if is_optimal else None,
             listed,
             told.get("stopped"),
             backbone,
             where,
             weighed,
-            joins_in(read, told if maps else {}, steps),
-            drives_in(read, told if maps else {}, steps),
+            joins_in(read, told if maps else {}, steps, drives),
+            drives,
         )
         return listing.checked(one_view=theory is None or _has_one_view(theory))
 

@@ -131,7 +131,10 @@ def questions_of(table: Table, maps: Sequence[SSHMap], *, same_places: bool) -> 
             asked = found.setdefault(_key(column), Asked(question, column, {}))
             asked.steps.setdefault("faults", set()).add(fault.step)
     places = [maps[0].dstates[label].place for label in maps[0].dstate_at] if same_places else []
-    steps_by_class = members_of(table.classes.tolist())
+    steps_by_class = {
+        number: [table.steps[t] for t in steps]
+        for number, steps in members_of(table.classes.tolist()).items()
+    }
     for sort in table.ones:
         heads = table.heads(sort).tolist()
         together = members_of(heads)

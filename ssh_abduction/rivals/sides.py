@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
 from ssh_abduction.data.checks import an_instance
+from ssh_abduction.data.drives import named_steps
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.regions import right_of
@@ -100,7 +101,7 @@ def shared_sides(listing: Listing) -> SharedSides | None:
     with_regions = [m for m in minimal if m.regions is not None]
     if not with_regions:
         return None
-    found = _sides(with_regions)
+    found = _sides(with_regions, named_steps(listing.drives, listing.steps))
     count = len(with_regions)
     named = [
         Beside(i, j, side, sides.count(side) / count)
@@ -116,17 +117,19 @@ def shared_sides(listing: Listing) -> SharedSides | None:
     )
 
 
-def only_in(first: SSHMap, other: SSHMap) -> tuple[tuple[Beside, ...], tuple[Beside, ...]]:
+def only_in(
+    first: SSHMap, other: SSHMap, steps: Sequence[int]
+) -> tuple[tuple[Beside, ...], tuple[Beside, ...]]:
     """Find the places beside paths that only the first map knows, and those only the other knows.
 
-    Both are empty if a map has no regions.
+    Both are empty if a map has no regions. `steps` are the numbers of all steps.
     """
     if first.regions is None or other.regions is None:
         return (), ()
     here, there = (
         tuple(
             Beside(i, j, side)
-            for (i, j), sides in _sides([first, other]).items()
+            for (i, j), sides in _sides([first, other], steps).items()
             if (side := sides[k]) is not None and sides[1 - k] != side
         )
         for k in (0, 1)
@@ -134,7 +137,9 @@ def only_in(first: SSHMap, other: SSHMap) -> tuple[tuple[Beside, ...], tuple[Bes
     return here, there
 
 
-def _sides(maps: Sequence[SSHMap]) -> dict[tuple[int, int], list[_Side | None]]:
+def _sides(
+    maps: Sequence[SSHMap], steps: Sequence[int]
+) -> dict[tuple[int, int], list[_Side | None]]:
     """For each place and path, named by steps, the side of the path in each map."""
     beside = [
         {
@@ -145,7 +150,6 @@ def _sides(maps: Sequence[SSHMap]) -> dict[tuple[int, int], list[_Side | None]]:
         for m in maps
     ]
     states = [[m.dstates[label] for label in m.dstate_at] for m in maps]
-    steps = range(len(maps[0].dstate_at))
     places: dict[tuple[int | None, ...], int] = {}
     courses: dict[tuple[tuple[int, int] | None, ...], int] = {}
     for t in steps:

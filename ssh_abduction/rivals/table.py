@@ -23,6 +23,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from ssh_abduction.data.drives import Drive, named_steps
 from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.solver import SORTS, Backbone, Shared, Sort
 
@@ -37,14 +38,16 @@ class Table:
     Attributes:
         firsts: The first step of each class, shape (classes,).
         classes: The class of each step, shape (steps,).
+        steps: The numbers of all steps, which name their drives if there are several.
         ones: For each sort that all maps have, an array of shape (maps, classes): the first class
             that is one with each class in each map; NONE if the class has no place, path or course.
     """
 
-    def __init__(self, maps: Sequence[SSHMap]) -> None:
+    def __init__(self, maps: Sequence[SSHMap], drives: Sequence[Drive] = ()) -> None:
         labelings = {ssh_map.dstate_at: i for i, ssh_map in enumerate(maps)}
         by_labels = {labels: np.array(labels, dtype=np.int32) for labels in labelings}
         self.classes = _common_classes(list(by_labels.values()))
+        self.steps = named_steps(drives, len(self.classes))
         _, self.firsts = np.unique(self.classes, return_index=True)
         label_of = {labels: numbers[self.firsts].tolist() for labels, numbers in by_labels.items()}
         has_places = all(any(s.place is not None for s in ssh_map.dstates) for ssh_map in maps)
@@ -66,7 +69,8 @@ class Table:
 
     def steps_of(self, classes: Sequence[int]) -> tuple[int, ...]:
         """List the steps of some classes, ascending."""
-        return tuple(np.flatnonzero(np.isin(self.classes, classes)).tolist())
+        found = np.flatnonzero(np.isin(self.classes, classes)).tolist()
+        return tuple(map(self.steps.__getitem__, found))
 
     def variants(self, sort: Sort) -> int:
         """Count the different ways in which maps group classes by this sort."""

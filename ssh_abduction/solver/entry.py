@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import replace
 
 from ssh_abduction.data.checks import an_instance
 from ssh_abduction.data.corrections import Corrections
@@ -173,7 +174,7 @@ def find_backbone(
         proven = prove_backbone(task, judging, cost, sharing, engine)
     # The search may have seen more maps than the solution holds.
     has_learnt = proven or sharing.maps > len(minimal)
-    return sharing.backbone(proven=proven) if has_learnt else known
+    return replace(sharing.backbone(proven=proven), drives=known.drives) if has_learnt else known
 
 
 def _is_known_by_mending_alone(task: Task) -> bool:

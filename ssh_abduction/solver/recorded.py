@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ssh_abduction.checker.joins import Join
-from ssh_abduction.data.drives import Drive
+from ssh_abduction.data.drives import Drive, named_steps
 from ssh_abduction.data.errors import MapError, TheoryError
 from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.data.trace import Trace
@@ -69,6 +69,7 @@ class Recorded:
         for i, warning in enumerate(warnings):
             if not isinstance(warning, str):
                 raise read.wrong(f"warnings[{i}]", "a sentence", warning)
+        drives = drives_in(read, record, steps)
         return cls(
             certificate=None if written is None else _certificate(read, written, steps),
             written_certificate=written,
@@ -76,8 +77,8 @@ class Recorded:
             explanation=None
             if record.get("explanation") is None
             else read.mapping(record["explanation"], "explanation"),
-            joins=joins_in(read, record, steps),
-            drives=drives_in(read, record, steps),
+            joins=joins_in(read, record, steps, drives),
+            drives=drives,
             onto=tuple(map(str, read.list(record, "onto", optional=True))),
         )
 
@@ -152,8 +153,11 @@ def drives_in(read: FieldReader, record: Mapping[str, Any], steps: int) -> tuple
     return found
 
 
-def joins_in(read: FieldReader, record: Mapping[str, Any], steps: int) -> tuple[Join, ...]:
+def joins_in(
+    read: FieldReader, record: Mapping[str, Any], steps: int, drives: tuple[Drive, ...]
+) -> tuple[Join, ...]:
     """Read the joins of the first map that rest on minimality alone. Raises MapError."""
+    names = named_steps(drives, steps)
 
     def join(value: Any, name: str) -> Join:
         written = read.mapping(value, name)
@@ -165,7 +169,7 @@ def joins_in(read: FieldReader, record: Mapping[str, Any], steps: int) -> tuple[
             raise read.wrong(f"{name}.steps", f"two steps from 0 to {steps - 1}", pair)
         if of not in ("place", "dstate"):
             raise read.wrong(f"{name}.of", "place or dstate", of)
-        return Join(first, second, of == "place")
+        return Join(names[first], names[second], of == "place")
 
     return read.each(record, "by_minimality", join, optional=True)
 

@@ -8,13 +8,13 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.checker.claims import contradictions
 from ssh_abduction.checker.joins import Join, joins_by_minimality, sentence_of
 from ssh_abduction.data.checks import a_whole_number, one_of
-from ssh_abduction.data.drives import Drive, drives_of
+from ssh_abduction.data.drives import Drive, drives_of, with_named_faults
 from ssh_abduction.data.errors import MapError, SolverError, brief, named
 from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.data.files import json_line
@@ -263,11 +263,13 @@ class Solution(MapSequence):
         not `proven`, and `find_backbone` can prove it.
         """
         if self.shared is not None:
-            return self.shared
+            return replace(self.shared, drives=self.drives)
         sharing = Sharing()
         for ssh_map in self.minimal_maps:
             sharing.absorb(ssh_map)
-        return sharing.backbone(proven=self.minimal_listed) if sharing.maps else None
+        if not sharing.maps:
+            return None
+        return replace(sharing.backbone(proven=self.minimal_listed), drives=self.drives)
 
     @property
     def summary(self) -> str:
@@ -410,6 +412,8 @@ class Solution(MapSequence):
         if (false := next(contradictions(record, maps, steps, theory), None)) is not None:
             raise MapError(f"{where}: {false}; it was changed by hand, or cut")
         _check_steps(where, maps, steps, theory, trace)
+        recorded = Recorded.of(read, record, steps)
+        maps = tuple(with_named_faults(ssh_map, recorded.drives) for ssh_map in maps)
         return cls(
             status=Status(record["status"]),
             maps=maps,
@@ -428,8 +432,8 @@ class Solution(MapSequence):
             shared=backbone_in(read, record, steps),
             trace=trace,
             support=Support(
-                recorded=Recorded.of(read, record, steps),
-                weighed=Weighed.from_dict(read, record["weighed"], steps)
+                recorded=recorded,
+                weighed=Weighed.from_dict(read, record["weighed"], steps, recorded.drives)
                 if record.get("weighed")
                 else None,
             ),

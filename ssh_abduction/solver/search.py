@@ -8,14 +8,14 @@ whole trace (`fallback.py`). `prefixes.py` proves why it is enough to solve the 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import replace
 from itertools import groupby
 from typing import TYPE_CHECKING, get_args
 
 from ssh_abduction.data.checks import an_instance, one_of
-from ssh_abduction.data.drives import starts_of
+from ssh_abduction.data.drives import Drive, drives_of, with_named_faults
 from ssh_abduction.data.errors import SolverError, TheoryError, brief
 from ssh_abduction.data.floors import with_floors
 from ssh_abduction.data.maps import SSHMap, checked_maps
@@ -232,11 +232,11 @@ class Search:
 
     def _given(self, ranking: Ranking | None) -> Iterator[SSHMap]:
         """Yield the maps, those of one cost in the order of `ranking`; None keeps their order."""
-        starts = starts_of(self.trace)
+        drives = drives_of(self.trace)
         for cost, level in groupby(self._found(), key=lambda priced: priced[1]):
             maps = (ssh_map for ssh_map, _ in level)
             for ssh_map in ranking.ranked(maps, self.over) if ranking else maps:
-                told = _told(ssh_map, self.trace, starts)
+                told = _told(ssh_map, self.trace, drives)
                 self._answer.take_down(told, cost)
                 yield told
 
@@ -421,12 +421,12 @@ class Search:
             known.status = Status.FEASIBLE
         known.stopped = stopped
         # clingo cannot say how large its program is while another thread is in it.
-        maps = () if best is None else (_told(best, self.trace, starts_of(self.trace)),)
+        maps = () if best is None else (_told(best, self.trace, drives_of(self.trace)),)
         solution = self._answer.solution(maps, Grounding(0, 0))
         return replace(solution, complete=known.status is Status.UNSATISFIABLE)
 
 
-def _told(ssh_map: SSHMap, trace: Trace, starts: tuple[int, ...]) -> SSHMap:
-    """Return a map with the floors of its trace, and the steps at which drives start."""
-    told = with_floors(ssh_map, trace)
-    return replace(told, starts=starts) if starts else told
+def _told(ssh_map: SSHMap, trace: Trace, drives: Sequence[Drive]) -> SSHMap:
+    """Return a map with its floors, the starts of drives, and faults that name their drives."""
+    told = with_named_faults(with_floors(ssh_map, trace), drives)
+    return replace(told, starts=tuple(drive.first for drive in drives[1:]))

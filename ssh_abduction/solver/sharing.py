@@ -23,6 +23,7 @@ from itertools import combinations
 from typing import Any, Literal, TypeAlias
 
 from ssh_abduction.data.checks import a_text, a_whole_number
+from ssh_abduction.data.drives import Drive, DriveStep, named_steps
 from ssh_abduction.data.errors import MapError, brief, is_whole
 from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.words import counted
@@ -113,6 +114,7 @@ class Backbone:
             no paths.
         proven: Whether this holds for all minimal maps. If not, it holds only for the known ones,
             and further maps may differ more.
+        drives: The drives of the trace, which name steps in words; empty if they are unknown.
     """
 
     dstates: Shared
@@ -120,6 +122,7 @@ class Backbone:
     paths: Shared | None
     courses: Shared | None
     proven: bool
+    drives: tuple[Drive, ...] = field(default=(), compare=False)
 
     def __repr__(self) -> str:
         return f"<Backbone{'' if self.proven else ' (not proven)'}: {self.sentence}>"
@@ -137,8 +140,9 @@ class Backbone:
             differing.pop("courses", None)
         same = [sort for sort in self.sorts if sort not in differing and sort != "courses"]
         told = [f"the same {_listed(same)}"] if same else []
+        steps = named_steps(self.drives, len(self.dstates.always))
         return "; ".join(
-            told + [_told_differing(sort, shared) for sort, shared in differing.items()]
+            told + [_told_differing(sort, shared, steps) for sort, shared in differing.items()]
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -390,7 +394,7 @@ def _name(dstate: DState, sort: Sort) -> Hashable:
     return None if dstate.path is None else (dstate.path, dstate.direction)
 
 
-def _told_differing(sort: Sort, shared: Shared) -> str:
+def _told_differing(sort: Sort, shared: Shared, steps: Sequence[int]) -> str:
     if len(shared.differing) == len(shared.sometimes) == 1:
         one = {
             "dstates": "one dstate",
@@ -398,7 +402,7 @@ def _told_differing(sort: Sort, shared: Shared) -> str:
             "paths": "along one path",
             "courses": "along one path in one direction",
         }[sort]
-        first, later = shared.sometimes[0]
+        first, later = (steps[t] for t in shared.sometimes[0])
         return f"steps {first} and {later} are {one} in some of them"
     whose = {
         "dstates": "dstate",
@@ -407,25 +411,32 @@ def _told_differing(sort: Sort, shared: Shared) -> str:
         "courses": "direction along the path",
     }[sort]
     if len(shared.differing) == 1:
-        return f"the {whose} of step {shared.differing[0]} differs"
+        return f"the {whose} of step {steps[shared.differing[0]]} differs"
     whose = {"courses": "directions along paths"}.get(sort, f"{whose}s")
-    return f"the {whose} of steps {stretches(shared.differing)} differ"
+    return f"the {whose} of steps {stretches([steps[t] for t in shared.differing])} differ"
 
 
 def stretches(steps: Sequence[int]) -> str:
     """Name steps in words, such as "12–15 and 40".
 
-    If they form more than NAMED stretches, only count the steps of the further ones.
+    If they form more than NAMED stretches, only count the steps of the further ones. A stretch of
+    named steps is of one drive, such as "tuesday:12–15".
     """
     runs: list[list[int]] = []
     for step in steps:
-        if runs and step == runs[-1][-1] + 1:
+        goes_on = runs and step == runs[-1][-1] + 1
+        if goes_on and not (isinstance(step, DriveStep) and step == step.first):
             runs[-1].append(step)
         else:
             runs.append([step])
-    told = [f"{s[0]}–{s[-1]}" if len(s) > 1 else str(s[0]) for s in runs[:NAMED]]
+    told = [f"{s[0]}–{_bare(s[-1])}" if len(s) > 1 else str(s[0]) for s in runs[:NAMED]]
     more = sum(map(len, runs[NAMED:]))
     return _listed([*told, f"{more} more"] if more else told)
+
+
+def _bare(step: int) -> int:
+    """Return the number of a step in its drive."""
+    return step - step.first if isinstance(step, DriveStep) else step
 
 
 def _listed(words: Sequence[str]) -> str:

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
+from ssh_abduction.data.drives import Drive, named_steps
 from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.data.map_parts import FAULTS
 
@@ -66,6 +67,7 @@ class Weighed:
         excess: How many times as large the misfit is as the standard deviations say. Probabilities
             divide costs by it.
         doubt: Why the costs cannot be trusted, such as "the track is unreliable"; None if they can.
+        drives: The drives of the trace, which name steps in words; empty if they are unknown.
     """
 
     bound: float
@@ -75,6 +77,7 @@ class Weighed:
     broken: float = -math.inf
     excess: float = 1.0
     doubt: str | None = None
+    drives: tuple[Drive, ...] = field(default=(), compare=False, repr=False)
 
     @property
     def nats(self) -> float:
@@ -133,7 +136,7 @@ class Weighed:
         at, of = (best.places, "place") if best.places else (best.dstates, "dstate")
         last: dict[int, int] = {}
         joins = list[tuple[int, int, float]]()
-        for step, name in enumerate(at):
+        for step, name in zip(named_steps(self.drives, len(at)), at, strict=True):
             if step - last.get(name, step) > 1:
                 joins.append((last[name], step, self.probability(last[name], step, of)))
             last[name] = step
@@ -176,13 +179,16 @@ class Weighed:
         }
 
     @classmethod
-    def from_dict(cls, read: FieldReader, value: Any, steps: int) -> Weighed:
+    def from_dict(
+        cls, read: FieldReader, value: Any, steps: int, drives: tuple[Drive, ...] = ()
+    ) -> Weighed:
         """Read what `to_dict` wrote.
 
         Args:
             read: Checks the fields.
             value: The data.
             steps: The number of steps of the trace.
+            drives: The drives of the trace; empty if they are unknown.
 
         Raises:
             MapError: A field is wrong.
@@ -202,7 +208,8 @@ class Weighed:
         doubt = record.get("doubt")
         if doubt is not None and not isinstance(doubt, str):
             raise read.wrong("weighed.doubt", "a text", doubt)
-        return cls(bound, within, rivals, record.get("searched") is True, broken, excess, doubt)
+        searched = record.get("searched") is True
+        return cls(bound, within, rivals, searched, broken, excess, doubt, drives)
 
 
 def _percent(probability: float) -> str:

@@ -29,6 +29,7 @@ from typing import TypeAlias
 
 from scipy.special import gammaincc
 
+from ssh_abduction.data.drives import drives_of
 from ssh_abduction.data.maps import Fault, SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
@@ -356,6 +357,7 @@ class Weighing:
             searched=self._is_searched() and excess < math.inf,
             broken=self._broken,
             excess=excess if excess < math.inf else 1.0,
+            drives=drives_of(self._parts.task.trace),
         )
 
     def _is_searched(self) -> bool:

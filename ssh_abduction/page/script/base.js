@@ -30,10 +30,11 @@ function stretches(steps) {
   const parts = [];
   for (const t of steps) {
     const last = parts.at(-1);
-    if (last && last[1] === t - 1) last[1] = t;
+    if (last && last[1] === t - 1 && driveOf(t - 1) === driveOf(t)) last[1] = t;
     else parts.push([t, t]);
   }
-  const told = parts.map(([a, b]) => (a === b ? `${a}` : `${a}–${b}`));
+  const bare = (t) => t - (data.drives[driveOf(t)]?.first ?? 0);
+  const told = parts.map(([a, b]) => (a === b ? called(a) : `${called(a)}–${bare(b)}`));
   const shown = told.length > 8 ? [...told.slice(0, 8), "…"] : told;
   return `${steps.length === 1 ? "step" : "steps"} ${shown.join(", ")}`;
 }

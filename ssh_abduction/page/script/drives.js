@@ -10,6 +10,19 @@ function called(t) {
   return drive ? `${drive.name}:${t - drive.first}` : `${t}`;
 }
 
+// Text as one word of the shell.
+function inShell(text) {
+  return /^[\w:.,-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`;
+}
+
+// The number of a step from its number, or from its name as called() writes it; NaN for none.
+function numberOf(text) {
+  const [, name, number] = /^(?:(.*):)?(\d+)$/.exec(text.trim()) ?? [],
+    drive = data.drives.find((drive) => drive.name === name);
+  if (name === undefined) return number === undefined ? NaN : Number(number);
+  return drive && Number(number) < drive.stop - drive.first ? drive.first + Number(number) : NaN;
+}
+
 function colourOf(k) {
   return `coloured path${k % COLOURS}`;
 }

@@ -36,7 +36,7 @@ function overviewFigure() {
       kind: hollow ? `hollow ${share(s.path)}` : share(s.maps),
       title: `dstate of ${stretches(s.steps)}: in ${s.maps} of ${all} maps${along}`,
       steps: s.steps,
-      name: isPlaces ? null : `${s.steps[0]}`,
+      name: isPlaces ? null : called(s.steps[0]),
       dstate: null,
       bare: !isPlaces,
     };

@@ -105,15 +105,11 @@ $("farther").addEventListener("click", () => zoom(1 / 1.3));
 $("whole").addEventListener("click", whole);
 for (const name of ["first", "later"])
   $(name).addEventListener("change", () => {
-    const steps = ["first", "later"]
-        .map((id) => $(id).value)
-        .filter((text) => text !== "")
-        .map(Number),
-      last = labelsOf(0).length - 1;
-    const wrong = steps.find((t) => !(Number.isInteger(t) && t >= 0 && t <= last));
-    state.picked = [
-      ...new Set(steps.filter((t) => Number.isInteger(t) && t >= 0 && t <= last)),
-    ].sort((a, b) => a - b);
+    const texts = ["first", "later"].map((id) => $(id).value).filter((text) => text !== ""),
+      last = labelsOf(0).length - 1,
+      isStep = (text) => numberOf(text) <= last;
+    const wrong = texts.find((text) => !isStep(text));
+    state.picked = [...new Set(texts.filter(isStep).map(numberOf))].sort((a, b) => a - b);
     judge();
     if (wrong !== undefined)
       $("verdict").textContent = `There is no step ${wrong}: steps are 0 to ${last}.`;

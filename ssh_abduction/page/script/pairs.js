@@ -12,8 +12,8 @@ function pick(t) {
 function judge() {
   giveUp();
   const [a, b] = state.picked;
-  $("first").value = a ?? "";
-  $("later").value = b ?? "";
+  $("first").value = a === undefined ? "" : called(a);
+  $("later").value = b === undefined ? "" : called(b);
   $("answer").textContent = "";
   $("costs").replaceChildren();
   $("ask").hidden = b === undefined && !theory();
@@ -101,7 +101,7 @@ function theory(more = null) {
   const all = { same: [...assumed.same], different: [...assumed.different] };
   if (more) all[more].push(state.picked);
   return ["same", "different"]
-    .flatMap((kind) => all[kind].map(([a, b]) => ` --${kind} ${a},${b}`))
+    .flatMap((kind) => all[kind].map(([a, b]) => ` --${kind} ${inShell(`${called(a)},${called(b)}`)}`))
     .join("");
 }
 
@@ -160,7 +160,7 @@ async function why() {
   if (!served) {
     $("answer").className = "command";
     $("answer").textContent =
-      `ssh-abduction explain ${data.trace} ${pair[0]} ${pair[1]}${data.flags}${theory()}`;
+      `ssh-abduction explain ${data.trace} ${pair.map(called).map(inShell).join(" ")}${data.flags}${theory()}`;
     return;
   }
   const told = await ask("explain", { pair, ...assumed });
@@ -203,5 +203,5 @@ async function assume(kind) {
     load(false);
   }
   $("answer").textContent =
-    `${kind ? `With steps ${pair.join(" and ")} assumed ${kind}: ` : ""}${told.text}`;
+    `${kind ? `With steps ${pair.map(called).join(" and ")} assumed ${kind}: ` : ""}${told.text}`;
 }

@@ -11,7 +11,7 @@ function setStep(t) {
   $("at").textContent =
     replay().other || !data.drives.length
       ? `${t} of ${last}`
-      : `${called(t)} of ${last - first} (step ${t})`;
+      : `${called(t)} of ${last - first}`;
   parts.push(`view ${step.view}`);
   if (step.confidence !== undefined) parts[0] += ` (confidence ${step.confidence})`;
   if (step.moved && t > 0) {

@@ -13,6 +13,7 @@ from collections.abc import Collection, Iterator, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, TypeAlias
 
+from ssh_abduction.data.drives import drives_of, named_steps
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
@@ -385,21 +386,22 @@ class Returns:
         )
         return float(squares[which][0]) - self.threshold(2 + which, together=False)
 
-    def why_apart(self, first: int, last: int, number_from: int = 0) -> str | None:
+    def why_apart(self, first: int, last: int, names: Sequence[int] = ()) -> str | None:
         """Say in words why two steps are not one dstate or place; None if displacements allow it.
 
         Args:
             first: The earlier step.
             last: The later step.
-            number_from: A number to add to the steps, if the trace is a part of a longer one.
+            names: What to call the steps; empty if this is the whole trace.
         """
-        named = f"steps {first + number_from} and {last + number_from}"
+        names = names or named_steps(drives_of(self.trace), len(self.trace))
+        named = f"steps {names[first]} and {names[last]}"
         i, j = self._begin_of_visit(first), self._begin_of_visit(last)
         if i in self.pairs.elsewhere.get(j, ()):
             they = (
                 "they"
                 if (i, j) == (first, last)
-                else f"steps {i + number_from} and {j + number_from}, where their visits begin,"
+                else f"steps {names[i]} and {names[j]}, where their visits begin,"
             )
             return (
                 f"{named} are not at one place: by the odometry {they} are "
@@ -420,18 +422,16 @@ class Returns:
         off = closing.metres if far else f"{closing.metres} and {closing.degrees}"
         return f"{named} are not one dstate: by the odometry they are {off} apart"
 
-    def why_not_both(self, returns: Collection[Equality], number_from: int = 0) -> str:
+    def why_not_both(self, returns: Collection[Equality], names: Sequence[int]) -> str:
         """Say in words why two returns cannot both be true.
 
         Args:
             returns: The two returns.
-            number_from: A number to add to the steps, if the trace is a part of a longer one.
+            names: What to call the steps.
         """
         ordered = sorted(returns, key=lambda e: (e.second, e.first, e.of))
         closings = [self.closing(e.first, e.second) for e in ordered]
-        named = ", and ".join(
-            f"steps {e.first + number_from} and {e.second + number_from}" for e in ordered
-        )
+        named = ", and ".join(f"steps {names[e.first]} and {names[e.second]}" for e in ordered)
         ways = " and ".join(f"{closing.way:.0f} m" for closing in closings)
         sizes = " and ".join(f"{closing.size:.1f} m" for closing in closings)
         turned = [
