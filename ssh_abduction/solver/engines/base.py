@@ -18,8 +18,8 @@ from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 
-# An engine with a chart first tries a prefix of this many steps, then one of AT_ONCE steps. For
-# most traces the first prefix is enough.
+# An engine with a chart first tries a prefix of this many steps, then a prefix of AT_ONCE steps.
+# For most traces the first prefix is enough.
 FIRST_PREFIXES = 32
 # Compare at most this many steps in pairs: n steps need a matrix of n x n bytes.
 AT_ONCE = 8000
@@ -31,7 +31,8 @@ class Found:
 
     Attributes:
         map: The map.
-        cost: The counts that the theory minimises, such as dstates, places and paths, in its order.
+        cost: The counts that the theory minimises, such as dstates, places and paths. The count
+            that is minimised first comes first.
     """
 
     map: SSHMap
@@ -71,7 +72,7 @@ class Task:
 
     @staticmethod
     def of(problem: Problem, watch: Watch | None = None, speedups: Speedups | None = None) -> Task:
-        """Make a task with those of the given speed-ups that hold for the theory.
+        """Make a task, with only those speed-ups that hold for the theory.
 
         Args:
             problem: The trace, the theory and the evidence.
@@ -98,7 +99,7 @@ class Engine(Protocol):
     Attributes:
         asker: Asks clingo.
         intact: False after an error during which clingo may have missed rules.
-        lists_least: Whether it can only list maps that have the fewest dstates of the prefix.
+        lists_least: Whether the engine can only list maps with the fewest dstates.
         goes_on: Whether `over` may be called after the trace has grown.
     """
 
@@ -132,7 +133,7 @@ class Engine(Protocol):
 
     @property
     def size_to_go_on(self) -> int:
-        """The first size to grow to, when the trace has grown since the search stopped."""
+        """The size to grow to first after the trace has grown."""
         ...
 
     def with_paths(self, paths: int) -> Engine:
@@ -163,10 +164,10 @@ class Engine(Protocol):
         ...
 
     def labellings(self, cost: tuple[int, ...]) -> Iterator[Settled] | None:
-        """Yield each labelling that maps of this cost have, once.
+        """Yield the maps of this cost, grouped by their labelling.
 
-        A labelling is the dstate of each step of the prefix. Each item gives the maps with one
-        labelling. Returns None if the engine does not find dstates before places and paths.
+        A labelling is the dstate of each step of the prefix. Each item stands for the best maps
+        with one labelling. Return None if the engine does not find dstates before places and paths.
         """
         ...
 

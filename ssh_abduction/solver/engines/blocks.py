@@ -8,8 +8,9 @@ faults of any map of the block with at most N dstates. Blocks that share no step
 
     cost  >=  least over N of  (10 N + sum over blocks of the least faults with N dstates)
 
-The blocks may differ for each N. With few dstates, short blocks already need a fault, and there are
-many of them. With many dstates only long blocks need one, but then the dstates alone cost much.
+The blocks may differ for each N. With few dstates, short blocks already need a fault, and the trace
+has many such blocks. With many dstates only long blocks need a fault, but the dstates alone cost
+much.
 
 A block needs a fault if it would otherwise contain a clique of more than N steps. A clique is a set
 of steps that are pairwise different dstates (`steps/apart.py`). Faults of the known map may be too
@@ -30,11 +31,10 @@ from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.steps.apart import Continuations
 from ssh_abduction.theory.evidence import Pairs
 
-# A block for clingo begins and ends up to this many steps, times the number of dstates, from the
-# faults.
+# A block for clingo extends beyond its faults by up to this many steps for each dstate of the map.
 MARGIN = 3
-# Find the length of the shortest block to within one step. Allow one more step for each COARSE
-# dstates beyond those of the known map.
+# Find the length of the shortest block to within one step. For each COARSE dstates beyond those of
+# the known map, it may be one more step too long.
 COARSE = 5
 # Ask clingo only about blocks up to this length, with at most this many names for dstates.
 MOST_STEPS = 200
@@ -63,8 +63,8 @@ class Blocks:
     faults: Mapping[str, Sequence[int]]
     dstates: int
     watch: Watch
-    # For each block (begin, end) that clingo refuted: the most dstates and the most tenths for
-    # faults with which it has no map.
+    # For each block (begin, end) that clingo refuted: limits on dstates, and on the cost of faults
+    # in tenths, within which the block has no map.
     _proven: dict[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
 
     @property
@@ -73,9 +73,9 @@ class Blocks:
         return 10 * self.dstates + self._known_cost(0, len(self.seen))
 
     def bound(self) -> int:
-        """Compute a lower bound on the cost of every map, in tenths of dstates.
+        """Compute a lower bound on the cost of all maps, in tenths of dstates.
 
-        The bound is at most the cost of the known map.
+        The result is at most the cost of the known map.
         """
         bound = self.cost
         most = -(-bound // 10) - 1  # the dstates of a larger map alone cost this bound
@@ -104,7 +104,7 @@ class Blocks:
         reach = 0  # how many steps after a fault the last block ended
         while begin < steps:
             following = begin
-            if most >= self.dstates:  # then a block without faults of the known map needs none
+            if most >= self.dstates:  # then a block in which the known map has no fault needs none
                 number = bisect_left(places, begin)
                 if number == len(places):
                     return total
@@ -131,8 +131,8 @@ class Blocks:
             most: The number of dstates that a map may have.
 
         Returns:
-            The step after the last one of the block, which may be a few steps longer than needed;
-            None if even the block to the end of the trace needs no fault.
+            The step after the last one of the block. The block may be a few steps longer than the
+            shortest one. None if even the block to the end of the trace needs no fault.
         """
         steps = len(self.seen)
         exact = 1 + max(most - self.dstates, 0) // COARSE
@@ -152,11 +152,11 @@ class Blocks:
         return high
 
     def _fails(self, begin: int, end: int, low: int, most: int) -> bool:
-        """Whether `end` is after `low` and the steps from `begin` up to it need no fault."""
+        """Whether `end` is after `low` and the block from `begin` to `end` needs no fault."""
         return end > low and not self._takes_fault(begin, end, most)
 
     def _takes_fault(self, begin: int, end: int, most: int) -> bool:
-        """Whether a block needs a fault, as without one it has a clique of more than `most` steps.
+        """Whether a clique shows that a block needs a fault: it has more than `most` steps.
 
         Args:
             begin: The first step of the block.
@@ -209,8 +209,8 @@ class Blocks:
     def _refuted(self, begin: int, end: int, most: int, tenths: int) -> bool:
         """Whether clingo proves that a block has no map within these limits.
 
-        Each view has enough names for all dstates, so no dstate is at the rest, the one name that
-        dstates without a name of their own share.
+        Each view has enough names for all dstates, so the rest (the one name that all dstates
+        without a name of their own share) is not needed.
 
         Args:
             begin: The first step of the block.
@@ -251,7 +251,7 @@ class Blocks:
         return True
 
     def _known_cost(self, begin: int, end: int) -> int:
-        """The cost of the known map's faults at the steps of a block and the links between them."""
+        """Add up the cost of the known map's faults in a block, in tenths of dstates."""
         last = {"misread": end, "slipped": end - 1}
         return sum(
             sum(
@@ -262,6 +262,7 @@ class Blocks:
         )
 
     def _least_price(self, begin: int, end: int) -> int:
+        """Return the cost of the cheapest fault that is possible in a block, in tenths."""
         return min(
             min(found[begin : end - (kind == "slipped")]) for kind, found in self.price.items()
         )

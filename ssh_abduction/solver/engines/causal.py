@@ -59,7 +59,7 @@ class CausalEngine:
         return map(self._found, self._named.all_of(cost[0], enough))
 
     def labellings(self, cost: tuple[int, ...]) -> None:
-        """Return None: a labelling has only one map here, as there are no places and paths."""
+        """Return None, as a labelling has only one map without places and paths."""
 
     def forbid(self, equalities: Collection[Equality]) -> bool:
         self._named.forbid_together([(equality.first, equality.second) for equality in equalities])

@@ -1,9 +1,9 @@
 """Searches for a map that contradicts something in which all known maps agree.
 
 Every engine uses this. Two steps may share a dstate, place, path or course in all known maps, but
-not in an unknown one. Or they may share it in no known map, but in an unknown one. Either
+not in some unknown map. Or they may share it in no known map, but in some unknown map. Either
 possibility is a *doubt*. Clingo gets the rule for each doubt once. Then it is asked for an answer
-in which some doubt of a given set holds.
+in which at least one doubt of a set holds.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from ssh_abduction.solver.asp.facts import path_reader, questions
 from ssh_abduction.solver.sharing import Sort
 
 Answer = TypeVar("Answer")
-# The sort of thing that may be shared, two steps or two dstates, and whether the doubt is that they
-# share it (True) or do not (False).
+# The sort of thing that may be shared, two steps or dstates, and what the doubt says: that they
+# share it (True), or that they do not (False).
 Doubt: TypeAlias = tuple[Sort, int, int, bool]
 
 
@@ -39,8 +39,8 @@ class Doubts:
         Args:
             asker: Asks clingo.
             control: The control that gets the doubts and is asked.
-            condition: For a sort and two steps (or dstates), the body of the rule that they share
-                a thing of that sort; None if they never do.
+            condition: Given a sort and two steps (or dstates), returns the body of a rule, which
+                says that they share a thing of that sort; None if they never do.
         """
         self._asker, self._control, self._condition = asker, control, condition
         self._told: dict[Doubt, int] = {}  # the number of each doubt that clingo has
@@ -74,6 +74,7 @@ class Doubts:
             return next(answers, None)
 
     def _tell(self, doubts: Sequence[Doubt]) -> None:
+        """Ground the rules for doubts that clingo does not have yet."""
         if not doubts:
             return
         self._parts += 1
@@ -88,7 +89,7 @@ class Doubts:
 
 
 class Settled:
-    """The best maps for one labelling, which gives the dstate of each step.
+    """Questions about the best maps with one labelling, that is, with these dstates of all steps.
 
     Engines that find dstates before places and paths use it.
     """

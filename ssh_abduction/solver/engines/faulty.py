@@ -1,18 +1,18 @@
 """The engine for the causal theory with faults: it finds all maps of least cost.
 
 A view may be misread, and an action may slip. The cost of a map is that of its dstates and its
-faults. Clingo gets only some steps of the trace (`faulty_control.py`), the *given* ones. Fewer
-steps are fewer constraints, so their cost is a lower bound for the whole trace. A map of the given
-steps is then followed through all other steps. If it predicts all views there, it is a minimal map
-of the whole trace. If not, clingo gets more steps.
+faults. Clingo gets only some steps of the trace, the *given* steps (`faulty_control.py`). Fewer
+steps are fewer constraints. So the least cost for the given steps is a lower bound for the whole
+trace. A minimal map of the given steps is then followed through all other steps. If it predicts all
+their views, it is a minimal map of the whole trace. If not, clingo gets more steps.
 
 A Viterbi pass chooses the further steps (Viterbi 1967). It explains the whole trace by the links
 that clingo found, with the cheapest faults. Clingo gets the steps at fault and those around them.
 The explanation is also a map of the whole trace, so it may be the new incumbent.
 
 The first maps of a long trace are guessed (`guesses/robust.py`), and clingo is only asked for
-cheaper ones. Its bound comes from its blocks (`engines/blocks.py`). For a short trace clingo is
-asked first, and maps are guessed if it does not end soon.
+cheaper ones. The lower bound of a long trace comes from its blocks (`engines/blocks.py`). For a
+short trace clingo is asked first, and maps are guessed if it does not end soon.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ class FaultyEngine:
                     return
 
     def _guesses(self) -> bool:
-        """Whether to guess maps: clingo solves the shortest traces at once."""
+        """Whether to guess maps. Clingo solves the shortest traces at once."""
         return self.size > FEW and not self._task.log.pairs.one and bool(self._price)
 
     def _asked_first(self) -> Iterator[Found]:
@@ -228,7 +228,7 @@ class FaultyEngine:
         return True
 
     def _raise_bound(self, bound: Sequence[int]) -> None:
-        """Take over a bound that clingo proved. What holds for the given steps holds for all."""
+        """Take over a bound that clingo proved. A bound for the given steps holds for all steps."""
         if bound and self._most_faults is None:
             self.bound = max(self.bound or 0, bound[0])
 
@@ -254,8 +254,8 @@ class FaultyEngine:
         """Follow the links of an answer through the steps that clingo was not given.
 
         Returns:
-            The dstate of each step, and -1. If that fails: None, and a step to give to clingo
-            next. The links do not explain this step, or evidence contradicts its dstate.
+            The dstate of each step, and -1. Or None, and the step to give to clingo next: the links
+            do not explain this step, or evidence contradicts its dstate.
         """
         number, machine = self._machine(answer)
         labels: list[int] = []
@@ -283,8 +283,8 @@ class FaultyEngine:
         """Explain the whole trace by the dstates and links of an answer, with the cheapest faults.
 
         Returns:
-            The map of the whole trace, or None if it is not allowed; and the first steps that
-            clingo was not given and that have a fault or an action without a link.
+            The map of the whole trace, or None if it is not allowed; and up to PLACES steps that
+            have a fault or an action without a link, and that clingo was not given.
         """
         _, machine = self._machine(answer)
         if not machine.shows:  # all given steps are lost
@@ -349,13 +349,16 @@ class FaultyEngine:
         )
 
     def _shown_somewhere(self, labels: Sequence[int], shown: Sequence[int]) -> list[int]:
-        """Return the views of dstates, so that each dstate has a view that is seen there.
+        """Correct the views of dstates, so that each dstate has a view that is seen there.
 
         A dstate whose view is always misread gets the view that is seen there most often.
 
         Args:
             labels: The dstate of each step.
-            shown: The view of each dstate before.
+            shown: The view of each dstate.
+
+        Returns:
+            The corrected views.
         """
         views = list(shown)
         for s in set(labels) - {s for t, s in enumerate(labels) if shown[s] == self._seen[t]}:

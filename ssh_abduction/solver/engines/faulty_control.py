@@ -1,9 +1,9 @@
 """The control of clingo for some steps of a trace with faults (faulty.lp).
 
-Clingo assigns a name, which is a dstate, to each step. Each view has some names and a *rest*. The
-rest is one name for all other dstates of the view. A rest costs one dstate, and no axiom constrains
-the steps at it. So a minimal answer without rests is minimal for any number of names. If an answer
-uses a rest, its view gets more names.
+Clingo assigns a name, which stands for a dstate, to each step. Each view has some names and a
+*rest*. The rest is one name for all other dstates of the view. A rest costs one dstate, and no
+axiom constrains the steps that have this name. So a minimal answer without rests would also be
+minimal if there were more names. If an answer uses a rest, its view gets more names.
 
 At first a misread step is *lost*: it has no dstate, so no link leads to or from it. If a minimal
 answer loses a step, the step becomes *full*: it may be at any dstate.
@@ -24,7 +24,7 @@ from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.theory.evidence import Equality
 
 LONG = 1000  # from this many steps on, blocks give the bound before clingo is asked
-AROUND = 8  # clingo gets this many steps before and after one that a map does not predict
+AROUND = 8  # clingo gets this many steps before and after a step that a map does not predict
 NAMES = 3  # names of each view at first
 MORE_NAMES = 2  # names added to a view whose rest is used
 OPTIONS = ("--opt-strategy=usc,stratify",)
@@ -61,9 +61,9 @@ class _Told:
     Attributes:
         names: The number of names of each view.
         full: The steps that may be at any dstate.
-        steps: The steps, in the order in which clingo got them.
+        steps: The given steps, in the order in which clingo got them.
         batches: The number of batches of steps.
-        forbidden: The number of forbidden sets.
+        forbidden: The number of forbidden sets of equalities.
     """
 
     names: dict[int, int] = field(default_factory=dict)
@@ -146,7 +146,7 @@ class FaultyControl:
             told.forbidden = len(self.forbidden)
 
     def forget(self) -> None:
-        """Make a new control for the next question, as clingo was stopped and may lack rules."""
+        """Use a new control for the next question. Clingo was stopped, and may lack rules."""
         self._told = _Told({}, set())
 
     def _begin(self) -> None:
@@ -207,6 +207,7 @@ class FaultyControl:
                     return
 
     def _read(self, model: clingo.Model) -> FaultyAnswer:
+        """Read an answer of clingo."""
         where, slips, lost = faulty_lp.read_faulty(model)
         used = set(where.values())
         rests = frozenset(view for name, view in faulty_lp.faulty_rests(self.names) if name in used)

@@ -10,10 +10,10 @@ one place, and how their frames are turned (`steps/chart.py`). visits.lp decides
 about the order of places on a path and about its sides. paths_framed.lp then finds the fewest paths
 and places that fit these dstates (`engines/framed_paths.py`).
 
-*Claim.* Every map of the topological theory determines an answer of visits.lp, by which of its
-visits are at one place. So the fewest dstates of visits.lp are a lower bound. If paths fit some
-answer of that cost, then all minimal maps are among the answers of that cost, with the fewest paths
-that fit them.
+*Claim.* Every map of the topological theory determines an answer of visits.lp: the one in which the
+same visits are at one place. So the fewest dstates of visits.lp are a lower bound. If paths fit
+some answer of that cost, then all minimal maps are among the answers of that cost, with the fewest
+paths that fit them.
 
 *If no paths fit an answer*, paths_framed.lp is asked for a path that the answer contradicts.
 sides_framed.lp then adds the axioms of order and sides for that path. Perhaps no single path is
@@ -67,8 +67,8 @@ class FramedEngine:
 
         Args:
             task: The problem, the limits and the speed-ups.
-            around: For each observation, the ones seen ahead, right, back and left of it, as in
-                `Chart.framed`. None if the steps have stars, the gateways seen there.
+            around: For each observation, the observations ahead, right, back and left of a robot
+                that makes it, as in `Chart.framed`. None if the steps have stars.
         """
         self.asker = Asker(task.watch)
         self.intact = True
@@ -77,7 +77,7 @@ class FramedEngine:
         self._sides = FramedSides(task.theory, self.asker)
         self._fitting = FramedPaths(task, self.asker)
         self._visits = VisitLabels(task, self.asker, self._charted, self._sides)
-        self._unframed_size = 0  # the size of the prefix, used if its visits fit no frames
+        self._unframed_size = 0  # the size of the prefix, in case that its visits fit no frames
         self._framed = True  # whether the visits fit their frames
         # The minimal cost, and all labels with maps of that cost.
         self._best: tuple[tuple[int, ...], list[Naming]] | None = None
@@ -153,7 +153,7 @@ class FramedEngine:
         self._best = best.cost, namings
 
     def _first_with_paths(self) -> Fitted | None:
-        """Find labels with the fewest dstates that paths fit; None if the prefix has no map."""
+        """Find labels with the fewest dstates and paths that fit; None if the prefix has no map."""
         fitted: list[Fitted] = []
 
         def why_not(labels: list[int]) -> list[int] | None:
@@ -220,6 +220,7 @@ class FramedEngine:
                 yield settled
 
     def _namings_of_cost(self, cost: tuple[int, ...]) -> Iterator[Naming]:
+        """Yield the labels that maps of this cost have, known ones if there are any."""
         if self._best and self._best[0] == cost:
             return iter(self._best[1])
         return self._all_with_paths(cost[0])
@@ -247,7 +248,7 @@ class FramedEngine:
             yield fitted.pop(tuple(labels)).naming
 
     def _refuse(self, labels: Sequence[int]) -> None:
-        """Give clingo a rule that excludes these labels, as no paths fit them."""
+        """Give clingo rules that exclude these labels, as no paths fit them."""
         visits, fitting = self._visits, self._fitting
         visits.take_back(labels)
         told = (
@@ -273,13 +274,13 @@ class FramedEngine:
         return True
 
     def _charted(self, size: int, before: FramedChart | None) -> FramedChart | None:
-        """Chart the nodes of the first steps, and the pairs of them that are at different places.
+        """Chart the first steps, with the pairs of nodes that must be at different places.
 
         The pairs are those that follow from the trace alone, by the axioms of order and sides.
 
         Args:
             size: The number of steps.
-            before: The chart of fewer steps, if there is one.
+            before: The chart of fewer steps, if there is one. Then only its pairs are taken.
 
         Returns:
             The chart; None if the steps fit no frames.
@@ -289,5 +290,5 @@ class FramedEngine:
 
 
 def _listing(cost: tuple[int, ...]) -> str:
-    """Return clingo's opt-mode that lists the maps of this cost, if the dstates are fixed."""
+    """Return clingo's opt-mode for listing the maps of this cost, with given dstates."""
     return f"enum,{','.join(map(str, (0, *cost[1:])))}"

@@ -6,7 +6,7 @@ fit, it finds clashes: minimal sets of nodes whose labels no paths fit. Paths ar
 are only merged when they must be one.
 
 Reading answers would take most of the time of a long list. So the reader starts from the atoms of
-the answer before, and clingo searches for the next answer while a map is made from the present one.
+the previous answer. And clingo searches for the next answer while a map is made from this one.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from ssh_abduction.solver.engines.refusing import smaller
 from ssh_abduction.solver.steps.chart import FramedChart
 from ssh_abduction.theory.evidence import Equality
 
-# Give clingo up to this many clashes at once. Each of them saves a question, and one control of
-# paths lists them all.
+# Give clingo up to this many clashes at once. Each of them saves a question, and one control lists
+# them all.
 CLASHES = 30
 # If labels have more dstates than this, first try paths that are separate if possible. Grounding
 # all ways to merge paths takes long.
@@ -44,7 +44,7 @@ BETTERING = 20_000
 
 @dataclass(frozen=True)
 class Naming:
-    """Labels for which clingo is asked for places and paths.
+    """Labels, for which clingo is then asked for places and paths.
 
     Attributes:
         chart: The chart of the nodes.
@@ -59,7 +59,7 @@ class Naming:
 
 @dataclass(frozen=True)
 class Fitted:
-    """Labels that paths fit (`naming`), and a map with these labels (`found`)."""
+    """A map (`found`), and its labels (`naming`)."""
 
     found: Found
     naming: Naming
@@ -92,11 +92,11 @@ class FramedPaths:
 
     @property
     def preparing(self) -> float:
-        """An estimate of the seconds for which clingo cannot be stopped, if asked for all paths."""
+        """An estimate of the seconds for which clingo cannot be stopped while it prepares."""
         return PREPARED * self._seconds
 
     def forget_time(self) -> None:
-        """Forget how long grounding took, as the next labels are of another prefix."""
+        """Forget how long grounding took. Call this before the labels of another prefix."""
         self._seconds = 0.0
 
     def some(self, chart: FramedChart, labels: Sequence[int]) -> Fitted | None:
@@ -107,8 +107,8 @@ class FramedPaths:
         """Find a map with these dstates and separate paths, if there are many dstates.
 
         Returns:
-            The map; None if there are few dstates, or no separate paths fit. Then `any` may still
-            find a map.
+            The map and its labels. None if there are few dstates, or no separate paths fit; then
+            `any` may still find a map.
         """
         found = self.separate(chart, labels) if len(set(labels)) > MANY_DSTATES else None
         return Fitted(found, Naming(chart, list(labels))) if found else None
@@ -182,6 +182,7 @@ class FramedPaths:
         return Settled(self._asker, control, mode, reader, reader.map_of)
 
     def _reader(self, naming: Naming, control: clingo.Control) -> path_reader.PathReader:
+        """Make a reader of the places and paths in answers of a control."""
         return path_reader.PathReader(
             control, self.task.trace, self.task.theory, naming.chart, naming.labels
         )
@@ -231,7 +232,10 @@ class FramedPaths:
         return clashes or [self._clash(chart, labels)]
 
     def _clash(self, chart: FramedChart, labels: Sequence[int]) -> list[int]:
-        """Find one small clash by trial, if it follows only after choosing which segments merge."""
+        """Find one small clash by trial: leave out nodes while no paths fit the others.
+
+        This is for labels whose contradiction shows only after choosing which segments merge.
+        """
 
         def clashing(nodes: list[int]) -> list[int] | None:
             control = self.control(chart, labels, nodes=nodes)

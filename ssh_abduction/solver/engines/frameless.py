@@ -7,14 +7,14 @@ With the axioms of places and paths for each step, clingo only manages a few doz
 exploring. But these axioms are about dstates: the place of a dstate, and the path that it is along.
 So the dstates get names, as in the causal theory (`engines/naming.py`). sides_frameless.lp has the
 axioms of order and sides, which exclude some links between dstates (`engines/frameless_paths.py`).
-Its size depends on the number of dstates, not of steps.
+The number of its rules depends on the number of dstates, not on the number of steps.
 
 *Claim.* Each map of the topological theory is an answer of names.lp and sides_frameless.lp, with
 the number of dstates as its cost.
 *Proof.* Let `goes` hold for the links of the map only. Let each other atom of sides_frameless.lp
 hold if its comment is true of the map. The rules of sides_frameless.lp then follow from the axioms
-for two or three dstates. A travel stays on its path and leads further along it, as the order is
-transitive. A turn stays at its place. The rules say nothing about the rest, the one name of all
+for two or three dstates: a travel stays on its path and leads further along it, the order is
+transitive, and a turn stays at its place. The rules say nothing about the rest, the one name of all
 dstates that have no name of their own (`engines/naming.py`). ∎
 
 So the bounds hold. If places and paths fit some answer of least cost, then all minimal maps are
@@ -36,7 +36,7 @@ from ssh_abduction.solver.engines.refusing import all_accepted
 from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.theory.evidence import Equality
 
-# First list about this many maps that differ in their places. They are kept in memory until all
+# First list about this many maps whose dstates or places differ. They are kept in memory until all
 # other maps are listed.
 SOONER = 1000
 
@@ -172,8 +172,8 @@ class FramelessEngine:
 
     def forbid(self, equalities: Collection[Equality]) -> bool:
         self._fitting.forbid_together(equalities)
-        # Steps at one dstate are also at one place. So if all pairs of steps were each at one
-        # dstate, all equalities would hold.
+        # Steps at one dstate are also at one place. So labels that put each of these pairs of steps
+        # at one dstate are forbidden, too.
         self._named.forbid_together([(one.first, one.second) for one in equalities])
         if self._best:  # the remaining maps of that cost have some of these labels
             self._best = (

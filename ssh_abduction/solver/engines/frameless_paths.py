@@ -2,9 +2,9 @@
 
 The input is a label, the number of a dstate, for each step. paths_frameless.lp finds the fewest
 places and paths that fit the labels. If none fit, then mostly some single path contradicts the
-axioms. sides_frameless.lp adds the axioms of a few such paths at a time. Mostly a dozen of them are
-enough. If no single path is contradictory, a minimal set of links that no places and paths fit is
-forbidden.
+axioms. Clingo then gets the axioms of a few such paths at a time (sides_frameless.lp). Mostly a
+dozen paths are enough. If no single path contradicts the axioms, clingo gets a rule against a
+minimal set of links that no places and paths fit.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ _Question: TypeAlias = tuple[tuple[int, ...], tuple[str, ...], tuple[str, ...]]
 # paths.
 TOLD, EACH = ("base", "segments"), ("each",)
 PARTS = (*TOLD, "least", "paths")
-# Ask whether the pairwise distinct places are enough, until that failed for TIGHT labels. Each
-# question may take TIGHTLY conflicts. The answer mostly comes at once.
+# First ask whether the pairwise distinct places are enough (`engines/homes.py`), until that failed
+# for TIGHT labellings. Each question may take TIGHTLY conflicts. The answer mostly comes at once.
 TIGHT, TIGHTLY = 5, 2000
 
 
 @dataclass(frozen=True)
 class _Far:
-    """A constraint from evidence: not all of these pairs of dstates are each at one place.
+    """A constraint from evidence: at least one of these pairs of dstates is at two places.
 
     Mostly there is only one pair.
 
@@ -72,8 +72,8 @@ class _Far:
             equalities: Equalities of steps that must not all hold.
 
         Returns:
-            The constraint; None if the labels already break an equality of dstates, or do not yet
-            include all the steps.
+            The constraint. None if it cannot be violated: an equality of dstates does not hold in
+            the labels, or the prefix does not have all the steps yet.
         """
         steps = dict.fromkeys(
             step for equality in equalities for step in (equality.first, equality.second)
@@ -88,7 +88,7 @@ class _Far:
 
 @dataclass(frozen=True)
 class _Members:
-    """A set of links and of constraints `_Far`, for which perhaps no places and paths exist."""
+    """A set of links and of constraints `_Far`, to find out whether places and paths fit them."""
 
     links: list[Link]
     far: list[_Far]
@@ -133,13 +133,13 @@ class PlacesAndPaths:
         self._told: set[tuple[int, int]] = set()
         # The last labels, and the control for their places and paths.
         self._asked: tuple[_Question, clingo.Control] | None = None
-        # For labels whose fewest places are known: the homes (`engines/homes.py`) and a best map.
-        # And the labels for which homes did not lead to a map.
+        # For each labelling for which the fixed places are enough: the homes (`engines/homes.py`)
+        # and a best map. And the labellings for which homes did not lead to a map.
         self._tight: dict[tuple[int, ...], tuple[Mapping[int, list[int]], Found]] = {}
         self._failed: set[tuple[int, ...]] = set()
 
     def forget(self) -> None:
-        """Forget everything about the control, as a new one comes for another prefix."""
+        """Forget everything about the control. Call this before there is one for another prefix."""
         self._told = set()
         self._forget_tight()
 
@@ -147,7 +147,7 @@ class PlacesAndPaths:
         self._tight, self._failed, self._asked = {}, set(), None
 
     def tell_again(self) -> None:
-        """Give a new control the axioms of paths that the one before had."""
+        """Give a new control the axioms of the paths that the previous control had."""
         told, self._told = self._told, set()
         if told:
             self._tell_of([key for key in self.named.program.names() if key in told])
@@ -257,6 +257,7 @@ class PlacesAndPaths:
         return None if self.fits(labels) else labels
 
     def _has_paths(self, control: clingo.Control) -> bool:
+        """Whether a control has an answer, that is, places and paths."""
         return next(self._asker.answers(lambda _: True, "ignore", 1, control=control), False)
 
     def forbid(self, labels: Sequence[int]) -> None:
@@ -285,15 +286,15 @@ class PlacesAndPaths:
             )
 
     def _turned_together(self, links: Iterable[Link], far: Iterable[_Far]) -> list[_Members]:
-        """Find pairs of dstates that turns put at one place, though evidence says they are not.
+        """Find constraints that turns violate: they put the dstates of each pair at one place.
 
         Args:
             links: All links between dstates.
             far: The constraints from evidence.
 
         Returns:
-            Each violated constraint, with the links of the shortest sequence of turns between its
-            dstates. At most `CONTRARY` of them, those with fewest links first.
+            Each violated constraint, with the links of the shortest sequence of turns between the
+            dstates of each pair. At most `CONTRARY` of them, those with the fewest links first.
         """
         turns = nx.Graph(
             (s, x, {"link": (s, action, x)}) for s, action, x in links if self._actions[action].turn
@@ -357,10 +358,10 @@ class PlacesAndPaths:
             links: Links between dstates.
             dstates: Further dstates, which may have no links.
             options: Options of clasp.
-            far: Constraints on dstates that are not at one place.
+            far: Constraints that evidence puts on the places of dstates.
             single: Merge places and segments only if they must be one.
             parts: The parts of the program to ground.
-            labels: The dstate of each step, if paths must not lead to other floors.
+            labels: The dstate of each step, so that paths stay on one floor; empty to ignore that.
         """
         control = Control(options, self._asker.watch.check, PREPARING)
         control.load_encodings("paths_frameless", "preference")

@@ -4,7 +4,7 @@ A place has a frame if its directions are numbered, and turns rotate by known ri
 dstates hardly depend on places and paths (`engines/framed.py`), and a good map of thousands of
 steps takes seconds. With star=pattern clingo gets all axioms for each step, and only manages a few
 dozen steps. But each map of `Theory.with_frames` is also a map of the theory with star=pattern. So
-in a world with frames this finds the true map or one that is about as small.
+if the world has frames, this finds the true map or one that is about as small.
 """
 
 from __future__ import annotations

@@ -9,9 +9,9 @@ No map has fewer. But to prove that the way back needs no other places is a pige
 it takes clasp minutes.
 
 So this module finds a large clique of pairwise distinct places, which are called *fixed*. Suppose
-that a map has only as many places as there are fixed ones. Then each other place is the same as a
-fixed one, its *home*. If a place comes after another along a path, then its home can come after
-the home of the other. This leaves few possible homes. In the corridor each place has only one.
+that a map has only as many places as there are fixed ones. Then each other place is one with a
+fixed place, its *home*. If a place comes after another along a path, then its home may come after
+the home of the other, too. This leaves few possible homes. In the corridor each place has only one.
 
 Clingo then tries only these homes. If it finds a map, this map has the fewest places, and all
 minimal maps use these homes. If it finds none, the supposition was wrong, and clingo tries all ways
@@ -80,6 +80,7 @@ def fewest_paths(told: Segments) -> int:
 
 
 def _by_segment(steps: list[tuple[int, int, int]]) -> Mapping[int, list[tuple[int, int]]]:
+    """Group travels (segment, from place, to place) by their segments."""
     found: dict[int, list[tuple[int, int]]] = defaultdict(list)
     for segment, c, b in steps:
         found[segment].append((c, b))
@@ -90,8 +91,8 @@ def _may_follow(pairs: list[tuple[int, int]], columns: list[int]) -> NDArray[np.
     """Find which fixed places may come after which others on the path of a segment.
 
     Args:
-        pairs: For each travel of the segment, the place where it begins and the one where it ends.
-        columns: The fixed places, by number.
+        pairs: For each travel of the segment, the places where it begins and where it ends.
+        columns: The numbers of the fixed places.
 
     Returns:
         A matrix, fixed x fixed: whether the place of the column may come after that of the row.

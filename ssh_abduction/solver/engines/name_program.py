@@ -1,8 +1,9 @@
 """The control of clingo that assigns names of dstates to steps (names.lp).
 
 The engines without frames use it. Clingo gets only some links of the trace at first, and more if an
-answer needs them. Fewer links are a relaxation, so a proven bound holds for the trace. Each answer
-is followed along the trace (`NameProgram.follow`). If it explains every link, it is a map.
+answer needs them. Fewer links are a relaxation, so a proven bound also holds for the whole trace.
+Each answer is followed along the trace (`NameProgram.follow`). If it explains every link, it is a
+map.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ PREPARING = 0.6
 # that are left.
 MORE_LINKS = 1000
 
-# A linked list of the links that were followed since the last node that clingo named, latest first.
+# A linked list of the links that were followed since the last node that clingo named. The latest
+# link comes first.
 _Trail: TypeAlias = "tuple[Link, _Trail] | None"
 
 
@@ -46,7 +48,7 @@ class Fitting(Protocol):
         ...
 
     def tell_again(self) -> None:
-        """Give a new control the rules that the one before had."""
+        """Give a new control the rules that the previous control had."""
         ...
 
 
@@ -58,9 +60,9 @@ class _Known:
         spare: The spare names of each view. The last one is the rest, which any number of dstates
             without a name of their own share.
         choices: For each node, the names that it may have.
-        is_open: For each node, whether the control has it and it may have several names.
-        links: The links, as keys in the order in which they were given.
-        nodes: The nodes.
+        is_open: For each node, whether clingo has it and has to choose its name.
+        links: The given links, as keys in the order in which they were given.
+        nodes: The given nodes.
         last: For each view, the last given node that may have several names.
         batches: The number of batches.
     """
@@ -79,7 +81,8 @@ class NameProgram:
 
     Attributes:
         pinned: The nodes, their links, and the clique of nodes that have names of their own.
-        forbidden: Sets of pairs of nodes. In no map are all pairs of one set at one dstate each.
+        forbidden: Sets of pairs of nodes. A map must not have the nodes of each pair of a set at
+            one dstate.
     """
 
     def __init__(
@@ -123,7 +126,7 @@ class NameProgram:
         return len(self._known.links)
 
     def tell_all(self, links: Iterable[Link]) -> None:
-        """Give a new control these links, and the rules for all that is forbidden."""
+        """Give a new control some links, and all rules that forbid something."""
         self.add(links)
         for number in range(len(self.forbidden)):
             self.tell_forbidden(number)
@@ -148,7 +151,7 @@ class NameProgram:
             for view, count in self._spares.items():
                 spare[view] = list(range(len(names), len(names) + count + 1))
                 names += [(name, view) for name in spare[view]]
-            # A node of the clique has one name. All others may also have any spare name.
+            # A node of the clique has one name. Other nodes may also have any spare name.
             choices = [
                 options
                 if len(options) == 1 and t == clique[options[0]]
@@ -265,7 +268,7 @@ class NameProgram:
         return {view for view, spare in self._known.spare.items() if spare[-1] in used}
 
     def resting(self, value: bool) -> tuple[clingo.Symbol, bool]:
-        """Return the assumption that some node is at a rest (True), or that none is (False)."""
+        """Return the assumption that some node has a rest as its name (True), or none (False)."""
         return names_lp.resting(self._known.batches - 1), value
 
     def reader(self) -> names_lp.NameReader:
@@ -280,8 +283,9 @@ class NameProgram:
             answer: The name of each node that clingo has.
 
         Returns:
-            The name of each node, -1 if it is unknown; and the links that the answer does not
-            explain, to be given to clingo next. If there are none, the names are those of a map.
+            The name of each node, -1 if it is unknown; and links that clingo lacks and should get
+            next, as the answer contradicts or does not explain them. If there are none, the names
+            make a map.
         """
         if self.has_all_links and not self.rests(answer):
             return [answer[node] for node in range(len(answer))], []
@@ -311,7 +315,7 @@ class NameProgram:
                         followed[u] = None if u in answer else trail
                 labels[u] = answer.get(u, -1) if there is None else there
             elif here >= 0 and labels[u] >= 0 and goes.setdefault(key, labels[u]) != labels[u]:
-                # The action leads to two names, so any link that was followed to get here may be
+                # The action leads to two names. So any link on the two trails that lead here may be
                 # wrong.
                 failed.update(self._not_given((link, followed[t])))
                 failed.update(self._not_given(followed[u]))
@@ -319,7 +323,7 @@ class NameProgram:
         return labels, list(failed)
 
     def _links_at_excluded(self, labels: Sequence[int]) -> list[Link]:
-        """List links that clingo lacks, at nodes that share a label against evidence."""
+        """List links that clingo lacks, at nodes that share a label against the evidence."""
         excluded = {
             node
             for pair in self.chart.excluded

@@ -1,11 +1,11 @@
-"""Searches for the fewest named dstates, for the engines without frames.
+"""Searches for names with the fewest dstates, for the engines without frames.
 
-Clasp raises the lower bound core by core. A core is a set of spare names that cannot all be left
-unused. Cores are small at first, as views share no names.
+Clasp raises the lower bound core by core. A core is a set of spare names of which at least one is
+needed. Cores are small at first, as views share no names.
 
-If that takes long, small maps are looked for (`engines/small_maps.py`, `engines/nearby.py`): first
-steps are merged, and later a map is guessed. The search ends as soon as some map has as few dstates
-as the bound.
+If that takes long, the search also looks for small maps in other ways (`engines/small_maps.py`,
+`engines/nearby.py`): first it merges steps, and later it guesses a map. The search ends as soon as
+some map has as few dstates as the bound.
 """
 
 from __future__ import annotations
@@ -22,12 +22,13 @@ from ssh_abduction.solver.engines.refusing import first_accepted_of
 from ssh_abduction.solver.engines.small_maps import SmallMaps
 from ssh_abduction.solver.steps.chart import Link
 
-# After this many conflicts clingo is given more links: too few links show soon.
+# If clingo has not ended after this many conflicts, give it more links. If it lacks links that
+# matter, this mostly shows sooner.
 PATIENCE = 2000
 # After this many conflicts with all links, look for a map near a guess. Then clingo continues
 # without a limit.
 CORES = 10_000
-# Try this often with more conflicts near the guess: later tries rarely help.
+# Search near a guess this many times, each time with more conflicts. Later tries rarely help.
 TRIES = 3
 
 
@@ -40,17 +41,17 @@ class Incumbent:
     """
 
     def __init__(self, is_allowed: Callable[[Sequence[int]], bool]) -> None:
-        """Know nothing yet.
+        """Begin without labels and without a bound.
 
         Args:
-            is_allowed: Whether labels agree with evidence about pairs of steps.
+            is_allowed: Says whether labels agree with the evidence about pairs of steps.
         """
         self.bound: int | None = None
         self.labels: list[int] | None = None
         self._is_allowed = is_allowed
 
     def raise_bound(self, bound: int) -> None:
-        """Take this bound if it is higher."""
+        """Take over a bound if it is higher than the known one."""
         self.bound = max(self.bound or 0, bound)
 
     def is_settled(self) -> bool:
@@ -58,9 +59,9 @@ class Incumbent:
         return self.labels is not None and len(set(self.labels)) <= (self.bound or 0)
 
     def take(self, labels: list[int] | None, bound: int) -> None:
-        """Take labels and a bound from a search near a guess, if better.
+        """Take over labels and a bound from a search near a guess, if they are better.
 
-        Such a search ignores evidence about pairs of steps.
+        Such a search ignores some evidence about pairs of steps, so the labels may not be allowed.
         """
         fewer = labels is not None and (
             self.labels is None or len(set(labels)) < len(set(self.labels))
@@ -85,12 +86,12 @@ class _Answer:
 
 @dataclass(frozen=True)
 class _Lacking:
-    """What clingo lacks. One attribute is set.
+    """The reason to reject an answer: what clingo lacks. One attribute is set.
 
     Attributes:
         views: Views that need another name.
         links: Links that the answer does not explain.
-        labels: Labels that violate demands beyond the causal theory.
+        labels: Labels that violate axioms beyond the causal theory.
     """
 
     views: Collection[int] = ()
@@ -113,19 +114,19 @@ class NameSearch:
 
         Args:
             task: The trace and the speed-ups that are on.
-            asker: It asks clingo.
-            program: The control that names dstates.
+            asker: Asks clingo.
+            program: The control that assigns names of dstates to nodes.
             incumbent: The best labels and the bound. The search improves them.
-            fitting: Further demands on labels; None in the causal theory.
+            fitting: Further axioms for labels; None in the causal theory.
         """
         self._task, self._asker, self._program = task, asker, program
         self._incumbent, self._fitting = incumbent, fitting
         self._small = SmallMaps(task, program.pinned)
-        self._hard = False  # whether few conflicts were not enough
-        self._had_all_help = False  # whether clingo has all links, and small maps were sought
+        self._hard = False  # whether clingo once did not end after few conflicts
+        self._had_all_help = False  # whether maps near a guess were sought already
 
     def improving(self) -> Iterator[list[int]]:
-        """Yield labels of all nodes. The last ones have the fewest dstates.
+        """Yield labels of all nodes. The last labels have the fewest dstates.
 
         If the search takes long, other labels with few dstates come first.
         """
@@ -149,14 +150,18 @@ class NameSearch:
         self._program.name_more(views)
 
     def _searched(self) -> Iterator[list[int]]:
-        """As `improving`. End early if a known map has the fewest dstates."""
+        """Do the work of `improving`. End early if a known map has the fewest dstates."""
         found = yield from first_accepted_of(self._cheapest_answer, self._why_not, self._tell_why)
         yield found.labels if found else self._incumbent.labels or []
 
     def _cheapest_answer(self) -> Generator[list[int], None, _Answer | None]:
-        """The cheapest answer under clingo's rules; None if a known map is as good.
+        """Find the cheapest answer for the links that clingo has.
 
-        If the search takes long, yield labels found in other ways.
+        Yields:
+            If the search takes long, labels that were found in other ways.
+
+        Returns:
+            The answer; None if a known map is as good.
         """
         while True:
             names, proven = self._cheapest(self._patience)
@@ -168,7 +173,11 @@ class NameSearch:
             self._program.add(self._program.more_links())
 
     def _cheapest(self, conflicts: int) -> tuple[dict[int, int] | None, bool]:
-        """The best answer within this many conflicts, and whether it is proven to be the best."""
+        """Find the best answer within a number of conflicts.
+
+        Returns:
+            The answer, or None if there is none yet; and whether it is proven to be the best.
+        """
         pinned = len(self._program.pinned.clique)
         answer = None
         answers = self._asker.answers(
@@ -186,7 +195,7 @@ class NameSearch:
                 return answer, bool(end.value)
 
     def _why_not(self, answer: _Answer) -> _Lacking | None:
-        """What clingo lacks, by an answer; None if the answer is a map."""
+        """Return the reason to reject an answer; None if the answer is a map."""
         program = self._program
         if views := program.rests(answer.names):
             return _Lacking(views=views)
@@ -201,6 +210,7 @@ class NameSearch:
         return _Lacking(labels=answer.labels)
 
     def _tell_why(self, lacking: _Lacking) -> None:
+        """Give clingo what it lacked when it found a rejected answer."""
         if lacking.views:
             self.name_more(lacking.views)
         elif lacking.links:
@@ -210,23 +220,23 @@ class NameSearch:
 
     @property
     def _patience(self) -> int:
-        """The number of conflicts after which to try something else; -1 for never."""
+        """The number of conflicts after which to interrupt clingo; -1 for never."""
         if not self._program.has_all_links:
             return PATIENCE
         return -1 if self._had_all_help or not self._may_help else CORES
 
     @property
     def _may_help(self) -> bool:
-        """Whether small maps may be looked for without clingo.
+        """Whether to look for small maps in other ways.
 
-        A small map of the causal theory need not fit further demands.
+        They are maps of the causal theory, so they are of no use if there are further axioms.
         """
         return self._fitting is None and (
             self._task.speedups.greedy or self._task.speedups.annealed
         )
 
     def _helped(self) -> Iterator[list[int]]:
-        """Labels of small maps found in other ways, as clingo's search takes long."""
+        """Look for small maps in other ways, as clingo's search takes long. Yield their labels."""
         if self._may_help and not self._hard and not self._program.pinned.is_long:
             yield from self._small.merged(self._asker.watch.check)
         self._hard = True
@@ -235,7 +245,7 @@ class NameSearch:
             yield from self._near_a_guess()
 
     def _near_a_guess(self) -> Iterator[list[int]]:
-        """Look for small maps near a guess for a while."""
+        """Look for small maps near a guess for a while. Yield their labels."""
         check, known = self._asker.watch.check, self._incumbent.labels
         if self._program.pinned.is_long:
             yield from _ever_fewer(self._small.from_beginning(check), known)
@@ -246,7 +256,7 @@ class NameSearch:
 
 
 def _ever_fewer(found: Iterable[list[int]], known: list[int] | None = None) -> Iterator[list[int]]:
-    """The labels that have fewer dstates than all before them."""
+    """Yield only the labels that have fewer dstates than all earlier ones, and than `known`."""
     for labels in found:
         if known is None or len(set(labels)) < len(set(known)):
             known = labels

@@ -12,12 +12,12 @@ spare name costs one dstate. Each view also has a *rest*, one name that all its 
 If there are several largest cliques, the one that leaves the other steps the fewest names is
 pinned.
 
-*Claim.* An answer of minimal cost that uses no rest is a minimal map, and its cost is the minimum.
+*Claim.* An answer of minimal cost that uses no rest is a minimal map.
 *Proof.* Name the dstates of any map. The pinned steps have their names. The other dstates get spare
 names of their view, while there are any, and then the rest. These names satisfy each rule of
-names.lp, as the rules say nothing about steps at a rest. They cost no more spare names than the map
-has dstates beyond the clique. So the minimal cost is a lower bound. An answer without a rest is a
-map of the trace with this cost. ∎
+names.lp, as the rules say nothing about steps that are named by a rest. They use no more spare
+names than the map has dstates beyond the clique. So the minimal cost of answers is a lower bound on
+that of maps. An answer without a rest is a map of the trace with its cost. ∎
 If a minimal answer uses a rest, its view gets one more spare name, and clingo is asked again.
 
 Not every step is needed. Clingo starts with the links of the pinned steps. Each answer is followed
@@ -86,7 +86,7 @@ class NamedLabels:
         self.size = 0
         self._task, self._asker, self._given_map, self._fitting = task, asker, given_map, fitting
         self._incumbent = Incumbent(self.is_allowed)
-        # Sets of pairs of steps. In no map are all pairs of one set at one dstate each.
+        # Sets of pairs of steps. A map must not have the steps of each pair of a set at one dstate.
         self._forbidden: list[list[tuple[int, int]]] = []
         self._pinned: Pinned | None = None
         self._program: NameProgram | None = None
@@ -126,6 +126,7 @@ class NamedLabels:
         return size
 
     def _clique_size(self, steps: int) -> int:
+        """Return the size of a largest clique of the first steps."""
         log = self._task.log
         return len(Continuations(log.seen[:steps], log.actions[: steps - 1]).clique())
 
@@ -178,9 +179,9 @@ class NamedLabels:
         }
 
     def improving(self) -> Iterator[list[int]]:
-        """Yield labels of all steps of the prefix. The last ones have the fewest dstates.
+        """Yield labels of all steps of the prefix. The last labels have the fewest dstates.
 
-        If the search takes long, labels with few dstates come before.
+        If the search takes long, other labels with few dstates come first.
         """
         assert self._search is not None  # `grow` comes first
         return self._search.improving()
@@ -190,7 +191,7 @@ class NamedLabels:
         return self.program.is_allowed(labels)
 
     def forbid_together(self, pairs: Collection[tuple[int, int]]) -> None:
-        """Exclude labels in which each of these pairs of steps is at one dstate."""
+        """Exclude labels in which the steps of each of these pairs are at one dstate."""
         self._forbidden.append(list(pairs))
         known = self._incumbent
         if known.labels and not self.is_allowed(known.labels):
@@ -198,12 +199,12 @@ class NamedLabels:
         self.program.tell_forbidden(len(self._forbidden) - 1)
 
     def all_of(self, dstates: int, enough: int) -> Generator[list[int], None, None]:
-        """Yield each labelling with this many dstates once, the known one first.
+        """Yield each labelling with a number of dstates once. A known labelling comes first.
 
         Args:
             dstates: The number of dstates.
-            enough: Ask clingo for at most this many labellings; 0 for all. Clingo is not asked
-                if this is 1 and one is known.
+            enough: Ask clingo for at most this many labellings; 0 for all. If this is 1 and a
+                labelling is known, clingo is not asked.
         """
         known = self._incumbent.labels
         if known and len(set(known)) != dstates:
@@ -230,7 +231,7 @@ class NamedLabels:
             yield [0]
             return
         while True:
-            # Ask again after nodes were added, as these may be at a rest.
+            # Ask this again after nodes were added, as their names may be rests.
             while not enough and self._needs_rest(spares):
                 pass
             held: list[list[int]] = []
@@ -261,7 +262,7 @@ class NamedLabels:
                 return
 
     def _needs_rest(self, spares: int) -> bool:
-        """Look for an answer of this cost that uses a rest, and if so add spare names.
+        """Look for an answer of this cost that uses a rest. If there is one, add spare names.
 
         Args:
             spares: The cost, as a number of spare names.

@@ -5,18 +5,19 @@ last map is minimal.
 
 If all steps were free to change their dstates, the search would take long. So most steps keep the
 dstates of a known map, and the search tries to save one dstate. If that is impossible, clingo
-returns an unsat core: a set of steps that cannot all stay where they are. The dstates of these
-steps become free. This is repeated until a dstate is saved, or is proven to be needed. If neither
-happens soon, all steps in some part of the map become free at once (large neighbourhood search:
-Shaw 1998). The size of parts is adapted so that each question is answered soon.
+returns an unsat core: a set of steps that cannot all keep their dstates. All steps at these dstates
+become free. This is repeated until a dstate is saved, or is proven to be needed. If neither happens
+soon, all steps in some part of the map become free at once (large neighbourhood search: Shaw 1998).
+The size of parts is adapted so that each question is answered soon.
 
-When each single dstate is needed, all steps become free. But at first no view may have more dstates
+If no single dstate can be saved, all steps become free. But at first no view may have more dstates
 than in the known map. Then views are allowed more dstates, one view after the other, and in the end
 any number (the rest, see `engines/naming.py`). Each time clingo is asked for a map with fewer
 dstates in total.
 
 *Claim.* If there is no such map when everything is allowed, the known map is minimal.
-*Proof.* This is the question of `engines/naming.py` for a cost lower by one (see its claim). ∎
+*Proof.* `engines/naming.py` asks the same question for its bound. So its claim applies, with a cost
+that is lower by one. ∎
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ from ssh_abduction.solver.steps.apart import Matrix
 CONFLICTS = 2000
 # A question in which all steps are free may take this many times as many conflicts.
 WIDE = 10
-# Try something else after drawing this many parts of the map without success.
+# Stop freeing parts of the map after this many parts in a row without success.
 REGIONS = 40
 # A part has this many dstates at first, and at least.
 FIRST_REGION = 10
@@ -81,8 +82,9 @@ class NearbySearch:
         Args:
             watch: The limits.
             pinned: The nodes, their links, and the clique of nodes that have names of their own.
-            far: Returns flags of the nodes at other dstates than a node; None for no such pairs.
-            configuration: A configuration of clasp; None for its default.
+            far: Given a node, returns a flag for each node: whether evidence excludes that the two
+                are at one dstate. None if there is no such evidence.
+            configuration: The name of a configuration of clasp; None for its default.
         """
         self.bound: int | None = None
         self._asker = Asker(watch)
@@ -91,11 +93,12 @@ class NearbySearch:
         self._names = SpareNames({}, frozenset(), (), {}, 0)
         self._labels: Labels = []
         self._needed: set[int] = set()  # names whose dstate is proven to be needed
-        # For each view, the number of spare names that it keeps, as fewer were not enough once.
+        # For each view whose rest was used once, the number of spare names that it needs at least.
         self._fewest: dict[int, int] = {}
-        # Names that do not help if allowed together. None before each was tried alone.
+        # Names that are proven not to help if they are allowed together. None until each was tried
+        # alone.
         self._allowed: list[int] | None = None
-        self._waiting: list[int] = []  # names that are not yet allowed
+        self._waiting: list[int] = []  # names that were not yet allowed together with these
         self._region = FIRST_REGION
         self._random = random.Random(0)
 
@@ -120,8 +123,8 @@ class NearbySearch:
         left = {view: iter(spare) for view, spare in self._names.spare.items()}
         name_of |= {key: next(left[key[0]]) for key in extra}
         self._labels = [-1 if key is None else name_of[key] for key in guessed]
-        # Ask even if the guess is a map: clasp keeps choosing as in its last answer, and so stays
-        # near the guess. First allow only the names of the guess, then all names but the rests.
+        # Ask even if the guess is a map: clasp then prefers the choices of its last answer, and so
+        # stays near the guess. First allow only the names of the guess, then all but the rests.
         for allowed in ((), [name for spare in self._names.spare.values() for name in spare[:-1]]):
             verdict = self._moved(
                 self._not_allowed(allowed), (), WIDE * CONFLICTS, step_by_step=True
@@ -206,12 +209,13 @@ class NearbySearch:
             self._asker.control.ground([(part, []), ("more", numbers(batch))])
 
     def _literal(self, symbol: clingo.Symbol) -> int:
+        """Return the literal of an atom."""
         atom = self._asker.control.symbolic_atoms[symbol]
         assert atom is not None
         return atom.literal
 
     def _not_allowed(self, allowed: Collection[int]) -> list[int]:
-        """Return assumptions that exclude all spare names but those in use and `allowed`."""
+        """Return assumptions that exclude all spare names except those in use and `allowed`."""
         taken = {*self._labels, *allowed}
         return [-literal for name, literal in self._names.used.items() if name not in taken]
 
@@ -287,6 +291,7 @@ class NearbySearch:
         self._label([name_of[answer[t]] for t in range(len(answer))])
 
     def _label(self, labels: Labels) -> None:
+        """Take over labels, and forget what was proven about the labels before."""
         self._labels, self._allowed, self._needed = labels, None, set()
 
     def _spared(self, conflicts: int) -> Iterator[Labels]:
@@ -363,14 +368,14 @@ class NearbySearch:
                 self._region = max(self._region - SMALLER, FIRST_REGION)
 
     def _widened(self, conflicts: int) -> Generator[Labels, None, _Verdict]:
-        """Look for labels with fewer dstates by allowing more and more names.
+        """Look for labels with fewer dstates, with all nodes free, by allowing more and more names.
 
         Yields:
             The new labels, if any are found.
 
         Returns:
-            "moved" if labels or names have changed; "needed" if all names are allowed and there
-            are no labels with fewer dstates; "open" if that is unknown.
+            "moved" if there are new labels, or more names; "needed" if all names are allowed and
+            there are no labels with fewer dstates; "open" if that is unknown.
         """
         if self._allowed is None:  # first allow no more names, then each of them alone
             taken = set(self._labels)
@@ -448,7 +453,7 @@ class NearbySearch:
         """Make a new control with more names for some views, and rename the labels accordingly.
 
         Args:
-            resting: The rests of these views, as names.
+            resting: The rests of these views.
         """
         before, taken = self._names.spare, set(self._labels)
         used = {view: [name for name in spare if name in taken] for view, spare in before.items()}

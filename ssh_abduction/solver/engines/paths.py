@@ -1,27 +1,26 @@
-"""Questions to paths_framed.lp: what order and sides imply for dstates, and mending of guesses.
+"""Asks paths_framed.lp what order and sides imply for dstates, and makes guesses into maps.
 
-This serves the engine with frames. Questions that need a choice of places and paths are in
-`engines/framed_paths.py`, under the limits of the engine. The questions here need hardly any
-choice: some conflicts are enough as their limit.
+The engine with frames uses it. `engines/framed_paths.py` asks the questions that need a search for
+places and paths, under the limits of the engine. The questions here need hardly any search. So a
+small number of conflicts is enough as their limit.
 
-*A guess.* Visits are annealed (`guesses/annealing.py`). If the guess cannot be right, its places
-become free, and their visits are merged by evidence (`guesses/merging.py`). Meanwhile
-paths_framed.lp says which visits cannot be one, which have to be, and which merge leads to no
-paths. So a guess becomes a map.
+*Guesses.* Annealing guesses which visits are at one place (`guesses/annealing.py`). Where the guess
+cannot be right, the labels are dropped, and the visits are merged by evidence instead
+(`guesses/merging.py`). Meanwhile paths_framed.lp says which visits cannot be at one place, which
+have to be, and which merge allows no paths. So a guess becomes a map.
 
-*Taken back.* If no paths fit the merged labels, bisection finds the first wrong merge. The two
-classes that it merged stay separate from then on. If the guess itself has no paths, its places are
-added in order: places visited once first, then places visited most. A place that leads to no paths
-is left out of the guess; this is done for a few places at most. If a guess leads to no map, another
-one follows, with more spare names for places: places that are merged for lack of names do not
-separate later.
+*Undone merges.* If no paths fit the merged labels, bisection finds the first wrong merge. The two
+classes that it merged stay separate from then on. If no paths fit the guess itself, its places are
+added in order: first the places visited once, then the places visited most. A place that allows no
+paths is left out of the guess. At most a few places are left out. If a guess leads to no map,
+another guess follows, with more spare names for places. With too few names, different places are
+merged and do not separate again.
 
-*Separate paths.* To see whether dstates have any paths, places and segments are not merged unless
-they have to be. That takes a small part of the time that it takes to ground all ways to merge
-them.
+*Separate paths.* To find out whether labels have any paths, places and segments are only merged if
+they must be. That takes a small part of the time for grounding all ways to merge them.
 
-*Pinned.* For the fewest paths, pairwise distinct segments are paths of their own. The other
-segments choose among these first.
+*Pinned segments.* To find the fewest paths, pairwise distinct segments get paths of their own. Then
+other segments are assigned to these paths, or to new ones.
 """
 
 from __future__ import annotations
@@ -53,25 +52,25 @@ from ssh_abduction.solver.steps.localising import faced, states_of, tracked
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.theory import Theory
 
-# So clasp lists the answers that are minimal in their shown atoms.
+# With these options, clasp lists the answers with minimal sets of shown atoms.
 SMALLEST = ("--heuristic=Domain", "--dom-mod=5,16", "--enum-mode=domRec")
-# If more than twice as many pairs of visits may be one, guess the beginning with this many pairs
-# first: annealing takes time for each pair.
+# Annealing takes time for each pair of visits that may be at one place. If there are more than
+# twice as many pairs, first guess only the first visits, with this many pairs.
 FIRST_PAIRS = 200_000
-# Continue a guess at the beginning if it leaves at most this share of the visits open. Otherwise it
-# helps little.
+# Continue a guess of the first visits if at most this share of all visits cannot be located by it.
+# Otherwise it helps little.
 LOST = 0.05
-# After this many conflicts, stop looking for separate paths: this is asked thousands of times, and
-# mostly decided without a conflict.
+# After this many conflicts, stop looking for separate paths. There are thousands of such questions,
+# and most of them are answered without a conflict.
 TRYING = 500
 # Leave at most this many places out of a guess so that the others have paths. If more are wrong,
 # make a new guess.
 LEFT_OUT = 3
-# Clasp prepares for about these multiples of the time and the memory that grounding took. It cannot
-# be stopped meanwhile.
+# Clasp prepares to solve for about these multiples of the time and the memory that grounding took.
+# It cannot be stopped meanwhile.
 PREPARING = (1.6, 2.1)
-# If a guess cannot be right, the places less than this many travels away also become free: a wrong
-# place mostly has a wrong neighbour.
+# Around a contradiction in a guess, drop the labels of places up to 0, 1, … travels away: this many
+# variants. A wrong place mostly has a wrong neighbour.
 LOOSENED = 2
 
 
@@ -87,15 +86,15 @@ class Paths:
         check: Callable[[], None] = lambda: None,
         forbidden: Sequence[Collection[Equality]] = (),
     ) -> None:
-        """Questions about a trace.
+        """Prepare questions about a trace.
 
         Args:
             trace: The trace.
-            theory: The settled theory.
-            pinned: Whether pairwise distinct segments are named as paths beforehand.
-            check: Called now and then while clingo grounds; it may raise. It is not sent to
-                another process, which has its own.
-            forbidden: Sets of equalities of steps that contradict evidence together.
+            theory: The theory, with all defaults filled in.
+            pinned: Whether pairwise distinct segments get paths of their own beforehand.
+            check: Called now and then while clingo grounds; may raise to stop. It is not sent to
+                other processes.
+            forbidden: Sets of equalities of steps. In no map do all equalities of one set hold.
         """
         self._trace = trace
         self._theory = theory
@@ -104,19 +103,20 @@ class Paths:
         self._check = check
 
     def __reduce__(self) -> tuple[Callable[..., Paths], tuple[Trace, Theory]]:
+        """Leave out `check` when this object is sent to another process."""
         return partial(Paths, pinned=self._pinned, forbidden=self._forbidden), (
             self._trace,
             self._theory,
         )
 
     def _under(self, check: Callable[[], None]) -> Paths:
-        """The same questions under these limits."""
+        """Make the same questions, with another `check`."""
         return Paths(
             self._trace, self._theory, pinned=self._pinned, check=check, forbidden=self._forbidden
         )
 
     def control(self, chart: FramedChart, options: Sequence[str] = ()) -> Control:
-        """A control with these axioms and the facts of a chart; nothing is grounded yet."""
+        """Make a control with the axioms and the facts of a chart. Nothing is grounded yet."""
         control = Control(options, self._check, PREPARING)
         control.load_encodings("paths_framed")
         control.add(
@@ -127,16 +127,16 @@ class Paths:
         return control
 
     def contrary(self, chart: FramedChart, labels: Sequence[int]) -> clingo.Control:
-        """A control that says which single paths these labels contradict."""
+        """Make a control whose answer says which single paths contradict the axioms."""
         control = self.control(chart)
         control.add("base", [], paths_lp.settled_labels(enumerate(labels)))
         control.ground([("base", []), ("again", []), ("contrary", [])])
         return control
 
     def clashing(self, chart: FramedChart, labels: Sequence[int]) -> clingo.Control:
-        """A control whose answers are minimal sets of nodes whose labels no paths fit.
+        """Make a control whose answers are minimal sets of nodes whose labels no paths fit.
 
-        It finds only sets that show without a choice of paths.
+        It finds only sets that clash however segments are merged to paths.
         """
         control = self.control(chart, SMALLEST)
         control.add("base", [], paths_lp.open_labels(labels))
@@ -152,7 +152,7 @@ class Paths:
         *,
         single: bool,
     ) -> clingo.Control:
-        """A control for the paths that fit labels.
+        """Make a control whose answers are the places and paths that fit labels.
 
         Args:
             chart: The chart of the nodes.
@@ -184,7 +184,7 @@ class Paths:
     def telling(
         self, chart: FramedChart, labels: Sequence[int], loose: Iterable[int]
     ) -> clingo.Control:
-        """A control for what holds in each map in which the nodes are at these dstates.
+        """Make a control whose answer is what holds in each map with these labels.
 
         Args:
             chart: The chart of the nodes.
@@ -199,9 +199,16 @@ class Paths:
         return control
 
     def told(self, chart: FramedChart, labels: Sequence[int], loose: Sequence[int]) -> Told | None:
-        """Which nodes are apart, and which are one, if all labels but the loose ones hold.
+        """Find out what follows from the labels that are not loose, by the axioms.
 
-        None if these labels cannot hold.
+        Args:
+            chart: The chart of the nodes.
+            labels: The label of each node.
+            loose: The nodes whose labels may be wrong.
+
+        Returns:
+            Which nodes are apart (a matrix), and which are one dstate (pairs); None if the labels
+            contradict the axioms.
         """
         control = self.telling(chart, labels, {labels[node] for node in loose})
         with control.solve(yield_=True) as handle:
@@ -214,7 +221,7 @@ class Paths:
         return _apart(chart, labels, elsewhere), [(first[a], first[b]) for a, b in one]
 
     def may_fit(self, chart: FramedChart, labels: Sequence[int], loose: Collection[int]) -> bool:
-        """Whether labels, except the loose ones, may have separate paths."""
+        """Whether the labels, except those of the loose nodes, may have separate paths."""
         control = self.control(chart)
         control.add("base", [], paths_lp.settled_labels(enumerate(labels)))
         control.ground([("base", [])])
@@ -223,7 +230,7 @@ class Paths:
     def has_separate(
         self, chart: FramedChart, labels: Sequence[int], nodes: Iterable[int] | None = None
     ) -> bool | None:
-        """Whether labels have separate paths; None if this is not soon known.
+        """Whether separate paths fit labels; None if clingo does not know this soon.
 
         Args:
             chart: The chart of the nodes.
@@ -236,16 +243,20 @@ class Paths:
     def _may_have_separate(
         self, chart: FramedChart, labels: Sequence[int], loose: Collection[int]
     ) -> bool:
+        """Whether separate paths fit the labels of all but loose nodes; True if it is unknown."""
         return (
             self.has_separate(chart, labels, set(range(len(labels))).difference(loose)) is not False
         )
 
     def guessed_labels(self, chart: FramedChart, watch: Watch) -> list[int]:
-        """Guess labels of a map of the causal axioms, if possible one that has separate paths.
+        """Guess labels that satisfy the causal axioms, if possible with separate paths that fit.
 
-        If no such map is soon found, the labels are those of a map of few dstates. In a long trace
-        the labels of the first visits are guessed, and followed along the rest. If that leads to no
-        map, twice as many visits are guessed, and so on.
+        If no such labels are found soon, return the guess with the fewest dstates. In a long trace
+        guess the labels of the first visits, and locate the other visits by them. If that leads to
+        no map, guess twice as many visits, and so on.
+
+        Returns:
+            The dstate of each node.
         """
         asked = self._under(watch.check)
         visits = chart.visits_with(FIRST_PAIRS)
@@ -259,7 +270,7 @@ class Paths:
         return asked._guessed(chart, watch.check)
 
     def _guessed(self, chart: FramedChart, check: Callable[[], None]) -> list[int]:
-        """The same, for visits that are guessed at once."""
+        """Do the same as `guessed_labels`, but guess all visits at once."""
         began = time.thread_time()  # a thread may be made to wait
         apart = chart.apart()
         found: list[list[int]] = []
@@ -278,7 +289,18 @@ class Paths:
     def _continued(
         self, chart: FramedChart, part: FramedChart, known: Sequence[int], check: Callable[[], None]
     ) -> list[int] | None:
-        """Labels of all visits near those of a beginning, if these locate most visits."""
+        """Locate all visits by a guess of the first ones, and find labels of a map near that.
+
+        Args:
+            chart: The chart of all visits.
+            part: The chart of the first visits.
+            known: The label of each node of `part`.
+            check: Called now and then; may raise to stop.
+
+        Returns:
+            The dstate of each node of `chart`; None if the guess does not locate most visits, or no
+            map is found soon.
+        """
         states = tracked(chart, dict(enumerate(states_of(part, known))))
         if states.count(-1) > LOST * len(states):
             return None
@@ -300,7 +322,7 @@ class Paths:
             chart: The chart of the nodes.
             apart: Which nodes are apart, nodes x nodes.
             start: The guess: a label for each node, -1 if it is unknown.
-            check: Called now and then; it may raise.
+            check: Called now and then; may raise to stop.
         """
         tell = partial(self._told_if_separate, chart)
         likely = self._likely(chart, apart, start, check)
@@ -314,14 +336,17 @@ class Paths:
     def _told_if_separate(
         self, chart: FramedChart, labels: Sequence[int], loose: Sequence[int]
     ) -> Told | None:
-        """As `told`; also None if the labels that are not loose have no separate paths."""
+        """Return the result of `told`; also None if no separate paths fit the labels.
+
+        Labels of loose nodes need not fit.
+        """
         told = self.told(chart, labels, loose)
         return told if told and self._may_have_separate(chart, labels, loose) else None
 
     def _likely(
         self, chart: FramedChart, apart: Matrix, start: Sequence[int], check: Callable[[], None]
     ) -> list[int] | None:
-        """The guess, with -1 at places that leave it no paths; None if they are many."""
+        """Replace the labels at places that allow no paths by -1; None if they are too many."""
         states = states_of(chart, kept(apart, chart.links, start))
         visits = Counter(state // 4 for state in states)
         # A place visited once cannot be wrong by itself. One visited often hardly is.
@@ -355,8 +380,8 @@ def pairwise_distinct(members: Sequence[int], pairs: Iterable[tuple[int, int]]) 
 
     Args:
         members: All segments or places.
-        pairs: The pairs that are not one. A member that is paired with itself contradicts the
-            axioms. clingo will find that out.
+        pairs: The pairs that are not one. A pair of a member with itself, which means that the
+            labels contradict the axioms, is ignored.
     """
     number = {member: i for i, member in enumerate(members)}
     rivals = np.zeros((len(members), len(members)), dtype=bool)
@@ -368,7 +393,10 @@ def pairwise_distinct(members: Sequence[int], pairs: Iterable[tuple[int, int]]) 
 def _apart(
     chart: FramedChart, labels: Sequence[int], elsewhere: Iterable[tuple[int, int]]
 ) -> Matrix:
-    """Which nodes have visits with labels at different places: nodes x nodes.
+    """Find the pairs of nodes that are at different places, as a matrix, nodes x nodes.
+
+    Two visits are at different places if some dstate of one is elsewhere than some dstate of the
+    other.
 
     Args:
         chart: The chart of the nodes.

@@ -20,7 +20,7 @@ class Pinned:
     Attributes:
         chart: The chart: nodes and the links between them.
         clique: Nodes that are pairwise distinct.
-        may_be: For each node, the names of the clique's nodes that it may share a dstate with.
+        may_be: For each node, the names of those clique nodes with which it may share a dstate.
     """
 
     chart: Chart
@@ -48,4 +48,5 @@ class Pinned:
 
 
 def _not_apart(apart: Matrix) -> list[list[int]]:
+    """For each row of a matrix of flags, list the columns whose flag is False."""
     return [(~row).nonzero()[0].tolist() for row in apart]

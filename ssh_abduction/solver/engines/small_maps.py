@@ -1,14 +1,13 @@
 """Small maps of the causal theory that are made without clingo, or near a guess.
 
-They are for long traces: a search that has to stop then has a good map, and a map with as few
-dstates as the lower bound ends the search. `engines/nearby.py` proves maps minimal; this module
-does not.
+They are for long traces. If the search has to stop, there is at least a good map. And if a map has
+as few dstates as the lower bound, the search can end. `engines/nearby.py` proves that maps are
+minimal; this module does not.
 
-First, steps are merged by evidence (`guesses/merging.py`). Then a map is guessed. If the trace
-could be one of a world whose places have frames, the guess is annealed as such
-(`guesses/annealing.py`). `NearbySearch` looks for smaller maps near the guess. Of a long trace,
-only the beginning is guessed; the guess is then followed along the rest
-(`guesses/continuing.py`).
+First, steps are merged by evidence (`guesses/merging.py`). Then a map is guessed by annealing
+(`guesses/annealing.py`): the places, if turns may be rotations by right angles, otherwise the
+dstates. `NearbySearch` looks for smaller maps near the guess. Of a long trace, only the first steps
+are guessed. The guess is then followed along the other steps (`guesses/continuing.py`).
 """
 
 from __future__ import annotations
@@ -27,10 +26,10 @@ from ssh_abduction.solver.guesses.continuing import followed
 from ssh_abduction.solver.guesses.merging import merged, merged_near, thinned
 from ssh_abduction.solver.steps.chart import Chart
 
-# If the robot does not turn, guess at most this often until a guess is a map: guesses are slow, and
-# later ones are rarely better.
+# If turns cannot be rotations, stop after this many guesses, even if none of them is a map. Guesses
+# are slow, and later ones are rarely better.
 GUESSES = 10
-# Guess at most this many steps of a long trace at once: more take minutes.
+# Guess at most this many steps of a long trace at once. More steps take minutes.
 GUESSED = 24_000
 
 
@@ -47,9 +46,12 @@ class SmallMaps:
         self._task, self._pinned = task, pinned
 
     def search(self, watch: Watch) -> NearbySearch:
-        """A search near a guess, under these limits.
+        """Make a search near a guess.
 
-        Clasp's configuration `tweety` proves several times as soon as its default.
+        Clasp's configuration `tweety` finds proofs several times faster than its default.
+
+        Args:
+            watch: The limits of the search.
         """
         chart = self._pinned.chart
         return NearbySearch(
@@ -60,16 +62,16 @@ class SmallMaps:
         )
 
     def merged(self, check: Callable[[], None]) -> Iterator[list[int]]:
-        """Yield labels of a map whose nodes were merged by evidence; none without that speed-up."""
+        """Merge nodes by evidence, and yield the labels of the map; none without that speed-up."""
         if self._task.speedups.greedy:
             chart = self._pinned.chart
             yield merged(chart.apart(), chart.links, self._pinned.clique, check)
 
     def from_beginning(self, check: Callable[[], None]) -> Iterator[list[int]]:
-        """Yield labels of maps that guesses for the first steps of a long trace lead to.
+        """Guess a map of the first steps of a long trace, extend it, and yield labels of all steps.
 
-        Guess ever longer prefixes, until the map of the whole trace needs no more dstates than that
-        of the prefix.
+        Guess ever longer prefixes, until the map of the whole trace needs no more dstates than the
+        map of the prefix.
         """
         chart = self._pinned.chart
         size, steps = len(chart.seen), AT_ONCE
@@ -91,7 +93,13 @@ class SmallMaps:
     def near_guess(
         self, search: NearbySearch, check: Callable[[], None], tries: int | None = None
     ) -> Iterator[list[int]]:
-        """Yield labels of a map that is guessed, and of smaller ones near it."""
+        """Yield labels of a guessed map, and then of smaller maps near it.
+
+        Args:
+            search: Searches near the guess.
+            check: Called now and then; may raise to stop.
+            tries: Give up after this many rounds without progress; None for no limit.
+        """
         if not self._task.speedups.annealed:
             return
         near = self._map_of_guess(self._pinned, check)
@@ -99,20 +107,22 @@ class SmallMaps:
             yield from search.fewer(thinned(self._pinned.chart, near, check), tries)
 
     def _map_of_guess(self, pinned: Pinned, check: Callable[[], None]) -> list[int] | None:
-        """Labels of a map of these steps near a guess; None if there is no guess."""
+        """Return labels of a map of these steps near a guess; None if there is no guess."""
         guess = self._guessed(pinned, check)
         if guess is None:
             return None
         return merged_near(pinned.chart.apart(), pinned.chart.links, guess, check)
 
     def _guessed(self, pinned: Pinned, check: Callable[[], None]) -> list[int] | None:
-        """Guess the dstates of these steps, -1 where the guess is unsure.
+        """Guess the dstates of these steps.
 
-        None if a guess would take too much memory.
+        Returns:
+            A label for each step, -1 if the guess is not sure; None if a guess would take too much
+            memory.
         """
         steps = pinned.chart
         chart = Chart.turned(self._task.trace, self._task.log, len(steps.seen))
-        if chart is None:  # the robot does not turn, or turns do not rotate
+        if chart is None:  # turns cannot be rotations by right angles
             guesses: Iterable[list[int]] = islice(
                 annealed_steps(steps, pinned.clique, pinned.may_be, check), GUESSES
             )
@@ -128,16 +138,16 @@ class SmallMaps:
 
 
 def mended(guess: Sequence[int], chart: Chart) -> list[int]:
-    """Correct a guess: put each node where the same action from the same dstate mostly leads.
+    """Correct a guess: label each node as the action to it from that dstate mostly leads.
 
-    This corrects a few wrong labels: after a right one, all that follow become right.
+    This corrects a few wrong labels: once a label is right, all that follow become right.
 
     Args:
-        guess: A label of each node, -1 if it is unknown.
+        guess: The label of each node, -1 if it is unknown.
         chart: The chart of the nodes and links.
 
     Returns:
-        The new labels. A label stays if the view at the node contradicts the new one.
+        The new labels. A label stays as it was if the view at the node contradicts the new one.
     """
     keys = seen_labels(guess, chart)
     leads: dict[tuple[Key, int], Counter[Key]] = {}

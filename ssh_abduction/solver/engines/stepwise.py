@@ -23,13 +23,13 @@ from ssh_abduction.theory.fields import Count
 
 # A prefix grows by at least this factor, so that few prefixes are tried.
 GROWTH = 1.25
-# Ground AT_FIRST steps in one call until the prefix has FIRST_STEPS, and then one step a call. For
-# a short prefix the call takes longer than the steps.
+# Ground AT_FIRST steps per call until the prefix has FIRST_STEPS, and then one step per call. For a
+# short prefix, the overhead of a call is larger than the time for a step.
 AT_FIRST, FIRST_STEPS = 8, 32
 
 
 class StepEngine:
-    """The engine that grounds the readable encodings. The first step at a dstate names it."""
+    """The engine that grounds the readable encodings. A dstate is named by its first step."""
 
     lists_least = False
     goes_on = True
@@ -151,13 +151,13 @@ class StepEngine:
         return True
 
     def ask_for(self, number: int, count: Count) -> None:
-        """Ask only for maps with an exact number of something, from now on.
+        """Ask only for maps with an exact number of dstates, places or paths, from now on.
 
         The prefix must not grow any more.
 
         Args:
-            number: The number that maps must have.
-            count: "dstates", "places" or "paths".
+            number: The number.
+            count: What is counted: "dstates", "places" or "paths".
         """
         if self._number is not None:
             self.asker.control.release_external(questions.of_number(*self._number))
@@ -165,6 +165,7 @@ class StepEngine:
         self._tell_number()
 
     def _tell_number(self) -> None:
+        """Give clingo the rule about the exact number, if there is one."""
         if self._number is None:
             return
         part = f"number_{self._number[0]}"
@@ -173,6 +174,7 @@ class StepEngine:
         self.asker.control.assign_external(questions.of_number(*self._number), True)
 
     def _tell_forbidden(self, number: int) -> None:
+        """Give clingo the rule that excludes a forbidden set of equalities, by its number."""
         part = f"forbidden_{number}"
         self.asker.control.add(
             part,
@@ -188,7 +190,7 @@ class StepEngine:
 
 
 def paths_needed(task: Task, size: int, cost: tuple[int, ...] | None) -> int:
-    """Return a number of names for paths that is enough to prove a cost, or to list all its maps.
+    """Return how many names for paths are enough to prove a cost, and to list all maps with it.
 
     Args:
         task: The problem and the speed-ups.

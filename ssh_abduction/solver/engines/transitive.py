@@ -17,8 +17,8 @@ import numpy as np
 from ssh_abduction.solver.asp.facts import visits_lp
 from ssh_abduction.solver.steps.chart import FramedChart
 
-# Stop looking for triples of visits after this many, and give them to clingo. Grounding them takes
-# longer than finding them.
+# After finding this many triples of visits, stop looking for more, and give them to clingo.
+# Grounding them takes longer than finding them.
 AT_A_TIME = 20_000
 
 # (I, J, R): visits I < J are at one place, and slot (direction) 0 of I is slot R of J.
@@ -39,6 +39,9 @@ def intransitive(pairs: Sequence[Pair], fits: Set[Pair], chart: FramedChart) -> 
         pairs: The pairs of visits that are at one place in the answer.
         fits: The pairs that clingo may put at one place.
         chart: The chart of the visits, with the action that ends each of them.
+
+    Returns:
+        The triples; empty if the answer is transitive.
     """
     found: dict[Three, None] = {}
     turned: Turned = {}
@@ -86,7 +89,7 @@ class Transitive(clingo.Propagator):
         self._turned: Turned = {}
 
     def init(self, init: clingo.PropagateInit) -> None:
-        """Watch the literals of pairs, and note those that are true."""
+        """Watch the literals of pairs, and record the pairs whose literals are true already."""
         for literal in self._watched:
             init.remove_watch(literal)
         self._watched, self._turned = {}, {}
@@ -126,7 +129,7 @@ class Transitive(clingo.Propagator):
 
 
 class PairOf(dict[clingo.Symbol, Pair]):
-    """The pair of visits of each atom `same`. An atom is read when it is first looked up."""
+    """A dict from each atom `same` to its pair of visits. An atom is read when first looked up."""
 
     def __missing__(self, symbol: clingo.Symbol) -> Pair:
         pair = self[symbol] = visits_lp.read_same(symbol)
@@ -134,14 +137,14 @@ class PairOf(dict[clingo.Symbol, Pair]):
 
 
 def scattered(pairs: Sequence[Pair], visits: int) -> list[Pair]:
-    """Find the pairs whose group of visits is not consistent.
+    """List the pairs whose group of visits is not consistent.
 
     A group is all visits that pairs connect to each other. It is consistent if each two of its
-    visits are a pair, and the turns of all pairs agree.
+    visits are a pair, and the slots of all pairs agree.
 
     Args:
         pairs: The pairs of visits that are at one place.
-        visits: The number of visits.
+        visits: The number of all visits.
     """
     first, second, turns = np.array(pairs, dtype=int).reshape(-1, 3).T
     group = np.arange(visits)  # for each visit, the first visit that it is paired with
@@ -204,7 +207,7 @@ def _in_order(*visits: tuple[int, int]) -> Three:
     """Make a triple of three visits at one place, in their order.
 
     Args:
-        *visits: Each visit, and the slot there that is slot 0 of the first of them.
+        *visits: For each visit, its number and the slot there that is slot 0 of the first argument.
     """
     (i, a), (j, b), (k, c) = sorted(visits)
     return i, j, k, (b - a) % 4, (c - b) % 4

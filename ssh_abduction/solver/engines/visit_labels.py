@@ -1,4 +1,4 @@
-"""Finds labels with the fewest dstates, for theories with frames. It gives no names to dstates.
+"""Finds labels with the fewest dstates, for theories with frames, without names for dstates.
 
 A label is the number of the dstate of a node; a node is the steps of a visit that face one
 direction. The framed engine uses this module. Clingo is asked which visits are at one place
@@ -8,9 +8,9 @@ axioms of order and sides.
 
 Names, as in `engines/naming.py`, help little if there are many dstates with few visits. Whatever
 clingo learns about one spare name, it has to learn again about the next. And any node of the view
-may have the name. An equality of two visits, in contrast, is only about these two. A node is *lone*
-if no earlier node, in an order of choice, is at its dstate. So the number of dstates is the number
-of lone nodes.
+may have the name. An equality of two visits, in contrast, is only about these two. A node is
+*first* if no node before it, in an order of choice, is at its dstate. So the number of dstates is
+the number of first nodes.
 
 *Order of choice.* A clique of nodes comes first, then the nodes that can share a dstate with few
 others. When the trace grows, new nodes are put last. So the rules that clingo has, and the clauses
@@ -21,13 +21,13 @@ with a new clique.
 this rule only for visits at which an answer violates it (`engines/transitive.py`). Until then
 clingo solves a relaxation, so its bounds hold.
 
-*Few visits.* Of a long trace, clingo first gets the visits of the clique, and the first visits as
-long as few pairs of them may be at one place. Mostly an answer also determines the places of all
-other visits (`steps/localising.py`). If not, clingo gets further visits. Fewer visits are a
+*Few visits.* Of a long trace, clingo first gets the visits of the clique, and some of the first
+visits, such that few pairs of them may be at one place. Mostly an answer also determines the places
+of all other visits (`steps/localising.py`). If not, clingo gets further visits. Fewer visits are a
 relaxation, and an answer that locates all visits is an answer for all of them.
 
-*From below.* Unsat cores raise the bound (`Cores`). Clasp has this built in, but starts again with
-each call, and each answer that is not transitive needs another call.
+*Cores.* Unsat cores raise the bound (`Cores`). Clasp can do this itself, but starts again with each
+call, and each answer that is not transitive needs another call.
 """
 
 from __future__ import annotations
@@ -52,16 +52,16 @@ from ssh_abduction.solver.steps.apart import clique
 from ssh_abduction.solver.steps.chart import FramedChart
 from ssh_abduction.solver.steps.localising import Located
 
-# At first, give clingo the first visits up to where this many pairs of them may be at one place. It
-# gets other visits if answers need them.
+# At first, give clingo as many first visits that at most this many pairs of them may be at one
+# place. It gets other visits if answers need them.
 FIRST_PAIRS = 10_000
-# If the number of nodes has grown by this factor, make a new control, as the order of choice was
-# made for the first nodes.
+# If the number of nodes has grown by this factor, make a new control, as the order of choice only
+# suits the nodes that it was made for.
 GROWN = 1.1
 # After this many answers found one by one, look for the next ones near the last. That is faster if
 # there are many answers.
 MANY = 5
-# After this many violations of transitivity nearby, ask for single answers again.
+# After this many violations of transitivity near an answer, ask for single answers again.
 FAR = 200
 
 
@@ -95,9 +95,9 @@ class VisitLabels:
         self.size = 0
         self._task, self._asker, self._charted, self._sides = task, asker, charted, sides
         self._program: VisitProgram | None = None
-        self._first_nodes = 0  # the number of nodes when the control was made
+        self._nodes_at_start = 0  # the number of nodes when the control was made
         self._found: list[tuple[int, ...]] = []  # labels with the fewest dstates
-        self._excluded = 0  # clingo will not find this many of them again, from the first
+        self._excluded = 0  # how many of these, from the first on, clingo has a rule against
 
     @property
     def program(self) -> VisitProgram:
@@ -120,13 +120,13 @@ class VisitLabels:
         If there are many new nodes, make a new control.
 
         Returns:
-            False if the steps fit no frames; then nothing has changed.
+            True if this is done. False if the steps fit no frames; then nothing has changed.
         """
         if size == self.size:
             return True
         with self._asker.grounding_timed():
             grown = self._charted(size, self.chart) if self.size else None
-            if grown is not None and len(grown.seen) <= GROWN * self._first_nodes:
+            if grown is not None and len(grown.seen) <= GROWN * self._nodes_at_start:
                 program = self.program
                 new = range(len(self.chart.stars), len(grown.stars)) if program.knows_all else ()
                 self._give(grown, {*program.visits, *new}, range(len(grown.seen)))
@@ -142,7 +142,7 @@ class VisitLabels:
             return True
 
     def _order_of_choice(self, chart: FramedChart) -> list[int]:
-        """Order the nodes, and set `clique`.
+        """Set `clique`, and return the nodes in the order of choice.
 
         The clique comes first, then the nodes that can share a dstate with the fewest others.
         """
@@ -178,7 +178,7 @@ class VisitLabels:
         size, self.size = self.size, 0  # an error may leave this prefix incomplete
         if anew:
             self._program = VisitProgram(self._task, self._asker, chart, self._sides)
-            self._first_nodes = len(chart.seen)
+            self._nodes_at_start = len(chart.seen)
         self.program.give(chart, visits, order, fits)
         self._raise_bound()
         self._excluded = 0
@@ -192,6 +192,7 @@ class VisitLabels:
             self._give(self.chart, more, range(len(self.chart.seen)))
 
     def _raise_bound(self) -> None:
+        """Take over the bound of the cores if it is higher."""
         self.bound = max(self.bound or 0, self.program.cores.least)
 
     def fewest(self) -> list[int] | None:
@@ -211,7 +212,7 @@ class VisitLabels:
             self._give_more(reason.missed)
 
     def _best_answer(self) -> Answer | None:
-        """Find an answer with the fewest lone nodes; None if there is no answer.
+        """Find an answer with the fewest first nodes; None if there is no answer.
 
         Cores that clingo returns meanwhile raise the bound.
         """
@@ -360,7 +361,7 @@ class VisitLabels:
     def forbid_together(
         self, pairs: Collection[tuple[int, int]], places: Collection[tuple[int, int]] = ()
     ) -> None:
-        """Exclude labels in which each of `pairs` is one dstate and each of `places` one place.
+        """Exclude labels with each of `pairs` at one dstate, and each of `places` at one place.
 
         If places are given, labels found before are not removed, as labels do not show which nodes
         are at one place. The search for their paths rejects them later.
@@ -380,7 +381,7 @@ class VisitLabels:
         for a, b in away:
             (i, _), (j, _) = sorted((facing[a], facing[b]))
             choices.append([(i, j, turned) for turned in range(4) if (i, j, turned) in fits])
-        # If a pair has no choice, it is known to be distinct, so nothing has to be forbidden.
+        # If a pair has no choice, it is known to be distinct. Then nothing has to be forbidden.
         if len(choices) == len(apart) + len(away):
             program.tell(visits_lp.forbidden_places(choices))
         if away:

@@ -42,14 +42,14 @@ class Sides(Protocol):
 class Cores:
     """Raises a lower bound on the number of dstates, core by core (OLL).
 
-    A node is *lone* if no earlier node, in the order of choice, is at its dstate. So there is one
-    lone node for each dstate. Clingo is first asked for an answer without lone nodes. If there is
-    none, it returns an unsat core: nodes of which at least one is lone. This raises the bound by
-    one. From then on one node of the core may be lone. A later core may allow a second one, and so
-    on.
+    A node is *first* if no node before it, in the order of choice, is at its dstate. So there is
+    one first node for each dstate. Clingo is initially asked for an answer without first nodes. If
+    there is none, it returns an unsat core: nodes of which at least one is first. This raises the
+    bound by one. From then on one node of the core may be first. A later core may allow a second
+    one, and so on.
 
     Attributes:
-        least: A lower bound on the number of lone nodes.
+        least: A lower bound on the number of first nodes.
         avoided: The atoms that are assumed to be false, by the literal of that assumption.
 
     Reference:
@@ -67,10 +67,10 @@ class Cores:
         self.least = 0
         self.avoided: dict[int, clingo.Symbol] = {}
         self._asker, self._tell = asker, tell
-        self._sizes: list[int] = []  # sizes of cores
+        self._sizes: list[int] = []  # the number of members of each core
 
     def avoid(self, symbol: clingo.Symbol) -> None:
-        """Assume from now on that this atom is false, if the control has it."""
+        """Assume from now on that an atom is false, if the control has this atom."""
         if atom := self._asker.control.symbolic_atoms[symbol]:
             self.avoided[-atom.literal] = atom.symbol
 
@@ -97,7 +97,7 @@ class Cores:
 
         Args:
             core: The number of the core.
-            count: The number of true members that is one too many.
+            count: One more than the number of members that may be true.
         """
         if count <= self._sizes[core]:
             self._asker.control.ground([("over", numbers(core, count))])
@@ -146,7 +146,7 @@ class _Known:
         ends: The visits for which the control has the action that ends them.
         turns: The turns, as (node, direction, node).
         fits: The pairs of visits that may be at one place.
-        joined: The pairs of visits that the user says are at one place.
+        joined: The pairs of visits that are at one place, as the user says.
     """
 
     visits: set[int] = field(default_factory=set)
@@ -257,24 +257,25 @@ class VisitProgram:
         control.add(part, [], sides_lp.turn_facts(self.batch, chart, added, turns))
         control.ground([(part, []), ("more", numbers(self.batch))])
         control.assign_external(visits_lp.listed(self.batch), True)
-        self._avoid_lone(place for place, *_ in nodes)
+        self._avoid_first(place for place, *_ in nodes)
         self._unread += new
         self._sides.extend(self.batch)
 
     def _joined(self) -> set[Pair]:
-        """The pairs of visits that the user says are at one place: a step of each is one dstate."""
+        """List the pairs of visits with steps that the user says are one dstate."""
         chart, found = self.chart, set()
         for i, t in self._one:
             if t < len(chart.node_of):
                 (first, slot), (last, other) = (chart.facing[chart.node_of[x]] for x in (i, t))
-                # A visit has one node a slot, so different slots of one visit are a contradiction.
+                # Two slots of one visit cannot be one dstate. Such a pair makes the program
+                # inconsistent.
                 if first != last or slot != other:
                     earlier = (first, last, (other - slot) % 4)
                     found.add(earlier if first <= last else (last, first, (slot - other) % 4))
         return found
 
-    def _avoid_lone(self, places: Iterable[int]) -> None:
-        """Assume that none of these new nodes is lone; count those that are lone in any case.
+    def _avoid_first(self, places: Iterable[int]) -> None:
+        """Assume that none of these new nodes is first. Count the nodes that are first in any case.
 
         Args:
             places: The positions of the nodes in the order of choice.
@@ -292,7 +293,7 @@ class VisitProgram:
         return [self._pair_of[symbol] for symbol in model.symbols(shown=True)]
 
     def read_literals(self) -> Mapping[Pair, int]:
-        """Return the literal that says that two visits are at one place, for each pair.
+        """Return, for each pair, the literal that says that its visits are at one place.
 
         Pairs are in the order in which they were given to clingo. Looking up many literals takes
         seconds, so call this only if they are needed.
@@ -307,8 +308,8 @@ class VisitProgram:
     def tell(self, told: str, part: str | None = None, number: int = 0) -> None:
         """Give clingo more rules.
 
-        This does not check any limits. If it stopped halfway, a core would be relaxed without the
-        limit on its members.
+        This does not check any limits: if it stopped halfway, a core would be relaxed without the
+        rule that limits its members.
 
         Args:
             told: The rules.
@@ -379,7 +380,7 @@ class VisitProgram:
         return {labels[node]: self.chart.facing[node] for node in self._known.place_of}
 
     def spanning(self, labels: Sequence[int], nodes: Iterable[int]) -> list[Pair]:
-        """List pairs of visits that, put at one place, give these nodes the dstates of the labels.
+        """List the pairs of visits that have to be at one place so that nodes have these labels.
 
         Args:
             labels: The dstate of each node.

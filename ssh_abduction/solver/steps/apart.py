@@ -46,9 +46,10 @@ Matrix = NDArray[np.bool_]
 class Continuations:
     """Compares the continuations of steps: the views and actions of the trace from each step on.
 
-    The steps are sorted by their continuations, as in a suffix array (Manber, Myers 1993). This
-    takes n log² n for n steps. The common prefix of two steps is as long as the shortest common
-    prefix of two neighbours between them in the sorted order.
+    The steps are sorted by their continuations, as in a suffix array (Manber, Myers 1993). For n
+    steps this takes time proportional to n log² n. Take two steps and all steps between them in the
+    sorted order. The shortest prefix that two neighbours of these share is the prefix that the two
+    steps share.
     """
 
     def __init__(
@@ -69,7 +70,7 @@ class Continuations:
         steps = len(shown)
         self._seen = seen
         self._excluded = _spread(excluded, done) if excluded and steps <= COMPARED else None
-        # The excluded steps of each step, if the trace is too long for a matrix.
+        # For each step the steps that evidence excludes, if the trace is too long for a matrix.
         self._partners: dict[int, list[int]] = {}
         for i, j in excluded if self._excluded is None else ():
             self._partners.setdefault(i, []).append(j)
@@ -92,11 +93,14 @@ class Continuations:
         self._shared = 2 * (here - self._sorted[:-1]) + (shown[here] == shown[there])
 
     def apart_from(self, step: int, actions: int = 0) -> Matrix:
-        """The steps that are apart from one step, as a row of `apart`: a flag for each step.
+        """Find the steps that are apart from one step.
 
         Args:
             step: The step.
-            actions: Count only views that differ after at least this many actions.
+            actions: Count only steps whose views differ after at least this many actions.
+
+        Returns:
+            A flag for each step: a row of `apart`.
         """
         place, steps = self._place[step], len(self._place)
         shared = np.empty(steps, dtype=int)
@@ -109,7 +113,7 @@ class Continuations:
         return row
 
     def excluded_from(self, step: int) -> Matrix:
-        """The steps that evidence excludes from being one dstate with a step: a flag for each."""
+        """Find the steps that by evidence are not one dstate with a step: a flag for each step."""
         if self._excluded is not None:
             row: Matrix = self._excluded[step]
             return row
@@ -126,14 +130,14 @@ class Continuations:
         return apart
 
     def clique(self) -> list[int]:
-        """A largest clique: a sorted list of steps that are pairwise apart.
+        """Find a largest clique: a sorted list of steps that are pairwise apart.
 
         Of several largest cliques, take one whose steps are apart from the most other steps. With
         evidence, the graph is no longer a cograph. Then also grow a clique greedily, and return the
-        larger one, which need not be a largest clique.
+        larger of both. It need not be a largest one.
         """
-        # The nested groups that the current step is in. Each has the length of the common prefix of
-        # its steps, and a largest clique so far.
+        # The nested groups that the current step is in. Each pair is the length of the prefix that
+        # the steps of the group share, and a largest clique of its steps so far.
         begun: list[tuple[int, _Clique]] = []
         for step, shared in zip(self._sorted.tolist(), [*self._shared.tolist(), -1], strict=True):
             so_far = _Clique((step,), 0, 1)
@@ -148,9 +152,13 @@ class Continuations:
 
 
 def _spread(excluded: Collection[tuple[int, int]], done: NDArray[np.int_]) -> Matrix:
-    """The matrix of pairs of steps that are different dstates by evidence, steps x steps.
+    """Find all pairs of steps that are different dstates by evidence, as a matrix, steps x steps.
 
-    These are the excluded pairs, and the pairs from which the same actions lead to these.
+    These are the excluded pairs, and the pairs from which the same actions lead to excluded pairs.
+
+    Args:
+        excluded: The pairs that evidence names.
+        done: The action after each step, numbered from 1; 0 for the last step.
     """
     found = np.zeros((len(done), len(done)), dtype=bool)
     first, second = np.array(list(excluded)).T
@@ -242,13 +250,12 @@ def _greedy_clique(apart: Matrix) -> list[int]:
 def _grown(apart: Matrix, kept: list[int], random: np.random.Generator) -> list[int]:
     """Grow a clique from some nodes until no node can be added.
 
-    Each time add a node that is apart from the most of the remaining candidates. Break ties by
-    chance.
+    Each time add the candidate that is apart from the most other candidates. Chance breaks ties.
 
     Args:
         apart: Which nodes are apart, as a matrix of nodes x nodes.
         kept: The nodes to begin with, which are pairwise apart.
-        random: Breaks ties.
+        random: The source of random numbers.
     """
     left = np.flatnonzero(apart[kept].all(axis=0)) if kept else np.arange(len(apart))
     found = list(kept)

@@ -27,8 +27,9 @@ from ssh_abduction.solver.steps.noise import Noise, noise_in
 # Steps that are apart (the same actions lead from them to different views) are different dstates
 # by these axioms.
 RESTS_ON = frozenset({"functional_view", "deterministic"})
-# Write a certificate with its words only if these have at most this many actions, some megabytes.
-# The size of all words may grow with the cube of the trace, and a checker can compute them again.
+# Write a certificate with its words only if they have at most this many actions together, which are
+# some megabytes. The number of actions may grow with the cube of the number of steps. A checker can
+# compute the words again.
 WRITTEN = 500_000
 
 
@@ -73,10 +74,13 @@ class Certificate:
         return {pair: _word(trace, *pair) for pair in combinations(self.clique, 2)}
 
     def to_dict(self, trace: Trace | None) -> dict[str, Any]:
-        """The certificate as plain data: "clique", "refuted", and perhaps "words".
+        """Return the certificate as plain data: "clique", "refuted", and perhaps "words".
 
-        Pairs of steps with different views need no word, so they are left out. There are no words
-        at all if the trace is None, or if they have more than WRITTEN actions together.
+        Pairs of steps with different views need no word, so they are left out.
+
+        Args:
+            trace: The trace, for the words. If it is None, or the words have more than WRITTEN
+                actions together, there are no words.
         """
         if trace is None:
             return {"clique": list(self.clique), "refuted": list(self.refuted)}
@@ -106,9 +110,9 @@ class Certificate:
 
 @dataclass(frozen=True)
 class Basis:
-    """The data for a certificate. The certificate itself is made when it is first used.
+    """The data for a certificate, which is made when it is first used.
 
-    To make a certificate takes as long as to solve a short trace.
+    Making a certificate takes as long as solving a short trace.
 
     Attributes:
         views: The view of each of the first steps of the trace, as a number.
@@ -122,6 +126,7 @@ class Basis:
 
     @cached_property
     def certificate(self) -> Certificate:
+        """The certificate."""
         # Imported here, as loading numpy takes longer than solving a short trace.
         from ssh_abduction.solver.steps.apart import Continuations
 
@@ -130,11 +135,16 @@ class Basis:
 
     @cached_property
     def noise(self) -> Noise | None:
+        """The step that looks like noise; None if there is none."""
         return noise_in(self.views, self.actions)
 
 
 def _word(trace: Trace, i: int, j: int) -> tuple[str, ...]:
-    """The names of the actions that lead from both steps i and j to different views."""
+    """Return the names of the actions that lead from both steps i and j to different views.
+
+    Raises:
+        SolverError: No sequence of actions does that.
+    """
     word: list[str] = []
     while True:
         here, there = trace.steps[i + len(word)], trace.steps[j + len(word)]

@@ -59,7 +59,7 @@ class Chart:
 
     @staticmethod
     def of_steps(log: Log, size: int) -> Chart:
-        """The chart of the first `size` steps in which each step is a node."""
+        """Make the chart of the first `size` steps, with a node for each step."""
         links = tuple((t, log.actions[t], t + 1) for t in range(size - 1))
         return Chart(
             tuple(log.seen[:size]),
@@ -106,10 +106,10 @@ class Chart:
 
     @staticmethod
     def turned(trace: Trace, log: Log, size: int) -> FramedChart | None:
-        """The chart of the first `size` steps, as if places had frames.
+        """Make the chart of the first `size` steps of a trace without stars, as if it had frames.
 
-        The views ahead, right, back and left take the place of a star (the openings seen). This is
-        a guess, as turns need not rotate the robot in the causal theory.
+        The observations ahead, right, back and left are used instead of a star (the openings seen).
+        This is a guess, as turns need not rotate the robot in the causal theory.
 
         Returns:
             The chart; None if `around` finds no views, or if some visit contradicts them.
@@ -119,12 +119,12 @@ class Chart:
 
     @staticmethod
     def around(trace: Trace, log: Log, size: int) -> dict[int, list[int]] | None:
-        """The four observations around each observation, as seen by turning there.
+        """For each observation, find the four observations that a robot makes by turning there.
 
         Returns:
-            For each observation, the ones seen ahead, right, back and left. None if some action is
-            neither turn nor travel, if the observation after a turn does not follow from the one
-            before it, or if some of the four were never seen.
+            For each observation, the observations ahead, right, back and left. None if some action
+            is neither turn nor travel, if a turn leads from one observation to two different ones,
+            or if some of the four observations are unknown.
         """
         # For an observation and a number of quarters clockwise: the observation after that turn.
         after: dict[tuple[int, int], int] = {}
@@ -155,14 +155,14 @@ class Chart:
         size: int | None = None,
         around: Mapping[int, Sequence[int]] | None = None,
     ) -> FramedChart | None:
-        """The chart of the first steps for places with frames.
+        """Make the chart of the first steps, for places with frames.
 
         Args:
             trace: The trace.
             log: The same trace as integers.
             size: The number of steps; all by default.
-            around: For each observation, the four seen ahead, right, back and left when facing it.
-                They replace the stars of the trace. None to use the stars.
+            around: For each observation, the four observations ahead, right, back and left of a
+                robot that makes it. They replace the stars of the trace. None to use the stars.
 
         Returns:
             The chart; None if some visit contradicts itself, so that there is no map with frames.
@@ -225,10 +225,12 @@ class FramedChart(Chart):
     Attributes:
         facing: The visit and the slot of each node. Slot K of a visit is K quarters clockwise of
             the heading in which the robot arrived.
-        stars: For each visit, which of the four slots are open (1 or 0), or the observations there.
+        stars: For each visit, which of the four slots are open (1 or 0). Without stars: the
+            observation at each slot.
         travels: The links that are travels, in order: travel V leads from visit V to visit V + 1.
             An action that slipped counts as a travel by an action that occurs only once.
-        elsewhere: Pairs of nodes that are known to be at different places.
+        elsewhere: Pairs of nodes that are known to be at different places, by evidence or by the
+            axioms of order and sides.
         away: The pairs of `elsewhere` that evidence names.
     """
 
@@ -239,11 +241,11 @@ class FramedChart(Chart):
     away: frozenset[tuple[int, int]] = frozenset()
 
     def with_elsewhere(self, more: Iterable[tuple[int, int]]) -> FramedChart:
-        """The same chart with more pairs of nodes in `elsewhere`."""
+        """Return the same chart with more pairs of nodes in `elsewhere`."""
         return replace(self, elsewhere=self.elsewhere | frozenset(more))
 
     def __getstate__(self) -> dict[str, object]:
-        """The fields, for sending the chart to another process without the large cached arrays."""
+        """Return the fields only: other processes get the chart without its large cached arrays."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def apart(
@@ -287,7 +289,7 @@ class FramedChart(Chart):
         return list(dict.fromkeys((s, action.turn, x) for (s, x), action in steps if action.turn))
 
     def beginning(self, visits: int) -> FramedChart:
-        """The chart of the first `visits` visits."""
+        """Return the chart of the first `visits` visits."""
         nodes = next(
             (node for node, (visit, _) in enumerate(self.facing) if visit == visits),
             len(self.facing),
@@ -314,16 +316,16 @@ class FramedChart(Chart):
         )
 
     def visits_with(self, pairs: int) -> int:
-        """The largest n so that at most `pairs` pairs of the first n visits may be at one place."""
+        """Find the most first visits of which at most `pairs` pairs may be at one place."""
         import numpy as np
 
         return int(np.searchsorted(self.fitting, pairs, side="right")) - 1
 
     @cached_property
     def fitting(self) -> NDArray[np.int_]:
-        """For each number of first visits, from 0, the number of triples that `fits` would list.
+        """For each n from 0: how many triples `fits` would list for the first n visits.
 
-        There may be too many triples to list them.
+        They are only counted, as there may be too many to list.
         """
         import numpy as np
 
@@ -350,9 +352,9 @@ class FramedChart(Chart):
         """Which pairs of visits misfit, as an array of flags, 4 x visits x visits.
 
         The flag [R, I, J] is True if visits I and J cannot be at one place such that slot 0 of I is
-        slot R of J. The reason is that they show different things, that evidence says so, or that
-        both leave by one action in the same direction to visits that misfit in turn. For this last
-        reason, the visits are compared from the last to the first.
+        slot R of J. There are three reasons: they show different things; evidence says so; or both
+        end by the same action in the same direction, and the next visits misfit. Because of the
+        third reason, the visits are compared from the last to the first.
         """
         import numpy as np
 
@@ -393,7 +395,7 @@ class FramedChart(Chart):
 
 
 def _pairs_within(earlier: Earlier, size: int) -> list[tuple[int, int]]:
-    """The pairs of steps in which both are among the first `size`, the earlier step first."""
+    """List the pairs of steps that are both among the first `size`, the earlier step first."""
     return [(i, t) for t, others in earlier.items() if t < size for i in others]
 
 
@@ -404,15 +406,14 @@ def numbered(labels: Iterable[Hashable]) -> list[int]:
 
 
 def _views_around(seen: int, after: Mapping[tuple[int, int], int]) -> list[int] | None:
-    """The observations ahead, right, back and left of a robot that faces `seen`.
+    """Find the observations ahead, right, back and left of a robot that makes an observation.
 
     Args:
-        seen: An observation.
-        after: For an observation and a number of quarters clockwise, the observation after that
-            turn.
+        seen: The observation ahead.
+        after: For (observation, quarters clockwise), the observation after that turn.
 
     Returns:
-        Four observations; None if some of them is not known, or if turns contradict each other.
+        Four observations; None if some of them are unknown, or if turns contradict each other.
     """
     views = {0: seen}
     waiting = [0]

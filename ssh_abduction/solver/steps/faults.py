@@ -1,4 +1,4 @@
-"""The faults and links of a map, from the dstate of each step and from a mended trace."""
+"""Finds the faults and links of a map, from the dstate of each step and from a mended trace."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def faults_of(
     """Make the faults of a map.
 
     Args:
-        faults: Steps and kinds of faults.
+        faults: Pairs of a step and a kind of fault.
         labels: The dstate of each step.
         views: The view of each dstate.
         trace: The trace.
@@ -55,13 +55,14 @@ def faults_of(
 def links_of(
     labels: Sequence[int], trace: Trace, faults: Iterable[tuple[int, str]] = ()
 ) -> tuple[tuple[int, str, int], ...]:
-    """The distinct links (dstate, action, dstate) of labels, sorted.
+    """List the distinct links (dstate, action, dstate) that labels make, sorted.
+
+    An action that slipped makes no link, nor does the start of a drive.
 
     Args:
         labels: The dstate of each step.
         trace: The trace.
-        faults: Steps and kinds of faults. An action that slipped makes no link, nor does the start
-            of a drive.
+        faults: Pairs of a step and a kind of fault.
     """
     none = {t for t, kind in faults if kind == "slipped"}
     none |= {t for t, action in enumerate(trace.actions) if action.starts}
@@ -70,13 +71,14 @@ def links_of(
 
 
 def view_at(trace: Trace, step: int) -> str | int:
+    """Return the view at a step that is known to have one."""
     view = trace.steps[step].view
     assert view is not None
     return view
 
 
 def with_changes(ssh_map: SSHMap, trace: Trace, theory: Theory) -> SSHMap | None:
-    """Return a map with the gateways that differ between drives as its faults.
+    """Add a fault of kind "changed" to a map for each gateway that differs between drives.
 
     Args:
         ssh_map: A map of the first steps of the trace, with the heading of each dstate as a slot.
@@ -111,7 +113,10 @@ def with_changes(ssh_map: SSHMap, trace: Trace, theory: Theory) -> SSHMap | None
 
 
 def with_compass(ssh_map: SSHMap) -> SSHMap:
-    """Say of each change of a map with poses in which direction the gateway is. North is up."""
+    """Add to each "changed" fault of a map with poses which way its gateway is; y is north.
+
+    A map of several pieces, which have no common frame, is returned as it is.
+    """
     if not any(fault.kind == "changed" for fault in ssh_map.faults) or len(ssh_map.pieces) > 1:
         return ssh_map
     poses = ssh_map.fit.poses if ssh_map.fit else ()
@@ -128,7 +133,12 @@ def with_compass(ssh_map: SSHMap) -> SSHMap:
 
 
 def turned_to_frame(openings: tuple[bool, ...], heading: int) -> tuple[bool, ...]:
-    """Turn openings seen ahead, right, back and left into slots, for a robot that faces one."""
+    """Turn openings seen ahead, right, back and left into slots of the place.
+
+    Args:
+        openings: The openings.
+        heading: The slot that the robot faces.
+    """
     return tuple(openings[(slot - heading) % 4] for slot in range(len(openings)))
 
 

@@ -1,12 +1,12 @@
 """Find how the stars of a trace fit each other when they are turned. gateways.lp reads this.
 
-A star is the gateways that a step sees. Some of these may be unobserved. A *frame* is a star after
-it is decided which unobserved gateways exist. The gateways of a frame are numbered clockwise; these
-numbers are its *slots*. All frames at a place have the same number N of slots. Slot K of a frame is
-slot (K+C) mod N of an earlier frame, for some *shift* C. A gateway is seen at some bearing, give or
-take a spread in degrees. So the shift limits by which rotations the robot can have turned between
-the two frames. A set of rotations has whole degrees clockwise. If it is empty, the two frames are
-not seen at one place with this shift.
+A star is the gateways that are seen at a step. For some directions it may be unknown whether there
+is a gateway. A *frame* is a star after this is decided. The gateways of a frame are numbered
+clockwise; these numbers are its *slots*. All frames at a place have the same number N of slots.
+Slot K of a frame is slot (K+C) mod N of an earlier frame, for some *shift* C. A gateway is seen at
+some bearing, give or take a spread in degrees. So the shift limits by which rotations the robot can
+have turned between the two frames. A set of rotations has whole degrees clockwise. If it is empty,
+the two frames are not seen at one place with this shift.
 
 >>> from ssh_abduction.data.star import Star
 >>> from ssh_abduction.solver.steps.frames import members, rotations
@@ -27,8 +27,8 @@ from ssh_abduction.data.trace import Action, Trace
 
 # A set of rotations is an integer: bit R is 1 if R degrees clockwise are in the set.
 FULL = (1 << 360) - 1
-# A turn right or left is by more degrees than this, and falls short of a turn around by more than
-# this. Bearings that differ by less may belong to one gateway.
+# A turn right or left differs by more than this many degrees from no turn, and from a turn around.
+# Bearings that differ by less may belong to one gateway.
 LEAST_TURN = int(2 * SPREAD)
 WAYS = {"alike": 0, "opposite": 180}  # the rotation of each way, in degrees
 
@@ -70,7 +70,7 @@ class Frames:
 
 @lru_cache(maxsize=2**16)
 def rotations(first: Frame, then: Frame, shift: int) -> int:
-    """The rotations by which the robot may have turned between two frames at one place.
+    """Find the rotations by which the robot may have turned between two frames at one place.
 
     Args:
         first: The earlier frame.
@@ -92,13 +92,16 @@ def rotations(first: Frame, then: Frame, shift: int) -> int:
 
 
 def may_face(first: Frame, then: Frame, shift: int) -> list[str]:
-    """The ways that the robot may face in the later frame, compared to the earlier one.
+    """List how the robot may face in the later frame, compared to the earlier one.
+
+    Slots that the trace declares opposite belong to one path, at any angle. The robot also faces
+    alike if it faces the same direction of such a path in both frames, and so on.
 
     Arguments are as for `rotations`.
 
     Returns:
-        "alike" if it may face the same way, "opposite" if it may face the opposite way; or both,
-        or none. The robot may also face along one path by slots declared opposite.
+        A list with "alike" if it may face the same way, and "opposite" if it may face the opposite
+        way.
     """
     found = rotations(first, then, shift)
     return [
@@ -109,7 +112,7 @@ def may_face(first: Frame, then: Frame, shift: int) -> list[str]:
 
 
 def must_face(first: Frame, then: Frame, shift: int) -> list[str]:
-    """The ways ("alike", "opposite") that the robot must face, as `may_face`: at most one."""
+    """Return the only way that the robot can face, as `may_face`: a list of at most one."""
     found = rotations(first, then, shift)
     return [
         way
@@ -124,10 +127,10 @@ def may_turn(action: Action, first: Frame, then: Frame, shift: int) -> bool:
 
 
 def ends(frame: Frame) -> list[str]:
-    """The directions in which the path of the robot ends at this place: "ahead", "behind".
+    """List the directions in which the path of the robot ends at this place: "ahead", "behind".
 
-    A path ends if no gateway is straight ahead (or straight behind) within twice its spread. It
-    ends in neither direction if it leads through gateways declared opposite.
+    A path ends ahead if no gateway is straight ahead within twice its spread, and likewise behind.
+    A path that leads through gateways declared opposite does not end.
     """
     if _way(frame) is not None:
         return []
@@ -142,7 +145,7 @@ def ends(frame: Frame) -> list[str]:
 
 
 def heading(first: Frame, then: Frame, shift: int) -> int:
-    """The heading in the later frame, in whole degrees clockwise from the heading in the first.
+    """Return the heading in the later frame, in whole degrees clockwise from that in the first.
 
     It is the middle of the possible rotations; 0 if any rotation is possible, or none.
     """
@@ -150,7 +153,7 @@ def heading(first: Frame, then: Frame, shift: int) -> int:
 
 
 def middle(found: int) -> int:
-    """The middle of the longest interval in a set of rotations; 0 if the set is full or empty."""
+    """Return the middle of the longest interval in a set of rotations; 0 if it is full or empty."""
     starts = [r for r in members(found) if not found >> (r - 1) % 360 & 1]
     lengths = {
         start: next(length for length in range(1, 361) if not found >> (start + length) % 360 & 1)
@@ -166,7 +169,7 @@ def members(found: int) -> list[int]:
 
 
 def _turned_by(action: Action, first: Frame) -> int:
-    """The set of rotations that a turn from a frame may make."""
+    """Return the set of rotations by which a turn may rotate a robot that sees a frame."""
     if action.bearing is not None:
         return _about(round(action.bearing), int(SPREAD))
     if action.gateway is not None:
@@ -201,10 +204,7 @@ def _declared(first: Frame, then: Frame, shift: int) -> str | None:
 
 
 def _way(frame: Frame) -> tuple[int, int] | None:
-    """The slots ahead and behind of a robot whose path leads through slots declared opposite.
-
-    None if its path does not.
-    """
+    """Find the slots ahead and behind of a robot, if they are declared opposite; None if not."""
     for ahead, behind in enumerate(frame.opposite):
         if behind is not None and (frame.faces(ahead) or frame.has_behind(behind)):
             return ahead, behind
@@ -214,19 +214,19 @@ def _way(frame: Frame) -> tuple[int, int] | None:
 def _surely(found: int, towards: int) -> bool:
     """Whether a set of rotations contains a direction, but neither 90 nor 270 degrees.
 
-    Stars without known gateways allow nearly all rotations. Then no direction is sure.
+    Stars without known gateways allow nearly all rotations, so that no direction is sure.
     """
     return bool(found >> towards & 1) and not found >> 90 & 1 and not found >> 270 & 1
 
 
 @lru_cache(maxsize=2**14)
 def _about(degrees: int, spread: int) -> int:
-    """The set of rotations that differ from `degrees` by at most `spread`."""
+    """Return the set of rotations that differ from `degrees` by at most `spread`."""
     return _of((degrees + d) % 360 for d in range(-spread, spread + 1))
 
 
 def _between(least: int, most: int) -> int:
-    """The set of rotations from `least` to `most` degrees, both included."""
+    """Return the set of rotations from `least` to `most` degrees, both included."""
     return _of(range(least, most + 1))
 
 

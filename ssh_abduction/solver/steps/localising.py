@@ -2,12 +2,12 @@
 
 A *visit* is the steps between two travels, in a chart for places with frames. For a long trace in a
 small world, clingo does not need every visit: a map of some visits locates the others. This is
-Markov localisation in which a belief is the set of possible *states* of a visit (its place, and how
-it is turned there). The map says where the action of a visit leads from each possible state. That
-gives the possible states of the next visit. A visit is *missed* if none of its possible states
-fits what it shows, if the map does not know the action that leads to it, or if it faces a slot that
-no visit of the map faced. Then the map needs this visit, and enough visits before it to localise
-it.
+Markov localisation in which a belief is the set of possible *states* of a visit. A state is a
+placing as a number: the place, and the slot there that is slot 0 of the visit. The map says where
+the action of a visit leads from each possible state. That gives the possible states of the next
+visit. A visit is *missed* if none of its possible states fits what it shows, if the map does not
+know the action that leads to it, or if it faces a slot that no visit of the map faced. Then the map
+needs this visit, and enough visits before it to localise it.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from ssh_abduction.solver.steps.chart import FramedChart
 
-# Find at most this many stretches of missed visits before clingo solves again with these. Its next
-# map may explain later stretches, and each further visit makes the problem larger.
+# After finding this many stretches of missed visits, let clingo solve again with them. Its next map
+# may explain later stretches, and each further visit makes the problem larger.
 STRETCHES = 10
 
 # The state of a visit: 4 times the number of its place, plus the slot of the place that is slot 0
@@ -68,7 +68,7 @@ def tracked(chart: FramedChart, states: Mapping[int, State]) -> list[State]:
 
 
 def states_of(chart: FramedChart, labels: Sequence[int]) -> list[State]:
-    """Turn labels into states: visits are at one place if nodes of theirs have the same label.
+    """Turn labels into states: two visits are at one place if nodes of both have the same label.
 
     Args:
         chart: The chart of the visits.
@@ -150,10 +150,10 @@ class _Localiser:
         )
 
     def _stretch_up_to(self, visit: int) -> Iterable[int]:
-        """The shortest tried stretch of visits, ending at this one, that the map cannot explain.
+        """Find a short stretch of visits, up to this one, that the map cannot explain.
 
-        The map explains the stretch from no state of its first visit. The stretches that are tried
-        double in length.
+        The map cannot explain a stretch if it fits none of the states of its first visit. Stretches
+        of 2, 3, 5, 9, … visits are tried, the shortest first.
         """
         back = 1
         while True:
@@ -168,14 +168,18 @@ class _Localiser:
             back *= 2
 
     def _anywhere(self, visit: int) -> set[State]:
-        """The possible states of a visit by itself, without the visits before it."""
+        """Return the states that fit a visit by itself, whatever came before."""
         return set(np.flatnonzero(self._fits[visit]).tolist())
 
     def _after(self, possible: set[State], visit: int) -> set[State]:
-        """The possible states of the next visit, if this one has one of the states `possible`.
+        """Return the possible states of the next visit.
 
-        If the map does not know from each of these states where the action leads, any state that
-        fits the next visit is possible.
+        If the map lacks a link for the action from one of the states, any state that fits the next
+        visit is possible.
+
+        Args:
+            possible: The possible states of this visit.
+            visit: This visit.
         """
         slot, action = self._leaves[visit]
         there = {self._leads.get((faced(state, slot), action)) for state in possible}
@@ -213,10 +217,10 @@ def faced(state: State, slot: int) -> State:
 
 
 def _fitting(chart: FramedChart, states: Mapping[int, State]) -> NDArray[np.bool_]:
-    """Say which visits may have which states, as a matrix of flags, visits x states.
+    """Find which visits may have which states, as a matrix of flags, visits x states.
 
-    A visit cannot have a state if it contradicts a visit known to be at that place. A visit of
-    known state has only this state.
+    A visit cannot have a state if that contradicts a visit known to be at the same place. A visit
+    of known state has only this state.
     """
     fits = np.empty((len(chart.stars), 4 * (max(states.values()) // 4 + 1)), dtype=bool)
     at: dict[int, list[int]] = {}

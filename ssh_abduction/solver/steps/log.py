@@ -17,13 +17,13 @@ from ssh_abduction.theory.evidence import pairs_of
 from ssh_abduction.theory.pairs import Pairs
 from ssh_abduction.theory.theory import Theory
 
-# For the end of an unknown action, try at most this many dstates, the earliest ones first. So a
+# Where an unknown action may lead, try at most this many dstates, the earliest ones first. So a
 # view that is seen nearly everywhere does not use up all predictions.
 TRIED = 100
 # For a greedy map, predict at most this many steps, which takes about a second. After that, unknown
 # actions lead to new dstates: a map that needs more predictions is large anyway.
 STEPS_TRIED = 3_000_000
-# For long traces, predict this many steps for each step of the trace, if that is more.
+# For a long trace, predict up to this many steps for each step of the trace, if that is more.
 EACH = 20
 
 
@@ -40,9 +40,9 @@ class Replay:
     """The result of a replay of a trace over a map.
 
     Attributes:
-        labels: The dstate of each first step that the map explains.
-        outcome: How the replay ended. Unless it is PREDICTED, the map does not explain step
-            len(labels).
+        labels: The dstates of the first steps, as far as the map explains them.
+        outcome: How the replay ended. Unless it is PREDICTED, step number len(labels) is the first
+            one that the map does not explain.
     """
 
     labels: tuple[int, ...]
@@ -53,8 +53,9 @@ def observation(step: Step, theory: Theory) -> tuple[object, object]:
     """What the axioms read at a step: its view, and its star (the openings seen there) or None.
 
     Two steps at one dstate have equal observations, by functional_view and the axioms of stars. If
-    only the pattern of a star matters (star=pattern), its four rotations are one observation. If
-    stars are not used, or agree only within tolerance (star=alike or gateways), the star is None.
+    only the pattern of a star matters (star=pattern), its four rotations are one observation. The
+    star is None if stars are not used, or if they need to agree only within their spread
+    (star=alike or gateways).
     """
     star = step.openings if theory.star in ("pattern", "frame") else None
     if star is None or theory.star == "frame":
@@ -70,7 +71,7 @@ class Log:
     Attributes:
         actions: The action after each step but the last.
         seen: The observation (view, and perhaps star) at each step.
-        pairs: Evidence about pairs of steps.
+        pairs: The evidence about pairs of steps: which cannot be, or must be, one dstate or place.
     """
 
     def __init__(self, trace: Trace, theory: Theory, pairs: Pairs | None = None) -> None:
@@ -91,8 +92,8 @@ class Log:
         Args:
             labels: The dstate of each of the first steps.
             known: Make the map only from this many first steps; from all labels by default.
-            place_of: The place of each dstate, to check evidence about places. None if the map has
-                no places.
+            place_of: The place of each dstate, to check the evidence about places; None if the map
+                has no places.
 
         Returns:
             The labels of all steps that the map explains, and how the replay ended.
@@ -126,11 +127,11 @@ class Log:
     def merged(self) -> tuple[int, ...]:
         """Label all steps greedily, so that the labels make a causal map. It need not be minimal.
 
-        If an action is unknown in a dstate, try each known dstate with the next observation as its
-        end. From there the map predicts the trace up to the next unknown action, unless a step
-        contradicts it earlier. Let the action lead to the dstate that predicts the most steps
-        without contradiction, or else to a new dstate. So no link has to be taken back. After
-        STEPS_TRIED predictions, let all unknown actions lead to new dstates.
+        If an action at a dstate has no link yet, try to let it lead to each known dstate with the
+        next observation. From there the map predicts the trace up to the next unknown action,
+        unless a step contradicts it earlier. Let the action lead to the dstate that predicts the
+        most steps without contradiction, or else to a new dstate. So no link has to be undone.
+        After STEPS_TRIED predicted steps, let all unknown actions lead to new dstates.
 
         Returns:
             The dstate of each step.

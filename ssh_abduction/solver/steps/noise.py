@@ -5,10 +5,10 @@ step in the log, each earlier step differs from all others by its distance to th
 then allow no map with fewer dstates than the trace has steps.
 
 The largest *clique* (set of steps that are different dstates in every map, see `apart.py`) shows
-this without a map. The clique of the steps before the noisy step is small. The clique with the
-noisy step has nearly all steps. It has two thirds of them if several places of a circuit look the
-same and different actions follow there. When a robot only explores, the clique grows by one with
-each new dstate.
+this without a map. The clique of the steps before the noisy step is small. With the noisy step, the
+clique has nearly all steps, or two thirds of them if several places of a circuit look the same and
+different actions follow there. When a robot only explores, the clique grows by one with each new
+dstate.
 
 >>> from ssh_abduction.solver.steps.noise import noise_in
 >>> circuits = [0, 1, 2, 3] * 8
@@ -24,12 +24,12 @@ from dataclasses import dataclass
 
 from ssh_abduction.data.trace import Trace
 
-# None of this many first steps is noise, as a robot may begin with a new dstate at each step.
+# None of this many first steps is called noise, as a robot may begin with new dstates only.
 LEAST = 20
 # A step is noise only if at least this share of the steps up to it are dstates of their own.
 MOST = 0.5
-# A step is noise only if the clique of the steps before it, and the clique of the whole trace
-# without it, have at most this share of the clique with it. A step that doubles the clique is no
+# A step is noise only if two cliques are at most this share of the clique up to the step: that of
+# the steps before it, and that of the whole trace without it. A step that doubles the clique is no
 # exploration, as exploring adds at most one dstate a step.
 FALL = 0.5
 
@@ -50,7 +50,7 @@ class Noise:
     without: int
 
     def sentence(self, trace: Trace) -> str:
-        """The warning for a user, as a sentence."""
+        """Return the warning for a user, as a sentence."""
         return (
             f"{trace.at(self.step)}: view {trace.steps[self.step].view!r} looks like noise at step "
             f"{self.step}: because of it {self.told_apart} of the {self.step + 1} steps up to there"
@@ -88,7 +88,7 @@ def noise_in(views: Sequence[int], actions: Sequence[int]) -> Noise | None:
 
 
 def _clique(views: Sequence[int], actions: Sequence[int], steps: int) -> list[int]:
-    """A largest clique of the first `steps` steps: these are different dstates in every map."""
+    """Find a largest clique of the first `steps` steps: steps that are pairwise apart."""
     # Imported here, as loading numpy takes longer than solving a short trace.
     from ssh_abduction.solver.steps.apart import Continuations
 
