@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import TypeAlias
 
+from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.solver.weighed import Rival
@@ -86,6 +87,19 @@ def _begins(at: Sequence[int], visit: Sequence[int]) -> list[int]:
         is_first = not step or at[step - 1] != name or visit[step] == step
         begins.append(step if is_first else begins[-1])
     return begins
+
+
+def course_of(ssh_map: SSHMap) -> Course:
+    """The dstate and the place of each step, numbered by first visit."""
+    places = [ssh_map.dstates[label].place for label in ssh_map.dstate_at]
+    return tuple(numbered(ssh_map.dstate_at)), tuple(numbered(places))
+
+
+def rival_of(ssh_map: SSHMap, nats: float) -> Rival:
+    """The rival that a map of this cost is."""
+    dstates, places = course_of(ssh_map)
+    faults = tuple((fault.kind, fault.step) for fault in ssh_map.faults)
+    return Rival(nats, dstates, places if ssh_map.places else (), faults=faults)
 
 
 def least_places(problem: Problem) -> int:

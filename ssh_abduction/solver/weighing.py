@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import TypeAlias
@@ -34,19 +33,26 @@ from ssh_abduction.data.maps import Fault, SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.runtime.logs import log_of
-from ssh_abduction.solver.asp.limits import LimitError, StageTimeError
+from ssh_abduction.solver.asp.limits import LimitError
+from ssh_abduction.solver.beams import Beams
 from ssh_abduction.solver.choosing import READABLE, new_engine, takes_all
 from ssh_abduction.solver.engines.base import Engine, Found, Task
 from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.equations import spreads_of
-from ssh_abduction.solver.estimating import CostOf, Course, estimated, least_places
+from ssh_abduction.solver.estimating import (
+    CostOf,
+    Course,
+    course_of,
+    estimated,
+    least_places,
+    rival_of,
+)
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
 from ssh_abduction.solver.map_list import Priced
 from ssh_abduction.solver.misfit import Misfit
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.prefixes import Prefixes
-from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.solver.values import Cost, Status
 from ssh_abduction.solver.weighed import EQUAL, Rival, Weighed
 from ssh_abduction.theory.evidence import Equality
@@ -68,13 +74,8 @@ EXCESS = 2.25
 # Without a time limit, give the proof up when no better map was found for this many seconds, and
 # this many times as long as it took to find the best one.
 PATIENCE, MORE = 10.0, 5.0
-# Guess maps by beams of hypotheses of these widths. Each ends when this share of the time limit is
-# over, and the beam that breaks axioms at BREAKING.
-WIDTHS, BREAKING = {1: 0.7, 4: 0.6, 16: 0.7}, 0.8
 # Estimating rivals ends OVERTIME seconds beyond the limit, but takes these numbers of seconds.
 OVERTIME, LEAST_ESTIMATING, ESTIMATING = 1.0, 0.1, 0.5
-# A beam of this width or more ends with the map of least cost, nearly always.
-BROAD = 4
 
 # Lists the minimal maps of a trace and a theory within some seconds, and says whether they are
 # proven.
@@ -114,9 +115,7 @@ class Weighing:
         self.bound = 0.0
         self.proven = False
         self._of_labels: OfLabels | None = None
-        # The cost of the best map of the last broad beam, and the cost that the beam gave it.
-        self._searched = math.inf, math.inf
-        self._broken = -math.inf  # how many nats less a map costs that breaks axioms
+        self._beams = Beams(parts, self.add, self.keep_best)
         self._improved = 0.0  # when the best map was found
 
     @property
@@ -130,7 +129,7 @@ class Weighing:
         return [candidate for candidate in self.candidates if candidate.nats <= least]
 
     def guess(self, clashes: Callable[[], bool]) -> bool:
-        """Find some maps of little cost without clingo, in a share of the time.
+        """Find some maps of little cost without clingo, in a share of the time (`beams.py`).
 
         Args:
             clashes: Says whether it is plain that the trace has no map. It is asked if the first
@@ -139,46 +138,7 @@ class Weighing:
         Returns:
             Whether the trace may have a map.
         """
-        parts, watch = self._parts, self._parts.watch
-        begun, left = watch.elapsed(), watch.left()
-        if left > 0 and parts.task.theory.star != "gateways":
-            parts.candidates.sketch(0.0)  # only the surest sketch has time
-            self.keep_best()
-        # With several drives or floors, a broad beam keeps as many hypotheses as a wider one.
-        several = parts.task.theory.several_drives or parts.task.theory.lifts
-        widths = {w: share for w, share in WIDTHS.items() if w <= BROAD or not several}
-        # The widest beam of all, that of those that ended, and the seconds of the narrowest one.
-        widest, ended, narrow = max(widths), 0, math.inf
-        for width, share in widths.items():
-            began = watch.elapsed()
-            if width < widest and widest * narrow < widths[widest] * left - (began - begun):
-                continue  # there is time for the widest beam
-            watch.end_stage_after(begun + share * left)
-            if (beam := parts.candidates.beam(width)) is None:
-                break
-            try:
-                found = [self.add(ssh_map) for ssh_map in parts.candidates.maps_of(beam)]
-                ended = width
-                if width >= BROAD:
-                    self._searched = min(found, default=math.inf), beam.nats
-                    # A beam without axioms would be the same if the checker refused nothing.
-                    self._broken = -math.inf if beam.refuses else 0.0
-            except StageTimeError:
-                if not ended:
-                    parts.candidates.go_on(beam)
-            self.keep_best()
-            parts.report()
-            if narrow == math.inf and parts.known.best is None and clashes():
-                watch.end_stage_after(math.inf)
-                return False
-            narrow = min(narrow, watch.elapsed() - began)
-        watch.end_stage_after(begun + BREAKING * left)
-        with suppress(StageTimeError):
-            is_open = self._searched[1] < math.inf and math.isinf(self._broken)
-            if is_open and (beam := parts.candidates.beam(ended)):
-                self._broken = self._searched[1] - beam.nats_without_axioms()
-        watch.end_stage_after(math.inf)
-        return True
+        return self._beams.search(clashes)
 
     def search(self, of_labels: OfLabels) -> None:
         """Find the maps of least cost and their rivals, and prove that there are no others.
@@ -262,7 +222,7 @@ class Weighing:
         )
         found, proven = self._of_labels(trace, pinned, self._parts.watch.left())
         jumps = tuple(fault for fault in ssh_map.faults if fault.kind == "jumped")
-        alike = [_with(jumps, other) for other in found if _course(other) == _course(ssh_map)]
+        alike = [_with(jumps, other) for other in found if course_of(other) == course_of(ssh_map)]
         return tuple(alike) or (ssh_map,), proven and bool(alike)
 
     def add(self, ssh_map: SSHMap) -> float:
@@ -347,23 +307,18 @@ class Weighing:
             return None
         rivals: dict[Course, Rival] = {}
         for candidate in self.candidates:
-            rival = _rival_of(candidate)
+            rival = rival_of(candidate.map, candidate.nats)
             rivals.setdefault((rival.dstates, rival.places), rival)
         found, excess = list(rivals.values()), self._excess()
         return Weighed(
             bound=self.bound,
             within=self._within if self.proven else 0.0,
             rivals=(*found, *self._estimated(found[0], set(rivals))),
-            searched=self._is_searched() and excess < math.inf,
-            broken=self._broken,
+            searched=self._beams.found(self.candidates[0].nats) and excess < math.inf,
+            broken=self._beams.broken,
             excess=excess if excess < math.inf else 1.0,
             drives=drives_of(self._parts.task.trace),
         )
-
-    def _is_searched(self) -> bool:
-        """Whether a broad beam ended with the best map, and maps that break axioms were sought."""
-        is_best = self._searched[0] <= self.candidates[0].nats + EQUAL
-        return is_best and math.isfinite(self._broken)
 
     def _excess(self) -> float:
         """How many times as large the misfit of the returns of the best map is as expected.
@@ -425,7 +380,7 @@ def _exactly(ssh_map: SSHMap) -> list[Equality]:
     Maps with faults may have other faults, and less of them, if more steps are one dstate. So only
     the maps with the same dstates and places are excluded.
     """
-    dstates, places = _course(ssh_map)
+    dstates, places = course_of(ssh_map)
     found = []
     for of, names in (("dstate", dstates), ("place", places if ssh_map.places else ())):
         pairs = combinations(range(len(names)), 2)
@@ -439,12 +394,6 @@ def _with(faults: Sequence[Fault], ssh_map: SSHMap) -> SSHMap:
         return ssh_map
     both = sorted((*ssh_map.faults, *faults), key=lambda fault: (fault.step, fault.kind))
     return replace(ssh_map, faults=tuple(both))
-
-
-def _course(ssh_map: SSHMap) -> Course:
-    """The dstate and the place of each step, numbered by first visit."""
-    places = [ssh_map.dstates[label].place for label in ssh_map.dstate_at]
-    return tuple(numbered(ssh_map.dstate_at)), tuple(numbered(places))
 
 
 def _pinned(theory: Theory, ssh_map: SSHMap) -> Theory:
@@ -463,12 +412,6 @@ def _pinned(theory: Theory, ssh_map: SSHMap) -> Theory:
         different=(*theory.different, *different),
         elsewhere=(*theory.elsewhere, *elsewhere),
     )
-
-
-def _rival_of(candidate: Candidate) -> Rival:
-    dstates, places = _course(candidate.map)
-    faults = tuple((fault.kind, fault.step) for fault in candidate.map.faults)
-    return Rival(candidate.nats, dstates, places if candidate.map.places else (), faults=faults)
 
 
 class _Judging(Judging):
