@@ -21,8 +21,8 @@ NEAR = 1.5
 APART = 2.3
 # Values of trimmed M within this factor of the largest count as equal, and the smallest k wins.
 EQUAL = 0.95
-# An image is isolated by its distance to this nearest neighbour, so that two or three images of one
-# strange thing are isolated.
+# The distance of an image to its third nearest neighbour decides whether it is isolated. So two or
+# three images of one strange thing are isolated, too.
 NEIGHBOURS = 3
 
 
@@ -58,7 +58,7 @@ class Predictor:
 
     Attributes:
         model: The fitted clusterer, or a classifier if the clusterer cannot predict.
-        inside: (m, d) the fitted images that are not isolated. It is empty if none can be.
+        inside: (m, d) the fitted images that are not isolated; empty if the settings isolate none.
         reach: An image is isolated if its third nearest neighbour is farther than this.
     """
 
@@ -75,7 +75,7 @@ class Predictor:
 
 
 def single(fitted: Any, images: NDArray[np.float64], trim: float) -> tuple[Any, Tried]:
-    """The fitted clusterer, and its clustering as the only one that was tried."""
+    """Return a fitted clusterer, and a `Tried` that holds its clustering alone."""
     labels = labels_of(fitted, images)
     inside = labels != NOISE
     k = len(set(labels[inside].tolist()))

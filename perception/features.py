@@ -152,7 +152,7 @@ def _neighbours(
 
 
 def _permuted(images: Floats, second: NDArray[np.bool_], seed: int) -> Floats:
-    """The margin that is lost if a feature is shuffled, (d,).
+    """Compute how much of the margin is lost if each feature is shuffled, (d,).
 
     The recogniser learns half of the images. The margin is measured on the other half.
     """
@@ -172,10 +172,11 @@ def _permuted(images: Floats, second: NDArray[np.bool_], seed: int) -> Floats:
 
 
 def _margin(model: Any, images: Floats, second: NDArray[np.bool_]) -> float:
-    """How much farther the nearest image of the other dstate is than that of the own dstate.
+    """Compute the margin: how much nearer images are to their own dstate than to the other one.
 
-    The number is a mean difference of squared distances. Shuffling a useless feature adds the same
-    to both squares, so the difference stays.
+    It is the mean over all images of the squared distance to the nearest image of the other dstate,
+    minus that to the nearest image of their own. Shuffling a useless feature adds the same to both
+    squares, so the difference stays.
     """
     distances = cdist(images, model._fit_X, "sqeuclidean")
     same = second[:, None] == model.classes_[model._y]
@@ -188,9 +189,9 @@ def _margin(model: Any, images: Floats, second: NDArray[np.bool_]) -> float:
 
 
 def _linear(images: Floats, second: NDArray[np.bool_]) -> Floats:
-    """What each feature adds to the difference of the dstates' mean scores, (d,).
+    """Compute what each feature adds to the difference of the mean scores of two dstates, (d,).
 
-    The score is that of a logistic regression which separates the dstates.
+    The scores are those of a logistic regression that separates the dstates.
     """
     model = LogisticRegression(max_iter=1000).fit(images - images.mean(axis=0), second)
     return np.asarray(model.coef_[0] * (images[second].mean(axis=0) - images[~second].mean(axis=0)))

@@ -272,7 +272,10 @@ def _apart(log: RobotLog, turns: Array, stretch: float = 1.0) -> Array | None:
 
 
 def _pairs(log: RobotLog) -> list[tuple[Scan, Scan]]:
-    """At most PAIRS pairs of scans that see the same walls and have accurate odometry between."""
+    """Choose at most PAIRS pairs of scans so near to each other that they see the same walls.
+
+    The odometry between near scans is accurate.
+    """
     kept = moving(log.scans)
     pairs = []
     for i, scan in enumerate(kept):

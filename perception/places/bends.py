@@ -1,7 +1,7 @@
-"""Finds the bends of the lines of a skeleton: corners of a corridor, where no other way begins.
+"""Finds the bends in the lines of a skeleton: corners of a corridor without a branch.
 
-A bend is a place, although nothing is decided there. A robot that turns at a corner knows well
-where it is along its way.
+A bend is a place, although the robot has no choice there. A robot that turns at a corner knows well
+how far it is along the corridor.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from perception.places.track import Array
 
 Bend = tuple[Node, list[Array]]
 
-# A line bends if the directions from a cell to the points before and after it differ by at least
-# TURN radians from straight on. A gateway is merged with another one up to this angle, too.
+# A line bends at a cell if it turns there by at least this many radians. Ways out that differ by
+# less are merged (`visits.MERGED`).
 TURN = math.radians(45)
 
 
@@ -27,8 +27,8 @@ def bends(graph: Graph, distance: Array, out: float) -> Iterator[Bend]:
     Args:
         graph: The skeleton.
         distance: (rows, columns) distance of each cell to the nearest obstacle, in cells.
-        out: The directions are those of points so many cells out of the disc of a cell. A line
-            that ends before does not show whether it bends.
+        out: The direction of a line before and after a cell is measured at points that lie this far
+            outside the disc of the cell, in cells. A line that ends nearer than that has no bend.
 
     Yields:
         The node of each bend and its two branches: (n, 2) rows and columns each.
@@ -41,14 +41,14 @@ def bends(graph: Graph, distance: Array, out: float) -> Iterator[Bend]:
 
 
 def _bends_of(edge: Edge, first: float, last: float, distance: Array, out: float) -> Iterator[Bend]:
-    """The bends of one line, the sharpest first.
+    """Find the bends of one line, the sharpest first. See `bends`.
 
     Args:
         edge: The line.
         first: Length of the line in the disc of its first node, in cells.
         last: Length of the line in the disc of its last node, in cells.
         distance: (rows, columns) distance of each cell to the nearest obstacle, in cells.
-        out: How far out of the disc directions are measured, in cells.
+        out: How far outside the disc of a cell directions are measured, in cells.
     """
     cells = edge.cells
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(cells, axis=0).T))])
@@ -63,13 +63,13 @@ def _bends_of(edge: Edge, first: float, last: float, distance: Array, out: float
 
 
 def _turns(cells: Array, along: Array, radii: Array, out: float) -> Array:
-    """By how many radians a line turns at each cell, (n,).
+    """Compute by how many radians a line turns at each cell, (n,).
 
     Args:
         cells: (n, 2) rows and columns.
         along: (n,) length of the line up to each cell.
         radii: (n,) radius of the disc of each cell, in cells.
-        out: How far out of the disc directions are measured, in cells.
+        out: How far outside the disc of a cell directions are measured, in cells.
     """
 
     def at(where: Array) -> Array:

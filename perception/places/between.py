@@ -100,7 +100,10 @@ def _relations(found: Sequence[Closing], first: Imported, last: Imported) -> _Re
 
 
 def _largest(found: Sequence[Closing], relations: _Relations) -> list[Closing]:
-    """The largest set of matches that agree with one of them; empty if it is too small."""
+    """Find the relation of the frames on which most matches agree, and list these matches.
+
+    The list is empty if too few visits agree, or if another relation has more than half as many.
+    """
     sets = [relations.agreeing(k) for k in range(len(found))]
     visits = np.array([one.last for one in found], int)
 

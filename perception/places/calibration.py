@@ -1,9 +1,9 @@
 """Estimates from the closures of a log how precise its track is.
 
-The covariances of matched scans hold for no robot in particular. Closures measure where the track
-went wrong. So the covariances of the track are multiplied by the factor that makes the errors at
-the closures most probable. A steady drift of the heading is estimated with it, and taken out: it is
-an unknown of the map, and no part of the covariances.
+Scan matching estimates covariances by the same constants for every robot. Closures measure how far
+the track of this robot is really off. So the covariances of the track are multiplied by the factor
+that makes the errors at the closures most probable. A steady drift of the heading is estimated at
+the same time and removed from these errors, because the covariances do not include it.
 """
 
 from __future__ import annotations
@@ -30,12 +30,13 @@ from perception.places.visits import Visit
 
 # Standard deviations of the error of a closure, in metres and radians (docs/measurements/logs.md).
 ERROR = (0.05, 0.05, math.radians(0.5))
-# The factors that are tried, and the standard deviation of their natural logarithm. So a few
-# closures do not change the covariances much.
+# The factors that are tried, and the standard deviation of the prior of their natural logarithm.
+# Because of this prior, a few closures do not change the covariances much.
 FACTORS = 2.0 ** np.arange(-7, 5, 0.5)
 CHANGE = 0.5
-# The share of closures that are wrong, and the logarithm of the volume of their errors: those that
-# closures may have at all, if the covariance is 1. It is that of a ball.
+# WRONG is the share of closures that are wrong. The errors of wrong closures are uniformly
+# distributed in the ellipsoid that the gate of `closures` allows. VOLUME is the natural logarithm
+# of its volume if the covariance is the unit matrix, so that it is a ball.
 WRONG = 0.02
 VOLUME = math.log(4 / 3 * math.pi * (INFLATED * GATE) ** 1.5)
 
@@ -52,7 +53,7 @@ def calibrated(track: Track, visits: Sequence[Visit], closings: Sequence[Closing
 
 
 def factor_of(track: Track, visits: Sequence[Visit], closings: Sequence[Closing]) -> float:
-    """Estimate by what the covariances of a track have to be multiplied. See `calibrated`."""
+    """Estimate the factor that corrects the covariances of a track; 1 if there is no closure."""
     if not closings:
         return 1.0
     scans = [visit.scan for visit in visits]

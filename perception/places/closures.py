@@ -35,7 +35,8 @@ DRIFTS = BEND * np.arange(-BENDS, BENDS + 1)
 TURN, SIGMAS = math.radians(6), 3.0
 # Each visit has at most this many closures with earlier ones: those with the best scores.
 KEPT = 2
-# Each visit is matched with at most this many earlier ones, and so many local maps stay prepared.
+# Each visit is matched with at most MATCHES earlier ones. The last SCENES local maps are cached in
+# the form in which they are matched.
 MATCHES, SCENES = 32, 128
 
 
@@ -92,11 +93,11 @@ def find_closures(
 def _closings(
     scene: Callable[[int], Scene], asked: Sequence[tuple[int, _Gate]], last: int
 ) -> Iterator[Closing]:
-    """Match a visit with earlier ones.
+    """Match a visit with earlier ones, and yield the closures.
 
     Args:
-        scene: Makes the local map of a visit.
-        asked: The earlier visits to try, each with what the track says.
+        scene: Makes the scene of a visit from its index.
+        asked: Index and gate of each earlier visit to try.
         last: Index of the visit.
     """
     if not asked:
@@ -130,7 +131,7 @@ class _Gate:
 
     @property
     def turns(self) -> range:
-        """Rotations to try, those that the track allows: k for k times TURN."""
+        """The rotations that the track allows, as multiples of TURN."""
         margin = SIGMAS * math.sqrt(self.covariance[2, 2])
         least, most = self.poses[:, 2].min() - margin, self.poses[:, 2].max() + margin
         first, last = math.floor(least / TURN), math.ceil(most / TURN)
@@ -146,7 +147,7 @@ class _Gate:
 
 
 class _Gates:
-    """What the track says about each two visits.
+    """Makes the gate of any two visits.
 
     Args:
         track: Trajectory of the robot.
@@ -173,7 +174,7 @@ class _Gates:
         return range(begin, max(begin, end))
 
     def allowed(self, last: int, some: Sequence[int]) -> list[tuple[int, _Gate]]:
-        """The earlier visits of some that may be near a visit, each with what the track says."""
+        """List those of some earlier visits that may be near a visit, each with its gate."""
         if not some:
             return []
         # By the axes of each earlier visit, for each drift: (drifts, visits, 3).
@@ -217,28 +218,31 @@ class _Corrected:
         self._turns[closing.last] = turn + closing.match.turn
 
     def nearest(self, visit: int, some: range) -> list[int]:
-        """The MATCHES visits of some that are nearest to a visit, in order."""
+        """List the MATCHES visits of a range that are nearest to a visit, in ascending order."""
         far = np.hypot(*(self._places[some.start : some.stop] - self._places[visit]).T)
         kept = np.argsort(far, kind="stable")[:MATCHES] + some.start
         return sorted(kept.tolist())
 
 
 def seen_from(first: Array, last: Array) -> Array:
-    """Compute poses by the axes of other poses: both (..., 3), x, y and rotation of the axes."""
+    """Compute the poses `last` in the frames of the poses `first`.
+
+    All poses are (..., 3): x, y in metres and rotation of the axes in radians.
+    """
     cos, sin = np.cos(first[..., 2]), np.sin(first[..., 2])
     x, y, turned = np.moveaxis(last - first, -1, 0)
     return np.stack([cos * x + sin * y, cos * y - sin * x, turned], axis=-1)
 
 
 def errors_of(poses: Array, matches: Array) -> Array:
-    """Compute how far poses are off from what matches say: (..., 3) metres and radians."""
+    """Subtract the poses that matches give from other poses: (..., 3) metres and radians."""
     off = poses - matches
     off[..., 2] = (off[..., 2] + math.pi) % math.tau - math.pi
     return off
 
 
 def drifted(middles: Array, way: Array, drift: float) -> Array:
-    """The middles of visits, if the heading of the track drifts steadily.
+    """Compute the middles of visits after a steady drift of the heading is removed.
 
     Args:
         middles: (n, 2) middles in metres, by the track.
@@ -246,7 +250,7 @@ def drifted(middles: Array, way: Array, drift: float) -> Array:
         drift: The drift to remove, in radians a metre.
 
     Returns:
-        (n, 3) x, y and rotation of the axes.
+        (n, 3) x, y in metres and rotation of the axes in radians.
     """
     turn = -drift * (way - way[0])
     halfway = (turn[1:] + turn[:-1]) / 2

@@ -53,7 +53,7 @@ DELAY = 125.0
 
 
 def find_visits(log: RobotLog, track: Track, width: float = WIDTH) -> tuple[Visit, ...]:
-    """Find the visits to distinctive places in a log, in order: the list of `visits_of`.
+    """Find the visits to distinctive places in a log, in order.
 
     Args:
         log: The scans. Corrected poses are not read.
@@ -314,7 +314,7 @@ def _stays(far: Array, radius: float) -> Iterator[tuple[int, int]]:
 
 
 def _ways(sightings: Sequence[_Sighting], radius: float) -> tuple[Way, ...]:
-    """The ways out of a place that its sightings show; sure if half of the sightings show them."""
+    """Find the ways out of a place. A way is sure if half of the sightings show it."""
     groups: list[list[float]] = []
     for sighting in sightings:
         for bearing in _bearings(sighting.junction, radius):

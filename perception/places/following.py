@@ -377,7 +377,7 @@ def _matched(
     pose, information, share = guess, weight, 0.0
     if len(walls) and len(points):
         kept = np.unique(np.linspace(0, len(points) - 1, min(len(points), POINTS)).astype(int))
-        # A tree that is built faster is asked as fast.
+        # These settings build the tree faster, and queries take no longer.
         tree = cKDTree(walls, compact_nodes=False, balanced_tree=False)
         fit = _Fit(points[kept], normals[kept], walls, wall_normals, tree)
         share, pose, information = fit.improved(guess, weight)

@@ -78,7 +78,7 @@ def import_log(
 
     Args:
         log: The log of one drive.
-        width: Width of the robot in metres. Narrower parts of the free space are no ways.
+        width: Width of the robot in metres. It cannot pass narrower parts of the free space.
         name: Name of the trace.
         tell: Takes each note on suspicious odometry as soon as it is known.
 
@@ -172,7 +172,7 @@ def _imported(
     notes: tuple[str, ...],
     seconds: dict[str, float],
 ) -> Imported:
-    """Make the trace of visits."""
+    """Make the trace of the visits, and gather the result of an import. Raises LogError."""
     if not visits:
         raise LogError(
             f"{named(log.source)}: expected a way past junctions or turning points, got "
@@ -205,7 +205,7 @@ def stream_visits(
     Args:
         scans: The scans with odometry, in order, for example those of `stream_log`. Damaged parts
             are skipped.
-        width: Width of the robot in metres. Narrower parts of the free space are no ways.
+        width: Width of the robot in metres. It cannot pass narrower parts of the free space.
         tell: Takes each note on suspicious scans and odometry as soon as it is known.
 
     Yields:

@@ -84,7 +84,7 @@ def _closings(parts: Sequence[Imported], counts: Sequence[int]) -> Iterator[Clos
     """Yield the closures between drives, with visits numbered over all drives.
 
     Args:
-        parts: What they were imported as.
+        parts: The import of each drive.
         counts: The number of visits before each drive.
     """
     scenes = [scenes_of(part) for part in parts]
@@ -94,7 +94,7 @@ def _closings(parts: Sequence[Imported], counts: Sequence[int]) -> Iterator[Clos
 
 
 def _arrivals(trace: Trace, track: Track, visits: Sequence[Visit]) -> list[tuple[int, float]]:
-    """The first step of each visit, and its heading in the frame of the track."""
+    """List the first step of each visit, and its heading in the frame of the track, in radians."""
     first = {int(step.extra["visit"]): t for t, step in reversed([*enumerate(trace.steps)])}
     return [
         (first[k], float(track.poses[visit.scan, 2] + trace[first[k]].extra["seen"][2]))

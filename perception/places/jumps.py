@@ -38,7 +38,7 @@ MISSING = 0.5
 # A clock starts anew if it goes back by more than ANEW_CLOCK seconds or on by more than a DAY, at
 # most SEAMS times in a log.
 ANEW_CLOCK, DAY, SEAMS = 60.0, 86400.0, 3
-# Number of steps before a step that say how long a usual one is, while a robot drives.
+# While a robot drives, the usual length of a step is the median of this many earlier steps.
 LATELY = 100
 # Limit of ranges in metres, for comparing scans.
 NO_RANGE = 25.0
@@ -110,7 +110,7 @@ def usual_step(log: RobotLog) -> float:
 
 
 def _of_source(scans: tuple[Scan, ...], members: NDArray[np.intp]) -> tuple[Scan, ...]:
-    """All scans, with odometry that is inter- and extrapolated from the scans of one source.
+    """Replace the odometry of all scans by that of one source, inter- and extrapolated.
 
     Args:
         scans: The scans.

@@ -37,7 +37,7 @@ class LiveLog:
 
     Args:
         items: The scans with odometry, in order. Damaged parts are skipped.
-        width: Width of the robot in metres. Narrower parts of the free space are no ways.
+        width: Width of the robot in metres. It cannot pass narrower parts of the free space.
         tell: Takes each note on suspicious scans as soon as it is known.
         source: Name of the log.
 

@@ -155,7 +155,7 @@ class LocalMaps:
 
     Args:
         recent: The scans with their poses.
-        beams: Their cells.
+        beams: The cells that the beams of these scans passed and met.
         reach: Metres of trajectory. The window of a scan reaches this far before and after it.
     """
 

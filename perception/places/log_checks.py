@@ -38,9 +38,10 @@ RUNS_BACK = 0.05
 # A robot returns if it comes within NEAR metres, plus DRIFT of the way between, of a point where it
 # was at least AWAY metres of way before.
 NEAR, DRIFT, AWAY = 3.0, 0.02, 15.0
-# A scan contradicts the scans before it if more than the share INTRUDING of the points of either
-# lie in the free space of the other, by MARGIN metres, and less than the share POORLY matches. In
-# good logs, no scan with such a match has more than 0.27.
+# A scan contradicts the scans before it if less than the share POORLY of its points matches, and
+# more than the share INTRUDING of the points of either side lies in the free space of the other, at
+# least MARGIN metres from walls. BESIDE scans on each side are compared. In good logs, scans that
+# match so badly have at most the share 0.27 there.
 INTRUDING, MARGIN, POORLY, BESIDE = 0.3, 0.4, 0.6, 3
 
 
@@ -152,7 +153,7 @@ def _about_order(log: RobotLog) -> list[str]:
 
 
 def _about_odometry(log: RobotLog, unseen: bool | None) -> list[str]:
-    """Describe odometry that is missing, of two sources, or at odds with its own headings."""
+    """Describe odometry that is missing, alternates, or does not fit its own headings."""
     straight, usual = ahead(log), jumps.usual_step(log)
     back_and_forth = jumps.goes_back_and_forth(log)
     if jumps.is_missing(log) and (jumps.moves_unseen(log) if unseen is None else unseen):
@@ -183,7 +184,7 @@ def judged(log: RobotLog, track: Track, explained: bool) -> tuple[Track, list[st
     Args:
         log: The scans with odometry.
         track: Poses by scan matching.
-        explained: Whether another note says what is wrong, so that this one need not guess.
+        explained: Whether another note already gives a cause, so that none is suggested here.
 
     Returns:
         The track, which is marked if it is unreliable; and notes for the user, none if nothing is

@@ -54,9 +54,10 @@ def near(mask: Bools, far: float, cell: float) -> Bools:
 
 
 def box_of(mask: Bools) -> Box:
-    """Find the smallest box with all cells of a mask and a margin of one cell, where there is one.
+    """Find the smallest box that holds all cells of a mask, with a margin of one cell.
 
-    Outside of it, thinning and distances within the mask have nothing to look at.
+    At the border of the mask the box has no margin. Thinning the mask, or computing distances
+    within it, needs the cells of this box only.
     """
     rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
     if not len(rows):

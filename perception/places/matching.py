@@ -38,7 +38,8 @@ CLASH, CLEAR = 0.5, 0.3
 # share of all wall points. So maps that hardly overlap do not match.
 OVERLAP = 0.3
 # A match is refined only if its coarse score is at least HOPELESS, and if the standard deviation of
-# its shift is less than SPREAD metres. Otherwise quite other shifts match as well.
+# its shift is less than SPREAD metres. A larger deviation means that very different shifts match
+# equally well.
 HOPELESS, SPREAD = 0.7, 0.85
 # Scores differ by 1 / SHARPNESS where a shift is e times as probable.
 SHARPNESS = 25.0
@@ -125,13 +126,14 @@ class Scene:
         return np.asarray(Turned.of(self, [0.0]).spectra[:, 0].conj())
 
     def agreement(self, points: Array) -> tuple[Array, Array]:
-        """The sum of the agreements of points with the walls, and how many were observed here.
+        """Compute how well points agree with the walls of this scene, for several poses.
 
         Args:
-            points: (n, 2, m) x and y in metres, relative to the middle, of m points with n poses.
+            points: (n, 2, m) x and y in metres, relative to the middle, of m points in n poses.
 
         Returns:
-            (n,) and (n,).
+            For each pose, the sum of the agreements of its points, (n,), and the number of points
+            whose cells this scene observed, (n,).
         """
         cells = self.cells(points)
         return self._sharp.ravel()[cells].sum(axis=1), self._observed.ravel()[cells].sum(axis=1)
@@ -150,9 +152,10 @@ class Scene:
         return float(seen / max(min(self._observed.sum(), other._observed.sum()), 1))
 
     def cells(self, points: Array) -> NDArray[np.intp]:
-        """The numbers of the cells of points, (..., 2, m); a border cell for those outside.
+        """Number the cells in which points, (..., 2, m), lie.
 
-        Border cells are farther than REACH from the middle. So nothing was observed there.
+        A point outside gets a border cell. Border cells are farther than REACH from the middle, so
+        nothing was observed there.
         """
         size = len(self._observed)
         at = (points + self._shift[:, None]) / CELL + (size // 2 + 0.5)
@@ -160,7 +163,7 @@ class Scene:
         return np.asarray(rows * size + columns)
 
     def sampled(self, points: Array) -> _Floats:
-        """The blurred walls, and whether there was an observation, at points (2, m): (2, m)."""
+        """Look up points, (2, m): the blurred walls and whether a cell was observed, (2, m)."""
         cells = self.cells(points)
         return np.stack([self._blurred.ravel()[cells], self._observed.ravel()[cells]])
 
@@ -196,10 +199,13 @@ class Turned:
 
 
 def _spread_out(at: Array) -> Array:
-    """Distribute points over the four cells around each, by their distances.
+    """Distribute each point over the four cells around it, by its distances from them.
 
     Args:
-        at: (n, 2) rows and columns of the points.
+        at: (n, 2) rows and columns of the points, as fractions of cells.
+
+    Returns:
+        (SIDE, SIDE) the weight of points in each cell.
     """
     corner = np.floor(at)
     rest = at - corner
@@ -271,7 +277,7 @@ def _spread(less: Array) -> float:
 
 
 def _refined(first: Scene, second: Scene, turn: float, shift: Array) -> tuple[float, float, Array]:
-    """Improve a rotation and a shift step by step; return the score, too."""
+    """Improve a rotation and a shift step by step; return the score and both of them."""
     least = OVERLAP * (len(first.walls) + len(second.walls))
 
     def scores_of(poses: Array) -> Array:

@@ -68,14 +68,15 @@ class Recent:
         return float(self._rows[max(index, self.begin) - self._base, 3])
 
     def at(self, way: float, side: Literal["left", "right"] = "left") -> int:
-        """Find the first kept scan at which the robot has driven so many metres.
+        """Find the first kept scan at which the robot has driven a number of metres.
 
         Args:
             way: The metres.
-            side: "right" for the first scan at which it has driven more.
+            side: "left" for the first scan at which it has driven at least so far; "right" for the
+                first at which it has driven farther.
 
         Returns:
-            Its index; that after the last scan if there is none.
+            The index of the scan, or the index after the last scan if there is none.
         """
         ways = self._rows[self.begin - self._base : len(self._scans), 3]
         return self.begin + int(np.searchsorted(ways, way, side=side))

@@ -40,10 +40,10 @@ OUT, SHARE = 0.75, 0.5
 # Junctions are one up to ONE metres from each other, even if their discs are smaller. The free
 # space between them is nowhere narrower than a share of NARROW of the smaller disc.
 ONE, NARROW = 0.6, 0.75
-# A shore is so many widths of the robot away from obstacles. Shores at both sides of a space are
-# two ways if they are farther apart than that. So a space is open if its middle is at least WIDE
-# times as far from obstacles as the shore.
-# The directions of a bend are those of points as far out of its disc.
+# A shore is SHORE widths of the robot away from obstacles. A space is open if its middle is at
+# least WIDE times as far from obstacles as the shore. Then the shores on both sides of the space
+# are farther apart than SHORE widths, and count as two ways. The directions of a bend are measured
+# SHORE widths outside its disc.
 SHORE, WIDE = 3.0, 1.5
 
 # A node of a skeleton with its branches: (n, 2) rows and columns each.
@@ -137,7 +137,7 @@ def open_space(distance: Array, far: float) -> Bools:
 
 
 def with_shores(lines: Bools, inner: Bools) -> Bools:
-    """Replace the lines of a skeleton in open spaces by the shores of these.
+    """Replace the lines of a skeleton inside open spaces by the shores of these spaces.
 
     Args:
         lines: (rows, columns) lines of the skeleton.
@@ -178,7 +178,7 @@ def _distances(mask: Bools) -> Array:
 
 
 def pruned(graph: Graph) -> Graph:
-    """Remove the branches that lead nowhere, beginning with the one that leads out least."""
+    """Remove branches that end soon after they leave the disc of their junction, shortest first."""
     while True:
         degrees = graph.degrees
         short = [
@@ -193,7 +193,7 @@ def pruned(graph: Graph) -> Graph:
 
 
 def _out(edge: Edge, nodes: Mapping[int, Node], degrees: Mapping[int, int]) -> float | None:
-    """By how many metres a dead end leads out of the disc of its junction.
+    """Compute by how many metres a branch to prune leads out of the disc of its junction.
 
     Args:
         edge: The edge from the junction to the dead end.
@@ -201,7 +201,7 @@ def _out(edge: Edge, nodes: Mapping[int, Node], degrees: Mapping[int, int]) -> f
         degrees: The number of edges of each node.
 
     Returns:
-        None if the edge is no dead end, or leads far enough.
+        The metres; None if the edge is no dead end, or leads far enough to stay.
     """
     if degrees[edge.ends[0]] < 3 or degrees[edge.ends[1]] > 1 or nodes[edge.ends[1]].cut:
         return None
@@ -246,7 +246,8 @@ def _are_one(
 
     Args:
         edge: The edge.
-        heads: The junctions with the largest discs of those that are one with either end.
+        heads: For each end of the edge, the junction with the largest disc among those that were
+            merged with that end.
         nodes: The nodes.
         distance: (rows, columns) distance of each cell to the nearest obstacle, in cells.
     """

@@ -53,12 +53,12 @@ class _Turn:
 
 
 class Stays:
-    """Makes final visits of those that chains of junctions show.
+    """Turns the visits that chains of junctions show into final visits.
 
     Args:
         recent: The last scans with their poses.
         maps: Makes the local map of a visit.
-        half: Half the side of such a map in metres.
+        half: Half the side of the local map of a visit in metres.
     """
 
     def __init__(self, recent: Recent, maps: LocalMaps, half: float) -> None:
@@ -115,18 +115,18 @@ class Stays:
             self._passing = replace(visit, begin=min(visit.begin, last.begin))
 
     def _may_overlap(self, last: Visit, scan: int, begin: int | None = None) -> bool:
-        """Whether a visit overlaps with the visit before it.
+        """Whether a visit may overlap with the visit before it.
 
         Args:
             last: The visit before it.
-            scan: The first scan that the visit may have in its middle.
-            begin: The first scan that it may begin with; None if that is `scan`.
+            scan: The scan nearest to the middle of the visit, or the earliest that it may be.
+            begin: The first scan of the visit, or the earliest that it may be; None for `scan`.
         """
         soon = self._recent.way(scan) <= self._recent.way(last.scan) + STAY
         return soon and (scan if begin is None else begin) <= last.end + 2
 
     def _settle(self) -> None:
-        """Take the last visit as found."""
+        """Add the last visit to those that were found: the next visit will not replace it."""
         if self._passing:
             self._found.append((self._recent.way(self._passing.scan), self._passing))
         self._passing = None
@@ -143,7 +143,10 @@ class Stays:
         self._turns.sort(key=lambda turn: turn.scan)
 
     def _angle(self, scan: int, stride: float) -> float:
-        """By how many radians the robot turned at a scan; 0 if it hardly moved before or after."""
+        """Compute by how many radians the robot turned at a scan.
+
+        The result is 0 if the robot hardly moved in the stride before or after the scan.
+        """
         recent, way = self._recent, self._recent.way(scan)
         before, after = recent.at(way - stride), recent.at(way + stride)
         first, here, last = (recent.poses(i, i + 1)[0, :2] for i in (before, scan, after))
@@ -153,7 +156,7 @@ class Stays:
         return apart(math.atan2(there[1], there[0]), math.atan2(back[1], back[0]))
 
     def _limit(self, horizon: int | None) -> int:
-        """The scan before which all visits and turns can be completed."""
+        """Find the scan before which all visits and turns can be completed now."""
         recent = self._recent
         if horizon is None:
             return recent.end
@@ -206,7 +209,7 @@ class Stays:
         self._found = [(self._recent.way(visit.scan), visit) for visit in parts]
 
     def _split(self, visit: Visit, scan: int) -> Iterator[Visit]:
-        """The visits to a place before and after a turn that is outside of its disc."""
+        """Split a visit at a turn, and yield the parts that pass through the disc of the place."""
         begin = max(visit.begin, self._recent.begin)
         if not begin < scan < visit.end:
             yield visit
@@ -218,7 +221,7 @@ class Stays:
                 yield replace(visit, scan=nearest, begin=first, end=last)
 
     def _with_gateways(self, visit: Visit) -> Visit:
-        """Complete a visit by the ways that the robot took: those by which it crossed the disc."""
+        """Complete a visit with the ways by which the robot entered and left the disc."""
         ways, numbers = list(visit.ways), []
         for side in (-1, 1):
             bearing = self._crossing(visit, side)

@@ -96,14 +96,14 @@ class Graph:
         return Counter(node for edge in self.edges for node in edge.ends)
 
     def without(self, edge: Edge) -> Graph:
-        """The graph without an edge, whose nodes with two edges become parts of one edge."""
+        """Remove an edge. If two edges are left at one of its ends, they become one edge."""
         kept = Graph(self.nodes, [other for other in self.edges if other is not edge])
         for node in edge.ends:
             kept = kept.joined_at(node)
         return kept
 
     def joined_at(self, node: int) -> Graph:
-        """The graph whose two edges at a node are one edge, if there are two."""
+        """Make one edge of the two edges at a node, if there are two."""
         here = [edge for edge in self.edges if node in edge.ends]
         if len(here) != 2 or any(edge.ends == (node, node) for edge in here):
             return self
@@ -218,7 +218,13 @@ def _add_line(
 
 
 def _forks_beside(known: Mapping[int, int], cell: int, steps: Sequence[int]) -> list[int]:
-    """The numbers of the junctions that touch a cell, ascending."""
+    """List the numbers of the junctions that touch a cell, ascending.
+
+    Args:
+        known: The number of the junction at each cell of a junction.
+        cell: The cell.
+        steps: The offsets of the eight neighbours of a cell.
+    """
     return sorted({known[cell + step] for step in steps if cell + step in known})
 
 

@@ -24,8 +24,8 @@ from ssh_abduction.data.odometry import Covariance, Odometry, between, moved
 from ssh_abduction.data.star import Gateway
 from ssh_abduction.data.trace import Action, Step, Trace
 
-# Standard deviations between two visits of the middle of a place, in metres, and of the direction
-# of a way out, in radians (docs/measurements/logs.md).
+# How much two visits to one place differ: standard deviations of its middle, in metres, and of the
+# direction of a way out, in radians (docs/measurements/logs.md).
 MIDDLE, DIRECTION = 0.2, 0.1
 # A turn by less than this, in radians, goes straight on: it is no turn, and the visit has one step.
 AHEAD = math.radians(15)
@@ -105,9 +105,10 @@ def closure_of(found: Closing, arrivals: Sequence[tuple[int, float]]) -> Closure
 
 
 def _headings(visit: Visit, track: Track) -> list[float]:
-    """The headings of the robot at a visit, in radians: on arrival, and on departure if it turned.
+    """List the headings of a visit in radians: on arrival, and on departure if the robot turned.
 
-    If the visit has neither, it is the heading of the robot.
+    If the ways by which the robot came and left are both unknown, the list has the heading of the
+    robot at the middle of the place.
     """
     came = [] if visit.arrived is None else [wrapped(visit.ways[visit.arrived].bearing + math.pi)]
     went = [] if visit.left is None else [visit.ways[visit.left].bearing]

@@ -1,8 +1,7 @@
 """Checks the scans of a drive while they come, by the same checks as for a whole log.
 
 The first scans wait until the units of the odometry are recognised. Later scans are passed on at
-once. The checks run when there are LOOKS scans, and then for each stretch of as many scans as the
-last number.
+once. The scans are checked in stretches of 1,600: when a stretch has 200, 400, 800 and 1,600 scans.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from ssh_abduction.data.errors import named
 # Units are recognised when the robot has moved in MOVES steps and by LEAST_WAY metres, or when MOST
 # scans wait.
 MOVES, MOST = 100, 2000
-# Numbers of scans at which a stretch is checked. A stretch ends with the last number.
+# Numbers of scans of a stretch at which it is checked. It is complete at the last number.
 LOOKS = (200, 400, 800, 1600)
 
 

@@ -272,8 +272,8 @@ def _gaps(parts: list[Path]) -> list[str]:
     listed = ", ".join(map(str, missing[:5])) + (", …" if len(missing) > 5 else "")
     return [
         (
-            f"Of the drive that {named(parts[-1].name)} is a part of, these parts are not there: "
-            f"{listed}. What they hold is missing."
+            f"{named(parts[-1].name)} is one part of a drive, of which these parts are not there: "
+            f"{listed}. Their scans are missing."
         )
     ]
 

@@ -236,7 +236,7 @@ class _Odometer:
         restarts: Whether the next ODOM line starts from a corrected pose, and gives no motion.
         vertex: Index of the last vertex.
         truth: The last corrected pose, and the pose by odometry at that time.
-        news: A corrected pose without odometry yet; the next scan gives it.
+        news: A corrected pose that waits for the next scan, which gives its odometry.
     """
 
     found: Found

@@ -208,7 +208,7 @@ def interpreter_of(
 
 
 def _key(scan: Scan) -> _Key:
-    """What tells a laser from others."""
+    """The key that distinguishes the lasers of a log: reach, least range and mount."""
     return scan.laser.reach, scan.laser.nearest, scan.laser.mount
 
 

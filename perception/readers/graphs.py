@@ -71,10 +71,10 @@ class Graph:
         return Chain(tuple(poses), tuple(gaps))
 
     def _motion(self, start: int, end: int) -> Pose | None:
-        """The motion from one vertex to another, by their edge; None if it is unknown.
+        """Find the motion from one vertex to another; None if it is unknown.
 
-        If there is no edge between the two, the motions along the vertices between them, by
-        number, are added up.
+        It is that of the edge between the two. If there is none, the motions along the vertices
+        whose numbers lie between theirs are added up.
         """
         if (motion := self.edges.get((start, end))) is not None:
             return motion
