@@ -139,7 +139,7 @@ def _opening(plan: Plan, door: Door) -> Opening:
 
 
 def _span(flat: Opening, walls: Array) -> tuple[float, float]:
-    """Where the wall with a door begins and ends, in metres along the wall from the door.
+    """Find where the wall with a door begins and ends, in metres along the wall from the door.
 
     An outline may have corners within a straight wall, so connected stretches are joined.
 
@@ -161,7 +161,13 @@ def _span(flat: Opening, walls: Array) -> tuple[float, float]:
 
 
 def _across(flat: Opening, wall: Array, along: float) -> float:
-    """How many metres a wall is to the left of a door's middle, at a position along the door."""
+    """Measure how many metres to the left of a door's middle a wall lies.
+
+    Args:
+        flat: The door, as an opening without depth.
+        wall: (4,) the wall.
+        along: Where to measure: metres along the door from its middle.
+    """
     ends = flat.frame(wall.reshape(2, 2))
     return float(np.interp(along, *ends[np.argsort(ends[:, 0])].T))
 

@@ -65,7 +65,7 @@ def follow(driver: Driver, space: FreeSpace, way: Array) -> Iterator[int]:
 
 
 def _come_to(way: Array, at: int, driver: Driver) -> int:
-    """The index of the nearest upcoming point of the route.
+    """Find the index of the nearest upcoming point of the route.
 
     If several points are equally near, it is the last of them, so that a route may turn back.
 

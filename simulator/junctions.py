@@ -282,5 +282,5 @@ def _is_open(image: Array, side: int, reach: float) -> bool:
 
 
 def _steer(street: Street) -> float:
-    """How far to turn on the next stride, to reach the midline and follow it, in radians."""
+    """Compute the turn in the next stride, in radians, that leads to the midline and along it."""
     return street.bearing - math.atan(1.5 * float(np.clip(street.offset, -0.5, 0.5)))

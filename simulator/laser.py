@@ -17,7 +17,8 @@ BEAMS = 180
 BEARINGS: Array = np.radians(
     np.arange(BEAMS) - 89.5
 )  # Radians, counterclockwise from straight ahead.
-# Intersections of beams and walls to compute at once, except for a single image: 32 MB.
+# Largest number of intersections of beams and walls that are computed at once: 32 MB. A single
+# image may need more.
 _BLOCK = 4_000_000
 
 

@@ -196,7 +196,7 @@ def _drive(
 
 
 def _way_through(plan: Plan, stand: Stand, goal: int) -> Iterator[tuple[Action, Stand]]:
-    """The actions that lead through a gateway of the room, each with the state it leads to."""
+    """Yield the actions that lead through a gateway. See `Floor.way_through`."""
     if stand != (turned := Stand(stand.room, goal)):
         yield _turn(plan, stand, goal), turned
     gateway = plan.gateways[stand.room][goal]
@@ -209,9 +209,10 @@ def _way_through(plan: Plan, stand: Stand, goal: int) -> Iterator[tuple[Action, 
 
 
 def _turn(plan: Plan, stand: Stand, goal: int) -> Action:
-    """The turn to a gateway of the room.
+    """Make the action of a turn to a gateway of the room.
 
-    Its number counts the gateways on its side. The gateway that the robot faces is not counted.
+    The number in the action counts the gateways on the side of the turn, up to the one where the
+    turn ends. The gateway that the robot faces is not counted.
     """
     found = plan.gateways[stand.room]
     if goal == (found[stand.gateway].opposite if stand.faces else stand.gateway):

@@ -92,13 +92,13 @@ def simulate(
     an_instance("world", world, World, SimulatorError, mend="take World.named or World.load")
     if every is not None and world.lifts:
         raise SimulatorError(
-            f"every: expected none in {world.name}, whose images all along would join its floors; "
-            "leave it out"
+            f"every: expected none in {world.name}, as evenly spaced images would join the floors "
+            "at its lifts; leave it out"
         )
     if world.by_places:
         raise SimulatorError(
-            f"{world.name}: route: expected actions, got places, to which a robot drives that "
-            "logs scans all along; write --format carmen, or give a route of actions"
+            f"{world.name}: route: expected actions, got places, and a robot that drives to places "
+            "writes a log of scans; write --format carmen, or give a route of actions"
         )
     driver = _driver(world, tours, seed, laser, body, tolerance)
     body, tolerance = driver.robot.body, driver.tolerance
@@ -153,8 +153,8 @@ def record(
     driver = _driver(world, tours, seed, laser, body, None)
     if world.lifts:
         raise SimulatorError(
-            f"{world.name}: lifts: expected none in the log of a robot, which does not say that "
-            "the floor changes; leave out --format"
+            f"{world.name}: lifts: expected none in the log of a robot, as a log does not show "
+            "that the floor changes; leave out --format"
         )
     recorder = driver.recorder = Recorder(every)
     recorder.note(driver.world, driver.robot.pose)
