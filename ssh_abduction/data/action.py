@@ -1,4 +1,4 @@
-"""Actions, which take the robot from one distinctive state (a place and a direction) to another."""
+"""Actions, which take the robot from one distinctive state (a place and a heading) to another."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class Action:
     Attributes:
         name: The name. Actions of a trace with the same name must be equal.
         kind: "travel", "turn", or None for other actions. A "lift" or "stairs" leads to another
-            floor. "start" is no action of the robot: the next step begins another drive, which the
-            name names, and may be anywhere.
+            floor. "start" is no action of the robot: the next step begins another drive, and may be
+            anywhere. The name is then that of the drive.
         turn: The direction of a turn: "right", "left" or "around".
         extra: Fields of the trace file that this package does not know.
         gateway: For a turn right or left, the number of the gateway (way out of a place) that it
@@ -103,10 +103,11 @@ class Action:
 
     @staticmethod
     def that_slipped(step: int) -> Action:
-        """Make the action that replaces one which did not do what its name says.
+        """Make the action that replaces an action that did not do what its name says.
 
         Args:
-            step: The step where the action was done. The new action equals none of another step.
+            step: The step where the action was done. Its number is in the name of the new action,
+                so that the new actions of two steps differ.
         """
         number = a_whole_number("step", step, TraceError)
         return Action(f"slipped at step {number}", extra={"slipped": True})

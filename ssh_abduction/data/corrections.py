@@ -1,6 +1,6 @@
 """Names and corrections: what a person says about the drives of a map.
 
-They stand in a file `corrections.yaml` beside the map. Each sentence names steps, not places: a
+They are in a file `corrections.yaml` beside the map. Each sentence names steps, not places: a
 place is "where the robot was at step 12 of Monday", written `monday:12`. So a sentence keeps its
 meaning when the map is solved again, and when drives are added.
 

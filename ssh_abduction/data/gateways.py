@@ -9,7 +9,7 @@
 frozenset()
 
 A star is all gateways (ways out of a place) seen at a step, each with a bearing. A sight is a
-dstate (distinctive state: a place and a direction) with a star that is seen there. A sight numbers
+dstate (distinctive state: a place and a heading) with a star that is seen there. A sight numbers
 its gateways; the numbers are its slots. The sights at a place see the same gateways, but a
 bearing may be off, and some gateways are not observed. So `fit` searches, at each place, for a
 frame (which gateways exist) and a shift of the slots for each sight, such that all axioms hold.
@@ -28,13 +28,14 @@ from ssh_abduction.data.star import SPREAD, Frame, Star
 from ssh_abduction.data.trace import Action, Trace
 from ssh_abduction.runtime.clock import look_at_clock
 
-# Stands for the half of gateway_path that allows opposite dstates to be on paths that are not one.
+# A name beside those of axioms, for a weaker form of the axiom gateway_path: dstates of one course
+# face one way, but dstates that face one way may be on different paths.
 COURSE = "course"
 
 
 @dataclass(frozen=True)
 class Sight:
-    """A dstate (a place and a direction) and a star (all gateways) seen there.
+    """A dstate (a place and a heading) and a star (all gateways) seen there.
 
     Attributes:
         dstate: The dstate.
@@ -263,7 +264,7 @@ def _fitted(
     made: tuple[tuple[Sight, Sight, frozenset[Action]], ...],
     axioms: frozenset[str],
 ) -> tuple[_Turned, ...] | None:
-    """Do what `fit` does. Maps of growing prefixes have many places in common.
+    """Do what `fit` does, with a cache: maps of growing prefixes have many places in common.
 
     Args:
         sights: The sights at one place.

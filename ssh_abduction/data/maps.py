@@ -1,9 +1,9 @@
 """Maps: distinctive states, the links between them, places, and paths with an order of places.
 
-A map is an immutable value. In maps that this package finds, dstates (distinctive states: places
-and directions), places and paths are numbered by first visit, and direction +1 of a path is the one
-that the robot first faced. So two maps of a trace are equal exactly if they are the same up to
-renaming.
+A map is an immutable value. A dstate (distinctive state) is a place and a heading. In maps that
+this package finds, dstates, places and paths are numbered by first visit, and direction +1 of a
+path is the one that the robot first faced. So two maps of a trace are equal exactly if they are the
+same up to renaming.
 
 Equality compares the dstates with their places and paths, the links, and the faults. It does not
 compare the orders of paths, the headings, and the excused pairs. These only show that the map is
@@ -70,7 +70,7 @@ class SSHMap:
 
     Attributes:
         dstate_at: The id of the dstate of each step of the trace.
-        dstates: The dstates (distinctive states: places and directions). The index is the id.
+        dstates: The dstates. The index is the id.
         links: For each action tried at a dstate: the id of the dstate, the name of the action, and
             the id of the dstate that the action leads to.
         places: The ids of the places.
@@ -394,7 +394,7 @@ class SSHMap:
 
 
 def _changed(fault: Fault) -> tuple[int | None, ...]:
-    """What tells two changes at one step apart; empty for other faults."""
+    """What distinguishes two faults "changed" at one step: place and gateway; else empty."""
     return (fault.place, fault.gateway) if fault.kind == "changed" else ()
 
 

@@ -48,7 +48,7 @@ class Odometry:
         angle: Error of heading in each step, in radians.
         scale: Systematic error of all lengths, as a share; it is the same in the whole trace.
         bend: Systematic drift of heading, in radians a metre; it is the same in the whole trace.
-        offset: Error of x and of y of a dstate (a place and a direction) at each visit, in metres.
+        offset: Error of x and of y of a dstate (a place and a heading) at each visit, in metres.
             It does not accumulate along the way.
         facing: Error of the heading of a dstate at each visit, in radians.
         extra: Fields of the trace file that this package does not know.

@@ -76,7 +76,7 @@ def described(region: Region, called: Callable[[str, int], str]) -> str:
 
 
 def of_members(members: Mapping[Reason, Collection[int]]) -> tuple[Region, ...]:
-    """Make regions of sets of places: one region of equal sets, and the order by inclusion.
+    """Make a region of each different set of places, and find which regions contain others.
 
     Args:
         members: For each reason, the places that it makes a region. An empty set makes none.
@@ -106,7 +106,15 @@ def of_members(members: Mapping[Reason, Collection[int]]) -> tuple[Region, ...]:
 
 
 def _smallest_around(places: frozenset[int], before: Iterable[frozenset[int]]) -> tuple[int, ...]:
-    """Find which of the sets before contain these places, without those that contain another."""
+    """Find the smallest earlier sets that contain these places and more.
+
+    Args:
+        places: The places.
+        before: The earlier sets.
+
+    Returns:
+        The indices of the sets that contain the places, but no other such set.
+    """
     around = {i: other for i, other in enumerate(before) if places < other}
     return tuple(
         i for i, other in around.items() if not any(within < other for within in around.values())

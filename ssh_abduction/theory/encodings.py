@@ -91,7 +91,10 @@ def folder() -> Path:
 
 
 def path(name: str) -> str:
-    """Return the path of a readable encoding or, if none has this name, of another one."""
+    """Return the path of an encoding by its name.
+
+    Encodings of axioms come first. Those in the subfolders `derived` and `fast` come next.
+    """
     files = [folder() / part / f"{name}.lp" for part in ("", "derived", "fast")]
     return str(next((file for file in files if file.exists()), files[-1]))
 

@@ -18,7 +18,7 @@ class Pairs:
     Each attribute is a dict from a step to the set of earlier steps with which it forms a pair.
 
     Attributes:
-        apart: Pairs of steps at different dstates (distinctive states: places and directions).
+        apart: Pairs of steps at different dstates (distinctive states: a place and a heading).
             All pairs of `elsewhere` are included.
         elsewhere: Pairs of steps at different places.
         one: Pairs of steps at one dstate.

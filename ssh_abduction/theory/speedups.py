@@ -151,12 +151,12 @@ def _any_theory(theory: Theory) -> bool:
 
 
 def _knows_views(theory: Theory) -> bool:
-    """Whether the observations of all steps are known, and tell dstates apart."""
+    """Whether the observation of each step is known, and no gateway may change."""
     return not theory.unknown_views and not theory.changed
 
 
 def _keeps_headings(theory: Theory) -> bool:
-    """Whether a dstate (a place and a direction) has at most one heading."""
+    """Whether each dstate has at most one heading, if places have frames."""
     return theory.star != "frame" or "one_heading" in theory.hard
 
 

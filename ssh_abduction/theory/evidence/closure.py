@@ -79,7 +79,13 @@ class Closure:
 
 
 def _square(match: Match, odometry: Odometry, places: bool) -> float:
-    """The chi-square if the two steps of a closure have one position, or one pose."""
+    """Compute the chi-square of a closure if its two steps have one position, or one pose.
+
+    Args:
+        match: The closure.
+        odometry: The noise model, for the errors at both steps.
+        places: Whether only positions are compared, and not headings.
+    """
     import numpy as np
 
     kept = 2 if places else 3

@@ -1,4 +1,4 @@
-"""Make a conflict of edges that cross small, and describe it by equalities of steps."""
+"""Shrink a set of travels and turns whose edges cross, and describe it by equalities of steps."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def fewest(moves: list[int], cross: Callable[[list[int]], bool]) -> list[int]:
 
     Args:
         moves: The steps at which they begin.
-        cross: Whether such a subset crosses.
+        cross: Returns whether the edges of such a subset cross.
     """
     size = max(1, len(moves) // 2)
     while True:
@@ -39,7 +39,7 @@ def split(
     Args:
         labels: The dstate of each step.
         steps: The steps.
-        cross: Whether edges cross with some labels.
+        cross: Returns whether edges cross if the steps have some labels.
 
     Returns:
         The new labels.

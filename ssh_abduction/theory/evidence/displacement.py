@@ -100,9 +100,10 @@ class Displacement:
     def believed(
         self, trace: Trace, returns: Collection[Equality], wrong: Collection[int]
     ) -> frozenset[Equality]:
-        """The displacements in the loops of returns that a map believes, if some may be wrong.
+        """Find the displacements in the loops of returns that a map believes.
 
-        Closures make further loops. So with closures, all displacements are in loops.
+        Closures make further loops. So with closures, all displacements are in loops. The result is
+        empty if no displacement may be wrong.
 
         Args:
             trace: The trace.

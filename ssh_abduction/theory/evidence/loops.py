@@ -21,7 +21,7 @@ uncertain spatial relationships in robotics"). It is a polynomial in p(j), so pr
 for any loop at once.
 
 Two errors are not noise, but unknown constants of the whole trace: a wrong scale, and a steady
-drift of heading. The measured pose of a dstate (a place and a direction) may also be off at each
+drift of heading. The measured pose of a dstate (a place and a heading) may also be off at each
 visit, for example if the middle of a place is estimated from laser scans. This adds to the
 covariance at both ends of the loop and does not grow along the way.
 

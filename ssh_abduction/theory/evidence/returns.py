@@ -232,7 +232,7 @@ class Returns:
         return list(zip(first.tolist(), last.tolist(), strict=True))
 
     def _steps_of_visits(self, elsewhere: Earlier, since: int) -> Iterator[tuple[int, int]]:
-        """Yield the pairs of steps in visits to different places, but for those that views tell.
+        """Yield the pairs of steps of visits to different places that views do not distinguish.
 
         Args:
             elsewhere: For the first step of a visit, the first steps of earlier visits to other
@@ -268,7 +268,7 @@ class Returns:
     def _returns_among(
         self, labels: Sequence[int], places: Sequence[int | None], since: int = 0
     ) -> Steps:
-        """Do the same as `_returns_of`, with the place of each step (not dstate) in `places`."""
+        """Do the same as `_returns_of`. Here `places` has the place of each step, not dstate."""
         import numpy as np
 
         at_dstate: dict[int, list[int]] = defaultdict(list)
