@@ -182,7 +182,7 @@ def test_check_bound_on_the_command_line(
     assert main(["check", "--bound", str(trace), str(maps)]) == 0
     shown = capsys.readouterr().out
     data = json.loads(maps.read_text())
-    assert f"at least {len(data['certificate']['clique'])} dstates: as many steps" in shown
+    assert f"at least {len(data['certificate']['clique'])} dstates: no two of " in shown
     assert f"the maps have {data['cost']['dstates']}: no map has fewer" in shown
     data["certificate"]["refuted"] = list(
         range(len(data["certificate"]["clique"]), data["cost"]["dstates"] + 1)
@@ -234,7 +234,7 @@ def test_a_verdict_on_another_theory_or_trace_is_not_believed(
     del data["theory"]
     maps.write_text(json.dumps(data))
     assert main(["check", "--bound", str(trace), str(maps)]) == 0
-    assert "left out: the file does not say of which theory" in capsys.readouterr().out
+    assert "left out: the file names no theory" in capsys.readouterr().out
     rectangle(400, turn="L").save(trace)
     assert main(["check", "--bound", str(trace), str(maps)]) == 20
     assert "no map has fewer" not in capsys.readouterr().out

@@ -255,11 +255,11 @@ def test_where_nothing_is_judged_that_is_said(
     assert evaluated(tmp_path, tum(), trace_at((TIMES[0], None, None, None, None))) == 0
     assert (
         "judged by poses: expected pairs of visits to judge, got none: "
-        "the trace has 5 visits; of 10 pairs poses do not tell" in capsys.readouterr().err
+        "the trace has 5 visits; for 10 pairs, poses do not tell" in capsys.readouterr().err
     )
     assert evaluated(tmp_path, tum(), trace_at((1000.0, 1000.5, 1001.0, 1001.5, 1002.0))) == 0
     assert (
-        "of 10 pairs within 2 m the robot was at no visit farther away in between"
+        "between the visits of 10 pairs within 2 m, the robot made no visit farther away"
         in capsys.readouterr().err
     )
 
@@ -274,7 +274,7 @@ def test_where_nothing_is_judged_that_is_said(
     ],
 )
 def test_a_way_that_is_on_no_floor_is_noticed(text: str, tmp_path: Path) -> None:
-    with pytest.warns(TrajectoryWarning, match="expected a way on a floor"):
+    with pytest.warns(TrajectoryWarning, match="expected a trajectory on a floor"):
         read(tmp_path, text)
 
 

@@ -205,8 +205,7 @@ def test_relations_judge_where_poses_are_missing(
     assert main(arguments) == 0
     first, left_out, _, row = capsys.readouterr().out.splitlines()
     assert first.startswith(
-        "judged by relations: of 9 pairs of different visits 3 are returns to one place: within 2 "
-        "m, and"
+        "judged by relations: 3 of 9 pairs of visits are returns to one place (within 2 m, and"
     )
     assert left_out == "left out: 1 pair, as relations do not tell how far apart they are"
     assert row.split()[:6] == ["1", "2", "4", "1", "0.250", "0.333"]
@@ -244,9 +243,10 @@ def test_relations_of_another_log_are_noticed(
     )
     said = capsys.readouterr()
     assert (
-        "relations and the poses of the trace judge 6 of 10 pairs of visits alike: are " in said.err
+        "relations and the poses of the trace agree on 6 of 10 pairs of visits only: are "
+        in said.err
     )
-    assert "poses judge 6 of 10 pairs of visits alike" in said.out
+    assert "poses and relations agree on 6 of 10 pairs of visits" in said.out
 
 
 def test_names_and_poses_are_judged_where_both_are_asked_for(

@@ -92,8 +92,8 @@ def run(options: argparse.Namespace) -> int:
         return EXIT_VIOLATED if broken else 0
     if resolved.has_faults or (solved is not None and solved.has_faults):
         raise MapError(
-            "bound: expected a theory without faults (misread, slipped), as where steps may be "
-            "disbelieved no clique of them proves anything"
+            "bound: expected a theory without faults (misread, slipped), as a clique of steps "
+            "proves nothing if steps may be treated as wrong; leave out --bound"
         )
     if resolved.unknown_views:
         raise MapError(
@@ -104,7 +104,7 @@ def run(options: argparse.Namespace) -> int:
     if broken:
         doubt = "some maps break axioms"
     elif solved is None:
-        doubt = "the file does not say of which theory"
+        doubt = "the file names no theory"
     elif other:
         doubt = "the file is of another theory"
     proven = _bound(trace, data, theory, maps, doubt, made_by, bool(broken))
@@ -112,7 +112,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _axioms_of(theory: Theory) -> Theory:
-    """The theory without its choice of what is minimal."""
+    """Set the fields that say what is minimal to fixed values, to compare two theories."""
     return theory.replace(prefer=AUTO, weigh="count")
 
 
@@ -129,7 +129,7 @@ def _costs_hold(
     if len(trace) > LONGEST:
         print(f"costs in nats are not checked, as the trace has more than {LONGEST} steps")
     elif not false:
-        print("the costs in nats are right, by an account of its own")
+        print("the costs in nats are right: they were computed anew")
     return not false
 
 
@@ -149,7 +149,7 @@ def _bound(
         data: The content of the file.
         theory: The theory to check by.
         maps: The maps in the file.
-        doubt: Why what clingo proved does not hold for this trace and theory; None if it does.
+        doubt: Why clingo's proofs may not hold for this trace and theory; None if they do.
         solved: The theory in the file, in which no field is "auto".
         broken: Whether some maps break axioms.
 
@@ -182,7 +182,7 @@ def _bound(
     pairs = bound.dstates * (bound.dstates - 1) // 2
     states = counted(bound.dstates, "dstates")
     print(
-        f"at least {states}: as many steps, of which no two can be one dstate "
+        f"at least {states}: no two of {counted(bound.dstates, 'steps')} can be one dstate "
         f"({counted(pairs, 'pairs')} checked)"
     )
     total = bound.dstates + (0 if doubt else len(bound.refuted))

@@ -44,8 +44,8 @@ def add_parser(verbs: Verbs) -> None:
         ),
     )
     diff = (
-        "only describe how two maps differ; each is given by its number, from 1, or its id; "
-        "with OTHER, J is in that file"
+        "only describe how maps I and J differ. Give each by its number, from 1, or its id. With "
+        "OTHER, map J is in that file"
     )
     parser.add_argument("--diff", nargs=2, metavar=("I", "J"), help=diff)
     parser.add_argument("--json", action="store_true", help="print JSON")

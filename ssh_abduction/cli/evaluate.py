@@ -133,8 +133,8 @@ def run(options: argparse.Namespace) -> int:
             print(f"ssh-abduction: warning: {_nothing_judged(visits)}", file=sys.stderr)
         if visits.by_both is not None and visits.by_both[1] < ALIKE * visits.by_both[0]:
             print(
-                "ssh-abduction: warning: relations and the poses of the trace judge "
-                f"{visits.by_both[1]} of {counted(visits.by_both[0], 'pairs')} of visits alike: "
+                "ssh-abduction: warning: relations and the poses of the trace agree on "
+                f"{visits.by_both[1]} of {counted(visits.by_both[0], 'pairs')} of visits only: "
                 f"are {named(options.relations)} relations of this log?",
                 file=sys.stderr,
             )
@@ -166,13 +166,13 @@ def _nothing_judged(found: VisitsEvaluation) -> str:
     why = f"the trace has {counted(found.visits, 'visits')}"
     if found.places.stayed:
         why += (
-            f"; of {counted(found.places.stayed, 'pairs')} within {found.near:g} m the robot was "
-            "at no visit farther away in between"
+            f"; between the visits of {counted(found.places.stayed, 'pairs')} within "
+            f"{found.near:g} m, the robot made no visit farther away"
         )
     if found.places.unknown:
         why += (
-            f"; of {counted(found.places.unknown, 'pairs')} {found.judge} do not tell how far "
-            "apart they are"
+            f"; for {counted(found.places.unknown, 'pairs')}, {found.judge} do not tell how far "
+            "apart the visits are"
         )
     return (
         f"judged by {found.judge}: expected pairs of visits to judge, got none: {why}; evaluate a "
@@ -184,7 +184,7 @@ def _told_of_visits(found: VisitsEvaluation) -> str:
     places, dstates = found.places, found.dstates
     left_out = [
         counted(places.stayed, "pairs")
-        + " within that, as the robot was at no visit farther away in between"
+        + " within this distance, as the robot made no visit farther away in between"
         if places.stayed
         else "",
         counted(places.unknown, "pairs") + f", as {found.judge} do not tell how far apart they are"
@@ -192,15 +192,14 @@ def _told_of_visits(found: VisitsEvaluation) -> str:
         else "",
     ]
     return (
-        f"judged by {found.judge}: of {counted(places.judged, 'pairs')} of different visits "
-        f"{places.returns} are returns to one place: within "
-        f"{found.near:g} m, and the robot was farther away in between; of "
-        f"{counted(dstates.judged, 'pairs')} of their steps {dstates.returns} are returns "
-        f"to one dstate: headings differ by at most {found.turned:g} degrees, too"
+        f"judged by {found.judge}: {places.returns} of {counted(places.judged, 'pairs')} of visits "
+        f"are returns to one place (within {found.near:g} m, and the robot was farther away in "
+        f"between); {dstates.returns} of {counted(dstates.judged, 'pairs')} of steps are returns "
+        f"to one dstate (headings also differ by at most {found.turned:g} degrees)"
         + "".join(f"\nleft out: {text}" for text in left_out if text)
         + (
-            f"\nposes judge {found.by_both[1]} of {counted(found.by_both[0], 'pairs')} of visits "
-            "alike"
+            f"\nposes and relations agree on {found.by_both[1]} of "
+            f"{counted(found.by_both[0], 'pairs')} of visits"
             if found.by_both
             else ""
         )

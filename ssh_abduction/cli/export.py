@@ -51,8 +51,8 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_setting(
         "hide_undecided",
         (
-            "whether to leave out the places where the robot always went on, between the same two "
-            "neighbours (nav2 and tmap2 only; default: false)"
+            "whether to leave out each place that the robot only passed, always between the same "
+            "two neighbours (nav2 and tmap2 only; default: false)"
         ),
         default=False,
         type=true_or_false,

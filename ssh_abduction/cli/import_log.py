@@ -46,7 +46,7 @@ def add_parser(verbs: Verbs) -> None:
         help=(
             "a CARMEN log, a g2o-style log with scans, a ROS 1 bag, a ROS 2 bag or MCAP; may be "
             "compressed by gzip, bzip2, xz or zstd. '-' reads lines of CARMEN from standard input, "
-            "in flat memory, and shows each place when it is final"
+            "with little memory, and shows each place when it is final"
         ),
     )
     add_output(parser)
@@ -65,7 +65,7 @@ def add_reading(parser: Parser) -> None:
         type=metres,
         metavar="METRES",
         help=(
-            "width of the robot. Narrower parts of the free space are no ways for it (default: "
+            "width of the robot. It cannot pass narrower parts of the free space (default: "
             f"{WIDTH:g})"
         ),
     )

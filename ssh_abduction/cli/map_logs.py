@@ -53,9 +53,9 @@ def add_parser(verbs: Verbs) -> None:
         type=float,
         metavar="S",
         help=(
-            "seconds for the search (default: three quarters of what the import leaves of a "
-            "twentieth of the driving time, but at least 30; a search that finds no map goes "
-            "on for longer)"
+            "seconds for the search (default: a twentieth of the driving time, minus the time of "
+            "the import; a quarter of that is kept for --set ladder; at least 30; a search that "
+            "finds no map goes on for longer)"
         ),
     )
     parser.add_setting(

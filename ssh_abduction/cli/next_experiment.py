@@ -179,9 +179,9 @@ def _untried(plan: Plan) -> str:
     if len(plan.rivals) == 1 or plan.branches:
         return ""
     if plan.untried is None:
-        return "; nothing tells them apart"
+        return "; nothing distinguishes them"
     return (
-        "; known links tell no more, try "
+        "; known links distinguish no more of them, try "
         f"{printable(', '.join((*plan.untried.way, plan.untried.action)))}"
     )
 

@@ -42,7 +42,7 @@ def add_parser(verbs: Verbs) -> None:
     text = (
         "Drive a robot through a world, and write a trace with an image, an action and the "
         "odometry at each dstate. Run cluster on the trace to get views. With --format, write a "
-        "log of scans and odometry all along the way, as of a real robot, and a file with the "
+        "log of scans and odometry, as a real robot records it, and a file with the "
         "truth beside it."
     )
     parser = verbs.add_parser("simulate", help="drive a robot through a world", description=text)
@@ -91,7 +91,7 @@ def add_parser(verbs: Verbs) -> None:
         ("stars", "whether to log the openings seen at each place (default: true)", True, FLAG),
         (
             "every",
-            "metres from one image to the next, to log images all along the way instead of at "
+            "metres from one image to the next, to log evenly spaced images instead of images at "
             "dstates; with --format, metres from one scan to the next (default: 0.25)",
             None,
             METRES,

@@ -94,7 +94,7 @@ def add_parser(verbs: Verbs) -> None:
         metavar="MAPS",
         help=(
             "add the trace to the first map in this file, which solve -o wrote, and keep its "
-            "dstates and places; costs about what the new trace costs"
+            "dstates and places; takes about as long as solving the new trace alone"
         ),
     )
     parser.add_argument(
@@ -233,7 +233,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _joint(paths: Sequence[str]) -> Trace:
-    """Load several traces and join them. What is odd about them is printed on stderr."""
+    """Load several traces and join them. Print warnings about them on stderr."""
     with warnings.catch_warnings(record=True) as odd:
         warnings.simplefilter("always")
         trace = together([Trace.load(path) for path in paths])

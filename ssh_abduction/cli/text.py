@@ -1,6 +1,6 @@
 """Write maps and solutions as text for a terminal.
 
-A dstate (distinctive state) is a place and the direction that the robot faces there.
+A dstate (distinctive state) is a place and a heading.
 """
 
 from __future__ import annotations
@@ -47,12 +47,12 @@ def headline(solution: Solution, count: int, explanation: Explanation | None) ->
     if solution.status is Status.UNSATISFIABLE and not solution.stopped:
         kinds = ", ".join(evidence.name for evidence in evidence_of(solution.theory))
         return (
-            "unsatisfiable: no map satisfies the axioms: those that clingo found are refused as "
-            f"wholes, by evidence ({kinds})"
+            "unsatisfiable: no map satisfies the axioms: the evidence rejects each map that clingo "
+            f"found ({kinds})"
         )
     if solution.status is Status.UNSATISFIABLE:
         return (
-            "unsatisfiable: no map satisfies the axioms; why was not found out in time "
+            "unsatisfiable: no map satisfies the axioms; the reason was not found in time "
             f"({solution.stopped})"
         )
     why = f" ({solution.stopped})" if solution.stopped else ""

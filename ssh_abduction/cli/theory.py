@@ -18,8 +18,8 @@ def add_parser(verbs: Verbs) -> None:
 
 def run(options: argparse.Namespace) -> int:
     print(
-        "presets: on, or stars (on where the trace has stars that fit right angles), or gateways "
-        "(on where it has other stars), or –"
+        "A preset has an axiom: on = always; stars = if the trace has stars that fit right angles; "
+        "gateways = if it has other stars; – = never"
     )
     for level in encodings.levels():
         print(f"\n{level}")
@@ -34,7 +34,7 @@ def run(options: argparse.Namespace) -> int:
             if axiom.level == level
         ]
         print(table(["axiom", *PRESETS, "sentence", "source"], rows))
-    print("\nregions, which follow from a map: no search has these axioms")
+    print("\nregions (derived from a map after the search)")
     rows = [
         [axiom.name, axiom.sentence, f"[{axiom.source}]"] for axiom in encodings.region_axioms()
     ]
@@ -44,6 +44,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _state(name: str, preset: str) -> str:
+    """Say when a preset has an axiom: "on", "stars", "gateways" or "–"."""
     theory = PRESETS[preset]()
     if name in theory.axioms:
         return "on"

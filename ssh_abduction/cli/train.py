@@ -244,8 +244,8 @@ def run_tell_apart(options: argparse.Namespace) -> int:
     ranges, labels, ssh_map, features = _mapped(options)
     if not isinstance(features, ReciprocalTransformer):
         raise MapError(
-            f"{options.trace}: expected a trace with ranges, as beams are told of, got panoramas; "
-            "take a trace of a laser"
+            f"{options.trace}: expected a trace with ranges, as the result names laser beams, got "
+            "panoramas; take a trace of a laser"
         )
     images = ReciprocalTransformer().fit_transform(ranges)
     views = {s.id: s.view for s in ssh_map.dstates if s.view is not None}

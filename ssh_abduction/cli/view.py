@@ -40,9 +40,9 @@ def add_parser(verbs: Verbs) -> None:
         "-o", "--output", metavar="FILE", help="write the page to this file and do not open it"
     )
     localised = (
-        "the trace of a robot in the mapped world, to be replayed too, with a belief about where "
-        "the robot is at each step. It may be TRACE itself. Beliefs come from its views, or from "
-        "the file of --belief"
+        "a second trace from the mapped world. The page replays it, with a belief about where the "
+        "robot is at each step. It may be TRACE itself. Beliefs come from its views, or from the "
+        "file of --belief"
     )
     parser.add_argument("--run", dest="followed", metavar="RUN", help=localised)
     parser.add_argument(
