@@ -42,7 +42,8 @@ FIELDS = ("time1", "time2", "x", "y", "z", "roll", "pitch", "yaw")
 # A moment that is not between two related times may be this many seconds from the nearest time.
 # Robots that map buildings drive at most a metre a second.
 NEAREST = 0.5
-# Each relation makes a way this many metres longer, as short relations also have errors.
+# The length of a relation is its distance plus this many metres, as short relations have errors,
+# too. So ways along fewer relations are preferred.
 EACH = 0.05
 
 

@@ -175,7 +175,7 @@ class Trajectory:
             warnings.warn(
                 f"{named(self.source)}: {len(times) - told} of {len(times)} steps have no pose "
                 f"within {NEAREST:g} s of their time, and no truth: "
-                "expected poses all along the log",
+                "expected poses for the whole log",
                 TrajectoryWarning,
                 stacklevel=2,
             )
@@ -325,9 +325,9 @@ def _warn_of_space(source: str, rise: float, leaning: int, count: int) -> None:
     """
     if rise > FLAT or 2 * leaning > count:
         warnings.warn(
-            f"{named(source)}: expected a way on a floor, x and y in metres, got one that rises by "
-            f"{rise:.1f} m, and {leaning} of {count} poses that lean by more than 30 degrees: "
-            "tz and the lean are not read; give the poses of the robot, not of a camera",
+            f"{named(source)}: expected a trajectory on a floor, x and y in metres, got one that "
+            f"rises by {rise:.1f} m, and {leaning} of {count} poses that lean by more than 30 "
+            "degrees: tz and the lean are not read; give the poses of the robot, not of a camera",
             TrajectoryWarning,
             stacklevel=3,
         )

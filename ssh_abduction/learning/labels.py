@@ -104,8 +104,8 @@ def map_of(
 
     Args:
         solution: The minimal maps.
-        vectors: (n, d) the vector of each image. Views say little of how drives lie to each other.
-            So of several joint maps those are kept that fit the images best.
+        vectors: (n, d) the vector of each image. Views say little about how drives relate. So if
+            there are several joint maps, only those that fit the images best are kept.
         choose: Index of the map, from 0; None takes the first map, and labels only the steps on
             which all maps agree.
     """
@@ -147,8 +147,8 @@ def warn_of_pieces(trace: Trace, ssh_map: SSHMap) -> None:
     drives = drives_of(trace)
     if len(joined_drives(drives, ssh_map)) > 1:
         warnings.warn(
-            f"{sentence_of(drives, ssh_map)}: a dstate that several pieces have gets several "
-            "labels; drive where another drive was",
+            f"{sentence_of(drives, ssh_map)}: a dstate that is in several pieces gets several "
+            "labels; let each drive pass places of another drive",
             AmbiguousMapWarning,
             stacklevel=3,
         )
@@ -179,8 +179,8 @@ def _followed(
 ) -> NDArray[np.intp]:
     """Follow a trace that may begin at any dstate. Return the dstate of each step, (m,).
 
-    Try each dstate as the first one. Drop those that a later view contradicts, and take the one
-    for which most images look like their dstates. Behind an action that the map has no link for,
+    Try each dstate as the first one. Drop those that a later view contradicts. Take the one for
+    which most images look like their dstates. After an action for which the map has no link,
     dstates are unknown (-1) and contradict no view.
 
     All steps get -1 if two first dstates fit equally many images, or if the best one fits fewer

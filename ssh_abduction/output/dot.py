@@ -10,7 +10,7 @@ from ssh_abduction.data.regions import course_named, listed
 def to_dot(ssh_map: SSHMap) -> str:
     """Write the dstates and links of a map as DOT text.
 
-    Each dstate (distinctive state: a place and a direction) is a node, each link an edge, and each
+    Each dstate (distinctive state: a place and a heading) is a node, each link an edge, and each
     place a cluster of nodes. A region behind one place is a cluster of places.
 
     Raises:
@@ -30,7 +30,8 @@ def to_dot(ssh_map: SSHMap) -> str:
 def _clusters(ssh_map: SSHMap, places: set[int], after: int, indent: str = "  ") -> list[str]:
     """Write clusters for places, and around them for the regions behind one place.
 
-    Two such regions lie in each other or are apart. The largest come first.
+    Of two such regions, one contains the other, or they have no place in common. The largest come
+    first.
 
     Args:
         ssh_map: The map.

@@ -29,11 +29,11 @@ def to_networkx(
     Args:
         ssh_map: The map.
         level: The kind of graph.
-            "causal" is a MultiDiGraph. Each dstate (distinctive state: a place and a direction) is
+            "causal" is a MultiDiGraph. Each dstate (distinctive state: a place and a heading) is
             a node with the attributes view, place, path, direction, heading, floor, place_name and
             path_name. Each link is an edge with the attribute action. Unknown attributes are left
             out. If the map lists regions, nodes have their ids as the attribute regions, and
-            `graph["regions"]` has the regions as dicts; so in all graphs.
+            `graph["regions"]` has the regions as dicts. The other kinds have these, too.
             "topological" is a bipartite Graph with the nodes ("place", p) and ("path", h). Each
             place on a path gives an edge with the attribute index, its position in the order of
             the path.
@@ -95,7 +95,10 @@ def to_graphml(ssh_map: SSHMap) -> str:
 
 
 def in_text(graph: nx.Graph[Any]) -> nx.Graph[Any]:
-    """Return a graph whose regions are texts, as files have no lists: JSON, and ids of a node."""
+    """Convert the regions of a graph to texts, because files hold no lists. Return the graph.
+
+    The regions of the graph become JSON. Those of a node become ids, separated by spaces.
+    """
     if "regions" in graph.graph:
         graph.graph["regions"] = json.dumps(graph.graph["regions"])
     for _, data in graph.nodes(data=True):

@@ -1,6 +1,6 @@
 """Find headings for drawing dstates on a page, from the turns between them.
 
-A dstate (distinctive state) is a place and a direction. A course is a path, or a part of one, that
+A dstate (distinctive state) is a place and a heading. A course is a path, or a part of one, that
 is drawn straight. Each course gets the heading that agrees best with all turns. This is angular
 synchronisation (Singer 2011, "Angular synchronization by eigenvectors and semidefinite
 programming").
@@ -20,7 +20,8 @@ from scipy.sparse import coo_array
 from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.output.turns import SURE
 
-# Key of what has one heading in the drawing: a path, a part of a path, or a dstate along no path.
+# The key of a course, which is drawn with one heading: a path, a part of a path, or a dstate that
+# is along no path.
 Course: TypeAlias = tuple[int, ...]
 
 # Radians. If a drawing is off by more than this, a turn may go to the wrong side. The first is for

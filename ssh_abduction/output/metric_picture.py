@@ -1,6 +1,6 @@
 """Draw a map with poses as an SVG picture, to scale. The first dstate faces right on the page.
 
-A dstate (distinctive state) is a place and a direction. Around each place, an ellipse of two
+A dstate (distinctive state) is a place and a heading. Around each place, an ellipse of two
 standard deviations shows how uncertain its position relative to the first dstate is. Labels without
 room are left out. Browsers show the same text as a title when the pointer is on a dstate's arrow.
 """

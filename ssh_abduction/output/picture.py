@@ -1,6 +1,6 @@
 """Draw a map as an SVG picture: paths through places, and marks for the dstates at each place.
 
-A dstate (distinctive state) is a place and a direction. A map with poses is drawn to scale
+A dstate (distinctive state) is a place and a heading. A map with poses is drawn to scale
 (`metric_picture`). A map without poses is drawn with straight paths (`layout`).
 """
 

@@ -100,10 +100,11 @@ def place_title(ssh_map: SSHMap, place: int) -> str:
 
 
 def _depth(region: Region, regions: Sequence[Region]) -> int:
-    """How many regions lie in each other within this one."""
+    """Count how deep regions are nested inside this one; 0 if no region is inside it."""
     inner = _within(region, regions)
     return 1 + max(_depth(r, regions) for r in inner) if inner else 0
 
 
 def _within(region: Region, regions: Sequence[Region]) -> list[Region]:
+    """List the regions that lie inside a region."""
     return [r for r in regions if {*r.places} < {*region.places}]

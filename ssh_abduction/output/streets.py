@@ -1,6 +1,6 @@
 """Find positions of spots by a linear program, given the headings of the streets between them.
 
-A spot is a place, or a dstate (a place and a direction) whose place is unknown. A street should be
+A spot is a place, or a dstate (a place and a heading) whose place is unknown. A street should be
 at least one unit long, and otherwise short. A street that leaves its heading costs much. If two
 streets overlap or cross, the program is solved again with one street on a side of the other. This
 drawing is taken if it costs less than the crossing.

@@ -1,4 +1,4 @@
-"""Find the places of a map at which nothing was ever decided, such as corners of a corridor."""
+"""Find the places of a map that the robot only passed, such as corners of a corridor."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ def place_of_steps(ssh_map: SSHMap) -> list[int | None]:
 
 
 def undecided_places(ssh_map: SSHMap) -> frozenset[int]:
-    """Find the places at which nothing was ever decided.
+    """Find the places that the robot only passed.
 
-    The robot came from one of two neighbours and went on to the other, at every visit. It neither
-    turned around there, nor began or ended a drive.
+    At every visit, the robot came from one of two neighbours and went on to the other. It never
+    turned around at such a place, and never began or ended a drive there.
     """
     places, labels = place_of_steps(ssh_map), ssh_map.dstate_at
     # A drive starts where no action leads from the step before.

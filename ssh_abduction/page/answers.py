@@ -15,7 +15,7 @@ from ssh_abduction.theory.theory import Theory
 def explained(
     trace: Trace, first: int, second: int, theory: Theory, limit: float | None, watch: Watch
 ) -> PairExplanation:
-    """Explain why two steps are one dstate (a place and a direction), or why they are not.
+    """Explain why two steps are one dstate (a place and a heading), or why they are not.
 
     Args:
         trace: The trace.

@@ -1,6 +1,6 @@
 """Compute in advance what it costs to assume that two steps are one dstate, or different ones.
 
-A dstate (distinctive state) is a place and a direction. The page then shows these costs without a
+A dstate (distinctive state) is a place and a heading. The page then shows these costs without a
 server.
 
 >>> from ssh_abduction import Trace, solve

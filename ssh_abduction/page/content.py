@@ -1,6 +1,6 @@
 """Make the content of the page as plain data: maps, what they share, drawings, steps of the trace.
 
-A labeling gives each step its dstate (distinctive state: a place and a direction). Maps of one
+A labeling gives each step its dstate (distinctive state: a place and a heading). Maps of one
 trace have much in common. Therefore each labeling, set of places and order of paths is listed once,
 and maps refer to it by number. Only some maps have their own drawing. In all others, a place or
 dstate is drawn where its steps are in the first map, so that the reader sees what stays the same.

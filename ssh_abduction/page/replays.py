@@ -1,6 +1,6 @@
 """Make the replays of the page: the steps of traces, with images and a localised robot's beliefs.
 
-A belief gives the probability that the robot is at each dstate (a place and a direction) of a map.
+A belief gives the probability that the robot is at each dstate (a place and a heading) of a map.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Serve the page on this computer, and answer its questions: why is it so, and what if it is not?
+"""Serve the page on this computer, and answer its questions.
 
+The page asks why two steps are one dstate or not, and for the maps under the user's assumptions.
 The server answers a request only if its address has the secret token and its host is this computer.
 So no other computer can ask, and no other page in the browser (not even by DNS rebinding).
 
@@ -221,7 +222,7 @@ class _Handler(BaseHTTPRequestHandler):
             with _while_there(self.connection, watch):
                 told = self.server.answer(asked, data, watch)
         except LimitError as error:
-            told = {"error": f"none was found in time ({error.reason}); --time-limit gives it more"}
+            told = {"error": f"no answer in time ({error.reason}); --time-limit gives more time"}
         except (AbductionError, ValueError, RecursionError) as error:
             told = {"error": str(error)}
         if not watch.interrupted:

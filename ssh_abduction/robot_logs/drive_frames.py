@@ -65,11 +65,16 @@ def _spots(poses: Sequence[Pose], imported: Imported) -> list[Pose]:
 def _next(
     drives: Sequence[Drive], ssh_map: SSHMap | None, laid: Sequence[int]
 ) -> tuple[int, list[tuple[int, int]]]:
-    """Choose the drive that shares most places with drives that lie already.
+    """Choose the drive to move next: the one that shares most places with the moved drives.
+
+    Args:
+        drives: All drives.
+        ssh_map: The map that says which places drives share; None if there is no map.
+        laid: The indices of the drives that were moved already.
 
     Returns:
-        The index of the drive; and pairs of a step that lies already and a step of this drive, at
-        one place. Empty if none of the other drives shares a place with them.
+        The index of the drive; and pairs of a step of a moved drive and a step of this drive, at
+        one place. There are no pairs if no other drive shares a place with the moved drives.
     """
     known: dict[object, list[int]] = defaultdict(list)
     for k in laid:

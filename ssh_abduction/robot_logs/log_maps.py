@@ -315,12 +315,12 @@ def map_log(
             be known of where a drive starts.
         theory: The axioms. None is BARE, which has neither stars nor sides.
         choices: Values of fields of Theory, by name. They replace those of the theory.
-        width: The width of the robot in metres. Narrower parts of the free space are no ways.
+        width: The width of the robot in metres. It cannot pass narrower parts of the free space.
         name: The name of the trace, or the names of the drives. None for no name, or for "drive 1",
             "drive 2" and so on.
-        time_limit: Seconds for the search for minimal maps. None takes what the import leaves of a
-            twentieth of the time that the robot drove, but at least 5. If that yields no map, the
-            search is given up to 64 times as long.
+        time_limit: Seconds for the search for minimal maps. None takes a twentieth of the time that
+            the robot drove, minus the time of the import, but at least 30 s. The ladder gets a
+            quarter of this time. If no map is found, the search may take up to 64 times as long.
         max_maps: List at most this many minimal maps; None lists all.
         with_ladder: Whether to solve the trace with fewer kinds of evidence, too, to show what each
             kind contributes.
@@ -390,7 +390,7 @@ def map_log(
 
 
 def _doubted(solution: Solution) -> Solution:
-    """Return a solution without a confidence, as its log does not show how the robot moved."""
+    """Return a solution without confidence, for a log that does not show how the robot moved."""
     if solution.weighed is None:
         return solution
     weighed = replace(solution.weighed, doubt="the track is unreliable")

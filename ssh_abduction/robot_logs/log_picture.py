@@ -1,8 +1,8 @@
 """Draw the first map of a log over the walls that the laser saw.
 
 Edges follow the course of the robot. Travels between the same two places whose courses lie close
-together are one edge. Places show their disc and their gateways. Places at which nothing was ever
-decided are drawn as dots. Each of several drives has a colour of its own.
+together are one edge. Places show their disc and their gateways. Places that the robot only passed,
+always between the same two neighbours, are drawn as dots. Each of several drives has its colour.
 """
 
 from __future__ import annotations

@@ -73,7 +73,7 @@ def report(
         "<h2>Rival maps</h2>" + _paragraph(solution.summary or "There is no other minimal map.")
         if solution.maps
         else "",
-        "<h2>What the map disbelieves</h2>" + _faults(solution) if solution.maps else "",
+        "<h2>What the map treats as wrong</h2>" + _faults(solution) if solution.maps else "",
         "<h2>Settings</h2>" + _settings(run),
         "<h2>Time</h2>" + _time(run),
         "<h2>The log</h2>" + _log(log, run),
@@ -98,7 +98,7 @@ def _summary(solution: Solution, run: Mapping[str, Any]) -> str:
         f"{run['visits']} visits to distinctive places, {run['steps']} steps."
     )
     if cost is None:
-        return f"{seen} No map of them: {solution.status.value}."
+        return f"{seen} There is no map of them: {solution.status.value}."
     if solution.status is not Status.OPTIMAL:
         proven = "a map without a proof that it is the best"
     elif solution.complete and solution.count == 1:
@@ -201,8 +201,8 @@ def _settings(run: Mapping[str, Any]) -> str:
         if value not in (None, False, [], 0)
     )
     rows = [
-        ("places", "junctions, turning points", "where the ways of the free space part"),
-        ("width", f"{run['width']:g} m", "of the robot; narrower parts are no ways"),
+        ("places", "junctions, turning points", "where the free space forks, or the robot turned"),
+        ("width", f"{run['width']:g} m", "of the robot; it cannot pass narrower parts"),
         ("theory", theory, "the axioms, and the choices in them"),
     ]
     return _table(("", "", ""), rows)

@@ -211,7 +211,7 @@ DIFFERENCES = {
         "As in the paper: 50 circuits of 8 dstates, 400 images.",
     ),
     "taylor-hall": (
-        "The hallway: its shape is drawn in the paper and not told. Here a main street of four "
+        "The hallway: the paper draws its shape, and gives no lengths. Here a main street of four "
         "places has three dead ends to one side; counts of dstates, places and paths are the "
         "paper's.",
         "The clutter, and all lengths, are choices of ours.",
@@ -314,7 +314,7 @@ figures are of seed {runs[0].seed}.
 The world, the robot and its laser were fixed before the seeds were run, on other seeds.
 Figures have the paper's numbers, by the order of its text, as its pages were not at hand.
 Figures and rows that the paper does not have are marked as ours.
-All can be made again: <code>configuration.json</code> says with what.</p>
+<code>configuration.json</code> lists the command, settings and versions to repeat all this.</p>
 <table><tr><th>claim</th><th>paper</th><th>here</th><th>holds in seeds</th></tr>
 {rows}
 </table>

@@ -59,9 +59,8 @@ def export_map(
         name: The name of the map in nav2 and tmap2 files. In tmap2 it also names the pointset.
         frame: The name of the coordinate frame of the positions, in nav2 and tmap2 files.
         turns: How actions turn, as in `to_svg`. The layout of a map without poses uses it.
-        hide_undecided: Whether nav2 and tmap2 files leave out the places at which nothing was ever
-            decided. There the robot always went on, between the same two neighbours. One road leads
-            past them.
+        hide_undecided: Whether nav2 and tmap2 files leave out each place that the robot only
+            passed, always between the same two neighbours. One road then joins these neighbours.
 
     Raises:
         MapError: An argument is wrong, or the map has no such level or no roads.

@@ -25,7 +25,7 @@ Way: TypeAlias = tuple[str | None, int | None, int | None]
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """A destination for a robot: a place, or a dstate (a place and a direction).
+    """A destination for a robot: a place, or a dstate (a place and a heading).
 
     Attributes:
         id: The number of the place or dstate.
