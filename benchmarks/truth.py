@@ -10,20 +10,21 @@ The script prints a table in Markdown with a row for each trace, and a summary b
 if its labels are the true dstates up to renaming, and its places are the true places. The options
 for noise are the fields of Odometry. They set the noise that is drawn and the noise that the trace
 states. In Taylor Hall, the robot has noise of its own. `--scale-error` and `--bend-error` add
-systematic errors. With `--displacement none`, the solver ignores displacements. Seeds begin at
---first.
+systematic errors. With `--displacement none`, the solver ignores displacements. `--misread N` and
+`--jumped N` make N views and N displacements of each trace wrong. Seeds begin at --first.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+import random
 import statistics
 import sys
 import time
 from collections.abc import Hashable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -59,6 +60,8 @@ ACES3 = {
     name: (COLUMNS[i % 3], ROWS[i // 3])
     for i, name in enumerate(("NW", "N", "NE", "W", "C", "E", "SW", "S", "SE"))
 }
+# What a wrong view and a wrong displacement cost, in dstates, if there are some.
+FAULTS = {"misread": 1.5, "jumped": 3.0}
 SURE = 0.95  # the confidence from which a map counts as sure
 COMPASS = {"E": 0.0, "N": math.pi / 2, "W": math.pi, "S": -math.pi / 2}
 
@@ -138,6 +141,42 @@ def random_walk(cells: int, steps: int, seed: int, noise: Noise, drive: int | No
         walk.truth,
         tuple(state[:2] for state in walk.truth if isinstance(state, tuple)),
     )
+
+
+def with_faults(known: Known, misread: int, jumped: int, seed: int) -> Known:
+    """Make some views and displacements of a trace wrong.
+
+    A wrong view is another view of the trace. A wrong displacement is of a travel: its way is at
+    most half as long, or the robot turned by 90 degrees without noticing it.
+
+    Args:
+        known: The trace.
+        misread: The number of wrong views.
+        jumped: The number of wrong displacements.
+        seed: Seed of the steps and errors.
+    """
+    chance = random.Random(seed)
+    steps = list(known.trace.steps)
+    travels = [
+        t
+        for t, action in enumerate(known.trace.actions, 1)
+        if action.kind == "travel" and steps[t].displacement is not None
+    ]
+    for t in chance.sample(travels, jumped):
+        ahead, left, turned = steps[t].displacement or (0.0, 0.0, 0.0)
+        wrong = chance.choice(
+            [
+                (ahead * chance.uniform(0, 0.5), left, turned),
+                (ahead, left, turned + math.pi / 2),
+                (ahead, left, turned - math.pi / 2),
+            ]
+        )
+        steps[t] = replace(steps[t], displacement=wrong)
+    views = sorted({step.view for step in steps}, key=str)
+    for t in chance.sample(range(len(steps)), misread):
+        other = chance.choice([view for view in views if view != steps[t].view])
+        steps[t] = replace(steps[t], view=other)
+    return replace(known, trace=replace(known.trace, steps=tuple(steps)))
 
 
 def plans(folder: Path, steps: int, seeds: Sequence[int], noise: Noise) -> Iterator[Known]:
@@ -391,6 +430,14 @@ def arguments() -> argparse.ArgumentParser:
     )
     for name in ("displacement", "boundary", "prefer", "weigh", "prices"):
         parser.add_argument(f"--{name}", metavar="CHOICE", help=f"the theory's field {name}")
+    for name, price in FAULTS.items():
+        parser.add_argument(
+            f"--{name}",
+            type=int,
+            default=0,
+            metavar="N",
+            help=f"faults of this kind in each trace; each costs {price} dstates (default 0)",
+        )
     for name in NUMBERS:
         parser.add_argument(
             f"--{name}",
@@ -447,14 +494,18 @@ def main() -> None:
         name: value
         for name in ("displacement", "boundary", "prefer", "weigh", "prices")
         if (value := getattr(options, name))
-    }
+    } | {name: price for name, price in FAULTS.items() if getattr(options, name)}
     if options.causal:
         theory = Theory.causal().replace(**choices, **({"star": "alike"} if options.stars else {}))
     else:
         theory = Theory.topological().replace(
             **choices, **({} if options.stars else {"star": "none"})
         )
-    print(f"\n{report(chosen(options), theory, options.limit)}")
+    traces = (
+        with_faults(known, options.misread, options.jumped, options.first + i)
+        for i, known in enumerate(chosen(options))
+    )
+    print(f"\n{report(traces, theory, options.limit)}")
 
 
 if __name__ == "__main__":
