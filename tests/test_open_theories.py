@@ -365,8 +365,7 @@ def test_an_explanation_names_assertions_and_own_axioms() -> None:
         ("#show same/2.", r"own\.lp:1: expected rules, got #show"),
         (
             "#program step(t).\n:- same(@first(1),t).",
-            r"own\.lp:2: expected what clingo works out by itself, got @first\(1\), a function of "
-            r"Python's",
+            r"own\.lp:2: expected rules without functions of Python, got @first\(1\); write rules",
         ),
         (
             "#program step(t).\n:- same(I,t,5).",

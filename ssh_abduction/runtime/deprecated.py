@@ -1,4 +1,4 @@
-"""Old names of parameters. They work for one more version, with a warning."""
+"""Accept old names of parameters for one more version, with a warning."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 It is silent unless a program calls `logging.basicConfig`, or a user gives `-v` in the shell.
 Messages are sentences for people and may change. INFO messages say what a search begins, finds and
-proves. DEBUG messages say what is passed to clingo.
+proves. DEBUG messages say what clingo gets.
 
 >>> log_of("ssh_abduction.solver.search").name, PROGRESS.name
 ('ssh_abduction.solver.search', 'ssh_abduction.progress')

@@ -11,7 +11,7 @@ import sys
 SIGNALLED, CTRL_C = 128, 2
 
 heard: list[int] = []  # the signals that asked this process to end, in order
-raised: list[int] = []  # those that raised a KeyboardInterrupt
+raised: list[int] = []  # the signals that raised a KeyboardInterrupt
 
 _PACKAGE = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 

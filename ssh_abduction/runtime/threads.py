@@ -1,6 +1,6 @@
-"""Keep arithmetic on small arrays to one thread.
+"""Do arithmetic on small arrays in one thread.
 
-The threads of libraries would mostly wait for each other, longer than they work.
+Several threads of a library would wait for each other longer than they work.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 
 
 def one_thread(user_api: str | None = None) -> AbstractContextManager[Any]:
-    """Return a context in which libraries of arithmetic use one thread.
+    """Return a context in which libraries such as BLAS and OpenMP use one thread.
 
     Args:
         user_api: "blas" for matrix products alone; None for all libraries. The libraries must be
@@ -23,10 +23,11 @@ def one_thread(user_api: str | None = None) -> AbstractContextManager[Any]:
 
 @cache
 def _controller(user_api: str | None) -> Any:
-    """Find the libraries that this process has loaded, once, since that takes milliseconds.
+    """Find the libraries that this process has loaded. Do this once, as it takes milliseconds.
 
     Args:
-        user_api: What the controller is for. Libraries of other kinds may be loaded later.
+        user_api: The value that `one_thread` got. Each value has its own controller, as libraries
+            of other kinds may be loaded later.
     """
     from threadpoolctl import ThreadpoolController
 

@@ -1,4 +1,4 @@
-"""Make the `Solution` of a search from the maps it gave and from what it has proven."""
+"""Makes the `Solution` of a search from the maps that it gave and from what it has proven."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ class Answer:
         self._levels: list[Level] = []
         self._first: SSHMap | None = None
         self._last: tuple[SSHMap, tuple[int, ...]] | None = None
-        self._basis: Basis | None = None  # of the whole trace, if the search was stopped
+        # The data for a certificate of the whole trace, if the search was stopped.
+        self._basis: Basis | None = None
 
     @property
     def cost(self) -> Cost | None:
@@ -38,13 +39,13 @@ class Answer:
         return None if self._last is None else cost_as_counted(*self._last, self._parts.task.theory)
 
     def take_down(self, ssh_map: SSHMap, cost: tuple[int, ...]) -> None:
-        """Count a map given to the caller in the level of its cost.
+        """Record a map that was given to the caller.
 
-        A level is the maps of one cost. Maps come level by level.
+        It is counted in its level, which is the maps of one cost. Maps come level by level.
 
         Args:
             ssh_map: The map.
-            cost: Its preferred counts, the most important one first.
+            cost: The counts of the map that the theory minimises, the first preference first.
         """
         theory = self._parts.task.theory
         self._first, self._last = self._first or ssh_map, (ssh_map, cost)
@@ -53,7 +54,7 @@ class Answer:
         self._levels[-1] = replace(self._levels[-1], count=self._levels[-1].count + 1)
 
     def count_apart(self) -> None:
-        """Raise the lower bound on dstates to the number of pairwise distinct steps.
+        """Raise the lower bound on dstates to the size of a clique: pairwise distinct steps.
 
         A search that was stopped needs this, as its own bound may be smaller.
         """
@@ -67,7 +68,7 @@ class Answer:
         """Make the solution that holds these maps.
 
         Args:
-            maps: The maps that the caller kept, in the order that the solution lists.
+            maps: The maps that the caller kept, in the order in which the solution lists them.
             grounding: The size of the ground program; None to ask clingo for it.
         """
         parts, known, task = self._parts, self._parts.known, self._parts.task
@@ -112,8 +113,8 @@ class Answer:
     def in_order(self, maps: tuple[SSHMap, ...]) -> tuple[SSHMap, ...]:
         """Sort the maps of each level into an order that is the same in each run.
 
-        If some maps were given but not kept, or a minimal map is missing, return them unsorted.
-        After sorting, each level gets the cost of its new first map.
+        Return the maps unsorted if the caller did not keep all of them, or if the list of minimal
+        maps is incomplete. After sorting, each level gets the cost of its new first map.
         """
         parts, theory = self._parts, self._parts.task.theory
         is_all = parts.known.complete or parts.rivals.listed
@@ -128,9 +129,9 @@ class Answer:
         return ordered
 
     def _basis_of(self, size: int) -> Basis | None:
-        """The data for a proof that no map of the first `size` steps has fewer dstates.
+        """Collect the data for a certificate of the bound, from the first `size` steps.
 
-        None if the theory lacks an axiom that the proof needs.
+        Return None if the theory lacks an axiom that the certificate needs.
         """
         task = self._parts.task
         if not row("clique").holds_for(task.theory):

@@ -1,13 +1,13 @@
-"""Find the backbone of a trace: what all its minimal maps share. Not all maps need be listed.
+"""Find the backbone of a trace: what all its minimal maps share. Not all maps have to be listed.
 
 Some minimal maps are known. Other minimal maps may not share what the known ones share. Two steps
 may be one dstate in all known maps, but not in some unknown minimal map, or the other way round.
-Each such possibility is a *doubt*. clingo looks for a minimal map in which at least one doubt is
+Each such possibility is a *doubt*. Clingo looks for a minimal map in which at least one doubt is
 true. If there is such a map, it becomes known, and fewer doubts are left. If there is none, the
 backbone is proven. This combines brave and cautious reasoning. Each answer is a map that can be
 checked.
 
-*Prefixes.* clingo looks for maps of a prefix that cost at most as much as minimal maps of the
+*Prefixes.* Clingo looks for maps of a prefix that cost at most as much as minimal maps of the
 trace. Each minimal map, cut to the prefix, is such a map (`prefixes.py`). So a found map that
 replays to the end of the trace is minimal. If a found map does not replay to the end, the prefix
 grows. Steps that are one dstate in all known maps form a *class*. If no doubt about the prefix is
@@ -15,9 +15,9 @@ left, the steps of each class are one dstate in all minimal maps. Actions are de
 classes replay like a map. If they replay to the end, each later step is in the class of a step of
 the prefix in every minimal map, and no doubt about that step is left. Otherwise the prefix grows.
 
-*Labels.* An engine that finds dstates before places and paths knows the labels (the dstate of each
-step) of all minimal maps. Even thousands of maps have only a few different labellings. So dstates
-are not in doubt. Doubts about places and paths are resolved for each labelling in turn.
+*Labels.* An engine that finds dstates before places and paths can list the labels (the dstate of
+each step) of all minimal maps. Even thousands of maps have only a few different labellings. So
+there are no doubts about dstates. Doubts about places and paths are resolved for each labelling.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Rivals:
         engine: The engine that found the maps. None if no proof is needed, or if an error left the
             engine unusable.
         reasons: Whether engines can prove what all minimal maps share. They cannot if the maps
-            come from mended traces.
+            were found by mending the trace.
     """
 
     def __init__(self, task: Task, judging: Judging) -> None:
@@ -73,7 +73,7 @@ class Rivals:
         self._proven = False
 
     def add(self, ssh_map: SSHMap, cost: tuple[int, ...]) -> None:
-        """Add a minimal map with its preferred counts, the most important one first."""
+        """Add a minimal map, with the counts that the theory minimises."""
         self._cost = cost
         self.sharing.absorb(ssh_map)
 
@@ -94,7 +94,7 @@ class Rivals:
 
     @property
     def backbone(self) -> Backbone | None:
-        """The backbone (what all minimal maps share) as far as known; None without a map.
+        """The backbone as far as it is known; None if no minimal map is known.
 
         It is `proven` if all minimal maps are listed, or if `reason` found a proof.
         """
@@ -115,16 +115,16 @@ def prove_backbone(
     Args:
         task: The task of the search.
         judging: Says which maps the evidence rejects.
-        cost: The preferred counts of minimal maps, the most important one first.
-        sharing: Has taken in at least one minimal map. Takes in each new one.
+        cost: The counts of minimal maps that the theory minimises, the first preference first.
+        sharing: What at least one minimal map shares. Each new map is added.
         engine: The engine that proved the minimum; None if it is no longer available.
 
     Returns:
-        True if the proof is complete. False if the theory allows a dstate at several places or
-        along several courses: then no proof is possible.
+        True if the proof is complete. False if no proof is possible, as the theory allows a dstate
+        at several places or along several courses.
 
     Raises:
-        LimitError: A limit of the search is over.
+        LimitError: A limit is reached.
     """
     if SHOWN_ONCE & task.theory.given_up:
         return False
@@ -181,7 +181,12 @@ class _Reasoning:
         return False
 
     def _differing_map(self, settled: Settled, labels: Sequence[int]) -> SSHMap | None:
-        """A map with these labels in which a doubt about places or paths is true; else None."""
+        """Find a map with these labels in which a doubt about places or paths is true; else None.
+
+        Args:
+            settled: The best maps with these labels.
+            labels: The dstate of each step.
+        """
         return settled.map_with(
             [
                 (sort, labels[i], labels[j], one)
@@ -192,7 +197,7 @@ class _Reasoning:
 
     def settle_steps(self) -> None:
         """Resolve all doubts with the readable encodings (`encodings/*.lp`)."""
-        # A minimal map that is cut to a prefix never has more paths than before.
+        # A minimal map that is cut to a prefix does not have more paths than before.
         counts = dict(zip(self._task.theory.priorities, self._cost, strict=True))
         names = (
             counts["paths"]
@@ -205,7 +210,7 @@ class _Reasoning:
             size = self._settle_prefix(engine, size)
 
     def _first_size(self) -> int:
-        """The size of the shortest prefix from which the known classes replay to the end.
+        """Return the size of the shortest prefix from which the known classes replay to the end.
 
         A shorter prefix cannot be enough for a proof.
         """
@@ -255,7 +260,7 @@ class _Reasoning:
     def _doubts(self, size: int) -> Iterator[Doubt]:
         """Yield the doubts about the first `size` steps, each as (sort, step, step, one).
 
-        `one` says whether the doubt is that the two steps are one, or that they are not.
+        `one` says what the doubt is: that the two steps are one (True), or that they are not.
         """
         firsts = self._sharing.firsts()
         yield from (
@@ -269,12 +274,12 @@ class _Reasoning:
         firsts = [t for t in sharing.firsts() if t < size]
         for sort in sharing.sorts():
             known = sharing.kept(sort)
-            heads: dict[int, int] = {}  # for each number, its first class
+            heads: dict[int, int] = {}  # the first class of each group that all known maps share
             for c in range(len(firsts)):
                 head = heads.setdefault(known.always[c], c)
                 if head != c:
                     yield sort, firsts[head], firsts[c], False
-                # If the class is along a path in all known maps, or in none, others may differ.
+                # If the class is along a path in all known maps, or in none, other maps may differ.
                 if sort == "paths" and ((c, c) in known.together) != (c in known.unnamed):
                     yield sort, firsts[c], firsts[c], c in known.unnamed
             for c, d in combinations(heads.values(), 2):
@@ -293,7 +298,7 @@ class _Reasoning:
         )
 
     def _entering(self, size: int) -> Iterator[int]:
-        """Yield the steps of the prefix that reach a known class by a new link.
+        """Yield the steps of the prefix at which a new link leads back to a known class.
 
         If an earlier step reached the class by the same action from the same class, determinism
         already proves that both steps are one dstate.

@@ -12,13 +12,13 @@ from ssh_abduction.solver.guesses.beam import Beam
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.weighed import EQUAL
 
-# The widths of the beams. Each beam ends when this share of the time limit is over, and the beam
-# that breaks axioms at BREAKING.
+# The widths of the beams, and the share of the time after which each of them ends. The beam without
+# axioms ends at the share BREAKING.
 WIDTHS, BREAKING = {1: 0.7, 4: 0.6, 16: 0.7}, 0.8
-# If the widest was quick, a beam of WIDER hypotheses takes this share, and at most this many
-# seconds. It takes about LONGER times as long as the one before.
+# A further beam of WIDER hypotheses takes about LONGER times as long as the widest of these. Search
+# it only if all beams then take at most the share QUICK of the time, and MOST_SECONDS.
 WIDER, QUICK, MOST_SECONDS, LONGER = 64, 0.3, 60.0, 5.0
-# A beam of this width or more ends with the map of least cost, nearly always.
+# A beam of this width or more nearly always ends with the map of least cost.
 BROAD = 4
 
 
@@ -26,14 +26,14 @@ class Beams:
     """The beams of one search, and what they say about the best map.
 
     Attributes:
-        broken: How many nats less a map costs that breaks axioms; 0 if none costs less than the
-            best map, -inf if none was sought.
+        broken: By how many nats the best map that breaks axioms costs less than the best map, as in
+            `Weighed`; 0 if it does not cost less, -inf if none was sought.
     """
 
     def __init__(
         self, parts: Parts, add: Callable[[SSHMap], float], keep_best: Callable[[], None]
     ) -> None:
-        """Search nothing yet.
+        """Prepare the search by beams.
 
         Args:
             parts: The parts of the search.
@@ -41,12 +41,12 @@ class Beams:
             keep_best: Makes the map of least cost the best one of the search.
         """
         self._parts, self._add, self._keep_best = parts, add, keep_best
-        # The cost of the best map of the last broad beam, and the cost that the beam gave it.
+        # The cost of the best map of the last broad beam, and the estimate of it by the beam.
         self._best = math.inf, math.inf
         self.broken = -math.inf
 
     def found(self, nats: float) -> bool:
-        """Whether a broad beam ended with a map of this cost, and one without axioms was sought.
+        """Whether a broad beam ended with a map of this cost, and `broken` is known.
 
         Args:
             nats: The cost of the best map.
@@ -57,8 +57,8 @@ class Beams:
         """Search by beams of growing width, as far as there is time.
 
         Args:
-            clashes: Says whether it is plain that the trace has no map. It is asked if the first
-                beam finds none.
+            clashes: Called if the first beam finds no map: returns whether a short proof shows that
+                the trace has none.
 
         Returns:
             Whether the trace may have a map.
@@ -71,12 +71,13 @@ class Beams:
         # With several drives or floors, a broad beam keeps as many hypotheses as a wider one.
         several = parts.task.theory.several_drives or parts.task.theory.lifts
         widths = {w: share for w, share in WIDTHS.items() if w <= BROAD or not several}
-        # The widest beam, that of those that ended, and the seconds of the first and the last one.
+        # The greatest width, the width of the last beam that ended, and the seconds that the first
+        # and the last beam took.
         widest, ended, first, last = max(widths), 0, math.inf, math.inf
         for width, share in widths.items():
             began = watch.elapsed()
             if width < widest and widest * first < widths[widest] * left - (began - begun):
-                continue  # there is time for the widest beam
+                continue  # there is time for the widest beam, so leave this one out
             watch.end_stage_after(begun + share * left)
             if (beam := parts.candidates.beam(width)) is None:
                 break
@@ -105,8 +106,8 @@ class Beams:
         """Search by a beam of WIDER hypotheses, if there is time.
 
         Args:
-            begun: When the first beam began.
-            seconds: The time of all beams together.
+            begun: The seconds on the clock when the first beam began.
+            seconds: The time that all beams together may take.
             needed: The seconds that the beam probably takes.
         """
         watch = self._parts.watch

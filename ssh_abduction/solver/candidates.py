@@ -1,6 +1,6 @@
 """Make maps of the whole trace quickly, without a proof that they are minimal.
 
-The checker accepts each of these maps. clingo then only has to find better ones.
+Only maps that the checker accepts are kept. Clingo then only has to find better ones.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ if TYPE_CHECKING:
 
 _log = log_of(__name__)
 
-# Seek maps with frames for at most FRAMING seconds. Until there is a map, take UNMAPPED times as
-# long.
+# Look for maps with frames for at most FRAMING seconds; if no map is found by then, for UNMAPPED
+# times as long.
 FRAMING, UNMAPPED = 30.0, 2.0
 # A sketch (a map made without a search) and its check may take this share of the time left for all
 # sketches.
 SKETCH_SHARE = 0.4
 # The sketch that succeeds most often may take this many seconds even if less time is left.
-# Otherwise a slow machine finds no map.
+# Otherwise a slow machine would find no map.
 SUREST = 1.0
-# The width of a broad beam of hypotheses. A beam is made of at most LONGEST steps: its time grows
-# with the cube of their number.
+# The width of a broad beam of hypotheses. Make a beam only for at most LONGEST steps, as its time
+# grows with the cube of their number.
 BROAD, LONGEST = 4, 2000
 
 
@@ -70,15 +70,15 @@ class Candidates:
             self.offer(answer_maps.causal_map(self._task.log.merged(), self._task.trace))
 
     def beam(self, width: int) -> Beam | None:
-        """A beam of hypotheses about dstates and places; None if there can be none.
-
-        There is none without the speed-up `greedy`, or if the trace is long. If it has neither
-        displacements nor stars at any angles, `guesses/tree.py` makes better maps.
-
-        A beam that did not end goes on when it is asked for maps again.
+        """Return a beam of hypotheses about dstates and places, which goes on where it stopped.
 
         Args:
             width: The number of hypotheses.
+
+        Returns:
+            The beam. None without the speed-up `greedy`, or if the trace is long. Also None if the
+            trace has neither displacements nor stars at any angles, as `guesses/tree.py` makes
+            better maps of it.
         """
         theory = self._task.theory
         if (
@@ -95,13 +95,13 @@ class Candidates:
         return self._beams[width]
 
     def maps_of(self, beam: Beam) -> Iterator[SSHMap]:
-        """The maps that a beam finds, the best one first."""
+        """Yield the maps that a beam finds and the checker accepts, the best one first."""
         yield from filter(self._judging.accepts, map(self._with_unknown_views, beam.maps()))
 
     def go_on(self, beam: Beam) -> None:
-        """Offer a sketch that begins with the steps that a beam reached before its time was over.
+        """Offer a sketch that begins with the map of a beam which did not reach the last step.
 
-        If what follows contradicts it, begin earlier.
+        If later steps contradict the sketch, begin with a map of fewer steps.
         """
         before = self._known.best
         for first in beam.partial():
@@ -114,9 +114,9 @@ class Candidates:
         """Make a sketch (a map without a search), if no map of the whole trace is known.
 
         A sketch extends the best map of a prefix, or begins at the first step. The sketch with the
-        most new dstates is large, but the checker accepts it most often and fastest, so it is tried
-        first. Then the others are tried, the smallest first. With a time limit, stop at the first
-        of these that improves the map.
+        most new dstates is large, but the checker accepts it most often and fastest. So it is tried
+        first. Then come the others, the smallest first. With a time limit, stop at the first of
+        these that is better.
 
         Args:
             seconds: The time for all sketches. Each sketch may use a share of the time left.
@@ -149,7 +149,7 @@ class Candidates:
         """Offer a sketch that has only as many dstates as there are pairwise distinct steps.
 
         No map has fewer dstates. Such a sketch exists if the robot drives there and back and most
-        views are different. clingo then only has to find the fewest places and paths.
+        views are different. Clingo then only has to find the fewest places and paths.
 
         Returns:
             Whether such a sketch was found and accepted.
@@ -179,7 +179,7 @@ class Candidates:
         return False
 
     def _attempts(self) -> list[Callable[[], None]]:
-        """The functions that each make one sketch, those that make small maps first."""
+        """List functions that each make one sketch. Those that make small maps come first."""
         trace, theory = self._task.trace, self._task.theory
         known = self._known.partial if trace is self._trace else None
         beams = [partial(self._offer_beam, width) for width in (BROAD, 1)]
@@ -247,10 +247,10 @@ class Candidates:
 
 
 def _with_all_views(task: Task) -> Task:
-    """The same task, with one new view for all steps of unknown view.
+    """Return the same task, with one new view for all steps of unknown view.
 
-    Each map of the changed trace is also a map of the trace itself. The new view only keeps steps
-    of unknown view from sharing a dstate with other steps.
+    Each map of the changed trace is also a map of the trace itself. The new view only prevents
+    steps of unknown view from sharing a dstate with other steps.
     """
     if not task.theory.unknown_views:
         return task

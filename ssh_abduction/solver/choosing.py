@@ -11,10 +11,10 @@ from ssh_abduction.theory.speedups import row
 # Solve traces with at most this many steps directly. This is faster than naming dstates or merging
 # steps first.
 FEW_STEPS = 24
-# Give traces with faults and places to the readable encodings if they have at most this many steps.
-# Longer ones would take too much memory.
+# With faults and places, use the readable encodings only for traces of at most this many steps.
+# Longer traces would take too much memory.
 READABLE = 60
-# After this many seconds with the step engine, check whether the dstates are known without a
+# After this many seconds with the step engine, check whether the dstates can be found without a
 # search. The check comes late because it loads numpy.
 SETTLE_AFTER = 0.15
 # After STEPWISE seconds with the step engine, or after STEPWISE_SHARE of the time left if that is
@@ -37,7 +37,7 @@ def takes_all(task: Task) -> bool:
 
 
 def new_engine(task: Task) -> Engine:
-    """Make the engine for the theory and the length of the trace. It has no steps yet."""
+    """Make the engine that suits the theory and the length of the trace. Its prefix is empty."""
     # Engines are imported here, one at a time, as loading them and numpy takes longer than solving
     # a short trace.
     if may_name(task) and row("named dstates with faults").holds_for(task.theory):
@@ -56,7 +56,7 @@ def new_engine(task: Task) -> Engine:
 
 
 def step_engine(task: Task) -> StepEngine:
-    """Make a `StepEngine`, which fits any theory. It has no steps yet.
+    """Make a `StepEngine`, which suits any theory. Its prefix is empty.
 
     With the speed-up `path_names` it begins with few names for paths.
     """

@@ -61,8 +61,8 @@ def solve(
             (`data.together`). `ssh_map.labels` has one sequence of labels for each trace.
         theory: The axioms and the preference; Theory.topological() by default.
         time_limit: Seconds of wall-clock time. At this limit the best answer so far is returned.
-        max_maps: List at most this many maps; None lists all. After the last one, the search goes
-            on for a second, or a tenth of the time so far if that is more. The answer is
+        max_maps: List at most this many maps; None lists all. After the last map, the search goes
+            on for a second, or for a tenth of the time so far if that is more. The answer is
             `complete` only if this proves that no further map exists.
         within: Also list maps with up to this many dstates more than the minimum: for each number
             of dstates, the best maps with that number. If the theory prefers few paths or places
@@ -71,9 +71,9 @@ def solve(
         speedups: The speed-ups that are on. None of them changes the answer.
         on_progress: A function that is called now and then with a `Progress`.
         corrections: Names and corrections of a person, to be obeyed.
-        onto: The solution of earlier drives, with their trace. Its first map stands, and the
-            minimal maps among those that keep its dstates and places are found. This costs about
-            what the new drive costs.
+        onto: The solution of earlier drives, with their trace. Its first map is kept: only maps
+            that have its dstates and places are considered, and the minimal ones of these are
+            found. This takes about as long as solving the new drive.
 
     Returns:
         The maps, their cost, and what is proven about them.
@@ -123,7 +123,7 @@ def find_backbone(
 ) -> Backbone | None:
     """Find the backbone: what all minimal maps share, also those that the solution does not list.
 
-    clingo looks for minimal maps that do not share what all known ones share, until it has proven
+    Clingo looks for minimal maps that do not share what all known ones share, until it has proven
     that there are none. That may take as long as the search did. If the solution already has a
     proven backbone, or has no minimal map, its backbone is returned at once.
 
@@ -178,15 +178,15 @@ def find_backbone(
 
 
 def _is_known_by_mending_alone(task: Task) -> bool:
-    """Whether a search would find the maps by mending the trace only. No engine has such maps."""
+    """Whether a search would find the maps only by mending the trace. No engine finds such maps."""
     mends = row("mending").holds_for(task.theory) and may_name(task)
     return mends and len(task.trace) > READABLE
 
 
 def _labelling_engine(task: Task, solution: Solution) -> Engine | None:
-    """An engine that finds dstates before places and paths, with the prefix of the solution.
+    """Make an engine that finds dstates before places and paths, with the prefix of the solution.
 
-    None if the search needed no such engine, or the theory has none.
+    Return None if the search needed no such engine, or the theory has none.
     """
     engine = new_engine(task)
     if isinstance(engine, StepEngine):

@@ -1,9 +1,9 @@
-"""What a trace says about the poses of its steps: displacements and closures, as equations.
+"""The displacements and closures of a trace, as equations for the poses of its steps.
 
-A displacement relates a step to the step before, a closure relates any two steps. Each gives three
-equations, with a covariance. If the robot is off the pose of its dstate, each step gives three
-more. Displacements share two errors, their scale and a steady drift of heading. Closures have
-neither, as they do not depend on the way that the robot drove.
+A displacement relates a step to the step before, and a closure relates any two steps. Each gives
+three equations, with a covariance. If the robot may be off the pose of its dstate, each step gives
+three more. All displacements share two errors: their scale, and a steady drift of heading. Closures
+have neither error, as they do not depend on how the robot drove.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from ssh_abduction.data.trace import Trace
 
 Array: TypeAlias = NDArray[np.float64]
 
-# If the robot is off the poses of dstates, then by this standard deviation at least, in metres and
-# radians.
+# If the odometry says that the robot may be off the poses of dstates, the standard deviation is at
+# least this, in metres and radians.
 LEAST = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """The displacements of a trace, and then its closures, n in all.
+    """The n displacements and closures of a trace. The displacements come first.
 
     Attributes:
-        first: The step from which each leads, n.
-        last: The step to which it leads, n.
-        moved: The displacement in metres and radians, n x 3.
-        noise: Its covariance, n x 3 x 3.
-        scaled: 1 if the shared error of scale applies, and 0 if not, n.
-        way: The metres over which the shared drift of heading applies, n.
-        sigma: The standard deviations of scale and drift, 2.
+        first: The step from which each of them leads, (n,).
+        last: The step to which each of them leads, (n,).
+        moved: The displacements in metres and radians, (n, 3).
+        noise: Their covariances, (n, 3, 3).
+        scaled: 1 if the shared error of scale applies, 0 if not, (n,).
+        way: The metres over which the shared drift of heading applies, (n,).
+        sigma: The standard deviations of scale and drift, (2,).
         spreads: The variances of the pose at each step, relative to its dstate (`spreads_of`).
     """
 
@@ -77,12 +77,13 @@ class Equations:
         )
 
     def beside(self, labels: NDArray[np.int_], size: int) -> Equations:
-        """These equations between dstates, and between dstates and the robot if it is off them.
+        """Return the same equations for the poses of dstates instead of those of steps.
 
-        The robot has a pose of its own at each step, with the numbers from `size` on.
+        If the robot may be off its dstates, it gets a pose of its own at each step t, which has the
+        number size + t. Then there are also equations between these poses and the dstates.
 
         Args:
-            labels: The dstate of each step, n.
+            labels: The dstate of each step.
             size: The number of dstates.
         """
         if not self.spreads.any():
@@ -100,16 +101,20 @@ class Equations:
 
 
 def noises(trace: Trace, steps: Sequence[int]) -> Array:
-    """The covariances of the displacements that lead to some steps: n x 3 x 3."""
+    """Return the covariances of the displacements that lead to n steps, (n, 3, 3)."""
     return np.array([trace.covariance(t) for t in steps], dtype=float).reshape(-1, 3, 3)
 
 
 def spreads_of(trace: Trace) -> Array:
-    """The variances of the pose of the robot at each step, relative to its dstate: n x 3.
+    """Compute the variances of the pose of the robot at each step, relative to its dstate.
 
     A dstate has one pose in a map, but the robot is not at exactly this pose on each visit. Turns
-    stay there, so the steps of a visit have one error of position. It counts once: each of k steps
-    has k times the variance. All variances are 0 if the odometry declares no such errors.
+    do not move it, so the k steps of a visit share one error of position. To count this error once,
+    each of the steps gets k times its variance.
+
+    Returns:
+        The variances of x, y and heading, (steps, 3), in square metres and square radians. They are
+        0 if the odometry declares no such errors.
     """
     odometry = trace.odometry or Odometry()
     visit = np.cumsum([1, *(action.kind != "turn" for action in trace.actions)]) - 1

@@ -1,9 +1,8 @@
-"""Estimate rivals of the best map, and the fewest places that any map has.
+"""Estimate rivals of the best map, and a lower bound on the number of places.
 
-In a rival, some visits to a place of the best map may be visits to a new place.
-
-The search for maps of least cost (`weighing.py`) finds few rivals of a long trace. So these are
-added. They fit the displacements, and may break axioms.
+The search for maps of least cost (`weighing.py`) finds few rivals of a long trace. So this module
+adds estimated rivals. They are like the best map, but some visits to one of its places are visits
+to a new place. They fit the displacements, and may break axioms.
 """
 
 from __future__ import annotations
@@ -21,8 +20,8 @@ from ssh_abduction.theory.settle import Problem
 Course: TypeAlias = tuple[tuple[int, ...], tuple[int, ...]]
 # Computes the cost in nats of a map with these dstates and places.
 CostOf: TypeAlias = Callable[[Sequence[int], Sequence[int]], float]
-# A rival that costs CERTAIN nats more than the best map does not count: a million of them make a
-# doubt of 0.005.
+# Leave out rivals that cost CERTAIN nats more than the best map. Even a million of them together
+# have a probability of only 0.005.
 CERTAIN = 19.0
 
 
@@ -31,12 +30,12 @@ def estimated(
 ) -> Iterator[Rival]:
     """Yield rivals that cost little more than the best map, each once.
 
-    In each, some visits to a place of the best map are visits to a new place: a single visit, or
-    all visits from one on.
+    In each rival, some visits to a place of the best map are visits to a new place instead: a
+    single visit, or a visit and all later ones.
 
     Args:
         best: The best map.
-        visit: The first step of the visit of each step.
+        visit: For each step, the first step of its visit.
         cost_of: Computes the cost of a map.
         seconds: The time that this may take.
     """
@@ -63,13 +62,13 @@ def estimated(
 
 
 def _moved(best: Rival, visit: Sequence[int], place: int, moved: Collection[int]) -> Course:
-    """The dstates and places of a map, if some visits to a place are visits to a new one.
+    """Return the dstates and places of a map after some visits to a place get a new place.
 
     Args:
         best: The map.
-        visit: The first step of the visit of each step.
+        visit: For each step, the first step of its visit.
         place: The place; without places, the dstate.
-        moved: The first steps of the visits.
+        moved: The first steps of the visits that get a new place.
     """
     at = best.places or best.dstates
     begins = _begins(at, visit)
@@ -81,7 +80,14 @@ def _moved(best: Rival, visit: Sequence[int], place: int, moved: Collection[int]
 
 
 def _begins(at: Sequence[int], visit: Sequence[int]) -> list[int]:
-    """The first step of the visit of each step to its place, or without places to its dstate."""
+    """For each step, find the first step of its visit.
+
+    A visit also begins where the place changes.
+
+    Args:
+        at: The place of each step; without places, the dstate.
+        visit: For each step, the first step of its visit by the trace alone.
+    """
     begins: list[int] = []
     for step, name in enumerate(at):
         is_first = not step or at[step - 1] != name or visit[step] == step
@@ -103,7 +109,10 @@ def rival_of(ssh_map: SSHMap, nats: float) -> Rival:
 
 
 def least_places(problem: Problem) -> int:
-    """The size of a large set of visits that are pairwise at different places by the evidence."""
+    """Return a lower bound on the places: the size of a set of steps pairwise at different places.
+
+    Only evidence is used to tell places apart.
+    """
     if problem.theory.level == "causal":
         return 0
     import numpy as np

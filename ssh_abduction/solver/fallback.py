@@ -1,4 +1,4 @@
-"""After a search was stopped, make some map of the whole trace and prove a bound."""
+"""Make some map of the whole trace and prove a bound, after a search was stopped."""
 
 from __future__ import annotations
 
@@ -57,12 +57,12 @@ def fall_back(parts: Parts, answer: Answer, *, may_search: bool) -> None:
 def two_steps_clash(
     trace: Trace, theory: Theory, maps_of: Callable[[Trace, Theory], tuple[Sequence[SSHMap], bool]]
 ) -> bool:
-    """Whether some step and the next one have no map by themselves. Then the trace has none.
+    """Whether some pair of successive steps has no map by itself. Then the trace has no map.
 
     Args:
         trace: The trace.
-        theory: Its theory, with all defaults filled in. With faults nothing is tried.
-        maps_of: Solves a trace: some map, and whether the answer is proven.
+        theory: Its theory, with all defaults filled in. If it allows faults, the result is False.
+        maps_of: Solves a trace. Returns some maps, and whether the answer is proven.
     """
     if theory.has_faults:
         return False
@@ -97,9 +97,9 @@ def salvage(parts: Parts) -> None:
 
 
 def best_map(parts: Parts) -> Iterator[Priced]:
-    """Yield the best map known with its preferred counts, if no map was given so far.
+    """Yield the best map known with its cost, if no map was given so far.
 
-    The checker looks at the map first, as far as there is time.
+    The checker checks the map first, as far as there is time.
     """
     known, watch = parts.known, parts.watch
     watch.start()
@@ -114,9 +114,9 @@ def best_map(parts: Parts) -> Iterator[Priced]:
 
 
 def _overtime(parts: Parts) -> float:
-    """The seconds that are left to make a map without a search, or to check one.
+    """Return the seconds that are left to make a map without a search, or to check one.
 
-    The parts of the search that cannot be stopped may have taken some of them.
+    Parts of the search that could not be stopped may have used up some of this time.
     """
     limit = parts.limits.time_limit
     if parts.known.stopped != "time limit" or limit is None:

@@ -12,11 +12,11 @@ True
 A displacement is how the robot moved from one step to the next, by its odometry. A closure is how
 two steps lie relative to each other, by a match of local maps. The unknowns are the position of
 each place (of each dstate, if the map has no places), the heading of each dstate, and two errors
-that all displacements share: their scale, and a steady drift of heading. These two have a prior.
-Each displacement and each closure gives three equations (`equations.py`). The
-best poses have the least sum of squares (Lu & Milios 1997, "Globally consistent range scan
-alignment"). If the map is true and the odometry is as good as it claims, this sum is chi-square
-distributed. The sum ranks equally minimal maps, and may cause a warning. It rejects no map.
+that all displacements share: their scale, and a steady drift of heading. These two errors have a
+prior. Each displacement and each closure gives three equations (`equations.py`). The best poses
+have the least sum of squares (Lu & Milios 1997, "Globally consistent range scan alignment"). If the
+map is true and the odometry is as good as it claims, this sum is chi-square distributed. The sum
+ranks equally minimal maps, and may cause a warning. It rejects no map.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ Array: TypeAlias = NDArray[np.float64]
 # With a standard deviation below this, in metres or radians, a displacement counts as exact.
 EXACT = 2e-3
 # SWEEPS is the number of iterations of the power method. HELD is the weight that keeps a rotation
-# at its old value. It is small: a metre weighs some hundreds.
+# at its old value. It is small compared with a metre, which has a weight of some hundreds.
 SWEEPS, HELD = 20, 1e-2
 # Levenberg-Marquardt: the least and the highest damping, and the most rounds. It ends if a round
-# gains less than STILL of the sum of squares; NEARLY is enough for a hypothesis. HELD_STILL keeps
-# poses that nothing is known of.
+# lowers the sum of squares by less than the share STILL, or NEARLY for a hypothesis. HELD_STILL is
+# a weight that keeps poses in place if no equation determines them.
 LEAST_DAMPING, MOST_DAMPING, ROUNDS, STILL, NEARLY = 1e-9, 1e8, 100, 1e-13, 1e-4
 HELD_STILL = 1e-9
 
@@ -79,12 +79,14 @@ class Poses:
     def __init__(
         self, trace: Trace, headings: Sequence[int], positions: Sequence[Hashable]
     ) -> None:
-        """Collect the equations; solve nothing yet.
+        """Collect the equations. Nothing is solved yet.
 
         Args:
             trace: A trace with displacements at some of its steps.
-            headings: The heading of each step, as a number. The numbers are consecutive, from 0.
-            positions: The position of each heading, as a number or another name.
+            headings: For each step, which of the unknown headings it has (mostly its dstate). The
+                numbers are consecutive, from 0.
+            positions: For each of these headings, the name of the position that it belongs to
+                (mostly the place of the dstate).
         """
         self._dstates = len(positions)
         labels = np.asarray(headings, dtype=int)
@@ -99,25 +101,26 @@ class Poses:
         self._place = np.array([number[position] for position in positions], dtype=int)
         self._positions, self._headings = len(number), len(positions)
         self._size = 2 * self._positions + self._headings + 2
-        # Displacements connect the headings of a group, and the positions of a part of the map.
+        # A group is the headings that displacements connect. A part of the map is the positions
+        # that they connect.
         self._group = connected_components(
             self._graph(self._from, self._to, self._headings), directed=False
         )[1]
 
     @staticmethod
     def of_map(trace: Trace, ssh_map: SSHMap) -> Poses:
-        """The poses of the dstates of a map of the whole trace, still unknown."""
+        """Collect the equations for the poses of the dstates of a map of the whole trace."""
         places = [s.place if s.place is not None else -1 - s.id for s in ssh_map.dstates]
         return Poses(trace, ssh_map.dstate_at, places)
 
     def misfit(self) -> float:
-        """The least chi-square of the displacements."""
+        """Compute the least chi-square of the displacements."""
         return float((self._residuals(self._best()) ** 2).sum())
 
     def settled(
         self, start: Array, fixed: Sequence[int], wanted: Sequence[int]
     ) -> tuple[float, Array, Array]:
-        """The least chi-square, and the unknowns that have it.
+        """Find the unknowns with the least chi-square, and their covariance.
 
         Args:
             start: Unknowns to begin with.
@@ -125,18 +128,18 @@ class Poses:
             wanted: The indices of the unknowns whose covariance is wanted.
 
         Returns:
-            The chi-square, the unknowns, and the covariance of the wanted ones.
+            The chi-square, all unknowns, and the covariance of the wanted ones.
         """
         unknown = self._best(start, NEARLY)
         squares = float((self._residuals(unknown) ** 2).sum())
         return squares, unknown, self._covariance(unknown, fixed, wanted)
 
     def _best(self, start: Array | None = None, still: float = STILL) -> Array:
-        """The unknowns with the least sum of squares.
+        """Find the unknowns with the least sum of squares.
 
         Args:
-            start: Unknowns to begin with; None to find some.
-            still: End if a round gains less than this share.
+            start: Unknowns to begin with; None to compute some.
+            still: End if a round lowers the sum of squares by less than this share.
         """
         unknown = self._begun() if start is None else start
         if not len(self._moved):
@@ -162,7 +165,7 @@ class Poses:
         return unknown
 
     def fit(self) -> Fit:
-        """The best poses, and how well they agree with the displacements."""
+        """Find the best poses, and compute how well they agree with the displacements."""
         unknown = self._best()
         squares = float((self._residuals(unknown) ** 2).sum())
         freedom = self._freedom(unknown)
@@ -171,7 +174,7 @@ class Poses:
         return Fit(squares, freedom, p, scale, bend, self._poses(unknown))
 
     def _begun(self) -> Array:
-        """The initial values of the unknowns, as one vector."""
+        """Compute initial values of the unknowns, as one vector."""
         unknown = np.zeros(self._size)
         at, heading = (
             unknown[: 2 * self._positions].reshape(-1, 2),
@@ -196,10 +199,10 @@ class Poses:
         return unknown
 
     def _reckoned(self) -> Array:
-        """The heading of each dstate in radians, relative to the first dstate of its group.
+        """Compute the heading of each dstate in radians, relative to the first one of its group.
 
-        Headings are added up along the fewest displacements. A group is the dstates that
-        displacements connect.
+        Turns are added up along the fewest displacements. A group is the dstates that displacements
+        connect.
         """
         heading = np.zeros(self._headings)
         rotated: dict[tuple[int, int], float] = {}
@@ -215,7 +218,7 @@ class Poses:
         return heading
 
     def _rotations(self, onward: Array) -> Array:
-        """The rotation of each group of headings, in radians, for which positions agree best.
+        """Find how to rotate each group of headings so that positions agree best, in radians.
 
         The rotations are complex numbers on the unit circle that minimise a quadratic form. The
         power method for its inverse finds them (Boumal 2016, "Nonconvex phase synchronization").
@@ -237,7 +240,7 @@ class Poses:
         return angles
 
     def _misfit(self, onward: Array) -> NDArray[np.complex128]:
-        """The matrix of the quadratic form that says how badly rotations of groups fit.
+        """Compute the matrix of the quadratic form that says how badly rotations of groups fit.
 
         For given rotations, the form is the least sum of squares that any positions have. Vectors
         in the plane are complex numbers.
@@ -258,19 +261,23 @@ class Poses:
         return form
 
     def _moves(self) -> Any:
-        """The matrix that maps one coordinate of all positions to that of displacements."""
+        """Make the matrix that maps one coordinate of all positions to that of displacements."""
         return self._differences(self._place[self._from], self._place[self._to], self._positions)
 
     def _graph(self, first: NDArray[np.int_], second: NDArray[np.int_], size: int) -> csr_array:
+        """Make a graph of `size` nodes from the ends of its edges, as a sparse matrix."""
         return coo_array((np.ones(len(first)), (first, second)), shape=(size, size)).tocsr()
 
     def _sigmas(self, axis: int) -> Array:
-        """The approximate standard deviation of each displacement along axis 0 (x), 1 (y) or 2."""
+        """Return the approximate standard deviation of each displacement, for one axis.
+
+        Axis 0 is x, 1 is y, both in metres, and 2 is the turn in radians.
+        """
         sigmas: Array = 1 / np.sqrt((self._whitening[:, :, axis] ** 2).sum(1))
         return sigmas
 
     def _differences(self, first: NDArray[np.int_], second: NDArray[np.int_], size: int) -> Any:
-        """The matrix that maps a vector to differences of its entries: second minus first.
+        """Make the matrix that maps a vector to differences of its entries: second minus first.
 
         Args:
             first: The index of the entry to subtract, for each difference.
@@ -306,6 +313,7 @@ class Poses:
         return np.stack([scale * ahead, scale * left, rotated], axis=1), cos, sin
 
     def _residuals(self, unknown: Array) -> Array:
+        """Compute predicted minus actual displacements, and the priors, in standard deviations."""
         look_at_clock()
         predicted = self._predicted(unknown)[0]
         off = predicted - self._moved
@@ -313,6 +321,7 @@ class Poses:
         return np.concatenate([np.einsum("nij,nj->ni", self._whitening, off).ravel(), unknown[-2:]])
 
     def _jacobian(self, unknown: Array) -> Any:
+        """Compute the derivative of the residuals with respect to the unknowns."""
         predicted, cos, sin = self._predicted(unknown)
         scale = 1 + unknown[-2] * self._sigma[0] * self._scaled
         m, heading = len(self._moved), 2 * self._positions
@@ -359,7 +368,7 @@ class Poses:
         return matrix(entries, (3 * m + 2, self._size))
 
     def _parts(self) -> NDArray[np.int_]:
-        """The number of the part of the map of each position. No displacement joins two parts."""
+        """For each position, find its part of the map. No displacement connects two parts."""
         part: NDArray[np.int_] = connected_components(
             self._graph(self._place[self._from], self._place[self._to], self._positions),
             directed=False,
@@ -367,13 +376,13 @@ class Poses:
         return part
 
     def _freedom(self, unknown: Array) -> int:
-        """The degrees of freedom: the number of equations minus the unknowns they determine.
+        """Count the degrees of freedom: equations minus the unknowns that they determine.
 
-        The equations do not determine where each part of the map is and how it is turned. They also
-        leave open how some groups of headings are turned.
+        The equations determine neither where each part of the map is nor how it is turned, nor how
+        some groups of headings are turned.
 
-        A displacement known to the millimetre has no noise worth counting. It determines as
-        many unknowns as it has equations, and adds no freedom.
+        A displacement with hardly any noise (EXACT) determines as many unknowns as it has
+        equations. So it adds no freedom.
         """
         said = np.unique(np.concatenate([self._from, self._to]))
         used = np.unique(self._place[said])
@@ -397,7 +406,7 @@ class Poses:
         )
 
     def _open_rotations(self, unknown: Array, said: NDArray[np.int_]) -> int:
-        """The number of independent rotations of groups of headings that displacements leave open.
+        """Count the independent rotations of groups of headings that displacements leave open.
 
         Args:
             unknown: The unknowns.
@@ -413,7 +422,7 @@ class Poses:
         return int((np.linalg.eigvalsh(form) < 1e-6 * max(float(form.diagonal().max()), 1.0)).sum())
 
     def _poses(self, unknown: Array) -> tuple[Pose, ...]:
-        """The pose and covariance of each dstate, relative to the first dstate of its part."""
+        """Compute the pose and covariance of each dstate, relative to the first one of its part."""
         at, heading = (
             unknown[: 2 * self._positions].reshape(-1, 2),
             unknown[2 * self._positions : -2],
@@ -440,9 +449,11 @@ class Poses:
         return tuple(poses)
 
     def _spreads(self, unknown: Array, origins: Sequence[int]) -> Array:
-        """The covariance of the position of each dstate: m x 2 x 2, in square metres.
+        """Compute the covariance of the position of each dstate, (dstates, 2, 2), in square metres.
 
-        The poses of the dstates `origins` count as known.
+        Args:
+            unknown: The unknowns.
+            origins: Dstates whose poses count as known.
         """
         fixed = [
             int(k)
@@ -458,7 +469,7 @@ class Poses:
         return spreads
 
     def _covariance(self, unknown: Array, fixed: Sequence[int], wanted: Sequence[int]) -> Array:
-        """The covariance of the wanted unknowns, if the fixed ones are known."""
+        """Compute the covariance of the wanted unknowns, given that the fixed ones are known."""
         look_at_clock()
         jacobian = self._jacobian(unknown)
         free = np.setdiff1d(np.arange(self._size), fixed)

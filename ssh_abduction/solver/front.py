@@ -1,8 +1,8 @@
 """The front of faults: the fewest dstates that explain a trace, for each number of faults.
 
-Without faults the causal theory always has a map, even if the trace is wrong: a map of many
-dstates. With many faults it has a map of few dstates. The truth is at the *knee*: the number of
-faults at which the number of dstates stops falling fast. A weighted sum of both numbers hides it.
+Even if the trace is wrong, the causal theory has a map without faults. It needs many dstates. With
+many faults, few dstates are enough. The truth is mostly at the *knee*: the number of faults at
+which the number of dstates stops falling fast. A weighted sum of both numbers hides the knee.
 
 >>> from ssh_abduction import Trace
 >>> from ssh_abduction.solver.front import fault_front
@@ -65,8 +65,9 @@ class Front:
     def knee(self) -> int | None:
         """The number of faults at which the number of dstates stops falling fast.
 
-        The fall to this point exceeds the fall to the next point by most. Only proven points
-        count. None if no fall exceeds the next one.
+        A fall is by how many dstates a point is below the point with one fault less. At the knee, a
+        fall exceeds the next fall by most. Only proven points count. None if no fall exceeds the
+        next one.
         """
         counts = self._proven
         bends = {
@@ -79,10 +80,9 @@ class Front:
 
     @property
     def prices(self) -> tuple[float, float] | None:
-        """The costs of a fault for which the map at the knee is the best one, as (low, high).
+        """For which costs of a fault the map at the knee costs least: between (low, high).
 
-        Costs are in dstates, and `low` and `high` are excluded. None if there is no such cost, or
-        no knee.
+        Costs are in dstates. None if there is no such cost, or no knee.
         """
         if self.knee is None:
             return None
@@ -148,6 +148,7 @@ def fault_front(
 
 
 def _points(task: Task, most: int) -> Iterator[Point]:
+    """Yield the points for 0 to `most` faults. The first point that is not proven ends them."""
     from ssh_abduction.solver.engines.faulty import FaultyEngine  # loads numpy
 
     before: SSHMap | None = None

@@ -1,8 +1,8 @@
-"""A second safety net: maps must pass the checker, which shares no code with the encodings.
+"""Check the maps of a search by the checker, which shares no code with the encodings.
 
-It would take longer to check every step of a long trace, or every map of a long list, than to find
-the maps. So checking gets only a share of the search time. The first maps are always checked, at
-least over the steps that clingo was given. Later maps are checked if there is time in that share.
+Checking every step of a long trace, or every map of a long list, would take longer than finding the
+maps. So checks get only a share of the search time. The first maps are always checked, at least for
+the steps that clingo was given. Later maps are checked if the share is not used up.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from ssh_abduction.theory.settle import Problem
 # Optional checks take at most SHARE of the search time plus BEYOND seconds.
 SHARE = 0.1
 BEYOND = 0.01
-ALWAYS = 3  # maps that are always checked, over the steps that clingo was given
-SAMPLE = 1000  # later steps to check at most, drawn at random, if there is no time for all
-A_STEP = 5e-6  # seconds that the checker takes for a step, before the first check measures it
+ALWAYS = 3  # this many maps are always checked, for the steps that clingo was given
+SAMPLE = 1000  # if there is no time for all later steps, check this many of them at random
+A_STEP = 5e-6  # seconds that the checker takes for a step, until the first check measures it
 # Without these axioms a dstate may have several places, courses or headings, but a map shows only
 # one. So the checker cannot judge it.
 UNSHOWN = frozenset({"one_place", "one_course", "one_heading", "gateway_heading"})
@@ -35,7 +35,7 @@ class InternalError(AbductionError):
 
 
 class Judging:
-    """Checks the maps of one search: against all evidence, and by the checker."""
+    """Judges the maps of one search: by the evidence, and by the checker."""
 
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
@@ -54,7 +54,7 @@ class Judging:
         return bool(self._evidence)
 
     def why_refused(self, ssh_map: SSHMap) -> frozenset[Equality] | None:
-        """A set of equalities of a map that contradicts some evidence; None if there is none.
+        """Find a set of equalities of a map that contradicts some evidence; None if there is none.
 
         Args:
             ssh_map: A map of the trace or of a prefix.
@@ -63,9 +63,14 @@ class Judging:
         return refusal[1] if refusal else None
 
     def refusal(self, ssh_map: SSHMap) -> tuple[str, frozenset[Equality]] | None:
-        """The first kind of evidence that rejects a map: its name, and why, as `why_refused`.
+        """Find the first kind of evidence that rejects a map.
 
-        None if no evidence rejects the map.
+        Args:
+            ssh_map: A map of the trace or of a prefix.
+
+        Returns:
+            The name of the evidence, and a set of equalities that contradicts it; None if no
+            evidence rejects the map.
         """
         for evidence in self._evidence:
             if found := evidence.refuse(self._trace, ssh_map):
@@ -75,10 +80,10 @@ class Judging:
     def allows_grown(self, trace: Trace, ssh_map: SSHMap, since: int) -> bool:
         """Whether no evidence rejects a map of a trace that has grown.
 
-        Further checks use the grown trace.
+        Later checks use this trace.
 
         Args:
-            trace: The grown trace.
+            trace: The trace.
             ssh_map: A map of all of its steps.
             since: The number of first steps that the evidence has already accepted.
         """
@@ -100,7 +105,7 @@ class Judging:
     def accepts(self, ssh_map: SSHMap) -> bool:
         """Whether a map of the whole trace satisfies all axioms and agrees with all evidence.
 
-        False also if some axioms cannot be checked.
+        The result is also False if some axioms cannot be checked.
         """
         accepted = (
             self.can_accept
@@ -143,7 +148,7 @@ class Judging:
         return self._shown and self._a_step * steps <= BEYOND + SHARE * elapsed - self._seconds
 
     def pass_grown_map(self, trace: Trace, ssh_map: SSHMap) -> None:
-        """Check a map of a trace that has grown. Further checks use this trace.
+        """Check a map of a trace that has grown. Later checks use this trace.
 
         Raises:
             InternalError: The map breaks an axiom.
@@ -152,6 +157,7 @@ class Judging:
         self._check(ssh_map, len(trace))
 
     def _check(self, ssh_map: SSHMap, steps: int) -> None:
+        """Check a map of the first `steps` steps, and measure the time. Raises InternalError."""
         began = time.perf_counter()
         violations = check(self._trace.prefix(steps), ssh_map, self._theory.of_steps(0, steps))
         spent = time.perf_counter() - began
@@ -179,6 +185,7 @@ class Judging:
                 )
 
     def _fail(self, violation: Violation) -> None:
+        """Raise InternalError for a violation of an axiom."""
         where = f" at step {violation.steps[-1]}" if violation.steps else ""
         raise InternalError(
             f"internal error: a map that was found breaks {violation.axiom}{where} (trace "

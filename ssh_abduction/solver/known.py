@@ -23,7 +23,8 @@ class Known:
             is none.
         partial: The map of a prefix that was found last; None before that.
         stopped: Why the search ended before it was complete; None if it did not.
-        complete: Whether no further map exists: no minimal one and, with `within`, none to list.
+        complete: Whether all maps were given: all minimal ones and, with `within`, all others that
+            it asks for.
         count: The number of maps given to the caller.
         refused: For each kind of evidence, by name, how many sets of equalities it rejected.
     """
@@ -55,7 +56,11 @@ class Known:
         self.best, self.cost = replace(found.map, dstate_at=labels), found.cost
 
     def raise_bound(self, proven: int | None) -> None:
-        """Raise the lower bound on the count that is preferred first. None changes nothing."""
+        """Raise the lower bound on the count that the theory minimises first.
+
+        Args:
+            proven: The bound; None for no bound. A smaller bound than the known one is ignored.
+        """
         first = self._theory.priorities[0] if self._theory.priorities else None
         if first and proven is not None and proven > (getattr(self.bound, first) or 0):
             self.bound = replace(self.bound, **{first: proven})

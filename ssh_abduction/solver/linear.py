@@ -1,4 +1,4 @@
-"""Matrices and linear systems of the fit of poses: dense if they are small, else sparse."""
+"""Matrices and linear systems for the fit of poses. Small ones are dense, large ones sparse."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from scipy.sparse.linalg import lsqr, splu
 
 Array: TypeAlias = NDArray[np.float64]
 
-# Matrices with at most this many columns are dense. Up to there, numpy takes less time for all
-# numbers than scipy does for those that are not zero.
+# Matrices with at most this many columns are dense. For these, numpy with all numbers is faster
+# than scipy with the numbers that are not zero.
 DENSE = 60
-# With at most this many unknowns, an inverse comes from a dense matrix.
+# With at most this many unknowns, compute an inverse from a dense matrix.
 DENSE_INVERSE = 3000
 
 
@@ -35,12 +35,12 @@ def matrix(entries: tuple[Any, tuple[Any, Any]], shape: tuple[int, int]) -> Any:
 
 
 def as_dense(some: Any) -> Any:
-    """The same matrix as an array of numpy."""
+    """Return the same matrix as an array of numpy."""
     return some if isinstance(some, np.ndarray) else some.toarray()
 
 
 def weighted(some: Any, weights: Array) -> Any:
-    """The matrix with each row multiplied by its weight."""
+    """Multiply each row of a matrix by its weight."""
     if isinstance(some, np.ndarray):
         return some * weights[:, None]
     return csr_array(some.multiply(weights[:, None]))
@@ -86,7 +86,8 @@ def inverse(square: Any, added: Array, rows: NDArray[np.intp]) -> Array:
         rows: The numbers of the wanted rows.
     """
     if square.shape[0] <= DENSE_INVERSE:
-        # With these rows last, the end of the Cholesky factor is the factor of what is wanted.
+        # If these rows come last, the wanted part of the inverse depends only on the last block of
+        # the Cholesky factor.
         order = np.concatenate([np.setdiff1d(np.arange(len(added)), rows), rows])
         with suppress(np.linalg.LinAlgError):
             whole = as_dense(square) + np.diag(added)

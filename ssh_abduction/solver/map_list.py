@@ -13,10 +13,9 @@ from ssh_abduction.solver.near import NearMinimal, counted_first
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.values import Status
 
-# After the last map asked for, seek one more for this many seconds. If there is none, the list is
-# complete.
+# After the last map asked for, look for one more for this many seconds, or for this share of the
+# time so far if that is more. If clingo proves that there is none, the list is complete.
 ONE_MORE = 1.0
-# Seek it for this share of the time that the other maps took, if that is more.
 ONE_MORE_SHARE = 0.1
 _log = log_of(__name__)
 
@@ -25,13 +24,13 @@ Priced: TypeAlias = tuple[SSHMap, tuple[int, ...]]
 
 
 def listed(parts: Parts, found: Iterator[Priced], *, keeps_time: bool) -> Iterator[Priced]:
-    """Yield the maps asked for, each with its preferred counts, after the checker passed it.
+    """Yield the maps asked for, each with its preferred counts, after a check.
 
     The clock of the search stops while the caller works with a map.
 
     Args:
         parts: The parts of the search.
-        found: The minimal maps, and then those that cost more.
+        found: The minimal maps, and then maps that cost more, each with its preferred counts.
         keeps_time: Whether to keep a share of the time limit for finding the backbone later.
     """
     known, watch, most = parts.known, parts.watch, parts.limits.most
@@ -85,6 +84,7 @@ def by_count(parts: Parts, mended_maps: tuple[SSHMap, ...] | None) -> Generator[
 
 
 def _told_cost(parts: Parts) -> str:
+    """Return the cost of minimal maps in words."""
     cost = parts.known.best_cost
     if cost is None:
         return "nothing that is counted"

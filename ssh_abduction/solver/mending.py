@@ -1,17 +1,17 @@
 """Find maps with faults in theories with places: guess the faults, mend the trace, and solve it.
 
 A fault is a view, an action or a displacement of the trace that a map treats as wrong. To *mend* a
-trace is to correct its faults: replace a wrong view by another view and a wrong action by an
-unknown one, and leave out a wrong displacement. So a map with faults is a map without faults of a
-mended trace, and all fast engines can solve a mended trace.
+trace is to correct its faults: replace a wrong view by another view, replace a wrong action by an
+unknown action, and leave out a wrong displacement. So a map with faults is a map without faults of
+a mended trace. All fast engines can solve a mended trace.
 
 Two methods guess which steps have faults. If places have frames, visits are merged robustly
 (`guesses/voting.py`). In any case, the causal theory with faults is solved (`engines/faulty.py`).
 A map with places becomes a map of that theory when its places are dropped.
 
 *Displacements.* Labels that were found without displacements show which displacements may be wrong
-(`guesses/outliers.py`). Then the labels of each better map show more. A displacement that was
-guessed to be wrong may agree with the map after all. Then the map does not count it as a fault.
+(`guesses/outliers.py`). The labels of each better map may show further ones. A displacement that
+was guessed to be wrong may agree with the map after all. Then it is no fault of the map.
 
 *Bound.* A map of the theory, without its places, is a causal map with the same dstates and with no
 more faults. So a lower bound for the causal theory holds here. If a mended trace has a map that
@@ -43,11 +43,11 @@ from ssh_abduction.theory.theory import Theory
 # Mend the trace by at most this many cheapest causal maps. If there are more, the list of minimal
 # maps may be incomplete.
 MOST_CAUSAL = 200
-ROUNDS = 5  # rounds of robust merging at most, each beginning with a better map
-# A trace that merging mended is solved for at most MERGED seconds. Any mended trace is solved for
-# at most SHARE of the time that is left.
+ROUNDS = 5  # the most rounds of robust merging, each of which begins with a better map
+# Solving a trace that was mended by merging takes at most MERGED seconds. Solving any mended trace
+# takes at most SHARE of the time that is left.
 MERGED, SHARE = 30.0, 0.5
-# A dstate with at most RARE visits is rare. One of the last BEFORE actions before it may have
+# A dstate with at most RARE steps is rare. One of the last BEFORE actions before it may have
 # slipped. At most SUSPECTED actions are tried.
 RARE, BEFORE, SUSPECTED = 1, 3, 60
 
@@ -99,7 +99,7 @@ class Mending:
         yield from self._by_rare_dstates()
 
     def minimal_maps(self, most: int) -> tuple[SSHMap, ...] | None:
-        """List the minimal maps, if all of them are maps of traces that were mended.
+        """List the minimal maps, if it is proven which mended traces have them.
 
         Call this after the iteration over `maps` has ended.
 
@@ -107,8 +107,8 @@ class Mending:
             most: The number of maps to list for each mended trace; 0 for all.
 
         Returns:
-            The maps; None if another mended trace may have some, or if the best map costs more than
-            the bound.
+            The maps. None if there is no such proof: the best map costs more than the bound, or not
+            all mended traces were solved.
         """
         if self._best is None or self._best.cost[0] != self.bound or not self._cheapest:
             return None
@@ -129,7 +129,7 @@ class Mending:
         """Yield a map, and remember it, if it is the best one so far.
 
         Args:
-            better: The map, as a map of the trace itself; None yields nothing.
+            better: The map, as a map of the trace itself; None for no map.
             mended: The mended trace that it was found for.
         """
         if better is not None and (self._best is None or better.cost < self._best.cost):
@@ -137,11 +137,11 @@ class Mending:
             yield better
 
     def _by_merging(self, trace: Trace) -> Iterator[Found]:
-        """Yield better maps that robust merging of visits leads to.
+        """Yield better maps, found by merging visits robustly (`guesses/voting.py`).
 
-        Merging groups the visits and thereby mends the trace. The groups are almost a map: yield
-        that map first, then solve the mended trace for a better one. If there is a better map,
-        merge again, beginning with its places.
+        Merging groups the visits, and the votes of the groups mend the trace. The groups are almost
+        a map. First yield a map near the groups, then solve the mended trace. If this gives a
+        better map, merge again, beginning with the places of this map.
 
         Args:
             trace: The trace of the task, perhaps without some displacements.
@@ -268,7 +268,7 @@ class Mending:
         return replace(self._task.trace, steps=tuple(steps))
 
     def _problem(self, mended: Trace) -> Problem:
-        """The problem of a mended trace, in which no further faults are allowed."""
+        """Make the problem of a mended trace, in which no further faults are allowed."""
         return self._task.problem.changed(mended, self._without_faults)
 
     def _minimal(self, mended: Trace, seconds: float = math.inf) -> tuple[Found | None, bool]:
@@ -279,8 +279,8 @@ class Mending:
             seconds: The time that the search may take.
 
         Returns:
-            The map, as a map of the trace itself with faults; None if none was found. And whether
-            the result is proven: a minimal map, or that there is none.
+            The map, as a map of the trace itself with faults, or None; and whether it is proven
+            that this map is minimal, or that there is no map.
         """
         if mended not in self._solved or not (self._solved[mended][1] or seconds < math.inf):
             maps, proven = self._maps_of(mended, 1, seconds)
@@ -306,7 +306,7 @@ class Mending:
         return list(maps), proven
 
     def _believed_again(self, ssh_map: SSHMap, mended: Trace) -> Trace:
-        """Put the missing displacements that agree with a map back into a mended trace."""
+        """Put those missing displacements back into a mended trace that agree with a map of it."""
         for t, (step, other) in enumerate(zip(self._task.trace.steps, mended.steps, strict=True)):
             if step.displacement == other.displacement:
                 continue
@@ -336,7 +336,7 @@ def _has_frames(task: Task) -> bool:
 
 
 def _places(ssh_map: SSHMap) -> list[tuple[int, int] | None]:
-    """The place of each step and the slot there that the robot faces; None if unknown."""
+    """For each step, return its place and the slot there that the robot faces; None if unknown."""
     at = [
         None if s.place is None or s.heading is None else (s.place, s.heading)
         for s in ssh_map.dstates

@@ -1,14 +1,14 @@
 """The misfit of a map to the displacements, and small sets of returns that cause a misfit.
 
-A *return* is a pair of steps that a map takes for one dstate or one place. The misfit of a set of
-returns is the least sum of squares of the displacements, if the two steps of each return have one
-pose, or one position (`solver/fit.py`). More returns leave less freedom. So the misfit of a set is
-never less than that of a part of it, and a part of the returns of a map bounds the misfit of every
-map that has them.
+A *return* is a pair of steps that a map has at one dstate or one place. The misfit of a set of
+returns is the least chi-square of the displacements and closures, given that the two steps of each
+return have one pose, or one position (`solver/fit.py`). More returns leave less freedom. So the
+misfit of a set is at least that of any subset. If a map has these returns, its misfit is at least
+that of the set.
 
-A visit to a place holds several steps, as turns stay at their place. So these steps have one
-position in each topological map, also without a return. If displacements may be wrong, one of a
-turn may be, too. Then each step is a visit of its own, and its turn is a return.
+A visit to a place has several steps, as turns stay at their place. So these steps have one position
+in each topological map, also without a return. But if displacements may be wrong, that of a turn
+may be wrong, too. Then each step is a visit of its own, and a turn is a return, too.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.evidence.displacement import jumped
 from ssh_abduction.theory.settle import Problem
 
-# The heading and the position of each step, as numbers. Steps with equal numbers share them. Last,
-# the steps whose displacements are ignored.
+# The heading of each step and the position of each step, as numbers, such that steps with equal
+# numbers share them; and the steps whose displacements are ignored.
 _Groups: TypeAlias = tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]
 
 
@@ -36,7 +36,7 @@ class Misfit:
     """
 
     def __init__(self, problem: Problem) -> None:
-        """Compute nothing yet.
+        """Find the visits of the trace. No misfit is computed yet.
 
         Args:
             problem: The trace, and its theory with all defaults filled in.
@@ -50,7 +50,7 @@ class Misfit:
         self._known: dict[_Groups, float] = {}
 
     def of_returns(self, returns: Iterable[Equality], wrong: Collection[int] = ()) -> float:
-        """The chi-square of a set of returns.
+        """Compute the misfit (a chi-square) of a set of returns.
 
         Args:
             returns: The returns.
@@ -66,7 +66,7 @@ class Misfit:
     def of_course(
         self, dstates: Sequence[int], places: Sequence[int], wrong: Collection[int] = ()
     ) -> float:
-        """The chi-square if each step is at this dstate and this place.
+        """Compute the misfit (a chi-square) if each step is at a given dstate and place.
 
         Args:
             dstates: The dstate of each step, as a number.
@@ -80,13 +80,13 @@ class Misfit:
         return self._of_groups((tuple(headings), tuple(positions), tuple(sorted(wrong))))
 
     def of_map(self, ssh_map: SSHMap) -> float:
-        """The chi-square of all returns of a map of the whole trace."""
+        """Compute the misfit (a chi-square) of a map of the whole trace."""
         return self.of_returns(self.returns_of(ssh_map), jumped(ssh_map))
 
     def returns_of(self, ssh_map: SSHMap) -> list[Equality]:
-        """The returns of a map to the last step at the same dstate or place, by their later step.
+        """List the returns of a map: each step with the last step at the same dstate or place.
 
-        All other returns follow from these.
+        All other returns follow from these. They are in the order of the later steps.
         """
         found: list[Equality] = []
         at_dstate: dict[int, int] = {}
@@ -105,7 +105,7 @@ class Misfit:
     def core(
         self, returns: Sequence[Equality], least: float, wrong: Collection[int] = ()
     ) -> list[Equality]:
-        """A minimal subset of returns whose misfit is at least `least`.
+        """Find a minimal subset of returns whose misfit is at least `least`.
 
         Args:
             returns: The returns.
@@ -113,7 +113,8 @@ class Misfit:
             wrong: The steps whose displacements are ignored.
 
         Returns:
-            The subset. All returns if even their misfit is less; none if no return is needed.
+            The subset. If even the misfit of all returns is less: all returns. If the misfit
+            without any return is that large: an empty list.
 
         Reference:
             Junker 2004, "QuickXplain: preferred explanations and relaxations for over-constrained
@@ -128,6 +129,7 @@ class Misfit:
         return [] if suffices([]) else _minimal(suffices, list(returns))
 
     def _of_groups(self, groups: _Groups) -> float:
+        """Compute the misfit if steps share headings and positions, or look it up."""
         if groups not in self._known:
             headings, positions, wrong = groups
             trace = self.trace.without_displacements_at(wrong)
@@ -142,7 +144,12 @@ class Misfit:
 def _minimal(
     suffices: Callable[[Sequence[Equality]], bool], returns: list[Equality]
 ) -> list[Equality]:
-    """A minimal subset that suffices, by halving. `suffices` never fails for more returns."""
+    """Find a minimal subset of returns that suffices, by QuickXplain.
+
+    Args:
+        suffices: Says whether some returns suffice. If a set does, so does each larger set.
+        returns: Returns that suffice.
+    """
 
     def needed(kept: list[Equality], is_new: bool, rest: list[Equality]) -> list[Equality]:
         if is_new and suffices(kept):
@@ -158,12 +165,13 @@ def _minimal(
 
 
 def _join(groups: list[int], first: int, second: int) -> None:
-    """Make the groups of two members one, in a forest of links to earlier members."""
+    """Merge the groups of two members. Each member is linked to an earlier one of its group."""
     a, b = _root(groups, first), _root(groups, second)
     groups[max(a, b)] = min(a, b)
 
 
 def _root(groups: list[int], member: int) -> int:
+    """Return the first member of the group of a member."""
     while groups[member] != member:
         groups[member] = groups[groups[member]]
         member = groups[member]
@@ -171,4 +179,5 @@ def _root(groups: list[int], member: int) -> int:
 
 
 def _roots(groups: list[int]) -> tuple[int, ...]:
+    """For each member, return the first member of its group."""
     return tuple(_root(groups, member) for member in range(len(groups)))

@@ -1,12 +1,12 @@
 """Find maps with more dstates than the minimum: for each number of dstates, the best such maps.
 
-To solve a prefix of the trace is enough only for minimal maps (`prefixes.py`). A map with one
-dstate more may become minimal when it is cut to a prefix. So the readable encodings
-(`encodings/*.lp`) get the whole trace here, and a rule that fixes the number of dstates.
+Solving a prefix of the trace is enough only for minimal maps (`prefixes.py`). A map with one dstate
+more may become minimal when it is cut to a prefix. So here the readable encodings
+(`encodings/*.lp`) get the whole trace, and a rule that fixes the number of dstates.
 
-If the theory prefers few paths or places first, the number of paths or places is fixed instead.
-Excuses (pairs of paths that an axiom is not applied to) are never fixed: adding an excuse never
-makes a map inconsistent.
+If the theory minimises paths or places first, their number is fixed instead. The number of excuses
+(pairs of paths to which an axiom is not applied) is never fixed: adding an excuse never makes a map
+inconsistent.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ class NearMinimal:
             judging: Says which maps the evidence rejects.
             most: The number of maps wanted; 0 for all.
             report: Called now and then to report progress.
-            before: Asked clingo for the minimal maps. Its times are added to those of this engine.
+            before: The asker of the search for the minimal maps. Its times are added to those of
+                this engine.
         """
         self._task = replace(task, speedups=replace(task.speedups, prefixes=False))
         self._judging, self._most, self._report = judging, most, report
@@ -86,8 +87,9 @@ class NearMinimal:
 
 
 def counted_first(theory: Theory) -> Count | None:
-    """The count in which listed maps may exceed the minimum: "dstates", "places" or "paths".
+    """Return the count in which listed maps may exceed the minimum.
 
-    It is the first count that the theory prefers, except excuses. None if there is no other.
+    It is the first count that the theory minimises, except excuses: "dstates", "places" or "paths".
+    None if there is no such count.
     """
     return next((name for name in theory.priorities if name != "excuses"), None)

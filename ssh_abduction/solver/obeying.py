@@ -17,8 +17,7 @@ def obeyed(corrections: Corrections, trace: Trace, theory: Theory) -> tuple[Trac
     """Return the trace and the theory that obey the corrections of a person.
 
     Pairs of steps are added to the fields same, different, elsewhere and same_place of the theory.
-    Gateways
-    that are open or closed change the stars of their steps.
+    Sentences about gateways that are open or closed change the stars of their steps.
 
     Args:
         corrections: The corrections. Sentences about drives that the trace lacks have no effect.

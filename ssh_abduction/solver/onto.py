@@ -1,11 +1,12 @@
-"""Add a drive to a map that stands, at about the cost of the new drive.
+"""Add a drive to the map of old drives, in about the time that solving the new drive takes.
 
-The solver does not see the old drives, but the standing map: a *digest* of it, which is a trace in
-which each link of the map occurs once. Axioms are about links and observations, so a map of the
-digest and the new drive is a map of all drives. Steps of the digest at different dstates or places
-are asserted to be different. If the best maps also keep its equal steps equal, they are the best
-of all maps that keep the standing one. If not, they are asserted to be equal, as far as the traces
-are short enough.
+The map of the old drives is the *standing map*: the joint map must keep its dstates and places. The
+solver does not get the old drives. It gets a *digest*: a trace in which each link of the standing
+map occurs once. Axioms are about links and observations, so a map of the digest and the new drive
+is a map of all drives. Steps of the digest at different dstates or places are asserted to be
+different. If the best maps also have its equal steps at one dstate, they are the best of all maps
+that keep the standing map. If not, equal steps are asserted to be equal, too, if the traces are
+short enough.
 
 >>> from ssh_abduction import Trace, solve
 >>> monday = Trace.from_steps("abcd", ["travel", "around", "travel"], name="monday")
@@ -56,11 +57,11 @@ class Solving:
 
 @dataclass(frozen=True)
 class Digest:
-    """A trace that stands for the old drives.
+    """A short trace that the solver gets instead of the old drives.
 
     Attributes:
         trace: The trace.
-        labels: The dstate of each of its steps in the standing map.
+        labels: For each of its steps, the dstate in the standing map.
     """
 
     trace: Trace
@@ -73,7 +74,7 @@ class Digest:
         Args:
             trace: The drives.
             ssh_map: Their map.
-            short: Whether each link occurs once. If not, the digest has all steps.
+            short: Whether each link occurs only once. If False, the digest has all steps.
         """
         if not short:
             return cls(trace, ssh_map.dstate_at)
@@ -103,12 +104,13 @@ def solve_onto(
     corrections: Corrections | None,
     solving: Solving,
 ) -> Solution:
-    """Find the least joint maps of a new drive and old ones that keep the map of the old ones.
+    """Find the minimal joint maps of new and old drives that keep the map of the old drives.
 
     Args:
         trace: The new drive, or several.
-        standing: The solution of the old drives, with their trace. Its first map stands.
-        theory: The theory; None for that of the solution. Its steps are those of the joint trace.
+        standing: The solution of the old drives, with their trace. Its first map is the standing
+            map.
+        theory: The theory; None for that of the solution. Steps in it are steps of the joint trace.
         corrections: Names and corrections of a person, to be obeyed; None for none.
         solving: How to solve a trace.
 
@@ -150,7 +152,7 @@ def solve_onto(
 
 
 def _standing(standing: object) -> tuple[Trace, SSHMap]:
-    """The trace of a solution and its first map. Raise SolverError if it lacks one."""
+    """Return the trace of a solution and its first map. Raises SolverError if one is missing."""
     mend = "take what solve returned, or Solution.load"
     solution = an_instance("onto", standing, Solution, SolverError, mend=mend)
     if not solution.maps or solution.trace is None:
@@ -167,7 +169,7 @@ def _standing(standing: object) -> tuple[Trace, SSHMap]:
 
 
 def _observations(trace: Trace, ssh_map: SSHMap) -> dict[int, list[Step]]:
-    """For each dstate, the different observations made there, those with a view first."""
+    """For each dstate, list the different observations made there, those with a view first."""
     shown: dict[int, dict[object, Step]] = {s.id: {} for s in ssh_map.dstates}
     for step, label in zip(trace.steps, ssh_map.dstate_at, strict=True):
         shown[label].setdefault((step.view, step.star), step)
@@ -181,7 +183,12 @@ def _observations(trace: Trace, ssh_map: SSHMap) -> dict[int, list[Step]]:
 
 
 def _trails(ssh_map: SSHMap) -> list[list[tuple[int, str | None]]]:
-    """Cover the links of a map by few trails, each of dstates with the actions that lead on."""
+    """Cover the links of a map by few trails.
+
+    Returns:
+        The trails: lists of pairs of a dstate and the action that leads to the next dstate, None
+        at the end. Each link is in one trail. A dstate without links is a trail of its own.
+    """
     leaving: dict[int, list[tuple[str, int]]] = {s.id: [] for s in ssh_map.dstates}
     excess = dict.fromkeys(leaving, 0)
     for s, action, x in sorted(ssh_map.links, reverse=True):
@@ -204,21 +211,23 @@ def _trails(ssh_map: SSHMap) -> list[list[tuple[int, str | None]]]:
 
 
 def _pinned(theory: Theory, digest: Digest, ssh_map: SSHMap, old: Trace, *, joins: bool) -> Theory:
-    """The theory for a digest and a new drive: different dstates and places of the map differ.
+    """Return the theory for a digest and a new drive, with assertions that keep the standing map.
+
+    They say that steps at different dstates or places of that map are different.
 
     Args:
-        theory: The theory.
+        theory: The theory. Its assertions about old steps are moved to steps of the digest.
         digest: The digest of the old drives.
         ssh_map: Their map.
         old: The old drives.
-        joins: Whether to assert equal dstates, too. The fast engine of places with frames obeys
-            this. For other theories, it would switch fast engines off.
+        joins: Whether to assert equal dstates, too. The fast engine for frames can obey this. With
+            other theories, it would switch fast engines off.
     """
     place = [ssh_map.dstates[s].place for s in digest.labels]
     first = {s: t for t, s in reversed([*enumerate(digest.labels)])}
     apart, elsewhere = [], []
     for s, i in first.items():
-        # If equal steps are asserted to be equal, their first steps are enough.
+        # If equal steps are asserted to be equal, one step of each dstate is enough.
         for x, j in first.items() if joins else ((x, j) for j, x in enumerate(digest.labels)):
             if s != x and place[i] != place[j]:
                 elsewhere.append((min(i, j), max(i, j)))
@@ -252,7 +261,12 @@ def _keeps(found: SSHMap, digest: Digest, ssh_map: SSHMap) -> bool:
 def _broken(
     found: SSHMap, digest: Digest, ssh_map: SSHMap
 ) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
-    """The pairs of dstates of the standing map that a map splits or merges: dstates, places."""
+    """Find what a map of a digest and a new drive changes in the standing map.
+
+    Returns:
+        Pairs of dstates of the standing map that are merged (a dstate that is split is paired with
+        itself); and pairs of dstates whose places are merged, or split.
+    """
     number: dict[int, int] = {}
     split = {
         (s, s)
@@ -279,7 +293,12 @@ def _with_assertions(
     found: Solution,
     solving: Solving,
 ) -> tuple[Solution, tuple[SSHMap, ...]]:
-    """Solve again and assert what is one in the standing map, if the trace is short enough."""
+    """Solve again with assertions that equal steps of the digest are equal, if it is short enough.
+
+    Returns:
+        The new solution, and its maps that keep the standing map; or the old solution `found` and
+        no maps.
+    """
     if len(part) > READABLE:
         return found, ()
     first: dict[int, int] = {}
@@ -299,7 +318,7 @@ def _with_assertions(
 
 
 def _of_all(found: SSHMap, digest: Digest, ssh_map: SSHMap, joint: Trace) -> SSHMap:
-    """The map of all drives, from a map of a digest and a new drive."""
+    """Turn a map of a digest and a new drive into a map of all drives."""
     number = dict(zip(digest.labels, found.dstate_at, strict=False))
     new = found.dstate_at[len(digest.labels) :]
     labels = (*(number[s] for s in ssh_map.dstate_at), *new)
@@ -308,7 +327,7 @@ def _of_all(found: SSHMap, digest: Digest, ssh_map: SSHMap, joint: Trace) -> SSH
 
 
 def _settled(found: Theory, theory: Theory) -> Theory:
-    """The settled theory without what pins the standing map."""
+    """Return the settled theory with the assertions of the user instead of those for a digest."""
     return found.replace(
         same=theory.same,
         different=theory.different,
@@ -320,8 +339,8 @@ def _settled(found: Theory, theory: Theory) -> Theory:
 def _contradiction(
     old: Trace, trace: Trace, ssh_map: SSHMap, digest: Digest, found: Solution
 ) -> SolverError:
-    """The error that says why the standing map cannot be kept, and what it would take."""
-    told, drives = "the standing map cannot be, as no map keeps it", drives_of(old)
+    """Make the error that says what contradicts the standing map, and what to do."""
+    told, drives = "no map keeps the standing map", drives_of(old)
     if found.maps:
         dstates, places = _broken(found.maps[0], digest, ssh_map)
         first = {s: t for t, s in reversed([*enumerate(ssh_map.dstate_at)])}

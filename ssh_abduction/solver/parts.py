@@ -1,4 +1,4 @@
-"""Hold together the parts of one search: what it knows, its engine, and its progress reports."""
+"""Holds the parts of one search: what it knows, its engine, and its progress reports."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class Parts:
 
     Attributes:
         limits: The limits of the search.
-        speedups: The speed-ups that the caller has on. `task.speedups` are those of them that are
-            exact for the theory.
+        speedups: The speed-ups that the caller has on. `task.speedups` has only those of them that
+            hold for the theory.
         watch: The clock of the search, with its limits.
         task: The trace and theory, as engines see them.
         known: What is known about the maps of the trace so far.
@@ -53,7 +53,7 @@ class Parts:
         self.watch = Watch(limits.time_limit, limits.memory_limit, self.report)
         self._on_progress = on_progress
         self._news: tuple[Cost | None, Bound] = (None, Bound())  # what the last report said
-        self.watch.start()  # comparing all pairs of steps may take long
+        self.watch.start()  # what follows compares pairs of steps, which may take long
         self.task = Task.of(problem, self.watch, speedups)
         self.known = Known(problem.theory)
         self.judging = Judging(problem)
@@ -69,7 +69,11 @@ class Parts:
         self.watch.stop()
 
     def _engine_after(self, after: Parts) -> Engine:
-        """The engine of a search for the first steps, if it can take more steps; else a new one."""
+        """Return the engine of an earlier search if it can take more steps, else a new engine.
+
+        Args:
+            after: The parts of the search for the first steps of the trace.
+        """
         self.watch.use_reserve()
         before = after.prefixes.engine
         is_outgrown = not before.goes_on or (isinstance(before, StepEngine) and may_name(self.task))

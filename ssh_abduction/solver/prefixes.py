@@ -25,14 +25,14 @@ has the same labels and links as the replayed R, and the same travels support it
 replayed R. Two different minimal maps of the prefix differ in the prefix, so they replay to
 different maps. ∎
 
-*Names for paths.* Grounding grows with the square of the number of names for paths. Most traces
-have far more segments than their maps have paths, so a control starts with a few names. Its minimum
-is right if no map with more paths can be as good. If the theory minimises paths first, this is so
-once there is any map. If it minimises dstates first, this is so once there are half as many names
-as the minimal map has dstates: every path has the two ends of a travel, and no dstate is along two
-paths. (Without the axiom course_needs_travel a path may have a single dstate. Then there must be as
-many names as dstates.) Otherwise the search makes a new control with more names. One name for each
-segment of the prefix is enough for any map.
+*Names for paths.* The size of the grounding grows with the square of the number of names for paths.
+Most traces have far more segments than their maps have paths, so a control begins with a few names.
+Its minimum is right if no map with more paths can be as good. If the theory minimises paths first,
+this holds as soon as there is a map. If it minimises dstates first, this holds if there are at
+least half as many names as the minimal map has dstates: each path has the two ends of a travel, and
+no dstate is along two paths. (Without the axiom course_needs_travel, a path may have a single
+dstate. Then there must be as many names as dstates.) Otherwise the search makes a new control with
+more names. One name for each segment of the prefix is enough for any map.
 
 A map whose replay stops early is no answer. A longer prefix shows how it continues. The claim needs
 determinism; one place, course and heading for each dstate; and axioms that a cut map still
@@ -61,14 +61,15 @@ from ssh_abduction.theory.evidence import Equality
 
 _log = log_of(__name__)
 
-FIRST_PREFIX = 8  # steps of the first prefix, which takes clingo no time
-# Hold at most this many maps until the prefix proves long enough. If there are more, give all of
-# them at once and the others as they come, so that memory stays constant.
+FIRST_PREFIX = 8  # steps of the first prefix; clingo solves it at once
+# Hold back at most this many maps until it is known that the prefix is long enough. If there are
+# more, yield them, and the others as they are found, so that memory stays constant.
 HELD_BACK = 1000
-# If all maps are wanted and evidence may reject some, remember up to this many maps. Until then,
-# forbid each rejected set of equalities and list anew. After that, skip rejected maps one by one.
+# If all maps are wanted and evidence may reject some of them: until this many maps are remembered,
+# forbid each rejected set of equalities and list the maps again. After that, only skip rejected
+# maps.
 REMEMBERED = 10_000
-# Names for paths to begin with. Few traces need more, and grounding grows with their square.
+# The number of names for paths to begin with. Few traces need more.
 FIRST_PATHS = 8
 
 
@@ -89,7 +90,7 @@ class Prefixes:
         most: int,
         report: Callable[[], None],
     ) -> None:
-        """Solve nothing yet.
+        """Prepare the search. `find_minimum` begins it.
 
         Args:
             task: The task of the search.
@@ -112,7 +113,7 @@ class Prefixes:
         self.start = len(task.trace) if self._at_once else FIRST_PREFIX
 
     def go_on_with(self, engine: Engine, start: int) -> None:
-        """Solve with another engine, from a prefix of `start` steps on."""
+        """Use another engine from now on, beginning with a prefix of `start` steps."""
         self.engine, self.start = engine, start
 
     def find_minimum(self) -> None:
@@ -123,7 +124,7 @@ class Prefixes:
         size, steps = min(len(self._task.trace), self.start), len(self._task.trace)
         while True:
             if size == steps:
-                self._task.watch.use_reserve(LAST)  # it was reserved for this search
+                self._task.watch.use_reserve(LAST)  # it was reserved for the whole trace
             _log.debug("%s is given %d of %d steps", type(self.engine).__name__, size, steps)
             self.engine.grow(size)
             minimal = self.minimise()
@@ -188,9 +189,10 @@ class Prefixes:
         return can_be_told and self.engine.forbid(equalities)
 
     def _minimise_as_told(self) -> Found | None:
-        """Find a minimal map of the prefix, not yet judged by evidence; None if there is none.
+        """Find a minimal map under the rules that the engine has; None if there is none.
 
-        Keep each better map of the whole trace that comes up on the way.
+        The evidence has not judged this map yet. If a map on the way replays to the end and is
+        better than the best known one, keep it.
         """
         while True:
             minimal = None
@@ -216,7 +218,7 @@ class Prefixes:
                 return minimal
 
     def _predicts_all(self, found: Found, replayed: Replay) -> bool:
-        """Whether a map of the prefix replays to the end, and no evidence rejects the result."""
+        """Whether a map of the prefix replays to the end, and no evidence rejects the whole map."""
         whole = replayed.outcome is Outcome.PREDICTED
         return whole and not self._judging.why_refused(self._whole(found.map, replayed))
 
@@ -240,8 +242,8 @@ class Prefixes:
 
     def minimal_maps(self) -> Iterator[SSHMap]:
         """Yield every minimal map once, after `find_minimum` has proven the minimal cost."""
-        streamed: list[int] = []  # sizes of the prefixes whose replayed maps were given
-        held: list[SSHMap] = []  # maps of this prefix that replay to the end
+        streamed: list[int] = []  # sizes of the prefixes whose maps were yielded
+        held: list[SSHMap] = []  # maps of this prefix that replay to the end, not yet yielded
         try:
             while True:
                 held.clear()
@@ -264,12 +266,12 @@ class Prefixes:
         whole trace.
 
         Args:
-            held: Gets the maps.
-            streamed: The sizes of earlier prefixes whose maps were given. Maps that already replay
-                from such a prefix are left out.
+            held: The list that gets the maps.
+            streamed: The sizes of earlier prefixes whose maps were yielded. Leave out maps that
+                already replay from such a prefix, as they were yielded, too.
 
         Returns:
-            The farthest step at which a replay fails; 0 if all minimal maps replay to the end.
+            The last step at which a replay fails; 0 if all minimal maps replay to the end.
         """
         enough = min(HELD_BACK, self._most + 1) if self._most else HELD_BACK
         asked = self._most and self._most + 1
@@ -314,7 +316,7 @@ class Prefixes:
                 continue
             if stuck or not asked or came < asked:
                 break
-            # clingo stopped at the number of maps asked for. But evidence rejected some of these,
+            # Clingo stopped at the number of maps asked for. But evidence rejected some of these,
             # so ask for more.
             asked *= 2
         if stuck and streaming:
@@ -324,8 +326,8 @@ class Prefixes:
     def _replay(self, ssh_map: SSHMap, known: int | None = None) -> Replay:
         """Replay the trace over a map of a prefix.
 
-        If stars (the openings seen at a step) need to agree only within tolerance, the stars of all
-        steps are compared at the end, too.
+        If stars (the openings seen at a step) need to agree only within their spread, also find out
+        at the end whether the stars of all steps fit the map.
 
         Args:
             ssh_map: The map.
@@ -357,7 +359,7 @@ class Prefixes:
     def _whole(self, ssh_map: SSHMap, replayed: Replay) -> SSHMap:
         """Extend a map of a prefix to all steps that a replay explains.
 
-        If stars need to agree only within tolerance, give the map headings that all stars allow.
+        If stars need to agree only within their spread, give the map headings that all stars allow.
         """
         whole = replace(ssh_map, dstate_at=replayed.labels)
         if not self._in_tolerance or len(ssh_map.dstate_at) == len(replayed.labels):

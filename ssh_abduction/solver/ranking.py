@@ -1,7 +1,7 @@
 """Rank equally minimal maps by how well their poses agree with the displacements of the trace.
 
 A map *closes* well if the displacements (how the robot moved, by its odometry) along each loop of
-the map nearly add up to nothing. `fit.py` measures this by a chi-square.
+the map nearly add up to zero. `fit.py` measures this by a chi-square.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ RANKED = 1000
 # Warn about the noise of the odometry only if the chi-square of the best map is so high, or so low,
 # that its probability is at most this.
 DOUBTED = 1e-3
-# Also warn only if standard deviations are too small by the first of these factors, or too large by
-# the second. Smaller errors change no answer.
+# Moreover, warn only if the standard deviations are too small by at least the first factor, or too
+# large by at least the second one. Smaller errors change no answer.
 TOO_SMALL, TOO_LARGE = 1.5, 2.0
 # With a displacement of at most this many standard deviations, the robot may have stood still.
 STANDING = 2.0
-NEVER_LESS = 0.01  # the least factor to name; if displacements agree exactly it would be 0
+NEVER_LESS = 0.01  # the least factor to name, as it would be 0 if displacements agree exactly
 
 OVERTIME = 0.3  # seconds beyond the limit for the fit of the first map
 
@@ -47,7 +47,7 @@ class Ranking:
         self._known: dict[_Key, Fit] = {}
 
     def fitted(self, ssh_map: SSHMap) -> SSHMap:
-        """The same map with its field `fit`: the poses, and how well they agree."""
+        """Return the same map with its field `fit`: the poses, and how well they agree."""
         from ssh_abduction.solver.fit import fit  # loads scipy
 
         key = ssh_map.dstate_at, tuple(s.place for s in ssh_map.dstates), jumped(ssh_map)
@@ -60,8 +60,8 @@ class Ranking:
 
         Args:
             maps: The maps as they are found. Only the first RANKED of them are sorted.
-            over: Returns whether a limit is over. From then on, maps get no fit and stay in their
-                order. Only the first map may use OVERTIME seconds more for its fit.
+            over: Returns whether a limit is reached. From then on, maps get no fit and keep their
+                order. Only the fit of the first map may take OVERTIME seconds more.
         """
         overtime = Watch(OVERTIME)
 
@@ -93,8 +93,8 @@ class Ranking:
 def in_order(maps: Sequence[SSHMap], counts: Iterable[int]) -> tuple[SSHMap, ...]:
     """Sort maps into an order that is the same in each run.
 
-    Maps with the least chi-square come first. Equal ones are sorted by labels, then by places,
-    paths, directions and faults.
+    Maps with the least chi-square come first. Maps with the same chi-square are sorted by labels,
+    then by places, paths, directions and faults.
 
     Args:
         maps: The maps, level by level. A level is the maps of one cost.
@@ -107,6 +107,7 @@ def in_order(maps: Sequence[SSHMap], counts: Iterable[int]) -> tuple[SSHMap, ...
 
 
 def _order(ssh_map: SSHMap) -> tuple[object, ...]:
+    """Return the key by which `in_order` sorts a map."""
     dstates = ssh_map.dstates
     places, paths = (
         [-1 if number is None else number for number in numbers]
@@ -124,9 +125,9 @@ def _order(ssh_map: SSHMap) -> tuple[object, ...]:
 
 
 def weights(maps: Sequence[SSHMap]) -> tuple[float, ...]:
-    """The probability of each map by displacements alone: exp(-chi2/2), so that the sum is 1.
+    """Return the probability of each map by displacements alone.
 
-    Empty unless all maps have a fit.
+    It is proportional to exp(-chi2/2), and the sum is 1. Empty unless all maps have a fit.
     """
     squares = [ssh_map.fit.chi2 for ssh_map in maps if ssh_map.fit]
     if not squares or len(squares) < len(maps):
@@ -136,7 +137,7 @@ def weights(maps: Sequence[SSHMap]) -> tuple[float, ...]:
 
 
 def noise_warning(fit: Fit | None, trace: Trace) -> str | None:
-    """A sentence that warns of a wrong noise model, if the best map contradicts it; else None.
+    """Return a warning if the best map contradicts the noise model of the odometry; else None.
 
     Args:
         fit: The fit of the best map; None if it has none.
@@ -148,8 +149,8 @@ def noise_warning(fit: Fit | None, trace: Trace) -> str | None:
     if 1 / TOO_LARGE < factor < TOO_SMALL:
         return None
     if factor < 1 and trace.odometry and trace.odometry.offset:
-        # The fit adds the error of a dstate's pose to every displacement there. That is too much,
-        # so a small chi-square says nothing.
+        # The fit adds the error of a dstate's pose to each displacement there, which is too much.
+        # So a small chi-square says nothing.
         return None
     how, told = ("smaller", "tight") if factor > 1 else ("larger", "loose")
     return (
@@ -161,10 +162,9 @@ def noise_warning(fit: Fit | None, trace: Trace) -> str | None:
 
 
 def units_warning(trace: Trace) -> str | None:
-    """A sentence that warns if all displacements are as small as their noise; else None.
+    """Return a warning if all displacements of travels are as small as their noise; else None.
 
-    This happens if displacements are in kilometres instead of metres. Only travels with a
-    displacement count. If there is none, there is no warning.
+    This happens if displacements are in kilometres instead of metres.
     """
     ways: list[float] = []
     sigmas: list[float] = []
@@ -192,4 +192,5 @@ def units_warning(trace: Trace) -> str | None:
 
 
 def _times(factor: float) -> str:
+    """Say a factor, or its inverse if that is larger, in words."""
     return f"{max(factor, 1 / factor):.1f} times"

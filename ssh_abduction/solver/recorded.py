@@ -27,7 +27,7 @@ from ssh_abduction.theory.theory import Theory
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """The parts of a solution's file that cannot be computed from its maps alone.
+    """The parts of a solution's file that do not follow from its maps alone.
 
     Attributes:
         certificate: The proof that no map has fewer dstates; None if the file has none.
@@ -37,7 +37,7 @@ class Recorded:
         explanation: Why there is no map, as in the file; None if the file does not say.
         joins: The joins of the first map that rest on minimality alone.
         drives: The drives of the trace; empty if the file does not say.
-        onto: The names of the drives whose map stood; empty if all drives were solved.
+        onto: The names of the old drives whose map had to be kept; empty if there are none.
     """
 
     certificate: Certificate | None
@@ -97,7 +97,7 @@ class Support:
         weighed: The costs in nats and the rival maps, if maps were compared by cost; else None.
         recorded: The certificate and warnings of the file, if the solution was read from a file;
             else None.
-        onto: The names of the drives whose map stood; empty if all drives were solved.
+        onto: The names of the old drives whose map had to be kept; empty if there are none.
     """
 
     basis: Basis | None = None
@@ -175,6 +175,7 @@ def joins_in(
 
 
 def _certificate(read: FieldReader, written: Mapping[str, Any], steps: int) -> Certificate:
+    """Read a certificate. Raises MapError."""
     clique, refuted = (
         tuple(
             _whole(read, x, f"certificate.{k}[{i}]") for i, x in enumerate(_list(read, written, k))
@@ -193,6 +194,7 @@ def _certificate(read: FieldReader, written: Mapping[str, Any], steps: int) -> C
 
 
 def _list(read: FieldReader, record: Mapping[str, Any], name: str) -> Sequence[Any]:
+    """Read a list from a field of a certificate. Raises MapError."""
     value = record.get(name)
     if not isinstance(value, list):
         raise read.wrong(f"certificate.{name}", "a list", value)
@@ -200,6 +202,7 @@ def _list(read: FieldReader, record: Mapping[str, Any], name: str) -> Sequence[A
 
 
 def _whole(read: FieldReader, value: Any, name: str) -> int:
+    """Read a whole number, 0 or more. Raises MapError."""
     number = read.integer(value, name)
     if number < 0:
         raise read.wrong(name, "a whole number, 0 or more", value)
@@ -291,6 +294,7 @@ def levels_in(read: FieldReader, record: Mapping[str, Any], maps: int) -> tuple[
 
 
 def _positive(read: FieldReader, value: Any, name: str) -> float:
+    """Read a number, 0 or more. Raises MapError."""
     number = read.number(value, name)
     if number < 0:
         raise read.wrong(name, "a number, 0 or more", value)

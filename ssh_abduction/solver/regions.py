@@ -28,8 +28,8 @@ from ssh_abduction.theory import encodings
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory
 
-# To derive the regions of a map of n dstates takes about STARTING + n² units of 3.5 microseconds.
-# A search spends at most FIRST units on its first map, and UNITS on all its other maps.
+# Deriving the regions of a map of n dstates takes about STARTING + n² units of 3.5 microseconds. A
+# search spends at most FIRST units on its first map, and UNITS on all its other maps.
 STARTING, FIRST, UNITS = 1000, 100_000, 30_000
 
 _Key: TypeAlias = tuple[tuple[object, ...], ...]
@@ -66,12 +66,12 @@ def with_regions(ssh_map: SSHMap, trace: Trace, theory: Theory | None = None) ->
 
 
 def axioms_for_regions(theory: Theory) -> frozenset[str]:
-    """The names of the axioms that derive regions: those of the theory and those of regions.lp."""
+    """Return the names of the axioms that derive regions: those of the theory and of regions.lp."""
     return frozenset({*theory.axioms, *(axiom.name for axiom in encodings.region_axioms())})
 
 
 def derived(ssh_map: SSHMap, trace: Trace, axioms: Collection[str]) -> tuple[Region, ...]:
-    """Derive the regions of a map by these axioms."""
+    """Derive the regions of a map of a trace by some axioms, given by name."""
     if not ssh_map.places:
         return ()
     look_at_clock()
@@ -92,7 +92,10 @@ class Deriving:
         self._left = UNITS
 
     def mapped(self, ssh_map: SSHMap) -> SSHMap:
-        """The same map with its regions; without them if it has no places, or too many dstates."""
+        """Return the same map with its regions.
+
+        If the map has no places, or too many dstates for the time left, it gets no regions.
+        """
         key = (
             tuple((s.place, s.path, s.direction) for s in ssh_map.dstates),
             ssh_map.links,

@@ -69,7 +69,8 @@ class Solution(MapSequence):
         cost: The counts of the first map; None if there is no map. All minimal maps share the
             counts that the theory minimises.
         bound: Proven lower bounds on the counts of any map.
-        complete: Whether no further map exists: no minimal one and, with `within`, none to list.
+        complete: Whether all maps are listed: all minimal ones and, with `within`, all others that
+            it asks for.
         theory: The theory. Each "auto" in it is replaced by the value that was used.
         steps: The number of steps of the trace.
         effort: What the search did: time, grounding, prefix, and evidence.
@@ -78,8 +79,8 @@ class Solution(MapSequence):
         within: The number of dstates above the minimum that a listed map may have.
         levels: The cost and the number of the minimal maps. With `within`, the same for each
             greater number of dstates.
-        shared: The backbone (what all minimal maps share) as the search found it, also from maps
-            that are not in `maps`; None if it is to be computed from `maps`.
+        shared: The backbone (what all minimal maps share) that the search found, also from maps
+            that are not in `maps`; None to compute it from `maps`.
         trace: The trace; None in a solution that was read from a file without its trace.
         support: The data behind the certificate and the warnings.
     """
@@ -111,7 +112,7 @@ class Solution(MapSequence):
         warnings = () if self.stopped == "interrupted" else self.warnings
         parts += [cards.paragraph(f"warning: {warning}") for warning in warnings]
         if self.count > 1:
-            title = f"{counted(self.count, 'maps')}, of which the first is shown"
+            title = f"{counted(self.count, 'maps')}; the first is shown below"
             parts.append(cards.folded(title, _table_of_maps(self)))
         if self.maps:
             parts.append(cards.map_card(self.maps[0]))
@@ -180,7 +181,7 @@ class Solution(MapSequence):
 
     @property
     def by_minimality(self) -> tuple[Join, ...]:
-        """The joins of the first map that rest on minimality alone, and imply all its others.
+        """The joins of the first map that rest on minimality alone and imply all others that do.
 
         A join is two steps at one place or one dstate (`ssh_abduction.checker.joins`). Empty if
         maps were weighed, as then `probability` says how sure a join is.
@@ -195,8 +196,8 @@ class Solution(MapSequence):
     def sureness(self) -> str:
         """How sure the first map is, in words; an empty text if there is nothing to say.
 
-        If maps were weighed, these are its probability and its most doubtful join. If they were
-        counted, these are the joins that rest on minimality alone.
+        If maps were weighed, the text gives its probability and its most doubtful join. If they
+        were counted, it gives the joins that rest on minimality alone.
         """
         if self.weighed is not None:
             return self.weighed.sentence
@@ -251,7 +252,7 @@ class Solution(MapSequence):
     def minimal_listed(self) -> bool:
         """Whether the search gave all minimal maps.
 
-        Unlike `complete`, this says nothing of the further maps that `within` asks for.
+        Unlike `complete`, this says nothing about the other maps that `within` asks for.
         """
         return self.complete or (bool(self.levels) and self.levels[0].complete)
 
@@ -288,15 +289,16 @@ class Solution(MapSequence):
     def certificate(self) -> Certificate | None:
         """The proof that no map has fewer dstates; None if the theory lacks an axiom for it.
 
-        It is computed at the first use. In a solution from a file it is the one of the file.
+        It is computed at the first use. A solution from a file has the certificate of the file.
         """
         return self.support.certificate
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Sentences that say what makes the trace suspicious.
+        """Sentences about what is suspicious in the trace.
 
-        One may name a step that looks like noise, another the noise or the units of the odometry.
+        They are about a step that looks like noise, and about the noise or the units of the
+        odometry.
         """
         if self.support.recorded is not None:
             return self.support.recorded.warnings
@@ -309,7 +311,7 @@ class Solution(MapSequence):
         """The step that looks like noise; None if there is no such step, or the map is small.
 
         Because of this step alone, most steps before it are dstates of their own. It is computed
-        at the first use; a solution from a file has None.
+        at the first use. In a solution that was read from a file it is None.
         """
         few = self.cost is not None and self.cost.dstates <= LEAST
         basis = self.support.basis
@@ -441,7 +443,7 @@ class Solution(MapSequence):
 
 
 def _checked_record(read: FieldReader, data: Any) -> Mapping[str, Any]:
-    """The fields of a solution, after a check that the data are one, in a readable version.
+    """Check that data are a solution in a version that can be read, and return its fields.
 
     Raises:
         MapError: They are not.
@@ -484,7 +486,7 @@ def _check_steps(
 
 
 def _table_of_maps(solution: Solution) -> str:
-    """An HTML table with a row for each map: its counts, and its chi-square if it has poses."""
+    """Return an HTML table with a row for each map: its counts, and perhaps its chi-square."""
     costs = solution.costs
     chi2 = [ssh_map.fit.chi2 if ssh_map.fit else None for ssh_map in solution.maps]
     columns: dict[str, list[object]] = {"map": [*range(1, solution.count + 1)]}

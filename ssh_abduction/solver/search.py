@@ -2,7 +2,7 @@
 
 A search makes a first map at once. Then it finds the minimal cost in stages (`stages.py`), and
 lists the maps of that cost (`map_list.py`). If it is stopped earlier, it makes some map of the
-whole trace (`fallback.py`). `prefixes.py` proves why it is enough to solve the first steps.
+whole trace (`fallback.py`). `prefixes.py` proves that it is enough to solve the first steps.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.speedups import ALL, Speedups, checked_speedups
 from ssh_abduction.theory.theory import Theory
 
-# A search for the maps of a mended trace may take at least this many seconds.
+# The time limit of a search for the maps of a mended trace is at least this many seconds.
 SHORTEST = 0.05
 # Without a time limit, the proof of what all minimal maps share may take this many seconds, or as
-# long as the search if that is more.
+# long as the search took if that is more.
 REASONING = 5.0
 if TYPE_CHECKING:
     from ssh_abduction.solver.weighing import Weighing
@@ -53,8 +53,8 @@ COUNTED = (
     "weigh: maps are counted instead of weighed, as the trace has no displacements whose misfit "
     "could be weighed"
 )
-# Maps are counted before they are weighed, for at most this share of the time. The fewest dstates
-# give the first map, and are seldom those of the best one.
+# Before maps are weighed, a map with the fewest dstates is sought for at most this share of the
+# time. It is a first map, and seldom the best one.
 COUNTING_SHARE = 0.4
 _log = log_of(__name__)
 
@@ -182,7 +182,7 @@ class Search:
 
     @property
     def complete(self) -> bool:
-        """Whether no further map exists: no minimal one and, with `within`, none to list."""
+        """Whether all maps were given: all minimal ones and, with `within`, all others."""
         return self._parts.known.complete
 
     @property
@@ -231,7 +231,7 @@ class Search:
         return self._given(None)
 
     def _given(self, ranking: Ranking | None) -> Iterator[SSHMap]:
-        """Yield the maps, those of one cost in the order of `ranking`; None keeps their order."""
+        """Yield the maps. `ranking` sorts maps of one cost; None keeps their order."""
         drives = drives_of(self.trace)
         for cost, level in groupby(self._found(), key=lambda priced: priced[1]):
             maps = (ssh_map for ssh_map, _ in level)
@@ -295,7 +295,7 @@ class Search:
         )
 
     def _weigh(self, weighing: Weighing) -> None:
-        """Find the maps of least cost: guess some, find some minimal map by counting, and prove."""
+        """Find the maps of least cost: guess some, find one with fewest dstates, and prove."""
         watch = self._parts.watch
 
         def maps_of(trace: Trace, theory: Theory) -> tuple[tuple[SSHMap, ...], bool]:
@@ -318,7 +318,7 @@ class Search:
     def _solve_mended(
         self, mended: Trace, theory: Theory, most: int, seconds: float
     ) -> tuple[tuple[SSHMap, ...], bool]:
-        """Solve a mended trace (one with its faults corrected) within the limits of this search.
+        """Solve a mended trace (its faults are corrected) within the limits of this search.
 
         Args:
             mended: The mended trace.
@@ -371,8 +371,8 @@ class Search:
     def over(self) -> bool:
         """Whether a limit is reached or the search was interrupted.
 
-        If the clock stands still, restart it: the caller still works with the maps, within the
-        same time limit.
+        If the clock stands still, restart it, as further work with the maps is under the same time
+        limit.
         """
         watch = self._parts.watch
         if not watch.running:
@@ -389,8 +389,9 @@ class Search:
         """Make the answer from what the search has proven and from the maps that the caller kept.
 
         Args:
-            maps: The maps that the answer holds. If all maps that were given are among them and no
-                minimal map is missing, they are sorted into an order that is the same in each run.
+            maps: The maps that the answer will hold. If they include all maps that the search gave,
+                and no minimal map is missing, they are sorted into an order that is the same in
+                each run.
         """
         solution = self._answer.solution(self._answer.in_order(checked_maps(maps)))
         if self._weighing is not None:
@@ -410,8 +411,8 @@ class Search:
         """
         one_of("stopped", stopped, get_args(Stop), SolverError)
         parts, known = self._parts, self._parts.known
-        # The other thread may change data while a sketch (a map without a search) reads them. If
-        # this raises, the answer has no sketch.
+        # The other thread may change data that the sketch (a map without a search) reads. If this
+        # raises an exception, the answer has no sketch.
         with suppress(Exception):
             if known.status in (Status.UNKNOWN, Status.FEASIBLE):
                 parts.candidates.sketch(OVERTIME)
@@ -420,7 +421,7 @@ class Search:
         if best is not None and known.status is Status.UNKNOWN:
             known.status = Status.FEASIBLE
         known.stopped = stopped
-        # clingo cannot say how large its program is while another thread is in it.
+        # Clingo cannot say how large its program is while another thread uses it.
         maps = () if best is None else (_told(best, self.trace, drives_of(self.trace)),)
         solution = self._answer.solution(maps, Grounding(0, 0))
         return replace(solution, complete=known.status is Status.UNSATISFIABLE)

@@ -1,7 +1,8 @@
 """Find what maps of one trace share: which steps are one in all, in some, or in none of them.
 
-Two steps are *one* if they are at one dstate, at one place, along one path, or along one course (a
-path in one direction). These are four *sorts*, and each sort is compared by itself.
+There are four *sorts* of things that two steps may share: a dstate, a place, a path, or a course (a
+path in one direction). Each sort is compared by itself. Two steps that share a thing of the sort
+are *one*.
 
 >>> from ssh_abduction.data.maps import DState, SSHMap
 >>> a, b = DState(0, "hall"), DState(1, "hall")
@@ -32,9 +33,9 @@ Pair: TypeAlias = tuple[int, int]
 Sort: TypeAlias = Literal["dstates", "places", "paths", "courses"]
 
 SORTS: tuple[Sort, ...] = ("dstates", "places", "paths", "courses")
-PRINTED = 1000  # print at most this many pairs of steps; further ones add little
+PRINTED = 1000  # write at most this many pairs of steps to a file
 NAMED = 6  # name at most this many stretches of steps in a sentence
-REMEMBERED = 10_000  # remember this many assignments of places, paths or courses that were compared
+REMEMBERED = 10_000  # remember this many assignments of names to classes, to compare each only once
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,9 +49,10 @@ class Shared:
 
     Attributes:
         always: A number for each step of the trace, counted from 0 in the order of first steps.
-        sometimes: Pairs of steps that are one in some maps only. Of all steps with one number, a
-            pair has the first.
-        untold: The steps in which the maps differ, if a file has only PRINTED of the pairs.
+        sometimes: Pairs of steps that are one in some maps only. Each of the two steps is the first
+            one with its number.
+        untold: The steps in which the maps differ, if `sometimes` was read from a file that does
+            not have all pairs.
     """
 
     always: tuple[int, ...]
@@ -76,8 +78,8 @@ class Shared:
     def differing(self) -> tuple[int, ...]:
         """The steps in which the maps differ, in order.
 
-        Such a step is one with an earlier step in some maps only, or it is always one with such a
-        step.
+        Such a step is one with an earlier step in some maps only, or it has the same number as such
+        a step.
         """
         if self.untold:
             return self.untold
@@ -85,10 +87,13 @@ class Shared:
         return tuple(t for t, number in enumerate(self.always) if number in numbers)
 
     def to_dict(self, steps: Iterable[int]) -> dict[str, Any]:
-        """The numbers of these steps, and all pairs, as plain data.
+        """Return the numbers of some steps, and the pairs, as plain data.
 
-        If there are more than PRINTED pairs, give only the first of them, their number, and the
-        steps in which the maps differ.
+        If there are more than PRINTED pairs, the data have only the first PRINTED, the number of
+        all pairs, and the steps in which the maps differ.
+
+        Args:
+            steps: The steps whose numbers are wanted.
         """
         more = (
             {"pairs": len(self.sometimes), "differing": list(self.differing)}
@@ -146,7 +151,7 @@ class Backbone:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """The backbone as plain data, as `solve --json` prints it (docs/reference/formats.md).
+        """Return the backbone as plain data, as `solve --json` prints it (reference/formats.md).
 
         There is a number for each step in "dstates". To save space, the other sorts have a number
         for each dstate only.
@@ -196,7 +201,7 @@ class Backbone:
 
 
 class Sharing:
-    """Takes in maps of one trace, one by one, and keeps what they share, in constant memory.
+    """Collects what maps of one trace share, in constant memory. The maps are added one by one.
 
     Steps that are one dstate in all maps so far form a *class*. In each of these maps, the steps of
     a class are at one place and along one course. So it is enough to compare the places and courses
@@ -215,7 +220,7 @@ class Sharing:
         self._kept: dict[Sort, Kept] = {}
 
     def absorb(self, ssh_map: SSHMap) -> None:
-        """Take in a map: keep only what it shares with all maps before."""
+        """Add a map: keep only what it shares with all earlier maps."""
         self.maps += 1
         if ssh_map.dstate_at != self._labels:
             self._split_by(ssh_map.dstate_at)
@@ -224,6 +229,7 @@ class Sharing:
             kept.absorb(names)
 
     def _sorts(self, dstates: Sequence[DState]) -> Mapping[Sort, Kept]:
+        """Return what is kept for each sort. The first map decides whether there are places."""
         if not self._kept:
             sorts = SORTS if any(s.place is not None for s in dstates) else SORTS[:1]
             self._kept = {sort: Kept(len(self._label_of)) for sort in sorts}
@@ -239,25 +245,25 @@ class Sharing:
             kept.split([before for before, _ in number])
 
     def firsts(self) -> list[int]:
-        """The first step of each class, by the number of the class."""
+        """List the first step of each class, in the order of the numbers of classes."""
         first: dict[int, int] = {}
         for t, number in enumerate(self.classes):
             first.setdefault(number, t)
         return list(first.values())
 
     def sorts(self) -> Iterable[Sort]:
-        """The sorts that are compared, such as "dstates"; none before the first map."""
+        """Return the sorts that are compared, such as "dstates"; none before the first map."""
         return self._kept
 
     def kept(self, sort: Sort) -> Kept:
-        """Which classes are one in all maps, and which in some, for one sort."""
+        """Return which classes are one in all maps, and which in some, for one sort."""
         return self._kept[sort]
 
     def backbone(self, *, proven: bool) -> Backbone:
         """Make the backbone from the maps so far.
 
         Args:
-            proven: Whether all minimal maps share it.
+            proven: Whether it is proven that all minimal maps share this.
         """
         found = {sort: self._shared(kept) for sort, kept in self._kept.items()}
         return Backbone(
@@ -265,6 +271,7 @@ class Sharing:
         )
 
     def _shared(self, kept: Kept) -> Shared:
+        """Turn what is kept about classes into what steps share."""
         number: dict[int, int] = {}
         always = tuple(number.setdefault(kept.always[c], len(number)) for c in self.classes)
         first: dict[int, int] = {}
@@ -298,7 +305,11 @@ class Kept:
         self._seen: set[tuple[Hashable, ...]] = set()
 
     def split(self, before: Sequence[int]) -> None:
-        """Replace the classes by parts of them. `before` gives the old class of each new class."""
+        """Replace the classes by parts of them.
+
+        Args:
+            before: For each new class, the old class that it is a part of.
+        """
         parts: dict[int, list[int]] = {}
         for new, old in enumerate(before):
             parts.setdefault(old, []).append(new)
@@ -336,12 +347,12 @@ class Kept:
 
 
 def _read_shared(data: Any, of_step: Sequence[int] | None, steps: int, where: str) -> Shared:
-    """Read what a file says about one sort.
+    """Read what a file says about one sort. Raises MapError.
 
     Args:
         data: The field of the file.
-        of_step: The dstate of each step, if the file has a number for each dstate. None if it has a
-            number for each step.
+        of_step: The number of the dstate of each step, if the file has one number for each dstate;
+            None if it has one number for each step.
         steps: The number of steps of the trace.
         where: The name of the field in error messages.
     """
@@ -374,10 +385,12 @@ def _read_shared(data: Any, of_step: Sequence[int] | None, steps: int, where: st
 
 
 def _are_steps(values: Sequence[Any], steps: int) -> bool:
+    """Whether all values are steps of a trace with this many steps."""
     return all(is_whole(t) and 0 <= t < steps for t in values)
 
 
 def _split(together: Iterable[Pair], parts: Mapping[int, Sequence[int]]) -> Iterator[Pair]:
+    """Replace each pair of old classes by all pairs of their parts, the smaller part first."""
     for i, j in together:
         for a in parts[i]:
             for b in parts[j]:
@@ -385,6 +398,7 @@ def _split(together: Iterable[Pair], parts: Mapping[int, Sequence[int]]) -> Iter
 
 
 def _name(dstate: DState, sort: Sort) -> Hashable:
+    """Return the name that a dstate has for a sort; None if it is along no path."""
     if sort == "dstates":
         return dstate.id
     if sort == "places":
@@ -395,6 +409,7 @@ def _name(dstate: DState, sort: Sort) -> Hashable:
 
 
 def _told_differing(sort: Sort, shared: Shared, steps: Sequence[int]) -> str:
+    """Say in which steps maps differ, for one sort. `steps` has the names of steps."""
     if len(shared.differing) == len(shared.sometimes) == 1:
         one = {
             "dstates": "one dstate",

@@ -29,19 +29,19 @@ class Stages:
     """
 
     def __init__(self, parts: Parts, solve_mended: Solver, *, goes_on: bool) -> None:
-        """Begin no stage yet.
+        """Prepare the stages, but begin none.
 
         Args:
             parts: The parts of the search. The results are added to `parts.known`.
             solve_mended: A function that solves a mended trace, see `mending.Solver`.
-            goes_on: Whether the search goes on from an earlier one for the first steps.
+            goes_on: Whether the search goes on from an earlier search for the first steps.
         """
         self.mends = False
         self.mended_maps: tuple[SSHMap, ...] | None = None
         self._parts, self._solve_mended, self._goes_on = parts, solve_mended, goes_on
 
     def make_first_map(self) -> None:
-        """Make a map quickly if the theory is causal. clingo then has to find a better one."""
+        """Make a map quickly if the theory is causal. Clingo then has to find a better one."""
         parts = self._parts
         if parts.known.status is not Status.OPTIMAL and (
             len(parts.task.trace) > choosing.FEW_STEPS
@@ -61,10 +61,10 @@ class Stages:
         engine, steps = parts.prefixes.engine, len(task.trace)
         if row("mending").holds_for(task.theory) and may_name(task) and self._mend():
             return
-        self.mends |= bool(task.theory.changed)  # no other engine than the readable one knows it
+        self.mends |= bool(task.theory.changed)  # only the readable encodings have changed gateways
         if self.mends and steps > choosing.READABLE:
             raise LimitError("no proof")
-        if parts.known.status is Status.OPTIMAL:  # another search proved a map minimal
+        if parts.known.status is Status.OPTIMAL:  # an earlier search proved a map minimal
             if not engine.size:
                 engine.grow(steps if engine.lists_least else min(steps, prefixes.FIRST_PREFIX))
             return

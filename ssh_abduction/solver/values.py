@@ -58,7 +58,7 @@ class Cost:
         return 10 * self.dstates + round(10 * self.faults)
 
     def preferred_by(self, theory: Theory) -> tuple[int, ...]:
-        """The counts that the theory minimises, the most important one first."""
+        """Return the counts that the theory minimises, the most important one first."""
         return tuple(getattr(self, name) for name in checked_theory(theory).priorities)
 
     def to_dict(self) -> dict[str, float]:
@@ -73,7 +73,7 @@ class Cost:
 
 
 def cost_as_counted(ssh_map: SSHMap, cost: tuple[int, ...], theory: Theory) -> Cost:
-    """The cost of a map, with the counts that the theory minimises taken from clingo.
+    """Return the cost of a map, with the counts that the theory minimises taken from clingo.
 
     Without some axioms, a dstate may have several places or paths, but a map shows only one. Then
     clingo counts more than the map shows.
@@ -93,9 +93,9 @@ def cost_as_counted(ssh_map: SSHMap, cost: tuple[int, ...], theory: Theory) -> C
 class Bound:
     """Proven lower bounds on the counts of every map of a trace.
 
-    A search proves a bound on the count that the theory minimises first. It proves none on the
-    other counts, as a map that is not minimal may have less of them. Each attribute is None if
-    nothing is proven.
+    A search proves a bound on the count that the theory minimises first. It proves no bound on the
+    other counts, as a map that is not minimal may have fewer places or paths. An attribute is None
+    if nothing is proven.
 
     Attributes:
         dstates: Lower bound on the dstates. For a search that was stopped, it is at least the
@@ -165,7 +165,7 @@ class Effort:
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """How many maps have one cost: the minimal one, or the best one for more dstates.
+    """The number of listed maps with one cost: the minimal cost, or the least for more dstates.
 
     Attributes:
         cost: The cost of the first of these maps. All of them share the counts that the theory
@@ -205,7 +205,7 @@ class Progress:
 
     @property
     def sentence(self) -> str:
-        """All of these values on one line."""
+        """These values on one line, in words."""
         best = (
             f"best {self.cost.dstates} dstates, {self.cost.places} places, {self.cost.paths} paths"
             if self.cost

@@ -17,10 +17,11 @@ from ssh_abduction.data.drives import Drive, named_steps
 from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.data.map_parts import FAULTS
 
-EQUAL = 1e-6  # costs in nats that differ by less are equal
-# The price of breaking axioms, in nats. A map that breaks them is said if it costs SAID less.
+EQUAL = 1e-6  # costs in nats that differ by less count as equal
+# The price of breaking axioms, in nats. Mention a map that breaks axioms only if it costs SAID nats
+# less than the best map.
 BROKEN, SAID = 12.0, 1.0
-MOST = 700.0  # exp of more nats is too large for a number
+MOST = 700.0  # exp of more nats overflows
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,8 +32,8 @@ class Rival:
         nats: Its cost, in nats.
         dstates: The dstate of each step, numbered by first visit.
         places: The place of each step, numbered by first visit; empty for a causal map.
-        estimated: Whether the map was made from the best one by taking a visit out of its place. It
-            fits the displacements, but may break an axiom.
+        estimated: Whether the map was made from the best one by giving visits a new place. It fits
+            the displacements, but may break an axiom.
         faults: The kind and the step of each fault, such as ("jumped", 7).
     """
 
@@ -56,16 +57,16 @@ class Weighed:
 
     Attributes:
         bound: A proven lower bound on the cost of every map, in nats.
-        within: All maps that cost less than this many nats more than the best one are in `rivals`.
-            0 if it is not proven that no map costs less.
+        within: `rivals` has all maps that cost less than this many nats more than the best one. 0
+            if it is not proven which map is the best.
         rivals: The maps that cost little more than the best one, the best one first. Estimated
-            ones come last.
+            maps come last.
         searched: Whether a broad beam of hypotheses ended with the best map, and its misfit is not
-            improbable. Such a map is seldom false, also if it is not proven to cost least.
-        broken: How many nats less a map costs that breaks axioms; 0 if none costs less than the
-            best map, -inf if none was sought.
-        excess: How many times as large the misfit is as the standard deviations say. Probabilities
-            divide costs by it.
+            improbable. Such a map is seldom false, even if it is not proven to be the best.
+        broken: By how many nats the best map that breaks axioms costs less than the best map; 0 if
+            it does not cost less, -inf if none was sought.
+        excess: The misfit of the best map, divided by the misfit that the standard deviations
+            predict. Costs are divided by it before they become probabilities.
         doubt: Why the costs cannot be trusted, such as "the track is unreliable"; None if they can.
         drives: The drives of the trace, which name steps in words; empty if they are unknown.
     """
@@ -86,7 +87,7 @@ class Weighed:
 
     @cached_property
     def weights(self) -> tuple[float, ...]:
-        """The probability of each rival, if there were no others."""
+        """The probability of each rival, if there are no other maps."""
         likely = [math.exp((self.nats - rival.nats) / self.excess) for rival in self.rivals]
         return tuple(weight / sum(likely) for weight in likely)
 
@@ -99,9 +100,10 @@ class Weighed:
     def confidence(self) -> float:
         """The probability of the best map among its rivals.
 
-        If it is neither proven to be the best nor `searched`, a map at the bound counts as one
-        more rival. Then the confidence is small, as such a map may cost much less. A map that
-        breaks axioms is a rival, too, at a price. If the costs are in `doubt`, it is 0.
+        If the best map is neither proven to be the best nor `searched`, a map that costs as little
+        as the bound is counted as one more rival. This makes the confidence small. A map that
+        breaks axioms is counted as a rival at a cost BROKEN nats higher. If there is a `doubt`, the
+        confidence is 0.
         """
         if self.doubt is not None:
             return 0.0
@@ -111,11 +113,11 @@ class Weighed:
         return 1 / (1 / self.weights[0] + unknown + broken)
 
     def probability(self, first: int, second: int, of: str = "dstate") -> float:
-        """The probability that two steps are at one dstate, or at one place, by the known rivals.
+        """Return the probability, by the known rivals, that two steps are at one dstate or place.
 
         Args:
             first: A step.
-            second: A step.
+            second: Another step.
             of: "dstate" or "place".
         """
         names = [r.dstates if of == "dstate" or not r.places else r.places for r in self.rivals]
@@ -127,10 +129,10 @@ class Weighed:
 
     @cached_property
     def joins(self) -> tuple[tuple[int, int, float], ...]:
-        """The joins of the best map, the least sure one first.
+        """The joins of the best map, each with its probability, the least probable one first.
 
-        A join is two steps at one place, with no step there in between, and its probability. In a
-        causal map the two steps are at one dstate.
+        A join is two steps at one place, with steps elsewhere in between. In a causal map the two
+        steps are at one dstate.
         """
         best = self.rivals[0]
         at, of = (best.places, "place") if best.places else (best.dstates, "dstate")
@@ -213,11 +215,12 @@ class Weighed:
 
 
 def _percent(probability: float) -> str:
-    """A probability with two digits, but never 1, as nothing is certain."""
+    """Return a probability with two digits as text, but never 1, as nothing is certain."""
     return "above 0.99" if probability >= 0.995 else f"{probability:.2f}"
 
 
 def _rival(read: FieldReader, value: Any, name: str, steps: int) -> Rival:
+    """Read a rival from the field `name`. Raises MapError."""
     record = read.mapping(value, name)
     dstates, places = (
         _names(read, record.get(field, default), f"{name}.{field}")
@@ -231,6 +234,7 @@ def _rival(read: FieldReader, value: Any, name: str, steps: int) -> Rival:
 
 
 def _faults(read: FieldReader, value: Any, name: str) -> tuple[tuple[str, int], ...]:
+    """Read the faults of a rival as pairs (kind, step). Raises MapError."""
     if not isinstance(value, list) or not all(
         isinstance(fault, list) and len(fault) == 2 and fault[0] in FAULTS for fault in value
     ):
@@ -239,12 +243,14 @@ def _faults(read: FieldReader, value: Any, name: str) -> tuple[tuple[str, int], 
 
 
 def _names(read: FieldReader, value: Any, name: str) -> tuple[int, ...]:
+    """Read the dstates or places of all steps, as numbers. Raises MapError."""
     if not isinstance(value, list):
         raise read.wrong(name, "a list of numbers", value)
     return tuple(read.integer(x, f"{name}[{i}]") for i, x in enumerate(value))
 
 
 def _number(read: FieldReader, record: Mapping[Any, Any], name: str, where: str) -> float:
+    """Read a finite number from a field of a record. Raises MapError."""
     value = record.get(name)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise read.wrong(f"{where}.{name}", "a number", value)

@@ -1,21 +1,20 @@
-"""Find the maps of least cost, and prove it: the prices of what a map has, and its misfit.
+"""Find the maps of least cost, and prove that none costs less.
 
-The cost of a map is the sum of the prices of its dstates, places, paths and faults, and half of the
-chi-square of its misfit to the displacements (`misfit.py`). A fault costs as much as some dstates.
+The cost of a map in nats is the sum of the prices of its dstates, places, paths and faults, plus
+half of the chi-square of its misfit to the displacements (`misfit.py`). The price of a fault is
+that of some dstates.
 
-*The search* is a logic-based Benders decomposition (Hooker & Ottosson 2003). clingo finds the map
-with the fewest dstates, and among these the fewest places and paths. It knows nothing of the
-misfit. If the map has returns whose misfit alone makes every map with them too expensive, clingo is
-told so: no map has all of these returns. Then it finds the next map. Its number of dstates never
-falls, so the prices of the last map bound the cost of all maps that are left. The search ends when
-this bound reaches the cost of the best map. If displacements may be wrong, a misfit excludes only
-maps that believe the displacements that cause it.
+*The search* is a logic-based Benders decomposition (Hooker & Ottosson 2003). Clingo finds the map
+with the fewest dstates, and among these the fewest places and paths. It does not know the misfit.
+If the misfit of some returns of this map makes each map with these returns too expensive, clingo
+gets a rule that excludes maps with all of them. Then it finds the next map. The number of dstates
+never falls from map to map. So the prices of the last map are a lower bound on the cost of all maps
+that are left. The search ends when this bound reaches the cost of the best map. If displacements
+may be wrong, a misfit excludes only maps that believe the displacements that cause it.
 
 *Rivals.* A map is too expensive if it costs at least `WITHIN` nats more than the best one. So all
-maps that cost less are found, and each weighs exp(-cost) beside the others.
-
-*Places* are not minimised first, so a bound on them comes from visits that are pairwise at
-different places by the evidence.
+cheaper maps are found, each with a probability proportional to exp(-cost). *Places* are not
+minimised first. Evidence gives their lower bound: steps that are pairwise at different places.
 """
 
 from __future__ import annotations
@@ -62,19 +61,19 @@ from ssh_abduction.theory.theory import Theory
 
 _log = log_of(__name__)
 
-# Maps that cost less than this many nats more than the best one are found: 100 times less probable.
+# Find all maps that cost less than this many nats more than the best one: these are less than 100
+# times less probable.
 WITHIN = math.log(100)
-# At most this many maps are kept. If there are more, fewer nats count.
+# Keep at most this many maps. If there are more, use fewer nats instead of WITHIN.
 RIVALS = 50
-# A misfit is improbable if a true map is worse with less than this probability.
+# A misfit is improbable if that of the true map exceeds it with less than this probability.
 IMPROBABLE = 0.01
-# Where the robot is off the poses of its dstates, by errors with heavy tails, a misfit may be this
-# many times as large as expected: standard deviations are 1.5 times too small.
+# If the robot may be off the poses of its dstates, by errors with heavy tails, a misfit may be this
+# many times as large as expected. Then standard deviations are 1.5 times too small.
 EXCESS = 2.25
-# Without a time limit, give the proof up when no better map was found for this many seconds, and
-# this many times as long as it took to find the best one.
+# Without a time limit, give up after PATIENCE seconds plus MORE times the time of the best map.
 PATIENCE, MORE = 10.0, 5.0
-# Estimating rivals ends OVERTIME seconds beyond the limit, but takes these numbers of seconds.
+# Estimating rivals may end OVERTIME seconds late. It gets LEAST_ESTIMATING to ESTIMATING seconds.
 OVERTIME, LEAST_ESTIMATING, ESTIMATING = 1.0, 0.1, 0.5
 
 # Lists the minimal maps of a trace and a theory within some seconds, and says whether they are
@@ -96,15 +95,11 @@ class Weighing:
     Attributes:
         candidates: The maps found that cost little more than the best one, the best one first.
         bound: A proven lower bound on the cost of every map, in nats.
-        proven: Whether the best map is proven to be one, and all its rivals are found.
+        proven: Whether it is proven that the best map is the best and all its rivals are found.
     """
 
     def __init__(self, parts: Parts) -> None:
-        """Search nothing yet.
-
-        Args:
-            parts: The parts of the search. Its stages may have found a map by counting.
-        """
+        """Prepare the search. `guess` and `search` do it."""
         self._parts = parts
         self._misfit = Misfit(parts.task.problem)
         self._prices = _prices_of(parts.task.theory)
@@ -116,7 +111,7 @@ class Weighing:
         self.proven = False
         self._of_labels: OfLabels | None = None
         self._beams = Beams(parts, self.add, self.keep_best)
-        self._improved = 0.0  # when the best map was found
+        self._improved = 0.0  # the seconds on the clock when the best map was found
 
     @property
     def best(self) -> Candidate | None:
@@ -132,8 +127,8 @@ class Weighing:
         """Find some maps of little cost without clingo, in a share of the time (`beams.py`).
 
         Args:
-            clashes: Says whether it is plain that the trace has no map. It is asked if the first
-                beam finds none.
+            clashes: Called if the first beam finds no map: returns whether a short proof shows that
+                the trace has none.
 
         Returns:
             Whether the trace may have a map.
@@ -174,10 +169,7 @@ class Weighing:
         self.keep_best()
 
     def keep_best(self) -> None:
-        """Make the map of least cost the best map of the search.
-
-        A map that the search made without weighing is weighed before.
-        """
+        """Make the map of least cost the best map of the search, after weighing the latter."""
         known = self._parts.known
         if known.best is not None:
             self.add(known.best)
@@ -190,7 +182,7 @@ class Weighing:
             known.keep(Found.of(best, self._parts.task.theory), best.dstate_at)
 
     def maps(self) -> Generator[Priced, None, None]:
-        """The maps of least cost, and then those that cost up to `within` nats more."""
+        """Yield the maps of least cost, then maps that cost up to `within` nats more."""
         parts, theory = self._parts, self._parts.task.theory
         complete = True
         listed: set[SSHMap] = set()  # Candidates with the same dstates and places list one another.
@@ -207,10 +199,10 @@ class Weighing:
                 yield candidate.map, Cost.of(candidate.map).preferred_by(theory)
 
     def _with_other_paths(self, ssh_map: SSHMap) -> tuple[tuple[SSHMap, ...], bool]:
-        """All maps with the dstates and places of a map, and as few paths; and whether it is all.
+        """List all maps that differ from a map only in its paths, and have as few of them.
 
-        They cost the same, as displacements say nothing about paths. They have the same wrong
-        displacements, and may have other faults.
+        They cost the same and have the same wrong displacements, but may have other faults. Also
+        return whether these are proven to be all.
         """
         task, wrong = self._parts.task, jumped(ssh_map)
         theory = task.theory
@@ -247,10 +239,13 @@ class Weighing:
         return nats
 
     def too_expensive(self, ssh_map: SSHMap) -> frozenset[Equality] | None:
-        """Returns of a map that no other map worth finding has; None if no such map is left.
+        """Add a map, and find equalities that exclude it, but no map that is still worth finding.
 
         Args:
-            ssh_map: The map that has the fewest dstates, places and paths of all maps left.
+            ssh_map: The map with the fewest dstates, places and paths of all maps left.
+
+        Returns:
+            Equalities: returns and believed displacements; None if no map left is worth finding.
         """
         look_at_clock()
         self._check_patience()
@@ -272,7 +267,7 @@ class Weighing:
         return frozenset((*returns, *believed)) or None
 
     def _check_patience(self) -> None:
-        """Without a time limit, raise LimitError if no better map was found for long."""
+        """Raise LimitError if there is no time limit and no better map was found for long."""
         watch = self._parts.watch
         if watch.left() == math.inf and watch.elapsed() > PATIENCE + MORE * self._improved:
             raise LimitError("no proof")
@@ -283,9 +278,9 @@ class Weighing:
         return self.candidates[0].nats + max(self._within, EQUAL)
 
     def _cost_of_others(self, ssh_map: SSHMap) -> float:
-        """A lower bound on the cost of all maps that are not before this one in clingo's order.
+        """Compute a lower bound on the cost of this map and of all maps after it in clingo's order.
 
-        The order is lexicographic: counts of a later map are equal up to one that is greater.
+        The order is lexicographic: the counts of a later map are equal up to one that is greater.
         """
         counts, priorities = Cost.of(ssh_map), self._parts.task.theory.priorities
         least = {name: self._least.get(name, 0) for name in self._prices}
@@ -302,7 +297,7 @@ class Weighing:
         return sum(price * counts.get(name, 0) for name, price in self._prices.items())
 
     def weighed(self) -> Weighed | None:
-        """What is known of the costs; None if no map is known."""
+        """Collect what is known about the costs of maps; None if no map is known."""
         if not self.candidates:
             return None
         rivals: dict[Course, Rival] = {}
@@ -321,9 +316,9 @@ class Weighing:
         )
 
     def _excess(self) -> float:
-        """How many times as large the misfit of the returns of the best map is as expected.
+        """Divide the misfit of the returns of the best map by the misfit that is expected.
 
-        It is 1 if the misfit is not improbable, and inf if it is too large to be trusted.
+        Return 1 if the misfit is not improbable, and inf if it is too large to be trusted.
         """
         best = self.candidates[0].map
         returns = self._misfit.returns_of(best)
@@ -335,7 +330,10 @@ class Weighing:
         return square / freedom if is_off and square <= EXCESS * freedom else math.inf
 
     def _estimated(self, best: Rival, known: Collection[Course]) -> Iterator[Rival]:
-        """Rivals that were not found. If all within some nats are, one below them breaks axioms."""
+        """Yield estimated rivals that the search did not find.
+
+        If it found all maps below a cost, estimated rivals below it break axioms: leave them out.
+        """
         least = best.nats + self._within if self.proven else -math.inf
         seconds = min(max(self._parts.watch.left() + OVERTIME, LEAST_ESTIMATING), ESTIMATING)
         for rival in estimated(best, self._misfit.visit, self._cost_like(best), seconds):
@@ -343,7 +341,7 @@ class Weighing:
                 yield rival
 
     def _cost_like(self, best: Rival) -> CostOf:
-        """Compute the cost of maps with the paths and faults of the best map."""
+        """Return a function for the cost of maps with the paths and faults of the best map."""
         prices, counts = self._prices, Cost.of(self.candidates[0].map)
         first, price = next(iter(prices.items()))
         units = _units_of(first)
@@ -360,9 +358,9 @@ class Weighing:
 
 
 def _prices_of(theory: Theory) -> dict[str, float]:
-    """The price of one of each count, in nats; the price of what is minimised first comes first.
+    """Return the price in nats of one unit of each count. The count minimised first comes first.
 
-    If faults are allowed, tenths of dstates are minimised: of dstates and faults together.
+    If faults are allowed, that is "tenths": the cost of dstates and faults in tenths of dstates.
     """
     dstate, place, path = theory.prices
     first = "tenths" if theory.has_faults else "dstates"
@@ -370,15 +368,15 @@ def _prices_of(theory: Theory) -> dict[str, float]:
 
 
 def _units_of(first: str) -> int:
-    """How many of what is minimised first a dstate costs."""
+    """Return how many units of the count minimised first a dstate is: 10 tenths, or 1 dstate."""
     return 10 if first == "tenths" else 1
 
 
 def _exactly(ssh_map: SSHMap) -> list[Equality]:
-    """For each two steps, whether they are one dstate, and whether they are at one place.
+    """List for each two steps whether they are at one dstate, and whether they are at one place.
 
-    Maps with faults may have other faults, and less of them, if more steps are one dstate. So only
-    the maps with the same dstates and places are excluded.
+    These equalities exclude only maps with exactly these dstates and places. A map with more
+    returns is not excluded, as it may have fewer faults.
     """
     dstates, places = course_of(ssh_map)
     found = []
@@ -389,7 +387,7 @@ def _exactly(ssh_map: SSHMap) -> list[Equality]:
 
 
 def _with(faults: Sequence[Fault], ssh_map: SSHMap) -> SSHMap:
-    """A map with some more faults."""
+    """Add faults to a map."""
     if not faults:
         return ssh_map
     both = sorted((*ssh_map.faults, *faults), key=lambda fault: (fault.step, fault.kind))
@@ -397,7 +395,7 @@ def _with(faults: Sequence[Fault], ssh_map: SSHMap) -> SSHMap:
 
 
 def _pinned(theory: Theory, ssh_map: SSHMap) -> Theory:
-    """The theory that counts, and demands the dstates of a map and its different places."""
+    """Return a theory that counts, and asserts the dstates and the different places of a map."""
     labels = ssh_map.dstate_at
     first = {label: labels.index(label) for label in dict.fromkeys(labels)}
     same = [(first[label], t) for t, label in enumerate(labels) if t != first[label]]
@@ -422,20 +420,20 @@ class _Judging(Judging):
         self._weighing = weighing
 
     def refusal(self, ssh_map: SSHMap) -> tuple[str, frozenset[Equality]] | None:
-        """The name of what rejects a map, and returns that no map left has; None to end here."""
+        """Return the evidence that rejects a map, or "cost", and equalities; None to end."""
         if (found := super().refusal(ssh_map)) is not None:
             return found
         returns = self._weighing.too_expensive(ssh_map)
         return None if returns is None else ("cost", returns)
 
     def why_refused(self, ssh_map: SSHMap) -> frozenset[Equality] | None:
-        """Returns that contradict evidence; None if no evidence rejects the map."""
+        """Return equalities of a map that contradict evidence; None if no evidence rejects it."""
         found = super().refusal(ssh_map)
         return found[1] if found else None
 
 
 def _engine(task: Task, parts: Parts) -> Engine:
-    """A new engine for the whole trace, of the kind that found maps by counting."""
+    """Make a new engine for the whole trace, of the kind that found maps by counting."""
     engine = new_engine(task)
     best = parts.known.best
     if isinstance(engine, StepEngine) and takes_all(task) and task.speedups.ways and best:

@@ -52,7 +52,7 @@ def summary_of(solution: Solution, count: int, backbone: Backbone | None) -> str
 
 
 def opening(theory: Theory, steps: int, within: int) -> dict[str, Any]:
-    """The fields of a solution's JSON that come before the maps, by name.
+    """Return the fields of a solution's JSON that come before the maps.
 
     Args:
         theory: The theory.
@@ -69,7 +69,7 @@ def opening(theory: Theory, steps: int, within: int) -> dict[str, Any]:
 
 
 def written_map(ssh_map: SSHMap, cost: Cost | None = None) -> dict[str, Any]:
-    """A map as it appears in a solution's JSON.
+    """Return a map as plain data, as it is in a solution's JSON.
 
     Args:
         ssh_map: The map.
@@ -79,14 +79,14 @@ def written_map(ssh_map: SSHMap, cost: Cost | None = None) -> dict[str, Any]:
 
 
 def written_trace(trace: Trace) -> dict[str, Any]:
-    """A trace as the file of its solution has it: the lines of its file, without images."""
+    """Return a trace as the file of its solution has it: the lines of its file, without images."""
     steps = tuple(replace(step, image=None, truth=None) for step in trace.steps)
     bare = replace(trace, steps=steps, images=None, drive=drives_of(trace)[0].name)
     return {"trace": [json.loads(line) for line in bare.to_lines()]}
 
 
 def ending(solution: Solution, count: int, backbone: Backbone | None) -> dict[str, Any]:
-    """The fields of a solution's JSON that come after the maps, by name.
+    """Return the fields of a solution's JSON that come after the maps.
 
     Args:
         solution: The solution.

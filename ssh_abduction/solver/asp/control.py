@@ -17,9 +17,9 @@ from ssh_abduction.solver.asp.limits import POLL, LimitError, Watch, peak_memory
 from ssh_abduction.solver.values import Grounding
 from ssh_abduction.theory import encodings
 
-# After grounding, clasp prepares the program and cannot be stopped. This takes about these shares
-# of the time and of the memory that grounding took. So begin no search if a limit would be reached
-# during the preparation.
+# After grounding, clasp prepares the program and cannot be stopped. This takes about these
+# multiples of the time and of the memory that grounding took. So do not begin a search if it would
+# reach a limit while it prepares.
 PREPARING = 0.6, 1.0
 
 SLOW = 0.05  # log the grounding if it takes more seconds than this
@@ -33,7 +33,7 @@ _under_way: set[clingo.SolveHandle] = set()  # the running searches of clingo, e
 def _end_all() -> None:
     """End all running searches of clingo when Python exits.
 
-    A search that nobody iterates to its end still has a thread, which would abort Python.
+    A search whose answers are not read to the end still has a thread. It would abort Python.
     """
     for handle in list(_under_way):
         handle.cancel()
@@ -41,9 +41,9 @@ def _end_all() -> None:
 
 @contextmanager
 def _held_back_interrupts() -> Iterator[None]:
-    """Hold back Ctrl-C and SIGTERM until this context ends, then handle the first that came.
+    """Hold back Ctrl-C and SIGTERM until this context ends. Then handle the first that came.
 
-    A signal that came while clingo starts a thread would leave a thread that nothing ends.
+    If a signal is handled while clingo starts a thread, nothing ends this thread.
     """
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     held = {number: handler for number, handler in handlers.items() if callable(handler)}
@@ -73,8 +73,8 @@ class Control(clingo.Control):
     once would wait for each other at each symbol and take three times as long.
 
     Attributes:
-        preparing: The shares of the time and of the memory of grounding that clasp needs to
-            prepare the program, as PREPARING.
+        preparing: What clasp needs to prepare the program, as PREPARING: multiples of the time and
+            of the memory that grounding took.
         seconds: The seconds that clingo has grounded since it last began to solve.
         mebibytes: The memory in MiB that this grounding added.
     """
@@ -91,8 +91,8 @@ class Control(clingo.Control):
             options: Command-line options of clingo.
             check: A function that is called now and then while clingo grounds an encoding with
                 `@go_on`. If it raises an exception, the grounding ends and the control is unusable.
-            preparing: The shares of the time and of the memory of grounding that clasp needs to
-                prepare the program.
+            preparing: What clasp needs to prepare the program: multiples of the time and of the
+                memory that grounding took.
         """
         super().__init__(["--warn=none", *options])
         self.preparing = preparing
@@ -114,7 +114,7 @@ class Control(clingo.Control):
             super().load(path)
 
     def load_encodings(self, *names: str) -> None:
-        """Load encodings by their names, each after the files that it shares with others."""
+        """Load encodings by their names, each with the files that it needs."""
         for name in names:
             for path in encodings.paths(name):
                 self.load(path)
@@ -135,6 +135,7 @@ class Control(clingo.Control):
     def _ground_alone(
         self, parts: Sequence[tuple[str, Sequence[clingo.Symbol]]], context: Any, asked: _Asked
     ) -> None:
+        """Ground program parts, and add up the time and the memory that this takes."""
         began, before = time.perf_counter(), peak_memory()
         try:
             super().ground(parts, context or asked)
@@ -209,7 +210,7 @@ class Asker:
     def grounding(self) -> Grounding:
         """The numbers of rules and atoms in the last search of clingo that ended; 0 before it.
 
-        To get them takes a millisecond, as clingo returns all its statistics.
+        This takes a millisecond, as clingo returns all its statistics.
         """
         try:
             program = self.control.statistics["problem"]["lp"]
@@ -230,10 +231,11 @@ class Asker:
         until: Callable[[], bool] = lambda: False,
         ahead: bool = False,
     ) -> Generator[Answer, None, bool]:
-        """Yield what `read` makes of each answer of clingo, as soon as the answer comes.
+        """Let clingo search, and yield each answer as soon as it comes, as a value of `read`.
 
         Args:
-            read: Makes a value from an answer at once, as clingo changes the answer afterwards.
+            read: Makes a value from an answer. It is called at once, as clingo changes the answer
+                afterwards.
             mode: The value of clingo's option --opt-mode, such as "opt" or "optN".
             models: The number of answers to ask for; 0 for all.
             assumptions: Literals that hold in each answer.
@@ -244,8 +246,8 @@ class Asker:
             ahead: Whether clingo searches for the next answer while the caller uses this one.
 
         Returns:
-            Whether the list of answers is complete: neither `conflicts` nor `until` ended the
-            search, and there is no further answer.
+            Whether the search was exhaustive: neither `conflicts` nor `until` ended it, and there
+            is no further answer.
 
         Raises:
             LimitError: A limit is reached.
@@ -312,7 +314,10 @@ class Asker:
         conflicts: int,
         on_bound: Callable[[Sequence[int]], None] | None = None,
     ) -> Iterator[clingo.SolveHandle]:
-        """Run a search of clingo in a thread of its own. The search ends with this context."""
+        """Run a search of clingo in its own thread. It ends with this context.
+
+        Arguments are as for `Asker.answers`. `project` is clingo's option of that name.
+        """
         configuration: Any = control.configuration.solve
         configuration.opt_mode, configuration.models, configuration.project = mode, models, project
         configuration.solve_limit = f"{conflicts},-1"
@@ -362,7 +367,7 @@ def mapped(
     """Yield the result of a function for each answer.
 
     Returns:
-        What the generator `answers` returns: whether the answers are complete.
+        What `Asker.answers` returns: whether the search was exhaustive.
     """
     with closing(answers):
         while True:
@@ -374,7 +379,7 @@ def mapped(
 
 
 def _result(handle: clingo.SolveHandle, conflicts: int) -> clingo.SolveResult:
-    """The result of a search that has ended.
+    """Return the result of a search that has ended.
 
     Raises:
         LimitError: The search was interrupted, although it had no limit of conflicts.
@@ -401,7 +406,7 @@ def new_control(encoding: str, base: str, options: Sequence[str]) -> Control:
 
 
 def has_processors() -> bool:
-    """Whether there are two processors, so that another process can work meanwhile."""
+    """Whether there are two processors, so that two processes can work at the same time."""
     from joblib import cpu_count  # loads slowly
 
     return bool(cpu_count() > 1)

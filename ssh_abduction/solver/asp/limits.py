@@ -11,14 +11,14 @@ from typing import Literal, TypeAlias
 
 from ssh_abduction.data.errors import SolverError, brief, is_finite
 
-# The search for minimal maps of prefixes ends when this share of the time limit is left. It is
-# reserved for finding any map of the whole trace, minimal or not.
+# The search for minimal maps of prefixes ends when this share of the time limit is left. The rest
+# of the time is reserved for finding any map of the whole trace, minimal or not.
 RESERVE = 0.2
 # If a search of the whole trace has found no map, it ends when this share of the time limit is
-# left. It is reserved for making a map without a search.
+# left. The rest of the time is reserved for making a map without a search.
 LAST = 0.05
-# Seconds between two checks of the clock and of Ctrl-C while clingo is busy. A limit may be overrun
-# by a second, and a check takes far less than this.
+# Seconds between two checks of the clock and of Ctrl-C while clingo is busy. Limits may be exceeded
+# by a second, and a check takes far less time than this.
 POLL = 0.05
 # Seconds between two reports of progress. A person cannot read them faster.
 TICK = 0.5
@@ -98,18 +98,21 @@ class Watch:
 
     @property
     def running(self) -> bool:
+        """Whether the clock runs."""
         return self._started is not None
 
     def use_reserve(self, last: float = 0.0) -> None:
         """Allow the search to use the reserved part of the time limit, too.
 
         Args:
-            last: The share of the limit that stays reserved; no effect if it is already in use.
+            last: The share of the limit that stays reserved. Time that is already allowed stays
+                allowed.
         """
         if self._limit is not None and self._allowed is not None:
             self._allowed = max(self._allowed, self._limit * (1 - last))
 
     def stop(self) -> None:
+        """Stop the clock. `start` lets it go on."""
         self._spent, self._started = self.elapsed(), None
 
     @property
@@ -130,14 +133,15 @@ class Watch:
 
     @property
     def stage_ends(self) -> float:
-        """What the clock shows when the present stage ends; infinity for no end."""
+        """The seconds on the clock at which the present stage ends; infinity for no end."""
         return self._stage_ends
 
     def end_stage_after(self, seconds: float) -> None:
-        """Let `check` raise StageTimeError once, when the clock shows this many seconds."""
+        """Let `check` raise StageTimeError once, as soon as the clock shows this many seconds."""
         self._stage_ends = seconds
 
     def elapsed(self) -> float:
+        """Return the seconds on the clock."""
         return self._spent + (0 if self._started is None else time.perf_counter() - self._started)
 
     def check(self, ahead: float = 0.0, mebibytes: float = 0.0) -> None:
@@ -169,25 +173,25 @@ class Watch:
         return self._allowed is None or self.elapsed() + seconds <= self._allowed
 
     def memory_left(self) -> float | None:
-        """The MiB that are left until the memory limit; None for no limit."""
+        """Return the MiB that are left until the memory limit; None for no limit."""
         if self._memory is None:
             return None
         return self._memory - peak_memory()
 
     def left(self) -> float:
-        """The seconds that are left until the time limit; infinity for no limit."""
+        """Return the seconds that are left until the time limit; infinity for no limit."""
         return math.inf if self._limit is None else self._limit - self.elapsed()
 
 
 def resident_memory() -> float:
-    """The memory in MiB that this process uses now; its peak if the system does not tell."""
+    """Return the memory in MiB that this process uses now; its peak if the system has no /proc."""
     with suppress(OSError, StopIteration), open("/proc/self/status", "rb") as status:
         return next(int(line.split()[1]) for line in status if line.startswith(b"VmRSS:")) / 2**10
     return peak_memory()
 
 
 def peak_memory() -> float:
-    """The largest memory in MiB that this process has used.
+    """Return the largest memory in MiB that this process has used.
 
     On Linux this reads /proc, as getrusage there also counts what the parent process used.
     """

@@ -1,8 +1,8 @@
 """Check whether a map satisfies a user's own rules.
 
-The checker does not know such rules, but clingo does: it grounds them with the content of the map
-as facts. If the rules read only what a map shows, clingo has no choices except those in the rules
-themselves. So the check takes hardly longer than grounding.
+The checker does not know such rules. So clingo checks them: it grounds them with the content of the
+map as facts. If the rules read only what a map shows, clingo has no choices except those in the
+rules themselves. So the check takes hardly longer than grounding.
 
 >>> from ssh_abduction import Theory, Trace, solve
 >>> from ssh_abduction.solver.asp.own import keeps_own_rules
@@ -65,9 +65,10 @@ FRAME = """
 
 
 def can_be_asked(theory: Theory) -> bool:
-    """Whether `keeps_own_rules` can check the rules of a theory.
+    """Whether `keeps_own_rules` can check the rules of a theory in which no field is "auto".
 
-    It can if the rules read only what a map and a trace show. No field may be "auto".
+    It can if the rules read only what a map and a trace show. Maps with faults, or with partial
+    orders of paths, do not show all that rules may read.
     """
     if not theory.rules:
         return True
@@ -78,7 +79,7 @@ def can_be_asked(theory: Theory) -> bool:
 
 
 def keeps_own_rules(problem: Problem, ssh_map: SSHMap) -> bool:
-    """Whether a map satisfies the user's own rules. First make sure that `can_be_asked` is true.
+    """Whether a map satisfies the user's own rules. Call this only if `can_be_asked` is True.
 
     Args:
         problem: The trace, and its theory with the rules.

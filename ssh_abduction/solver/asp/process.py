@@ -1,7 +1,8 @@
 """Run a Python function in a process of its own, so that it can use a second processor.
 
-Guesses run beside the main search. Both are mostly Python, and only one thread at a time runs
-Python or grounds (`asp/control.py`). So as two threads both would take three times as long.
+Guesses run at the same time as the main search. Both are mostly Python, and only one thread at a
+time can run Python, or ground (`asp/control.py`). As two threads of one process, both would take
+three times as long.
 """
 
 from __future__ import annotations
@@ -115,7 +116,7 @@ def serve() -> None:
 
 
 def _end_with_input() -> None:
-    """Exit when stdin closes, as the parent process has exited then."""
+    """Exit when stdin closes, which means that the parent process has exited."""
     while os.read(0, 1):
         pass
     os._exit(1)

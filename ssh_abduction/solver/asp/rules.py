@@ -23,7 +23,7 @@ from ssh_abduction.theory import encodings
 from ssh_abduction.theory.rules import Rules
 from ssh_abduction.theory.theory import Theory
 
-# The predicates of the facts of a trace, which are added step by step.
+# The predicates of the facts of a trace. These facts are added step by step.
 OF_STEPS = {"view", "act", "kind", "turns", "open", "excluded", "elsewhere", "one", "together"}
 READABLE = {"axiom", "path", "prefer", "defeasible"}  # the predicates of a theory's facts
 # The program parts that are grounded, with the number of their parameters.
@@ -94,8 +94,8 @@ def _check(rules: Rules, others: tuple[Rules, ...], files: tuple[str, ...]) -> N
             )
         for function in _functions_of_python(statement):
             raise TheoryError(
-                f"{where}: expected what clingo works out by itself, got {function}, "
-                "a function of Python's; say it in rules"
+                f"{where}: expected rules without functions of Python, got {function}; "
+                "write rules that derive its value"
             )
         if statement.ast_type is not ast.ASTType.Rule:
             continue
@@ -121,8 +121,8 @@ def _check(rules: Rules, others: tuple[Rules, ...], files: tuple[str, ...]) -> N
             name = atom.name
             if name in of_steps and part == "base":
                 raise TheoryError(
-                    f"{where}: {name}: expected in a program part of steps, as what is in base is "
-                    "read before there are steps; write #program step(t). before the rule"
+                    f"{where}: {name}: expected in a program part of steps, as the part base is "
+                    "grounded before there are steps; write #program step(t). before the rule"
                 )
             if name not in known | own | defined | OF_STEPS | READABLE:
                 raise TheoryError(
@@ -153,7 +153,7 @@ def _check(rules: Rules, others: tuple[Rules, ...], files: tuple[str, ...]) -> N
 
 
 def read_by(rules: Rules, every: Iterable[Rules]) -> frozenset[str]:
-    """The names of the predicates that a file of rules reads but no file of rules defines.
+    """Return the names of the predicates that a file of rules reads but no file of rules defines.
 
     Args:
         rules: The file, which passed `check_rules`.
@@ -213,7 +213,7 @@ def _statements(rules: Rules) -> list[tuple[ast.AST, str, str]]:
 
 
 def _said(rules: Rules, messages: list[str]) -> str:
-    """The message of an error: what clingo says about rules, and an example, on one line."""
+    """Return an error message: what clingo says about rules, and an example, on one line."""
     said = " ".join(messages[0].split()) if messages else "clingo cannot read them"
     said = re.sub(r"^<[^>]*>", lambda _: rules.name, said)
     said = said if said.startswith(rules.name) else f"{rules.name}: {said}"
@@ -241,7 +241,7 @@ def _check_safety(*files: Rules) -> None:
 def _predicates(
     files: tuple[str, ...],
 ) -> tuple[frozenset[str], frozenset[str], dict[str, frozenset[int]]]:
-    """The predicates of some encodings.
+    """Find the predicates of some encodings.
 
     Returns:
         The names of the predicates about steps; the names of all predicates that the encodings
@@ -323,6 +323,7 @@ def _atoms_in(node: ast.AST, positive: bool = True) -> Iterator[tuple[ast.AST, b
 
 
 def _children(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield the children of a node of a syntax tree."""
     for key in node.child_keys:
         child = getattr(node, key)
         yield from (
@@ -341,16 +342,18 @@ def _functions_of_python(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def _counted(numbers: frozenset[int]) -> str:
+    """Say how many arguments are possible, such as "2 or 3 arguments"."""
     return f"{' or '.join(map(str, sorted(numbers)))} arguments"
 
 
 def _is_settled(term: ast.AST, parameter: str) -> bool:
-    """Whether a term contains no variable and not the parameter of its program part."""
+    """Whether a term contains neither a variable nor the parameter of its program part."""
     if term.ast_type is ast.ASTType.Variable or str(term) == parameter:
         return False
     return all(_is_settled(child, parameter) for child in _children(term))
 
 
 def _short(statement: ast.AST) -> str:
+    """Return a statement as text of at most 60 characters."""
     text = " ".join(str(statement).split())
     return text if len(text) <= 60 else f"{text[:57]}…"

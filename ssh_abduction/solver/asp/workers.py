@@ -33,7 +33,7 @@ _BEGIN = b"\0ssh-abduction answers\n"  # whatever Python prints before this is n
 
 
 class Lost(NamedTuple):
-    """Says that a task has no answer, as its process ended, or was killed because it was late.
+    """Takes the place of an answer if the process of a task ended, or was killed as it was late.
 
     `number` is the number of the task. `late` says whether it took too long.
     """
@@ -50,7 +50,7 @@ class Worker:
     """
 
     def __init__(self, folder: str) -> None:
-        """Start a process, which makes its temporary files in this folder."""
+        """Start a process that makes its temporary files in a folder."""
         self.deadline: float | None = None
         self._late = False
         self._process = subprocess.Popen(
@@ -74,10 +74,11 @@ class Worker:
 
     @property
     def is_alive(self) -> bool:
+        """Whether the process runs."""
         return self._process.poll() is None
 
     def done(self, number: int, work: Callable[..., Any], arguments: tuple[object, ...]) -> Any:
-        """Let the process call `work`, and return the result of `work`; Lost if the process ends.
+        """Let the process call `work`. Return the result of `work`, or Lost if the process ends.
 
         Args:
             number: The number of the task, for Lost.
@@ -101,21 +102,23 @@ class Worker:
             self.deadline = None
 
     def _lost(self, number: int) -> Lost:
+        """Wait for the end of the process, and return Lost for a task."""
         self._process.kill()
         self._process.wait()
         return Lost(number, self._late)
 
     def give_up(self) -> None:
-        """Ask the process to end its current task soon. It must get no further task."""
+        """Ask the process to end its current task soon. Do not give it another task."""
         self._send(None)
 
     def end_if_late(self) -> None:
-        """Kill the process if its deadline is over."""
+        """Kill the process if its deadline has passed."""
         if self.deadline is not None and time.monotonic() > self.deadline:
             self._late = True
             self.kill()
 
     def kill(self) -> None:
+        """Kill the process."""
         self._process.kill()
 
     def _send(self, message: object) -> None:
@@ -139,9 +142,9 @@ def answers(
         work: The function to call, as in `Worker.done`.
         tasks: The arguments of `work` for each task. The first one is the number of the task.
         processes: The number of processes that work at once.
-        stopped: Returns whether to end. Once it does, no task begins, and running tasks are asked
-            to end soon.
-        seconds: The time for a task. After it the process is killed. None for no limit.
+        stopped: Returns whether to stop. Once it returns True, no further task begins, and running
+            tasks are asked to end soon.
+        seconds: The time for a task, after which its process is killed; None for no limit.
         patience: The seconds that a running task may take after it was asked to end.
     """
     waiting = queue.SimpleQueue[tuple[Any, ...]]()
@@ -149,7 +152,7 @@ def answers(
         waiting.put(task)
     ready = queue.SimpleQueue[Any]()  # answers, and None for each thread that ends
     workers: list[Worker | None] = [None] * processes
-    over = threading.Event()  # set when nobody waits for answers any more
+    over = threading.Event()  # set when the caller wants no more answers
     folder = tempfile.TemporaryDirectory(prefix="ssh-abduction-", ignore_cleanup_errors=True)
 
     def run(place: int) -> None:
@@ -158,7 +161,7 @@ def answers(
                 task = waiting.get_nowait()
                 before = workers[place]
                 worker = workers[place] = _living(before, folder.name)
-                if over.is_set():  # this worker may have begun after the others were ended
+                if over.is_set():  # perhaps the other workers have been ended already
                     worker.end()
                     break
                 if seconds is not None:
@@ -221,7 +224,7 @@ def _end(workers: Sequence[Worker], threads: Sequence[threading.Thread]) -> None
 
 
 class _Work:
-    """The tasks that a worker process receives. When stdin closes, deletes the folder and exits."""
+    """Receives the tasks of a worker process. When stdin closes, deletes the folder and exits."""
 
     def __init__(self, folder: str) -> None:
         self._folder = folder
@@ -242,9 +245,11 @@ class _Work:
             os._exit(1)
 
     def is_given_up(self) -> bool:
+        """Whether the parent process asked to end the current task soon."""
         return self._given_up
 
     def next(self) -> tuple[Callable[..., Any], tuple[object, ...]]:
+        """Wait for the next task, and return its function and arguments."""
         return self._waiting.get()
 
 
@@ -254,7 +259,8 @@ _outputs: list[BinaryIO] = []  # the stream for answers, in a worker process
 def reply(answer: object) -> None:
     """Send the answer of the current task to the parent process.
 
-    A task that calls this itself has to end the process afterwards.
+    `serve` does this for each task. A task that calls it directly has to end the process
+    afterwards.
     """
     pickle.dump(answer, _outputs[0])
     _outputs[0].flush()
