@@ -139,6 +139,7 @@ def features_of(trace: Trace) -> ReciprocalTransformer | PanoramaTransformer:
 
 
 def _bright(images: Any) -> NDArray[np.float64]:
+    """Check that no value of some images is negative. Raises PerceptionError."""
     if (images < 0).any():
         raise PerceptionError(
             f"images: expected values of 0 or more, got {images.min():g} (Negative values in "
@@ -148,6 +149,7 @@ def _bright(images: Any) -> NDArray[np.float64]:
 
 
 def _numbers(name: str, given: Any, count: int) -> tuple[int, ...]:
+    """Check that a setting is `count` whole numbers of at least 1. Raises PerceptionError."""
     if (
         not isinstance(given, list | tuple)
         or len(given) != count

@@ -138,6 +138,10 @@ def _neighbours(
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """For each image, find the nearest other image of its dstate and of the other dstate.
 
+    Args:
+        images: (n, d) images of two dstates.
+        second: (n,) whether each image is of the second dstate.
+
     Returns:
         Two arrays, (n,), of indices of images.
     """

@@ -151,6 +151,7 @@ class Recorder:
         self._add(world, pose, way / parts, abs(turned) / parts)
 
     def _add(self, world: World, pose: Pose, way: float, turned: float) -> None:
+        """Record a pose after a motion of `way` metres and `turned` radians; scan if one is due."""
         self.metres += way
         self._seconds.append(
             (self._seconds[-1] if self._seconds else 0.0) + way / SPEED + turned / SPIN

@@ -140,6 +140,7 @@ class Robot:
 
 
 def _moved(pose: Pose, forward: float, turn: float) -> Pose:
+    """Move a pose forward by metres, while it turns by radians counterclockwise."""
     x, y, heading = pose
     middle = heading + turn / 2
     return (

@@ -161,6 +161,7 @@ class Watch:
         return f". Likely cause: {'; or '.join(found)}" if found else ""
 
     def _causes(self, before: Pose) -> Iterator[str]:
+        """Yield a clause for each likely cause of an error, with advice in brackets."""
         world, body = self.world, self.driver.robot.body
         if world.own_reach is not None and world.own_reach != world.reach:
             yield (

@@ -441,7 +441,7 @@ def test_the_shell_prints_a_table(solved: str, capsys: pytest.CaptureFixture[str
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "none of 4 maps is the true one"
     assert (
-        lines[1] == "the truth, told at 23 of 23 steps: 22 dstates, 9 places; "
+        lines[1] == "the truth, known at 23 of 23 steps: 22 dstates, 9 places; "
         "13 % of the pairs of dstates share a view"
     )
     assert re.sub(r"  +", "|", lines[3]).startswith("|1|no|19 wrong|10 wrong|–|0.826|")
@@ -469,7 +469,7 @@ def test_the_shell_says_which_map_is_true(
     assert main(["evaluate", *files]) == 0
     out = capsys.readouterr().out
     assert out.startswith(
-        "map 1 is the true one, of 1 map\nthe truth, told at 25 of 25 steps: 8 dstates; 14 % of"
+        "map 1 is the true one, of 1 map\nthe truth, known at 25 of 25 steps: 8 dstates; 14 % of"
     )
     assert (
         re.sub(r" +", " ", out.splitlines()[-1]) == " 1 yes 8 right – – 1.000 – – – – 1.000 1.000"

@@ -90,6 +90,7 @@ class _Relations:
 
 
 def _relations(found: Sequence[Closing], first: Imported, last: Imported) -> _Relations:
+    """Collect what matches between the visits of two drives say about their frames."""
     here = [first.visits[one.first].middle + one.match.shift for one in found]
     there = [last.visits[one.last].middle for one in found]
     return _Relations(

@@ -106,6 +106,7 @@ class LiveLog:
             self._compare()
 
     def _scans_of(self) -> Iterator[Scan]:
+        """Yield the scans among the items, and note the damaged parts. Raises LogError."""
         for number, item in enumerate(self._items):
             if isinstance(item, Scan):
                 yield item

@@ -119,6 +119,7 @@ class Beams:
         return self._known[i]
 
     def _cells(self, i: int) -> tuple[Cells, Cells]:
+        """Compute the result of `of`."""
         scan, pose = self._recent.scan(i), self._recent.poses(i, i + 1)[0]
         cos, sin = math.cos(pose[2]), math.sin(pose[2])
         x = pose[0] + cos * scan.laser.mount[0] - sin * scan.laser.mount[1]
@@ -145,7 +146,10 @@ class Beams:
         return np.flatnonzero(cells).astype(np.int32), ends
 
     def _numbers(self, x: Array, y: Array) -> Cells:
-        """The indices in the torus of the cells of positions."""
+        """Number the cells in the torus at positions: x and y in metres, in the frame of the track.
+
+        Equal numbers may stand for cells far apart, as the torus repeats.
+        """
         rows, columns = (np.rint(values / CELL).astype(np.int32) % self.side for values in (x, y))
         return np.asarray(rows * self.side + columns)
 

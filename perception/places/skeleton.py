@@ -262,7 +262,14 @@ def _are_one(
 
 
 def _branches(graph: Graph, group: set[int], radius: float) -> list[Array]:
-    """The lines that lead from a group of junctions, without the short lines within the group."""
+    """List the lines that lead away from a group of merged junctions.
+
+    Args:
+        graph: The skeleton.
+        group: The numbers of the junctions.
+        radius: Radius of the merged junction in cells. Lines within the group that are shorter than
+            its diameter are left out.
+    """
     found = []
     for edge in graph.edges:
         inside = [node in group for node in edge.ends]

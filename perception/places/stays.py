@@ -260,12 +260,13 @@ class Stays:
 
 
 def _are_near(first: Visit, second: Visit) -> bool:
+    """Whether the middles of two visits are so near that they may be one place."""
     near = max(SAME, SHARE * max(first.radius, second.radius))
     return math.dist(first.middle, second.middle) < near
 
 
 def joined(first: Visit, last: Visit) -> Visit:
-    """Join two successive visits to one place."""
+    """Make one visit of two successive visits to the same place."""
     ways = list(first.ways)
     left = None if last.left is None else _taken(ways, last.ways[last.left].bearing)
     return _in_order(replace(first, end=last.end, ways=tuple(ways), left=left))
@@ -280,7 +281,14 @@ def _in_order(visit: Visit) -> Visit:
 
 
 def _taken(ways: list[Way], bearing: float) -> int:
-    """Mark the way that the robot took as sure, or add it, and return its index."""
+    """Find the way out that the robot took, and return its index in `ways`.
+
+    The way with nearly this bearing becomes sure. If there is none, a new way is added.
+
+    Args:
+        ways: The ways out of a place. They are changed.
+        bearing: Direction in which the robot crossed the disc, in radians.
+    """
     near = [k for k in range(len(ways)) if apart(ways[k].bearing, bearing) < MERGED]
     if not near:
         ways.append(Way(bearing))

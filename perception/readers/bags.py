@@ -344,7 +344,17 @@ class _ScanPoses:
 def _scans(
     bag: Bag, topics: set[str], where: _ScanPoses, damaged: list[Damage]
 ) -> Iterator[Scan | Damage]:
-    """Yield the damage that was found before, then the scans and damaged messages of topics."""
+    """Yield the scans of a bag.
+
+    Args:
+        bag: The open bag.
+        topics: The topics of the scans.
+        where: The poses of the robot and its lasers.
+        damaged: Damage that was found during the survey. It is yielded first.
+
+    Yields:
+        Scans, and `Damage` for messages that cannot be read.
+    """
     yield from damaged
     for connection, number, recorded, message in bag.messages(topics):
         if isinstance(message, Damage):
@@ -360,7 +370,13 @@ def _scans(
 
 
 def _measured(message: Any, mount: Pose, is_flipped: bool) -> tuple[NDArray[np.float64], Laser]:
-    """The ranges of a message and its laser. Raises Damaged."""
+    """Read the ranges of a message, and describe its laser. Raises Damaged.
+
+    Args:
+        message: A LaserScan or MultiEchoLaserScan.
+        mount: Pose of the laser in the frame of the robot.
+        is_flipped: Whether the laser hangs upside down, so that its beams turn clockwise.
+    """
     first, step, nearest, reach = (
         float(v)
         for v in (message.angle_min, message.angle_increment, message.range_min, message.range_max)

@@ -126,6 +126,7 @@ class Question:
             return self.failed(number, path, error)
 
     def _solved(self, number: int, path: str, trace: Trace, given_up: Callable[[], bool]) -> Answer:
+        """Solve one trace as `answer` does, but let errors pass."""
         self.theory.check_steps(trace)
         if self.memory is not None:
             _forget_memory()
@@ -202,6 +203,7 @@ class Question:
         explanation: Explanation | None,
         backbone: Backbone | None,
     ) -> Answer:
+        """Make the answer for a solution: its line, exit code and warnings."""
         if self.json:
             count = len(maps)
             maps_told = list(map(told, maps))

@@ -269,7 +269,7 @@ def _false_of_all(data: Mapping[str, Any], trace: Trace) -> Iterator[str]:
 
 
 def _is_near(said: Any, right: Any) -> bool:
-    """Whether all numbers in two nested values are almost equal, as machines round differently."""
+    """Whether all numbers in two nested values are almost equal: machines round differently."""
     if isinstance(right, Mapping):
         return (
             isinstance(said, Mapping)

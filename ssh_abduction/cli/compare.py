@@ -159,6 +159,7 @@ def _flat(value: Any, name: str = "") -> dict[str, Any]:
 
 
 def _lines(found: Comparison) -> Iterator[str]:
+    """Yield the lines that describe a comparison to people."""
     yield found.sentence
     if len(found.ids) > 1:
         if found.complete is False:

@@ -72,7 +72,11 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _pair(standing: Standing, kind: str, pair: str) -> tuple[str, str]:
-    """Read a pair of steps. Raise MapError if it is none."""
+    """Read a pair of steps, such as "monday:12,tuesday:3", from the option for this kind of pair.
+
+    Raises:
+        MapError: The text is no pair of two steps of the map.
+    """
     steps = [standing.step(step.strip()) for step in pair.split(",")]
     if len(steps) != 2 or steps[0] == steps[1]:
         raise MapError(

@@ -181,6 +181,7 @@ def _nothing_judged(found: VisitsEvaluation) -> str:
 
 
 def _told_of_visits(found: VisitsEvaluation) -> str:
+    """Say how many pairs of visits and of steps were judged, and how many were left out."""
     places, dstates = found.places, found.dstates
     left_out = [
         counted(places.stayed, "pairs")
@@ -207,12 +208,14 @@ def _told_of_visits(found: VisitsEvaluation) -> str:
 
 
 def _pairs(pairs: MapPairs | None) -> list[object]:
+    """Make five cells of a row about pairs; dashes if the map has no places."""
     if pairs is None:
         return [UNKNOWN] * 5
     return [pairs.things, pairs.joined, pairs.right, _share(pairs.precision), _share(pairs.recall)]
 
 
 def _headline(found: Evaluation, may_be_more: bool) -> str:
+    """Say which map is the true one. `may_be_more`: not all minimal maps are listed."""
     of = f"of {counted(len(found.maps), 'maps')}{', and there may be more' if may_be_more else ''}"
     if found.rank is not None:
         return f"map {found.rank} is the true one, {of}"
@@ -223,6 +226,7 @@ def _headline(found: Evaluation, may_be_more: bool) -> str:
 
 
 def _truth(found: Evaluation, steps: int) -> str:
+    """Describe the truth of a trace with this number of steps: where it is known, and counts."""
     told = (
         (found.true_dstates, "dstates"),
         (found.true_places, "places"),
@@ -234,10 +238,11 @@ def _truth(found: Evaluation, steps: int) -> str:
         if found.ambiguity is None
         else f"; {100 * found.ambiguity:.0f} % of the pairs of dstates share a view"
     )
-    return f"the truth, told at {found.steps} of {counted(steps, 'steps')}: {counts}{ambiguity}"
+    return f"the truth, known at {found.steps} of {counted(steps, 'steps')}: {counts}{ambiguity}"
 
 
 def _row(number: int, one: MapEvaluation) -> list[object]:
+    """Make the row of a map, which has this number, in the table."""
     return [
         number,
         _word(one.isomorphic, "yes", "no"),

@@ -147,6 +147,7 @@ def _as_json(explanation: Answer) -> str:
 
 
 def _exit_code(explanation: Answer) -> int:
+    """Find the exit code for an explanation, as the help lists them."""
     if isinstance(explanation, PlaceExplanation):
         if explanation.stopped == "interrupted":
             return interrupted_code()

@@ -41,6 +41,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _as_text(front: Front, most: int) -> str:
+    """Write a front of at most `most` faults as a table, with sentences below it."""
     if not front.points:
         return (
             f"no map has at most {counted(most, 'faults')}: what is asserted (--same, "
@@ -71,6 +72,7 @@ def _as_text(front: Front, most: int) -> str:
 
 
 def _as_data(front: Front) -> dict[str, object]:
+    """Convert a front to a dict for JSON."""
     points = [
         {
             "faults": p.faults,

@@ -82,6 +82,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _row(rung: Rung) -> list[object]:
+    """Make the row of a rung in the table."""
     data, cost = rung.to_dict(), rung.solution.cost
     counts: Iterator[object] = (
         getattr(cost, name) if cost else UNKNOWN for name in ("dstates", "places", "paths")

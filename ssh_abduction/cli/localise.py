@@ -164,6 +164,7 @@ def _steps(steps: Sequence[int]) -> str:
 
 
 def _row(step: int, belief: Mapping[str, Any], trace: Trace) -> list[object]:
+    """Make the row of a step in the table, from the belief after this step."""
     view = trace.steps[step].view
     return [
         step,

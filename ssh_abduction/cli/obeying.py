@@ -60,7 +60,7 @@ def as_corrected(
 
 
 def say_obeyed(said: Corrections, trace: Trace) -> None:
-    """Print on stderr how many sentences about the drives of a trace are obeyed."""
+    """Print on stderr how many sentences of the corrections are about drives of this trace."""
     here, all_of_them = (
         sum(1 for _ in told(some)) for some in (said.known_in(drives_of(trace)), said)
     )

@@ -186,6 +186,7 @@ def digest(logs: Sequence[str]) -> str | None:
 
 
 def _digest_of(path: str) -> str | None:
+    """Compute the digest of one log, as `digest` does. Raises LogError."""
     from perception.readers.lines import opened
 
     whole = hashlib.sha256()

@@ -376,6 +376,7 @@ def _text(lines: Iterable[str]) -> str:
 def _lines(
     search: Search, solution: Solution, explanation: Explanation | None, backbone: Backbone | None
 ) -> Iterator[str]:
+    """Yield the lines that describe the result of a search to people."""
     yield headline(solution, search.count, explanation)
     yield from by_displacements(solution)
     if (

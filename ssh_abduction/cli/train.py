@@ -162,6 +162,7 @@ def _mapped(options: argparse.Namespace) -> tuple[Any, Any, SSHMap, Any]:
 
 
 def run_train(options: argparse.Namespace) -> int:
+    """Run the verb `train`: train a recogniser, and write it to a file."""
     from perception.store import save
 
     images, labels, recogniser = _labelled(options)
@@ -174,6 +175,7 @@ def run_train(options: argparse.Namespace) -> int:
 
 
 def run_learning_curve(options: argparse.Namespace) -> int:
+    """Run the verb `learning-curve`: print the share of recognised images by training images."""
     from perception.recognition import learning_curve
 
     check_picture(options.plot)
@@ -209,6 +211,7 @@ def run_learning_curve(options: argparse.Namespace) -> int:
 
 
 def run_recognise(options: argparse.Namespace) -> int:
+    """Run the verb `recognise`: print the dstate of each image of a trace."""
     from perception.errors import PerceptionError
     from perception.images import images_of
     from perception.store import load
@@ -237,6 +240,7 @@ def run_recognise(options: argparse.Namespace) -> int:
 
 
 def run_tell_apart(options: argparse.Namespace) -> int:
+    """Run the verb `tell-apart`: print the laser beams that distinguish pairs of dstates."""
     from perception.features import strongest, telling_features
     from perception.reciprocal import ReciprocalTransformer
 

@@ -66,6 +66,7 @@ def telling(options: argparse.Namespace, for_programs: bool) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _handled(log: logging.Logger, handler: logging.Handler, level: int) -> Iterator[None]:
+    """While the block runs, send the records of a log from this level on to a handler."""
     before = log.level
     log.addHandler(handler)
     log.setLevel(level)

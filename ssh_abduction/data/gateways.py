@@ -138,6 +138,7 @@ def _onward_of(
             reached[s.path, -s.direction, q].add(p)
 
     def goes_on(path: int, direction: int, place: int) -> bool:
+        """Whether the path has a further place beyond this place, in this direction."""
         if reached[path, direction, place]:
             return True
         order = listed.get(path, ())[::direction]
@@ -276,6 +277,7 @@ def _fitted(
     turns = {(a, b): actions for a, b, actions in made}
 
     def extended(chosen: list[_Turned]) -> tuple[_Turned, ...] | None:
+        """Choose frames and shifts for the sights after the first `chosen`; None if none fit."""
         if len(chosen) == len(sights):
             return tuple(chosen)
         sight = sights[len(chosen)]

@@ -128,7 +128,7 @@ class Evaluation:
             "no map is the true one" if self.rank is None else f"map {self.rank} is the true one"
         )
         maps, steps = counted(len(self.maps), "maps"), counted(self.steps, "steps")
-        return f"<Evaluation: {which}, of {maps}; the truth is told at {steps}>"
+        return f"<Evaluation: {which}, of {maps}; the truth is known at {steps}>"
 
     @property
     def rank(self) -> int | None:
@@ -314,7 +314,7 @@ def checked_map(ssh_map: object, where: str, trace: Trace) -> SSHMap:
 
 
 def _evaluated(ssh_map: SSHMap, truth: _Truth) -> MapEvaluation:
-    """Measure the accuracy of a map."""
+    """Measure the accuracy of a map by the true names of the steps."""
     at = [ssh_map.dstates[label] for label in ssh_map.dstate_at]
     dstates = _Sort([s.id for s in at], truth.dstates)
     places = _Sort([s.place for s in at], truth.places)

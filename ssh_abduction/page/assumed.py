@@ -56,6 +56,7 @@ def assumptions(
     left: list[tuple[Pair, bool]] = []
 
     def tell(pair: Pair, one: bool, lost: Side) -> None:
+        """Record the costs for a pair. All minimal maps have `one` dstate; `lost`: the opposite."""
         won = Side(possible=True, cost=best, proven=True)
         same, different = (won, lost) if one else (lost, won)
         verdict = Verdict.SAME_IN_MINIMAL if one else Verdict.DIFFERENT_IN_MINIMAL

@@ -352,6 +352,7 @@ def map_log(
     climbed: list[Rung] = []
 
     def outcome(solution: Solution, interrupted: bool = True) -> LogMap:
+        """Make the result for the solution so far, with its names and notes."""
         ended = INTERRUPTED if interrupted else how_it_ended(solution, allowed)
         told = (*notes, ended) if ended else notes
         solution = solution if corrections is None else with_names(corrections, solution, trace)

@@ -174,6 +174,7 @@ class _Sheet:
         return [self.on_page(p) for p in (*self.walls.tolist(), *self.poses)]
 
     def walls_and_way(self) -> Iterator[str]:
+        """Draw the walls as dots, and the way of the robot as lines, one for each drive."""
         dots = "".join(f"M{x:.0f} {y:.0f}h0" for x, y in map(self.on_page, self.walls))
         width = max(GRAIN * self.unit, 1.0)
         yield (

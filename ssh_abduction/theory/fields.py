@@ -146,6 +146,7 @@ def choice(name: str, value: str) -> str:
 
 
 def _check_weigh(theory: Theory) -> None:
+    """Check that maps can be compared by cost. Raises TheoryError."""
     if theory.prefer != AUTO and theory.prefer[:1] != ("dstates",):
         raise TheoryError(
             "prefer: expected dstates first where maps are weighed, got "
@@ -166,6 +167,7 @@ def can_weigh(theory: Theory) -> bool:
 
 
 def _check_faults(theory: Theory) -> None:
+    """Check that the other fields allow faults. Raises TheoryError."""
     if theory.prefer != AUTO and theory.prefer[:1] != ("dstates",):
         raise TheoryError(
             "prefer: expected dstates first where faults are allowed, got "
@@ -200,6 +202,7 @@ def _check_faults(theory: Theory) -> None:
 
 
 def _check_numbers(theory: Theory) -> None:
+    """Check the fields that are numbers, and round the prices of faults. Raises TheoryError."""
     for name in EXCUSED:
         price = getattr(theory, name)
         if not is_finite(price) or not (price == 0 or 0.1 <= price <= DEAREST):
@@ -247,6 +250,7 @@ def _check_prices(theory: Theory) -> None:
 
 
 def _check_rules(theory: Theory) -> None:
+    """Check that the user's axioms have names of their own. Raises TheoryError."""
     taken = {axiom.name for axiom in encodings.axioms()}
     for rules in theory.rules:
         for axiom in rules.axioms:
@@ -259,6 +263,7 @@ def _check_rules(theory: Theory) -> None:
 
 
 def _set_names(theory: Theory, field: str, allowed: Iterable[str]) -> None:
+    """Convert a field to a tuple of different names out of those allowed. Raises TheoryError."""
     value = getattr(theory, field)
     if not isinstance(value, str | list | tuple):
         raise TheoryError(f"{field}: expected a list of names, got {brief(value)}")

@@ -63,7 +63,12 @@ def _lifted(trace: Trace) -> tuple[int, ...]:
 
 @lru_cache(maxsize=8)
 def _pairs(stretches: tuple[int, ...], lifted: tuple[int, ...]) -> Pairs:
-    """The pairs of steps on stretches that one lift separates."""
+    """Make the pairs of steps of which one is on the stretch before a lift, the other behind it.
+
+    Args:
+        stretches: For each step, the first step of its stretch.
+        lifted: The steps that a lift leads to.
+    """
     steps: dict[int, list[int]] = {}
     for t, stretch in enumerate(stretches):
         steps.setdefault(stretch, []).append(t)
@@ -87,7 +92,13 @@ def _meetings(ssh_map: SSHMap) -> Iterator[Equality]:
 
 
 def _way(one: int, other: int, beside: dict[int, dict[int, Equality]]) -> list[Equality]:
-    """The fewest meetings that connect two stretches; empty if none connect them."""
+    """Find the fewest meetings that connect two stretches; empty if none connect them.
+
+    Args:
+        one: A stretch, named by its first step.
+        other: Another stretch.
+        beside: For each stretch, the stretches that it meets at a dstate or place, and where.
+    """
     came: dict[int, int] = {one: one}
     queue = [one]
     for stretch in queue:

@@ -222,6 +222,7 @@ class Loops:
         )
 
     def _heading_variance(self, i: Steps, j: Steps) -> Array:
+        """Return the variance of the turn from steps i to steps j, by noise and drift, (m,)."""
         variance: Array = (
             self.moments[j, 10]
             - self.moments[i, 10]
@@ -245,10 +246,7 @@ class Loops:
         return moved
 
     def of_ends(self, end: int) -> Array:
-        """Return the covariance of the pose at step `end` from the noise up to each earlier step.
-
-        Its shape is (end + 1) x 9: one row for each of the steps 0 to `end`.
-        """
+        """Compute the covariance at step `end` by the noise up to each step: (end + 1) x 9."""
         every = np.arange(end + 1)
         there = np.full(end + 1, end)
         return self._white(np.zeros_like(every), every, there, there).reshape(-1, 9)
@@ -343,6 +341,7 @@ class Reckoning:
         return flat.closings(first + offset, last + offset)
 
     def _begins(self, known: Steps) -> Steps:
+        """Compute `begins` for all steps. `known` has it for the first steps."""
         loops = self.loops(0)
         start = len(known)
         begin = int(known[-1]) if start else 0

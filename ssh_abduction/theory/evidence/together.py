@@ -59,6 +59,7 @@ class _Alone:
     repeated: Array
 
     def followed_by(self, other: _Alone) -> _Alone:
+        """Append what is known about other returns."""
         pairs = (
             (self.inverse, other.inverse),
             (self.square, other.square),
