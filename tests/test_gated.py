@@ -8,6 +8,8 @@ from unittest.mock import patch
 import networkx as nx
 import planar
 import pytest
+from hypothesis import given, settings
+from test_gateways import traces
 
 from benchmarks.instances import maze
 from ssh_abduction import Theory, Trace, solve
@@ -16,6 +18,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver import Status, fallback
 from ssh_abduction.solver.asp.own import can_be_asked, keeps_own_rules
 from ssh_abduction.solver.guesses.beam import Beam
+from ssh_abduction.solver.guesses.gated import sketch_beyond, sketches_of
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.rules import Rules
 from ssh_abduction.theory.settle import Problem, settle
@@ -156,3 +159,62 @@ def test_rules_about_atoms_that_maps_lack_cannot_be_asked(body: str) -> None:
     assert not can_be_asked(
         settle(SMALL, ruled(f"#program step(t).\n:- {body}.", Theory.topological())).theory
     )
+
+
+def sketched(trace: Trace, theory: Theory) -> list[SSHMap]:
+    """The maps of the sketches of a trace that reach its end."""
+    return [
+        sketch.map()
+        for sketch in sketches_of(trace.steps[0], theory)
+        if all(
+            sketch.extend(action, step)
+            for action, step in zip(trace.actions, trace.steps[1:], strict=True)
+        )
+    ]
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_sketches_of_worlds_satisfy_all_axioms(world: str) -> None:
+    for seed in range(2):
+        trace = drive(world, seed, 60)
+        theory = settle(trace).theory
+        small, large = sketched(trace, theory)
+        assert check(trace, small, theory) == check(trace, large, theory) == ()
+        assert len(small.places) <= len(large.places)
+
+
+@settings(max_examples=60)
+@given(traces())
+def test_there_is_a_sketch_if_there_is_a_map(trace: Trace) -> None:
+    theory = settle(trace, Theory.topological().replace(star="gateways")).theory
+    exists = any(check(trace, ssh_map, theory) == () for ssh_map in sketched(trace, theory))
+    assert exists == bool(solve(trace, theory, max_maps=1, time_limit=100).maps)
+
+
+@pytest.mark.parametrize(("first", "places"), [([0], 2), ([0, 180], 3)])
+def test_a_travel_leads_back_only_to_an_end_of_its_path(first: list[int], places: int) -> None:
+    """The robot drives to and fro between a place and a dead end.
+
+    Both dead ends are one. The other place is one only if it is a dead end, too.
+    """
+    trace = Trace.from_steps(
+        "abcdab",
+        ["travel", "around", "travel", "around", "travel"],
+        stars=[first, [180], [0], [(180 + bearing) % 360 for bearing in first], first, [180]],
+    )
+    theory = settle(trace, Theory.topological().replace(star="gateways")).theory
+    small, large = sketched(trace, theory)
+    assert len(small.places) == 2
+    assert len(large.places) == places
+    assert check(trace, small, theory) == check(trace, large, theory) == ()
+
+
+def test_a_sketch_goes_on_from_a_map() -> None:
+    trace = drive("junction of 5", 0, 40)
+    theory = settle(trace).theory
+    known = solve(trace.prefix(20), theory, max_maps=1).maps[0]
+    sketch = sketch_beyond(known, trace.prefix(20), theory, homing=False)
+    assert sketch.map() == known
+    for action, step in zip(trace.actions[19:], trace.steps[20:], strict=True):
+        assert sketch.extend(action, step)
+    assert check(trace, sketch.map(), theory) == ()

@@ -60,7 +60,7 @@ class Sight:
 
 
 Turns = Mapping[tuple[Sight, Sight], Collection[Action]]
-_Turned = tuple[Frame, int]  # what a sight sees, and the shift of its slots
+Turned = tuple[Frame, int]  # what a sight sees, and the shift of its slots
 
 
 def turned(trace: Trace, ssh_map: SSHMap, axioms: Collection[str]) -> SSHMap | None:
@@ -210,20 +210,25 @@ def facing(trace: Trace, ssh_map: SSHMap, axioms: Collection[str]) -> Facing | N
         fitted = fit(seen, turns, held, as_shown=False)
         if fitted is None:
             return None
-        read = list(zip(seen, fitted, strict=True))
         for sight in seen:
             s = sight.dstate.id
             found.ends.extend(
                 (s, towards)
                 for towards in (0, 180)
-                if not any(_leads(frame, towards) for frame in sight.star.frames)
+                if not any(leads(frame, towards) for frame in sight.star.frames)
             )
-        for (a, (first, back)), (b, (then, on)) in combinations(read, 2):
-            shift = (on - back) % max(first.slots, 1)
-            turns_by = rotations(first, then, shift)
-            if _ways(first, then, shift, turns_by)[1] and not turns_by & {90, 270}:
+        for (a, seen_a), (b, seen_b) in combinations(zip(seen, fitted, strict=True), 2):
+            if are_opposite(seen_a, seen_b):
                 found.opposite.append((a.dstate.id, b.dstate.id))
     return found
+
+
+def are_opposite(seen_a: Turned, seen_b: Turned) -> bool:
+    """Whether the robot surely faces opposite ways in two sights of a place that `fit` read."""
+    (first, back), (then, on) = seen_a, seen_b
+    shift = (on - back) % max(first.slots, 1)
+    found = rotations(first, then, shift)
+    return _ways(first, then, shift, found)[1] and not found & {90, 270}
 
 
 def by_place(sights: Sequence[Sight]) -> dict[int, list[Sight]]:
@@ -237,7 +242,7 @@ def by_place(sights: Sequence[Sight]) -> dict[int, list[Sight]]:
 
 def fit(
     sights: Sequence[Sight], turns: Turns, axioms: Collection[str], as_shown: bool = True
-) -> list[_Turned] | None:
+) -> list[Turned] | None:
     """Find a frame and a shift for each sight at a place so that all pairs satisfy the axioms.
 
     Args:
@@ -264,7 +269,7 @@ def _fitted(
     headings: tuple[int | None, ...] | None,
     made: tuple[tuple[Sight, Sight, frozenset[Action]], ...],
     axioms: frozenset[str],
-) -> tuple[_Turned, ...] | None:
+) -> tuple[Turned, ...] | None:
     """Do what `fit` does, with a cache: maps of growing prefixes have many places in common.
 
     Args:
@@ -276,14 +281,14 @@ def _fitted(
     """
     turns = {(a, b): actions for a, b, actions in made}
 
-    def extended(chosen: list[_Turned]) -> tuple[_Turned, ...] | None:
+    def extended(chosen: list[Turned]) -> tuple[Turned, ...] | None:
         """Choose frames and shifts for the sights after the first `chosen`; None if none fit."""
         if len(chosen) == len(sights):
             return tuple(chosen)
         sight = sights[len(chosen)]
         for frame in sight.star.frames:
             if "gateway_end" in axioms and not all(
-                _leads(frame, towards) for towards in sight.onward
+                leads(frame, towards) for towards in sight.onward
             ):
                 continue
             # only shifts relative to the first sight matter
@@ -316,9 +321,9 @@ def _middle(found: Collection[int]) -> int:
 
 def _allowed(
     a: Sight,
-    seen_a: _Turned,
+    seen_a: Turned,
     b: Sight,
-    seen_b: _Turned,
+    seen_b: Turned,
     turns: Turns,
     axioms: Collection[str],
     as_shown: bool,
@@ -469,7 +474,7 @@ def _ways(first: Frame, then: Frame, shift: int, found: frozenset[int]) -> tuple
     return alike, opposite
 
 
-def _leads(frame: Frame, towards: int) -> bool:
+def leads(frame: Frame, towards: int) -> bool:
     """Whether the robot's path may go on by some gateway ahead (`towards` 0) or behind (180)."""
     return _passes(frame) is not None or any(
         _between(bearing, towards) <= 2 * spread

@@ -14,7 +14,7 @@ from itertools import pairwise
 from ssh_abduction.checker.checker import check, unchecked
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Action, Step, Trace
-from ssh_abduction.solver import Cost, Judging, Sketch
+from ssh_abduction.solver import Cost, Judging, Sketch, sketch_beyond, sketches_of
 from ssh_abduction.theory.pairs import Pairs
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import row
@@ -57,7 +57,7 @@ class Drafts:
         self._may_sketch = row("prefixes").holds_for(theory) and not unchecked(theory)
         self._trusts_sketches = row("certain sketches").holds_for(self._other_axioms)
         self._drafts: list[Draft] = []  # the best first
-        self._sketches = [Draft(sketch) for sketch in Sketch.all_of(trace.steps[0], theory)]
+        self._sketches = [Draft(sketch) for sketch in sketches_of(trace.steps[0], theory)]
         for before, step in pairwise(trace.steps):
             assert before.action
             self._sketches = [
@@ -96,7 +96,7 @@ class Drafts:
         if not self._may_sketch:
             return
         known = len(ssh_map.dstate_at)
-        sketch = Sketch.beyond(ssh_map, trace.prefix(known), self._theory)
+        sketch = sketch_beyond(ssh_map, trace.prefix(known), self._theory)
         later = zip(trace.actions[known - 1 :], trace.steps[known:], strict=True)
         if all(sketch.extend(action, step) for action, step in later):
             self._drafts = sorted([*self._drafts, Draft(sketch)], key=self._cost)[:DRAFTS]

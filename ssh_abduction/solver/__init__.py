@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.engines.framed import FramedEngine
     from ssh_abduction.solver.entry import find_backbone, solve
     from ssh_abduction.solver.front import Front, Point, fault_front
+    from ssh_abduction.solver.guesses.gated import sketch_beyond, sketches_of
     from ssh_abduction.solver.guesses.tree import Sketch
     from ssh_abduction.solver.judging import InternalError, Judging
     from ssh_abduction.solver.obeying import obeyed, with_names
@@ -84,6 +85,7 @@ _HOMES = {  # module: the names that this package exports from it
         "Point",
         "fault_front",
     ),
+    "guesses.gated": ("sketch_beyond", "sketches_of"),
     "guesses.tree": ("Sketch",),
     "judging": (
         "InternalError",
@@ -196,6 +198,8 @@ __all__ = [
     "observation",
     "opening",
     "resident_memory",
+    "sketch_beyond",
+    "sketches_of",
     "solve",
     "stretches",
     "summary_of",

@@ -8,6 +8,7 @@ from contextlib import suppress
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.asp.limits import StageTimeError
+from ssh_abduction.solver.candidates import SKETCH_SHARE
 from ssh_abduction.solver.guesses.beam import Beam
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.weighed import EQUAL
@@ -65,8 +66,8 @@ class Beams:
         """
         parts, watch = self._parts, self._parts.watch
         begun, left = watch.elapsed(), watch.left()
-        if left > 0 and parts.task.theory.star != "gateways":
-            parts.candidates.sketch(0.0)  # only the surest sketch has time
+        if left > 0:
+            parts.candidates.sketch(SKETCH_SHARE * left, beams=False)
             self._keep_best()
         # With several drives or floors, a broad beam keeps as many hypotheses as a wider one.
         several = parts.task.theory.several_drives or parts.task.theory.lifts

@@ -20,6 +20,7 @@ from ssh_abduction.solver import choosing
 from ssh_abduction.solver.asp.facts import answer_maps
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.engines.base import Found, Task
+from ssh_abduction.solver.guesses.gated import sketch_beyond, sketches_of
 from ssh_abduction.solver.guesses.tree import Sketch
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
@@ -106,11 +107,11 @@ class Candidates:
         before = self._known.best
         for first in beam.partial():
             done = self._task.trace.prefix(len(first.dstate_at))
-            self._go_on_to_end(Sketch.beyond(first, done, self._task.theory, homing=False))
+            self._go_on_to_end(sketch_beyond(first, done, self._task.theory, homing=False))
             if self._known.best is not before:
                 return
 
-    def sketch(self, seconds: float = math.inf) -> None:
+    def sketch(self, seconds: float = math.inf, beams: bool = True) -> None:
         """Make a sketch (a map without a search), if no map of the whole trace is known.
 
         A sketch extends the best map of a prefix, or begins at the first step. The sketch with the
@@ -120,6 +121,7 @@ class Candidates:
 
         Args:
             seconds: The time for all sketches. Each sketch may use a share of the time left.
+            beams: Whether to try beams of hypotheses, too.
         """
         with self._sketching:
             if (
@@ -129,11 +131,11 @@ class Candidates:
             ):
                 return
             whole = Watch().part(seconds)
-            *smaller, surest = self._attempts()
+            *smaller, surest = self._attempts(beams)
             for attempt in (surest, *smaller):
                 before, share = (
                     self._known.best,
-                    1.0 if attempt in (surest, smaller[-1]) else SKETCH_SHARE,
+                    1.0 if attempt in (surest, *smaller[-1:]) else SKETCH_SHARE,
                 )
                 part = (
                     Watch().part(max(seconds, SUREST))
@@ -165,7 +167,7 @@ class Candidates:
         ):
             return False
         apart: int | None = None
-        for sketch in Sketch.all_of(trace.steps[0], theory):
+        for sketch in sketches_of(trace.steps[0], theory):
             if not all(
                 sketch.extend(action, step)
                 for action, step in each_looking(zip(trace.actions, trace.steps[1:], strict=True))
@@ -178,17 +180,15 @@ class Candidates:
                 return self._known.best is not None and len(self._known.best.dstates) == apart
         return False
 
-    def _attempts(self) -> list[Callable[[], None]]:
+    def _attempts(self, beams: bool) -> list[Callable[[], None]]:
         """List functions that each make one sketch. Those that make small maps come first."""
         trace, theory = self._task.trace, self._task.theory
         known = self._known.partial if trace is self._trace else None
-        beams = [partial(self._offer_beam, width) for width in (BROAD, 1)]
-        if theory.star == "gateways":
-            return [*beams]
-        sketches = Sketch.all_of(trace.steps[0], theory)
+        broad = [partial(self._offer_beam, width) for width in (BROAD, 1) if beams]
+        sketches = sketches_of(trace.steps[0], theory)
         if known is not None:
-            sketches.insert(0, Sketch.beyond(known, trace.prefix(len(known.dstate_at)), theory))
-        return [*beams, self.merge, *(partial(self._go_on_to_end, sketch) for sketch in sketches)]
+            sketches.insert(0, sketch_beyond(known, trace.prefix(len(known.dstate_at)), theory))
+        return [*broad, self.merge, *(partial(self._go_on_to_end, sketch) for sketch in sketches)]
 
     def _offer_beam(self, width: int) -> None:
         """Offer the maps that a beam of hypotheses about the displacements finds."""

@@ -38,6 +38,7 @@ whether it is still consistent:
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 from ssh_abduction.data.maps import DState, MapPath, SSHMap
 from ssh_abduction.data.trace import Action, Step, Trace, View
@@ -46,7 +47,7 @@ from ssh_abduction.solver.steps.log import observation
 from ssh_abduction.theory.theory import Theory
 
 
-class _Contradiction(Exception):  # noqa: N818 - not an error
+class Contradiction(Exception):  # noqa: N818 - not an error
     """A step contradicts the axioms."""
 
 
@@ -128,7 +129,7 @@ class Sketch:
         return [cls(first, theory, homing, frames) for frames in framed for homing in (True, False)]
 
     @classmethod
-    def beyond(cls, ssh_map: SSHMap, trace: Trace, theory: Theory, homing: bool = True) -> Sketch:
+    def beyond(cls, ssh_map: SSHMap, trace: Trace, theory: Theory, homing: bool = True) -> Self:
         """Make a sketch that begins with a map of a trace.
 
         Args:
@@ -184,7 +185,7 @@ class Sketch:
                     self._links[here, action.name] = there
                 self._map = None
             self._must_show(there, step)
-        except _Contradiction:
+        except Contradiction:
             return False
         self.labels.append(there)
         return True
@@ -210,17 +211,7 @@ class Sketch:
         s = self._states[here]
         around = action.turn == "around"
         heading = (s.heading + QUARTERS[action.turn]) % 4
-        there: int | None = None
-        # Look for a known dstate to which the axioms say that the turn leads.
-        if self._framed:
-            there = self._facing.get((s.place, heading))
-        elif around and s.path is not None:
-            there = self._along.get((s.place, s.path, -s.direction))
-        elif around:
-            there = next(
-                (x for x in s.reverse if self._states[x].seen == observation(step, self._theory)),
-                None,
-            )
+        there = self._turned_to(here, heading, action, step)
         if there is None:
             there = self._new(step, s.place, heading)
         if around:
@@ -230,6 +221,18 @@ class Sketch:
         if self._theory.all_on_paths:
             self._find_course(there)
         return there
+
+    def _turned_to(self, here: int, heading: int, action: Action, step: Step) -> int | None:
+        """The known dstate to which the axioms say that a turn leads; None if there is none."""
+        s = self._states[here]
+        if self._framed:
+            return self._facing.get((s.place, heading))
+        if action.turn != "around":
+            return None
+        if s.path is not None:
+            return self._along.get((s.place, s.path, -s.direction))
+        seen = observation(step, self._theory)
+        return next((x for x in s.reverse if self._states[x].seen == seen), None)
 
     def _turned_around(self, here: int, there: int) -> None:
         """Add a turn around between two dstates.
@@ -254,7 +257,7 @@ class Sketch:
             if there is not None:
                 return there
             if self._theory.next_place:
-                raise _Contradiction
+                raise Contradiction
         there = self._new_place(step)
         if not self._framed:
             self._doubt_if_grown_from_map()
@@ -298,8 +301,7 @@ class Sketch:
         """
         s = self._states[here]
         if s.path is None:
-            # Without frames there are no slots, so this is a new path.
-            path, direction = self._slots.get((s.place, s.heading), (len(self._orders), 1))
+            path, direction = self._course_through(here) or (len(self._orders), 1)
             if path < len(self._orders) or not self._framed:
                 self._doubt_if_grown_from_map()
             if path == len(self._orders):
@@ -307,6 +309,14 @@ class Sketch:
             self._set_course(here, path, direction)
             return path, direction
         return s.path, s.direction
+
+    def _course_through(self, here: int) -> tuple[int, int] | None:
+        """The known path, and direction, that leaves the place of a dstate in its heading.
+
+        Without frames there are no slots, so every such path is new.
+        """
+        s = self._states[here]
+        return self._slots.get((s.place, s.heading))
 
     def _doubt_if_grown_from_map(self) -> None:
         """Set `certain` to False if the sketch began with a map.
@@ -324,7 +334,7 @@ class Sketch:
         if (s.path, s.direction) == (path, direction):
             return
         if s.path is not None or self._along.setdefault((s.place, path, direction), here) != here:
-            raise _Contradiction
+            raise Contradiction
         s.path, s.direction = path, direction
         if self._framed:
             self._slots[s.place, s.heading] = path, direction
@@ -341,7 +351,7 @@ class Sketch:
         """Add a dstate for a step at a place, and return the dstate."""
         assert step.view is not None
         if self._star(step, heading) != self._stars[place]:
-            raise _Contradiction
+            raise Contradiction
         self._states.append(_Known(step.view, observation(step, self._theory), place, heading))
         if self._framed:
             self._facing[place, heading] = len(self._states) - 1
@@ -358,9 +368,9 @@ class Sketch:
         return observation(step, self._theory)[1]
 
     def _must_show(self, there: int, step: Step) -> None:
-        """Raise `_Contradiction` if a step differs from the observation of its dstate."""
+        """Raise `Contradiction` if a step differs from the observation of its dstate."""
         if self._states[there].seen != observation(step, self._theory):
-            raise _Contradiction
+            raise Contradiction
 
     def _made(self, labels: tuple[int, ...]) -> SSHMap:
         """Build the map of all steps, with the dstate of each step as `labels`."""
