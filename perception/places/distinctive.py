@@ -36,7 +36,8 @@ WIDTH = 0.5
 EVERY, WINDOW, HALF = 1.0, 8.0, 8.0
 # Junctions farther than this from the robot, in metres, are too uncertain.
 SEEN = 5.0
-# A chain ends if so many milestones in a row do not show it. Its middle is the median of so many.
+# A chain ends if GAP milestones in a row do not show it. While it is open, its middle is the median
+# of its last RECENT sightings.
 GAP, RECENT = 4, 9
 # A chain that is LIFE metres long ends, too. Another one begins with its last sightings.
 LIFE = 60.0
@@ -46,9 +47,9 @@ PASSING, LEFT = 0.75, 0.5
 # Milestones within BESIDE metres along the trajectory are asked about a place. At least a share of
 # AGREED has to show it.
 BESIDE, AGREED = 3.0, 0.5
-# A visit is final at most so many metres after its end if scans are at most 0.5 m apart: a local
-# map waits for WINDOW, a chain for LIFE and GAP, and a visit twice for STAY and for turns nearby.
-# The rest is the distance of scans and of milestones.
+# A visit is final at most this many metres after its end, if scans are at most 0.5 m apart. This is
+# WINDOW (its local map is complete), LIFE and GAP (its chain ends), twice STAY and TURNING (no
+# visit or turn nearby can change it), and 5 m for the spacing of scans and milestones.
 DELAY = 125.0
 
 

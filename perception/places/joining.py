@@ -36,7 +36,7 @@ def join_logs(logs: Sequence[RobotLog], parts: Sequence[Imported]) -> tuple[Robo
 
     Returns:
         The joint log, and its joint import. Their visits and scans are numbered over all drives.
-        In the trace, `visit` is such a number, and `scan` is the number within the drive.
+        In the steps of the trace, `visit` counts over all drives, and `scan` within the drive.
 
     Raises:
         TraceError: Two drives have one name, or the traces differ in what they record.

@@ -24,11 +24,12 @@ from perception.places.watching import Teller, watched, without_ranges
 from perception.readers.scans import Damage, RobotLog, Scan
 from ssh_abduction.data.errors import brief, is_finite, named
 
-# The track is compared with the odometry over the first so many scans.
+# The number of first scans over which the track is compared with the odometry.
 COMPARED = 400
-# The ranges of the scans beside the first so many poor matches are kept, for the checks at the end.
+# The checks at the end need the ranges of the scans before and after a poor match. They are kept
+# for at most this many poor matches.
 MOST_POOR = 200
-# The notes on so many cuts of the track come at once, those on the others at the end.
+# Notes on this many cuts of the track are told at once. Those on later cuts come at the end.
 SAID = 3
 
 

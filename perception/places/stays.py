@@ -30,8 +30,8 @@ NEARBY, TURNING = 4.0, 8.0
 STAY = 16.0
 # The robot crosses a disc within AROUND metres before and after the scan nearest to the middle.
 AROUND = 16.0
-# The bearing of a way is taken at so many metres outside of the disc, whose radius is at least
-# SMALL metres.
+# The bearing of a way out is measured RIM metres outside of the disc. A radius of the disc below
+# SMALL metres counts as SMALL.
 RIM, SMALL = 0.5, 0.5
 
 
@@ -41,8 +41,8 @@ class _Turn:
 
     Attributes:
         way: Metres driven up to it.
-        stride: The directions of motion are taken over so many metres.
-        angle: The angle between them in radians.
+        stride: The metres before and after the scan over which directions of motion are measured.
+        angle: The angle between these directions in radians.
         scan: Index of the scan.
     """
 

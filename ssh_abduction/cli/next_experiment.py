@@ -59,7 +59,7 @@ def add_parser(verbs: Verbs) -> None:
         help="stop when the process has used this many MiB, with the best plan so far",
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
-    add_theory(parser, default="the theory of the maps, or how the maps read stars")
+    add_theory(parser, default="the theory in the file of maps")
     parser.set_defaults(run=run)
     parser.epilog = (
         "The plan for two maps is as short as possible. The plan for more maps is greedy, "

@@ -1,4 +1,4 @@
-"""Add a drive to a map that stands, for the verb solve."""
+"""ssh-abduction solve TRACE --onto MAPS: add a drive to a standing map, which keeps its places."""
 
 from __future__ import annotations
 

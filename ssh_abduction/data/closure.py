@@ -168,7 +168,7 @@ def closures_among(closures: Sequence[Closure], steps: Sequence[int]) -> tuple[C
     number = {step: k for k, step in enumerate(steps)}
     kept = [c for c in closures if c.first in number and c.last in number]
     return tuple(
-        # To make a closure anew takes long, as its covariance is checked.
+        # Reuse a closure whose steps keep their numbers: making one checks its covariance.
         c if number[c.last] == c.last else replace(c, first=number[c.first], last=number[c.last])
         for c in kept
     )

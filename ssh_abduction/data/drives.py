@@ -93,7 +93,7 @@ class DriveStep(int):
 
 
 def named_steps(drives: Sequence[Drive], steps: int) -> Sequence[int]:
-    """Return the numbers of all steps. In words, those of several drives have names of drives.
+    """Return the numbers of all steps, with names such as "tuesday:14" if there are several drives.
 
     Args:
         drives: The drives of a trace; empty if they are unknown.
@@ -423,7 +423,7 @@ def _displacements(trace: Trace) -> str | None:
 
 
 def _systematic(trace: Trace) -> dict[str, float] | None:
-    """The errors of the odometry that are not those of single displacements, by name."""
+    """The odometry's errors of scale, drift and dstates, by name; None without displacements."""
     told = _odometry(trace)
     if told is None:
         return None

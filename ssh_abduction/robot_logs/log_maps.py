@@ -48,7 +48,7 @@ SHARE, LADDER = 1 / 20, 1 / 4
 LEAST, LEAST_RUNG = 30.0, 1.0
 # Without a map, the search is given LONGER times its time, at most PATIENCE times.
 LONGER, PATIENCE = 4.0, 3
-# Shorter ranges than this, in metres, look alike to the recogniser, as they do to the views.
+# The recogniser treats all ranges below this, in metres, as equal. So does the clustering of views.
 FLOOR = 0.3
 # Largest number of seconds for a rung, because the ladder is only information for the reader.
 RUNG = 10.0

@@ -244,7 +244,7 @@ LIFTS = "the field lifts"
 # Fields that a trace sets, and that the Python code around each fast encoding knows.
 OF_TRACES = (DRIVES, LIFTS)
 # Axioms about links, observations and pairs of steps only. If a map satisfies them, so does the map
-# of its first steps. Nothing links two drives, so they may be cut, too.
+# of its first steps. Two drives may be cut apart, too, because no link joins them.
 SURVIVE_A_CUT = FRAMES | {
     "next_place",
     "all_on_paths",
@@ -263,15 +263,16 @@ SURVIVE_A_CUT = FRAMES | {
     "other_floor",
     *OF_TRACES,
 }
-# Kinds of evidence about steps only: they say which steps are different dstates or at different
-# places, and which labels contradict each other.
+# The axioms of evidence about steps only. Such evidence says which steps are different dstates or
+# at different places, and which labels contradict each other.
 PAIRS_OF_STEPS = ("asserted", "one_star", "one_pose", "closure", "planar", "other_floor")
 
 TABLE = (
     Speedup(
         "prefixes",
         "prefixes",
-        "Solve for a prefix, replay its maps, and extend it where they fail.",
+        "Solve for a prefix of the trace, replay its maps on the whole trace, and extend the "
+        "prefix to where they fail.",
         _keeps_headings,
         ONE_OF_EACH,
         lambda: SURVIVE_A_CUT,
@@ -279,8 +280,8 @@ TABLE = (
     Speedup(
         "prefixes in tolerance",
         "prefixes",
-        "The same where stars agree in tolerance: a map that is replayed has to fit the stars of "
-        "all steps.",
+        "The same if stars agree within a tolerance. A replayed map must fit the stars of all "
+        "steps.",
         lambda theory: theory.star == "gateways",
         ONE_OF_EACH | {"gateway_heading"},
         lambda: SURVIVE_A_CUT | GATEWAYS,
@@ -288,7 +289,7 @@ TABLE = (
     Speedup(
         "path_names",
         "path_names",
-        "Begin with few names for paths.",
+        "Begin with few names for paths, and add names when they are too few.",
         _has_paths,
         TRAVELS_AND_TURNS,
         EVERY,
@@ -296,7 +297,7 @@ TABLE = (
     Speedup(
         "named dstates",
         "names",
-        "Causal theory: give the dstates names before clingo is asked.",
+        "Causal theory: give the dstates names, of which clingo chooses one for each node.",
         _is_causal,
         CAUSAL,
         _kept_by("names", and_also=(*PAIRS_OF_STEPS, *OF_TRACES)),
@@ -304,8 +305,8 @@ TABLE = (
     Speedup(
         "named dstates with faults",
         "names",
-        "Causal theory with faults: give the dstates names, and clingo the steps that a map does "
-        "not predict.",
+        "Causal theory with faults: give the dstates names, and give clingo only the steps that a "
+        "map does not predict.",
         lambda theory: (
             theory.level == "causal" and theory.has_faults and theory.prefer == ("dstates",)
         ),
@@ -325,8 +326,8 @@ TABLE = (
     Speedup(
         "mending",
         "names",
-        "Places, or displacements that may be wrong, and faults: guess the faults, mend the "
-        "trace, and solve it without; causal maps with faults say what is minimal.",
+        "Faults, with places or with displacements that may be wrong: guess the faults, mend the "
+        "trace, and solve it without faults. Causal maps with faults show what is minimal.",
         lambda theory: (
             (theory.level == "topological" or theory.jumped > 0)
             and theory.has_faults
@@ -344,7 +345,8 @@ TABLE = (
     Speedup(
         "visits",
         "names",
-        "Places with frames: settle dstates, as visits that are one, before places and paths.",
+        "Places with frames: first find which visits are at one place, and so the dstates. Then "
+        "find places and paths.",
         _has_frames,
         FRAMES,
         _kept_by(
@@ -357,8 +359,8 @@ TABLE = (
     Speedup(
         "ways",
         "ways",
-        "Places without stars: where clingo takes its time, settle dstates before places and "
-        "paths, with names.",
+        "Places without stars: if clingo takes long, first find the dstates, with names. Then find "
+        "places and paths.",
         _has_bare_places,
         PLACES,
         _kept_by(
@@ -368,7 +370,7 @@ TABLE = (
     Speedup(
         "clique",
         "clique",
-        "Steps, or segments of paths, no two of which can be one, are given names of their own.",
+        "Find steps, or segments of paths, of which no two can be one, and give each its own name.",
         _knows_views,
         CAUSAL,
         EVERY,
@@ -376,7 +378,8 @@ TABLE = (
     Speedup(
         "sides",
         "sides",
-        "With frames: say what order and sides forbid while dstates are sought, path by path.",
+        "Places with frames: while dstates are sought, add what the order and the sides of paths "
+        "forbid, path by path.",
         _has_frames,
         FRAMES,
         EVERY,
@@ -384,7 +387,7 @@ TABLE = (
     Speedup(
         "lazy",
         "lazy",
-        "Give clingo only the links, or the visits, without which others go wrong.",
+        "Give clingo only some links, or visits, at first. Add others when an answer breaks them.",
         _any_theory,
         NOTHING,
         EVERY,
@@ -392,7 +395,7 @@ TABLE = (
     Speedup(
         "core_guided",
         "core_guided",
-        "Raise the bound from below, rather than better the map.",
+        "Raise the lower bound by unsat cores, instead of improving a map step by step.",
         _any_theory,
         NOTHING,
         EVERY,
@@ -400,8 +403,7 @@ TABLE = (
     Speedup(
         "processes",
         "processes",
-        "While a robot drives: guess and solve in a process of its own, where there are two "
-        "processors.",
+        "While a robot drives: guess and solve in a second process, if there are two processors.",
         _any_theory,
         NOTHING,
         EVERY,
@@ -409,7 +411,7 @@ TABLE = (
     Speedup(
         "annealed",
         "annealed",
-        "Where clingo takes its time, a map near a guess; it passes the checker.",
+        "If clingo takes long, search for a map near a guess. The checker judges this map.",
         _any_theory,
         NOTHING,
         EVERY,
@@ -417,8 +419,8 @@ TABLE = (
     Speedup(
         "greedy",
         "greedy",
-        "Some map without clingo: by sketches, or by a beam of hypotheses about the "
-        "displacements. It passes the checker.",
+        "Make a map without clingo, by sketches or by a beam of hypotheses about the "
+        "displacements. The checker judges this map.",
         _any_theory,
         NOTHING,
         EVERY,
@@ -426,8 +428,7 @@ TABLE = (
     Speedup(
         "certain sketches",
         "greedy",
-        "While a robot drives: a map made without a search is consistent as it is made, and is "
-        "not checked.",
+        "While a robot drives: a sketch is consistent by its construction, so it is not checked.",
         _keeps_headings,
         PLACES - {"course_needs_travel"},
         lambda: SURVIVE_A_CUT - {"asserted same", *PAIRS_OF_STEPS},
@@ -435,8 +436,8 @@ TABLE = (
     Speedup(
         "digest",
         "digest",
-        "A drive is added to a standing map: give the solver each link of the map once, instead "
-        "of all old steps.",
+        "To add a drive to a standing map, give the solver each link of the map once, instead of "
+        "all old steps.",
         lambda theory: not theory.has_faults,
         ONE_OF_EACH,
         lambda: (SURVIVE_A_CUT | GATEWAYS | {"the field unknown_views"}) - {"one_pose", "closure"},
@@ -444,8 +445,8 @@ TABLE = (
     Speedup(
         "framing",
         "framing",
-        "Stars as patterns: where clingo takes its time, a map in which places have frames; it "
-        "passes the checker.",
+        "Stars as patterns: if clingo takes long, search for a map in which places have frames. "
+        "The checker judges this map.",
         lambda theory: theory.star == "pattern" and row("visits").holds_for(theory.with_frames()),
         NOTHING,
         EVERY,

@@ -100,7 +100,7 @@ class Theory:
         same: Pairs of steps known to be one dstate.
         different: Pairs of steps known to be different dstates.
         elsewhere: Pairs of steps known to be at different places.
-        same_place: Pairs of steps known to be at one place. Fast engines do not know them.
+        same_place: Pairs of steps known to be at one place. They switch off the fast engines.
         weigh: How to compare maps. count: by the counts in `prefer`. cost: by their cost in nats,
             which is the prices of what they have, plus half of the chi-square of their misfit to
             the displacements. auto: cost if displacements are used and the theory allows it.

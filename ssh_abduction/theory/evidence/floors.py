@@ -63,7 +63,7 @@ def _lifted(trace: Trace) -> tuple[int, ...]:
 
 @lru_cache(maxsize=8)
 def _pairs(stretches: tuple[int, ...], lifted: tuple[int, ...]) -> Pairs:
-    """Make the pairs of steps of which one is on the stretch before a lift, the other behind it.
+    """Pair each step on the stretch before a lift with each step on the stretch behind it.
 
     Args:
         stretches: For each step, the first step of its stretch.

@@ -246,7 +246,7 @@ class Loops:
         return moved
 
     def of_ends(self, end: int) -> Array:
-        """Compute the covariance at step `end` by the noise up to each step: (end + 1) x 9."""
+        """Compute the covariance of the pose at `end` by noise up to each step: (end + 1) x 9."""
         every = np.arange(end + 1)
         there = np.full(end + 1, end)
         return self._white(np.zeros_like(every), every, there, there).reshape(-1, 9)
