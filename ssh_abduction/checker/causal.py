@@ -1,4 +1,4 @@
-"""Checks of the axioms of the causal level (dstates and links; C1, C2)."""
+"""Checks of the axioms of the causal level, which are about dstates and links (C1, C2)."""
 
 from __future__ import annotations
 

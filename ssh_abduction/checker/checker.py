@@ -64,9 +64,9 @@ class Violation:
     """An axiom that a map breaks.
 
     Attributes:
-        axiom: The name of the axiom.
-        steps: The steps of the trace that show the violation, ascending. The action between steps i
-            and i + 1 adds both. Empty if no step is to blame.
+        axiom: The name of the axiom; `map_explains_trace` if the map does not fit the trace.
+        steps: The steps of the trace that show the violation, ascending. An action is shown by both
+            the step at which it is done and the next one. Empty if no step is to blame.
         message: A sentence that describes the violation by the dstates, places and paths of the
             map.
     """

@@ -41,8 +41,8 @@ def false_claims(
         maps: The maps that the answer lists.
         steps: The number of steps of the trace.
         theory: The theory of the answer, with all defaults resolved.
-        proven: The lower bound on dstates that the certificate of the answer proves. Counts that
-            clingo refuted are taken as refuted.
+        proven: The lower bound on dstates that the certificate of the answer proves. Numbers of
+            dstates that clingo refuted, by the certificate, are included without a check.
 
     Returns:
         A sentence for each false claim.
@@ -332,6 +332,7 @@ class _Claims:
 
 
 def _counts(ssh_map: SSHMap) -> dict[str, int]:
+    """Count the dstates, places, paths and excuses of a map."""
     return {
         "dstates": len(ssh_map.dstates),
         "places": len(ssh_map.places),
@@ -341,10 +342,12 @@ def _counts(ssh_map: SSHMap) -> dict[str, int]:
 
 
 def _is(value: Any, number: int) -> bool:
+    """Tell whether a value is this whole number."""
     return is_whole(value) and value == number
 
 
 def _text(counts: Any) -> str:
+    """Put claimed counts into words."""
     return (
         ", ".join(f"{value} {name}" for name, value in counts.items())
         if isinstance(counts, Mapping) and counts

@@ -1,9 +1,9 @@
 """Check the axioms about places with any number of gateways (star=gateways).
 
-A star is the set of gateways seen at a step. A sight is a dstate and a star seen there. A map does
-not list which gateways of two sights are the same. So if no frame (numbering of the gateways of a
-place) fits all sights of a place, the check reports a smallest set of sights that no frame fits.
-The set is reported as a violation of each axiom that would let a frame fit if it were left out.
+A star is the set of gateways seen at a step. A sight is a dstate and a star seen there. A frame is
+a numbering of the gateways of a place. A map does not list which gateways of two sights are the
+same. So if no frame fits all sights of a place, the check reports a minimal set of sights that no
+frame fits. The set violates each axiom without which a frame would fit.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ NAMES = (
 
 @dataclass(frozen=True)
 class Clash:
-    """A smallest set of sights (dstate and star) of a place that no frame of the place fits.
+    """A minimal set of sights (dstate and star) of a place that no frame of the place fits.
 
     Attributes:
         place: The place.
@@ -50,7 +50,7 @@ def clashes(sights: Sequence[Sight], turns: Turns, axioms: Collection[str]) -> I
         axioms: Names of the axioms that hold.
 
     Yields:
-        For each such place, a smallest set of its sights that fits no frame.
+        For each such place, a minimal set of its sights that fits no frame.
     """
     hard = [name for name in NAMES if name in axioms]
     for place, seen in by_place(sights).items():
@@ -70,6 +70,7 @@ def clashes(sights: Sequence[Sight], turns: Turns, axioms: Collection[str]) -> I
 
 
 def _clashes_of(m: Reading) -> list[Clash]:
+    """List the clashes of a map."""
     return list(clashes(*sights_of(m.trace, m.map, m.onward), m.axioms))
 
 

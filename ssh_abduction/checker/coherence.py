@@ -49,6 +49,13 @@ def numbered_by_first_visit(m: Reading) -> Found:
 
 
 def _numbered(what: str, ids: Sequence[int], visits: Iterable[tuple[int, int | None]]) -> Found:
+    """Check that ids are 0, 1, 2, … by first visit, and that each is visited.
+
+    Args:
+        what: What the ids are of, in words, such as "places".
+        ids: The ids that the map lists.
+        visits: Pairs of a step and the id visited there, sorted by step; None for no id.
+    """
     if list(ids) != list(range(len(ids))):
         yield [], f"The ids of the {what} are not 0, 1, 2, … in this order."
     used = {x: i for i, x in reversed(list(visits)) if x is not None}

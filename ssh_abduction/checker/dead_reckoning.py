@@ -27,12 +27,13 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 
 Array: TypeAlias = NDArray[np.float64]
-# The numbers of `one_pose` in docs/explanation/theory.md. SIGMAS: the errors of the heading that
-# count, in standard deviations. LOST: the uncertainty in radians at which a heading is lost.
-# BENDS_A_SIGMA: how many drifts are tried per standard deviation. MOST_BENDS: the greatest drift,
-# in standard deviations. ROUNDED: the rounding error in metres and radians.
+# The numbers of `one_pose` in docs/explanation/theory.md. SIGMAS: up to how many standard
+# deviations of the heading the error of linearisation is bounded. LOST: the standard deviation in
+# radians above which a heading is unknown. BENDS_A_SIGMA: how many drifts are tried per standard
+# deviation. MOST_BENDS: the greatest drift, in standard deviations. ROUNDED: the rounding error in
+# metres and radians.
 SIGMAS, LOST, BENDS_A_SIGMA, MOST_BENDS, ROUNDED = 6.0, 1.0, 2, 6, 1e-3
-# The number of steps or returns between two looks at the clock. They take some milliseconds.
+# The number of steps or returns between two checks of the time limit. They take some milliseconds.
 FEW = 64
 
 
@@ -41,7 +42,8 @@ class ErrorFilter:
 
     Errors are those of the pose (x and y in metres, heading in radians), of the scale, and of the
     drift of the heading. The arguments `first` and `last` of the methods are the steps at the ends
-    of m loops, as arrays of length m. Two numbers give the result of one loop.
+    of m loops, as arrays of length m. For a single loop they may be two numbers; then the result
+    has no first axis.
 
     Args:
         trace: The trace, with displacements.
@@ -90,20 +92,20 @@ class ErrorFilter:
             self.repeated[t] = onward @ self.repeated[t - 1] + new
 
     def onward(self, first: Any, last: Any) -> Array:
-        """Compute F(last, first), m x 3 x 3: how an error at `first` shows at `last`."""
+        """Compute F(last, first), (m, 3, 3): how a pose error at `first` shows at `last`."""
         return _onward(self.pose[last, :2] - self.pose[first, :2])
 
     def since(self, first: Any, last: Any) -> Array:
-        """Compute the covariance of the noise between `first` and `last`, m x 3 x 3."""
+        """Compute the covariance at `last` of the noise between `first` and `last`, (m, 3, 3)."""
         onward = self.onward(first, last)
         covariance: Array = self.white[last] - onward @ self.white[first] @ onward.swapaxes(-1, -2)
         return covariance
 
     def new_until(self, end: int) -> Array:
-        """For each step up to `end`, compute how the noise up to it shows at `end`.
+        """For each step up to `end`, compute the covariance at `end` of the noise up to this step.
 
         Returns:
-            The covariances, (end + 1) x 9.
+            The covariances, (end + 1, 9).
         """
         steps = np.arange(end + 1)
         onward = self.onward(steps, np.full(end + 1, end))
@@ -116,7 +118,7 @@ class ErrorFilter:
         """Compute how the end of each loop moves if scale or drift is one standard deviation off.
 
         Returns:
-            The changes of the pose by scale and by drift, m x 3 x 2.
+            The changes of the pose by scale and by drift, (m, 3, 2).
         """
         moved: Array = (
             self.repeated[last] - self.onward(first, last) @ self.repeated[first]
@@ -124,7 +126,7 @@ class ErrorFilter:
         return moved
 
     def covariance(self, first: Any, last: Any) -> Array:
-        """Compute the covariance of the closing error of each loop, m x 3 x 3.
+        """Compute the covariance of the closing error of each loop, (m, 3, 3).
 
         Errors of the heading have effects that are not linear. The covariance is enlarged by a
         bound on these effects.
@@ -176,7 +178,7 @@ class ErrorFilter:
         return known
 
     def closing(self, first: Any, last: Any) -> Array:
-        """Compute the closing error of each loop (x, y, heading), m x 3.
+        """Compute the closing error of each loop (x, y, heading), (m, 3).
 
         This is the pose at `last` minus the pose at `first`, by dead reckoning.
         """
@@ -186,7 +188,7 @@ class ErrorFilter:
 
 
 def _onward(moved: Array) -> Array:
-    """Compute F, m x 3 x 3: how errors of the pose change by the movements `moved`, m x 2."""
+    """Compute F, (m, 3, 3): how errors of the pose change by the movements `moved`, (m, 2)."""
     onward = np.zeros((*moved.shape[:-1], 3, 3))
     onward[..., range(3), range(3)] = 1.0
     onward[..., 0, 2], onward[..., 1, 2] = -moved[..., 1], moved[..., 0]
@@ -194,10 +196,10 @@ def _onward(moved: Array) -> Array:
 
 
 class Drifts:
-    """An iterator over possible drifts of the heading, no drift first.
+    """Iterates over possible drifts of the heading, no drift first.
 
-    It yields an `ErrorFilter` with the poses for each drift, and the chi-square of that drift.
-    Poses are computed at their first use.
+    For each drift it yields an `ErrorFilter` with the poses for this drift, and the chi-square of
+    the drift itself. Poses are computed at their first use.
     """
 
     def __init__(self, trace: Trace) -> None:
@@ -210,6 +212,7 @@ class Drifts:
         return self._filter(0)
 
     def _filter(self, number: int) -> ErrorFilter:
+        """Return the filter for a drift of `number` / BENDS_A_SIGMA standard deviations."""
         step = self._odometry.bend / BENDS_A_SIGMA
         if number not in self._made:
             self._made[number] = ErrorFilter(self._trace, self._odometry, number * step, step / 2)

@@ -115,7 +115,7 @@ def closure(m: Reading) -> Found:
 
 
 def _p_value(match: Closure, odometry: Odometry, freedom: int) -> float:
-    """Compute how probable a closure at least so far from zero is, if both poses are one.
+    """Compute how probable a closure at least this far from zero is if both poses are one.
 
     Args:
         match: The closure.
@@ -176,9 +176,9 @@ def planar(m: Reading) -> Found:
 def _may_show_the_same(one: Star, other: Star) -> bool:
     """Tell whether two stars may show the same gateways, seen by a robot that has not turned.
 
-    They may if the gateways of one star can be matched one-to-one with those of the other, such
-    that bearings differ by no more than their spreads, and every gateway seen open in either star
-    is matched.
+    They may if the gateways of the two stars can be matched in pairs such that the bearings of a
+    pair differ by no more than their spreads, and each gateway that is seen open in one star is in
+    a pair.
     """
     import numpy as np
     from scipy.optimize import linear_sum_assignment

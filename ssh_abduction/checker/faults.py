@@ -12,8 +12,8 @@ from ssh_abduction.data.maps import Fault
 def faults_are_allowed(m: Reading) -> Found:
     """Check that the theory allows each fault of the map, and that the map lists it correctly.
 
-    A fault must be listed once, with the view or action that the trace shows at its step, and with
-    the cost that the theory sets.
+    A fault must be listed once, with the view or action that the trace has at its step, and with
+    the cost that the theory sets. If gateways may change, all changes must be listed.
     """
     steps, named = m.trace.steps, set[tuple[str, int, int | None]]()
     for fault in m.map.faults:

@@ -8,9 +8,9 @@ _LIFTS = ("lift", "stairs")
 
 
 def floors_of(m: Reading) -> dict[int, int]:
-    """Name the floor of each dstate by the first dstate there.
+    """For each dstate, find the first dstate on its floor.
 
-    Links that are no lifts, and common places, connect the dstates of a floor.
+    The dstates of a floor are connected by common places, and by links that are not lifts.
     """
     beside: dict[int, set[int]] = {s: set() for s in m.states}
     pairs = [(t.source.id, t.target.id) for t in m.moves if t.action.kind not in _LIFTS]
@@ -32,7 +32,7 @@ def floors_of(m: Reading) -> dict[int, int]:
 
 
 def other_floor(m: Reading) -> Found:
-    """Check that no links but lifts, and no common places, join the two ends of a lift."""
+    """Check that the two ends of a lift are on different floors."""
     floor = m.once(floors_of)
     for t in m.moves:
         if t.action.kind in _LIFTS and floor[t.source.id] == floor[t.target.id]:
@@ -57,7 +57,7 @@ def path_on_one_floor(m: Reading) -> Found:
 
 
 def floors_are_listed(m: Reading) -> Found:
-    """Check that a map lists the floor of each dstate by first visit, or lists no floors."""
+    """Check that a map lists the floors of all dstates, numbered by first visit, or of none."""
     listed = {s.id: s.floor for s in m.map.dstates}
     if not m.theory.lifts:
         if any(floor is not None for floor in listed.values()):

@@ -1,9 +1,9 @@
 """Guess missing displacements from the places that a map has on both sides of a gap.
 
 A displacement is missing where a drive starts, or where it was not logged. Between two gaps lies a
-*stretch* of steps. Dead reckoning gives the poses of its steps in a frame of its own. Two stretches
-that have a dstate in common fix their frames to each other, as do two that have two places in
-common.
+*stretch* of steps. Dead reckoning gives the poses of its steps in a frame of its own. If two
+stretches have a dstate or two places in common, this determines how their frames lie relative to
+each other.
 
 The guess is only a starting point: the misfit does not depend on it.
 """
@@ -18,7 +18,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-# Two places of a stretch that are less than this many metres apart show no direction.
+# The direction from one place to another is too uncertain to use if they are closer than this many
+# metres.
 NEAR = 1.0
 
 _Frame = tuple[complex, float]  # the position and the heading of the origin of a stretch
@@ -33,7 +34,7 @@ def likely_moves(
     """Guess the missing displacements.
 
     Args:
-        moved: The displacement that leads to each step, n x 3, in metres and radians.
+        moved: The displacement that leads to each of n steps, (n, 3), in metres and radians.
         missing: The steps to which no displacement is known.
         dstates: The dstate of each step.
         places: The place of each step.
@@ -82,7 +83,19 @@ def _frame(
     known: dict[int, int],
     position: dict[int, complex],
 ) -> _Frame | None:
-    """Find the frame of a stretch by a dstate, or two places, that have a pose already."""
+    """Find the frame of a stretch, by a dstate or two places whose poses are known already.
+
+    Args:
+        steps: The steps of the stretch.
+        pose: The pose of each step; those of `steps` are in the frame of the stretch.
+        dstates: The dstate of each step.
+        places: The place of each step.
+        known: For each dstate with a known pose, a step there.
+        position: For each place with a known position, this position.
+
+    Returns:
+        The position and the heading of the origin of the stretch; None if they are undetermined.
+    """
     for t in steps:
         if dstates[t] in known:
             at, heading = pose[known[dstates[t]]]

@@ -5,12 +5,12 @@ between these steps. The module `dead_reckoning` computes the error with which a
 the covariance of this error.
 
 Returns are tested alone and in pairs by their chi-square. Most pairs need no test, because a bound
-shows that they are not rejected. Let z and y be the chi-squares of the two returns alone. The
-matrix M is the covariance of the noise that both share, times the inverse of the covariance of the
-later return. If s is at least the greatest eigenvalue of M, the chi-square of the pair is at most
-(z + y) / (1 - sqrt(s)). The trace of M is such an s. It is the difference of two values of a table,
-so it is fast. The square root of the trace of M squared is a smaller s. It is tried on the pairs
-that are left.
+shows that they are not rejected. Let z and y be the chi-squares of the two returns alone. Let M be
+the inverse of the covariance of the later return, times the covariance of the noise that both
+returns share. If s is at least the greatest eigenvalue of M, the chi-square of the pair is at most
+(z + y) / (1 - sqrt(s)). The trace of M is such an s. It is fast to compute, as the difference of
+two values of a table. The square root of the trace of M squared is a smaller s. It is used for the
+pairs that are left.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ Return: TypeAlias = tuple[int, int, int]
 # Returns that are rejected, their chi-square, and the threshold.
 _Found: TypeAlias = tuple[tuple[Return, ...], float, float]
 
-# The number of sets that numpy works on at once.
+# The number of pairs of returns that numpy works on at once.
 AT_A_TIME = 50_000
-# If the bound leaves more pairs of returns than this, only about this many are tested, evenly
+# If the bound leaves more pairs of returns than this, test only about this many of them, evenly
 # spread. That takes a second or two.
 MOST_SETS = 300_000
-# The bound skips a pair only with this margin, because numbers are rounded.
+# The bound must hold with this margin, because numbers are rounded.
 MARGIN = 1e-3
 
 
@@ -68,7 +68,7 @@ class Closing:
 
 @dataclass(frozen=True)
 class Refused:
-    """One return or two returns of a map that the displacements reject.
+    """One return, or a pair of returns, that the displacements reject.
 
     A return is a pair of steps that the map has at one dstate or at one place. Its loop is the way
     between these steps.
@@ -103,6 +103,7 @@ class Refused:
         return f"they are {closing.size:.1f} ± {closing.size_sigma:.1f} m{turned} apart"
 
     def _of_loops(self) -> Iterator[tuple[str, list[float]]]:
+        """Yield the lengths of the loops, then their closing errors, each with a number format."""
         yield ".0f", [closing.way for closing in self.closings]
         yield ".1f", [closing.size for closing in self.closings]
 
@@ -173,8 +174,8 @@ def _returns(
         ssh_map: A map of the trace.
         theory: The theory, resolved for the trace.
         drifts: The poses by dead reckoning.
-        of_arrivals: Whether returns to dstates are limited to first steps of visits. Returns to
-            places always are.
+        of_arrivals: Whether to leave out returns to dstates in which a step is not the first one of
+            its visit. Returns to places always have first steps of visits.
 
     Yields:
         Returns: first step, last step, and degrees of freedom.
@@ -206,9 +207,10 @@ def _most(theory: Theory, freedom: int, together: bool) -> float:
     """Compute the chi-square above which returns are rejected.
 
     Args:
-        theory: The theory, with the chance of a false rejection and the number of tests.
+        theory: The theory, with the allowed probability of a false rejection, and the number of
+            returns.
         freedom: The degrees of freedom of all returns of one test.
-        together: Whether a test is of a pair of returns.
+        together: Whether pairs of returns are tested.
     """
     share = theory.reject / 2 if theory.joint > 1 else theory.reject
     tests = theory.returns * (theory.returns - 1) / 2 if together else theory.returns
@@ -277,7 +279,7 @@ def _sets(rows: Steps, filtered: ErrorFilter, most: float) -> Iterator[tuple[Ste
     """Find the pairs of returns whose loops overlap and that need a test.
 
     Args:
-        rows: The returns (first step, last step, degrees of freedom), sorted by last step, m x 3.
+        rows: The returns (first step, last step, degrees of freedom), sorted by last step, (m, 3).
         filtered: The poses without drift.
         most: The least chi-square at which a pair may be rejected.
 
@@ -301,9 +303,9 @@ class _Alone:
     """Values of m returns, each taken alone.
 
     Attributes:
-        inverse: The inverse of the covariance of each closing error, m x 9.
-        square: The chi-square of each return, m.
-        repeated: The part of each covariance that scale and drift cause, m x 9.
+        inverse: The inverse of the covariance of each closing error, (m, 9).
+        square: The chi-square of each return, (m,).
+        repeated: The part of each covariance that scale and drift cause, (m, 9).
     """
 
     def __init__(self, filtered: ErrorFilter, rows: Steps) -> None:
@@ -332,7 +334,7 @@ def _unsafe(
 
     Args:
         filtered: The poses without drift.
-        rows: The returns, sorted by last step, m x 3.
+        rows: The returns, sorted by last step, (m, 3).
         alone: The values of each return alone.
         end: The last step of the later return.
         most: The least chi-square at which a pair may be rejected.
@@ -369,7 +371,12 @@ def _unsafe(
 def _common_ends(rows: Steps, here: Steps, others: Steps) -> Steps:
     """Count the ends that the loops of two returns have in common.
 
-    At such an end the robot is off its dstate by one error, which both returns share.
+    Both returns share the error by which the robot is off its dstate at such an end.
+
+    Args:
+        rows: The returns.
+        here: Indices into `rows` of one return of each pair.
+        others: Indices into `rows` of the other return of each pair.
     """
     same: Steps = (rows[here, :2] == rows[others, :2]).sum(-1)
     return same
@@ -379,7 +386,7 @@ def _is_safe(share: Array, squares: Array, most: float) -> NDArray[np.bool_]:
     """For each pair of returns, tell whether the bound shows that it is not rejected.
 
     Args:
-        share: A bound s on the share of the covariance that both returns have in common.
+        share: The number s of the bound in the module's docstring.
         squares: The sum of the chi-squares of both returns.
         most: The least chi-square at which a pair may be rejected.
     """
@@ -432,7 +439,7 @@ def _square_together(filtered: ErrorFilter, rows: Steps, here: Steps, others: St
 
 
 def _square(off: Array, covariance: Array) -> Array:
-    """Compute the chi-squares of closing errors `off`, m x k, with covariances, m x k x k."""
+    """Compute the chi-squares of closing errors `off`, (m, k), with covariances, (m, k, k)."""
     square: Array = np.einsum("mi,mi->m", off, np.linalg.solve(covariance, off[..., None])[..., 0])
     return square
 

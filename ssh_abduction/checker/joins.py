@@ -39,8 +39,8 @@ class Join:
     Attributes:
         first: The earlier step.
         second: The later step.
-        at_place: Whether the join makes the two steps one place. If not, they are at one place for
-            another reason, or the map has no places. Then it makes them one dstate.
+        at_place: True if the join puts the two steps at one place. False if it only puts them at
+            one dstate: they are at one place for another reason, or the map has no places.
     """
 
     first: int
@@ -55,11 +55,11 @@ class Join:
 def joins_by_minimality(
     trace: Trace, ssh_map: SSHMap, theory: Theory | None = None
 ) -> tuple[Join, ...]:
-    """List the joins of a map that rest on minimality alone, and from which all others follow.
+    """List the joins of a map that rest on minimality alone and imply all other such joins.
 
-    The trace is read step by step. A step is joined to the last earlier step at its dstate; or, if
-    a visit to a place brings only new dstates, to the last step at the place. The join is listed
-    unless it follows from the joins of earlier steps by one of these reasons:
+    The trace is read step by step. A step at a known dstate is joined to the last step there. If a
+    visit to a known place has only new dstates, the visit is joined to the last step at the place.
+    A join is listed unless it follows from the joins of earlier steps by one of these reasons:
 
     - The same action at the same dstate led there before (`deterministic`).
     - The user says so (`asserted`).
@@ -68,11 +68,12 @@ def joins_by_minimality(
     - Both are known to be at one place, and along one path in one direction by the robot's travels
       and turns around (`one_dstate_per_course`).
 
-    With headings, a join of places includes how the robot faces there. Each listed join is wrong in
-    some map that satisfies the axioms and has the joins listed before it. There are exceptions: a
-    join may follow from your own rules, or from `next_place`, which is off in every preset. With
-    `star=gateways` a turn is taken to decide the heading. Few turns leave it open, such as a turn
-    right at a place with two gateways on the right and one star in both directions.
+    With headings, a join of places includes how the robot faces there. For each listed join, there
+    is a map that satisfies the axioms and has the joins listed before it, but not this one. There
+    are exceptions: a join may follow from the user's own rules, or from `next_place`, which is off
+    in every preset. With `star=gateways` it is assumed that turns determine the heading. Few turns
+    do not, such as a turn right at a place with two gateways on the right and the same star in both
+    directions.
 
     Args:
         trace: The trace.
@@ -110,13 +111,14 @@ def sentence_of(joins: Sequence[Join], maps: int = 1, *, minimal: bool = False) 
 
 
 def _named(joins: Sequence[Join]) -> str:
+    """Name the steps of the first SHOWN joins, and count the others."""
     pairs = ", ".join(f"{join.first} and {join.second}" for join in joins[:SHOWN])
     more = len(joins) - SHOWN
     return f"steps {pairs}" + (f", and {counted(more, 'more joins')}" if more > 0 else "")
 
 
 class _Classes:
-    """Steps in classes, which can be merged. Steps of one class share a property.
+    """Classes of steps that share a property. At first each step is a class. Classes can be merged.
 
     Args:
         steps: The number of steps.
@@ -133,9 +135,11 @@ class _Classes:
         return step
 
     def merge(self, first: int, second: int) -> None:
+        """Merge the classes of two steps."""
         self._above[self.of(second)] = self.of(first)
 
     def are_one(self, first: int, second: int) -> bool:
+        """Whether two steps are in one class."""
         return self.of(first) == self.of(second)
 
 
@@ -143,9 +147,9 @@ class _Joining:
     """Reads a trace step by step, and collects the joins that do not follow from earlier ones.
 
     Attributes:
-        places: Steps of one class are at one place, by what is known so far.
-        courses: Steps of one class are along one path, by what is known so far. The map says in
-            which directions.
+        places: Steps of one class are known to be at one place.
+        courses: Steps of one class are known to be along one path. The map says in which
+            directions.
     """
 
     def __init__(self, trace: Trace, ssh_map: SSHMap, theory: Theory) -> None:
@@ -156,7 +160,7 @@ class _Joining:
         asserted = [sorted(pair) for pair in theory.same if max(pair) < len(trace)]
         self.asserted = {second for _, second in asserted}
         slipped = {fault.step for fault in ssh_map.faults if fault.kind == "slipped"}
-        # The action that led to each step; None if it is unknown, or not what its name says.
+        # The action that led to each step; None if there is none, or if it slipped.
         self.led: list[Action | None] = [
             None,
             *(None if t in slipped else step.action for t, step in enumerate(trace.steps[:-1])),
@@ -183,7 +187,7 @@ class _Joining:
         return action is not None and action.kind == "turn" and "turn_stays" in self.axioms
 
     def _merge(self, first: int, second: int) -> None:
-        """Note that two steps are one dstate."""
+        """Record that two steps are known to be one dstate."""
         self.places.merge(first, second)
         self.courses.merge(first, second)
 
@@ -220,16 +224,18 @@ class _Joining:
         return tuple(sorted(found, key=lambda join: (join.second, join.first)))
 
     def _is_forced(self, first: int, second: int) -> bool:
-        """Whether two steps are one dstate by what is known so far, if they are so in the map."""
+        """Whether it is known that two steps are one dstate, given that they are in the map."""
         if second in self.asserted:
             return True
         if self.map.dstates[self.map.dstate_at[second]].place is None:
             return False
-        # Both headings, or both courses, are known relative to each other: so they are equal.
+        # The map has both steps at one dstate, so their headings and courses are equal in it. If
+        # headings, or courses, are known relative to each other, they are equal in all maps.
         return self.places.are_one(first, second) and (
             self.by_heading or (self.by_course and self._along_one_path(first, second))
         )
 
     def _along_one_path(self, first: int, second: int) -> bool:
+        """Whether two steps are known to be along one path."""
         on_path = self.map.dstates[self.map.dstate_at[second]].path is not None
         return on_path and self.courses.are_one(first, second)

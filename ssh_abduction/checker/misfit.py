@@ -1,11 +1,12 @@
 """Compute the cost of maps in nats anew, and compare it with what an answer claims.
 
 The solver looks for poses of dstates. This module looks for errors of the displacements instead, so
-the two share nothing. The unknowns z are the errors of all displacements and closures, the scale
-and the drift, each in standard deviations. A map demands that its loops close, and that the poses
-of the two steps of each closure lie as it says: c(z) = 0. The misfit is the least sum of z², found
-by Gauss-Newton: z is moved to the smallest solution of J z = J z - c(z), where J holds the
-derivatives of c. This is the update of an iterated Kalman filter for all loops at once.
+the two share no method. The unknowns z are the errors of all displacements and closures, the scale
+and the drift, each in standard deviations. A map demands that its loops close, and that the two
+steps of each closure lie as the closure says: c(z) = 0. The misfit is the least sum of z² with
+c(z) = 0. It is found by Gauss-Newton: the next z is the smallest solution w of J w = J z - c(z),
+where J holds the derivatives of c. This is the update of an iterated Kalman filter for all loops at
+once.
 """
 
 from __future__ import annotations
@@ -31,22 +32,24 @@ Faults: TypeAlias = Sequence[tuple[str, int]]
 ROUNDS = 50
 # Stop when no unknown moves by more than this many standard deviations.
 STILL = 1e-9
-# The standard deviation of a missing displacement, in metres and radians: it may be anything.
+# The standard deviation of a missing displacement, in metres and radians. It is so large that any
+# displacement is possible.
 MISSING = 1e4
-# Claimed costs may be off by this many nats, and by this share of the misfit.
+# Claimed costs may be wrong by this many nats, plus this share of the misfit.
 EXACT, SHARE = 1e-3, 1e-3
-# A robot that is off its dstates is so by this standard deviation at least, in metres and radians.
+# If the robot may be off its dstates, the standard deviation is at least this, in metres and
+# radians.
 SMALLEST = 1e-3
-# The rivals whose costs are checked.
+# The costs of this many rivals are checked.
 RIVALS = 5
-# Traces with more steps are not weighed anew: the derivatives are a dense matrix.
+# The costs of traces with more steps are not checked, as the derivatives are a dense matrix.
 LONGEST = 400
 
 
 def misfit(
     trace: Trace, dstates: Sequence[int], places: Sequence[int], faults: Faults = ()
 ) -> float:
-    """The least chi-square if each step is at this dstate and this place.
+    """Compute the misfit (the least chi-square) if each step is at a given dstate and place.
 
     Args:
         trace: A trace with displacements, and perhaps closures.
@@ -124,7 +127,7 @@ class _Errors:
             self._moved[t] = displacement
             self._root[t] = np.linalg.cholesky(np.array(covariance))
         self._way = np.hypot(self._moved[:, 0], self._moved[:, 1])
-        # A wrong heading after a gap may be too far off for Gauss-Newton: begin near the least.
+        # If a heading after a gap is too far off, Gauss-Newton fails. So begin near the solution.
         missing = [t for t in range(1, size) if trace.steps[t].displacement is None]
         for t, likely in likely_moves(self._moved, missing, dstates, places):
             self._moved[t] = likely
@@ -139,7 +142,7 @@ class _Errors:
         # off its dstate at each step, scale and drift.
         self._begin = 3 * (size + len(self._closures))
         self._size = self._begin + self._off.size + 2
-        # The loops: the last step at the same place, and whether it is at the same dstate.
+        # The loops: the last step at the same place, a step, and whether their dstate is the same.
         self._loops: list[tuple[int, int, bool]] = []
         at_place: dict[int, int] = {}
         at_dstate: dict[int, int] = {}
@@ -151,7 +154,7 @@ class _Errors:
             at_dstate[dstate], at_place[place] = t, t
 
     def least(self) -> float:
-        """The least sum of squares of the errors, in standard deviations."""
+        """Compute the least sum of squares of the errors, in standard deviations."""
         z: Array = np.zeros(self._size)
         for _ in range(ROUNDS):
             look_at_clock()
@@ -167,7 +170,7 @@ class _Errors:
         return float(z @ z)
 
     def _closings(self, z: Array) -> tuple[Array, Array]:
-        """How far off the loops close with these errors, and the derivatives by the errors."""
+        """Compute c(z), by how much loops and closures are off, and J, its derivatives by z."""
         size = len(self._moved)
         scale, bend = self._sigma * z[-2:]
         noise = np.einsum("tij,tj->ti", self._root, z[: 3 * size].reshape(size, 3))
@@ -223,11 +226,11 @@ class _Errors:
         return np.array(off), np.concatenate(rows) if rows else np.zeros((0, self._size))
 
     def _row(self, pose: Array, own: Array, first: int, last: int) -> Array:
-        """The derivatives of the pose at `last` minus that at `first`, 3 x the unknowns.
+        """Compute the derivatives of the pose at `last` minus that at `first`, (3, unknowns).
 
         Args:
-            pose: The poses of all steps, n x 3.
-            own: The derivatives of each movement by its own unknowns, n x 3 x 5.
+            pose: The poses of all steps, (steps, 3).
+            own: The derivatives of each movement by its own unknowns, (steps, 3, 5).
             first: The earlier step.
             last: The later step.
         """
@@ -244,11 +247,14 @@ class _Errors:
 
 
 def _off_dstates(trace: Trace) -> Array:
-    """How far the robot may be off the pose of its dstate at each step: n x 3 standard deviations.
+    """Compute by how much the robot may be off the pose of its dstate at each step.
 
-    In metres and radians; empty if the odometry says that it never is. A visit goes on while the
-    robot turns. Its steps share one error of position. So in a visit of k steps each has k times
-    the variance.
+    Turns do not move the robot, so the k steps of a visit share one error of position. To count
+    this error once, each of the steps gets k times its variance.
+
+    Returns:
+        The standard deviations of x, y and heading, (steps, 3), in metres and radians; empty if the
+        odometry declares no such errors.
     """
     odometry = trace.odometry or Odometry()
     if not odometry.offset and not odometry.facing:

@@ -12,10 +12,10 @@ from ssh_abduction.checker.moves import Move
 class Order:
     """The order of the places along one path, in directions +1 and -1.
 
-    If the axioms demand a total order, the order is the one that the map lists. Otherwise it has
-    only the pairs that travels imply. A list can only show an order that is asymmetric and
-    transitive. So if one of these two axioms is left out, a travel overrules the list. Without the
-    axiom on_path no place is known to be on the path, so the list is not used.
+    If the axioms demand a total order, this is the order that the map lists. Otherwise it has only
+    the pairs that travels imply. A list always shows an order that is asymmetric and transitive. So
+    if one of these two axioms is left out and a travel contradicts the list, the travel decides.
+    Without the axiom on_path no place is known to be on the path, so the list is not used.
 
     Args:
         listed: The places as the map lists them, in direction +1.
@@ -24,10 +24,10 @@ class Order:
         axioms: Names of the axioms that hold.
 
     Attributes:
-        listed: As above.
-        travels: As above.
+        listed: The argument `listed`.
+        travels: The argument `travels`.
         position: The position of each listed place in the list, from 0.
-        backward: The pairs of `travels` that the list has the other way round, or not at all.
+        backward: The pairs of `travels` that the list has the other way round, or does not have.
         rings: Lists of places. Travels lead from each place to the next, and from the last to the
             first.
         can_be_listed: Whether the axioms demand an order that a list can show.
@@ -61,7 +61,7 @@ class Order:
         self._is_listed = self._total and (self.can_be_listed or not self.backward)
 
     def _rings(self) -> list[list[int]]:
-        """Find the rings. Each has a travel against the list, so only those travels are tried."""
+        """Find the rings. Each has a travel that contradicts the list, so only these are tried."""
         try:
             TopologicalSorter(self._next[1]).prepare()
         except CycleError:
@@ -131,7 +131,7 @@ class Order:
     def _follows(self, p: int, direction: int) -> list[int]:
         """Find the places that travels or the list put after p.
 
-        The list is used only if the order is total. A travel overrules it.
+        The list is used only if the order is total. If a travel contradicts it, the travel decides.
         """
         travelled = self._next[direction].get(p, {})
         later = self._later(p, direction) if self._total else ()

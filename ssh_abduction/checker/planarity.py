@@ -147,7 +147,7 @@ class Edges:
             - at_edge
         ):
             at_edge |= more
-        # for each place, lists of gateways that follow each other clockwise
+        # for each place, sequences of gateways that are known to follow each other clockwise
         told: dict[int, list[list[Arm]]] = defaultdict(list)
         for s, turn, t in self.turns:
             if turn != "around" and {s, t} <= at_edge:
@@ -267,6 +267,7 @@ class Edges:
 
 
 def _cycles(following: Mapping[tuple[int, int], tuple[int, int]]) -> int:
+    """Count the cycles of a permutation."""
     left, cycles = set(following), 0
     while left:
         cycles += 1
@@ -280,6 +281,12 @@ def _parts(
     around: Mapping[int, Sequence[tuple[int, int]]],
     beyond: Mapping[tuple[int, int], tuple[int, int]],
 ) -> int:
+    """Count the connected parts of a drawing.
+
+    Args:
+        around: The gateways of each place.
+        beyond: For each gateway, the gateway at the other end of its edge.
+    """
     left, parts = set(around), 0
     while left:
         parts += 1
@@ -303,9 +310,11 @@ def _is_turned(faced: Mapping[int, int], turn: tuple[int, int, int]) -> bool:
 
 
 def _goes_round(order: Sequence[Arm], told: Sequence[Arm]) -> bool:
-    """Tell whether the gateways `told` are distinct, and clockwise in a circular order.
+    """Tell whether gateways are distinct, and clockwise in a circular order.
 
-    Gateways that the order does not have yet are skipped.
+    Args:
+        order: The circular order.
+        told: The gateways. Those that the order does not have yet are skipped.
     """
     there = [order.index(gateway) for gateway in told if gateway in order]
     return (
@@ -315,9 +324,13 @@ def _goes_round(order: Sequence[Arm], told: Sequence[Arm]) -> bool:
 
 
 def _orders(gateways: Sequence[Arm], told: Sequence[Sequence[Arm]]) -> list[tuple[Arm, ...]]:
-    """List all clockwise orders of gateways that agree with the `told` sequences.
+    """List all clockwise orders of gateways that agree with some sequences.
 
-    Orders that differ by a rotation are one: each starts with the first gateway.
+    Orders that differ by a rotation are listed once: each starts with the first gateway.
+
+    Args:
+        gateways: The gateways of one place.
+        told: Sequences of gateways that are known to follow each other clockwise.
     """
     orders: list[tuple[Arm, ...]] = [()]
     for gateway in gateways:

@@ -23,8 +23,9 @@ class ProvenBound:
     """The lower bound that a certificate proves, and what is wrong with the certificate.
 
     Attributes:
-        dstates: A lower bound on the dstates of every map. It is proven only if `faults` is empty.
-        refuted: The next numbers of dstates, from `dstates` up, for which the certificate says that
+        dstates: A lower bound on the dstates of every map: the size of the clique. It is proven
+            only if `faults` is empty.
+        refuted: Further numbers of dstates, from `dstates` up, for which the certificate says that
             clingo found no map. This is not checked here.
         faults: A sentence for each pair of steps that the certificate does not show to be distinct.
     """
@@ -103,6 +104,7 @@ def check_bound(trace: Trace, certificate: Any) -> ProvenBound:
 
 
 def _integers(values: Any) -> bool:
+    """Tell whether a value is a list of whole numbers."""
     return isinstance(values, list) and all(
         isinstance(value, int) and not isinstance(value, bool) for value in values
     )

@@ -57,6 +57,7 @@ class Reading:
         self._read()
 
     def _read(self) -> None:
+        """Read all steps, and fill the dicts."""
         labels, with_stars = self.map.dstate_at, self.theory.star in ("pattern", "frame")
         # whether the theory allows these faults is checked elsewhere
         doubted = {(fault.kind, fault.step) for fault in self.map.faults}
@@ -75,7 +76,7 @@ class Reading:
                 self.links.setdefault((label, step.action.name, labels[i + 1]), i)
 
     def named(self, step: int) -> int:
-        """Return a step, with the name of its drive in words; unchanged if there is no such one."""
+        """Return a step that in words has the name of its drive; unchanged if not in the trace."""
         return self.steps[step] if 0 <= step < len(self.steps) else step
 
     def once(self, compute: Callable[[Reading], _T]) -> _T:

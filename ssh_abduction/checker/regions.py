@@ -22,8 +22,8 @@ _Node: TypeAlias = tuple[str, int] | tuple[str, int, int | None]
 def known_sides(m: Reading) -> Mapping[Course, Mapping[int, Branch]]:
     """Find the places known to lie right of each course, each with the branch that leads to it.
 
-    Only travels tell the order of places here. The order that a map lists may have more, but then
-    another order would do as well.
+    Here the order of places comes from travels alone. If a map lists places in an order that
+    travels do not imply, another order may be just as right.
     """
     follows: dict[Course, dict[int, set[int]]] = defaultdict(lambda: defaultdict(set))
     for _, course, p, q in m.along_travels if "travel_orders" in m.axioms else ():
@@ -111,10 +111,12 @@ def _reached(links: Mapping[_Node, set[_Node]], start: _Node, closed: _Node) -> 
 
 
 def _places(nodes: Iterable[_Node]) -> _Places:
+    """Return the places among some nodes."""
     return frozenset(node[1] for node in nodes if node[0] == "place")
 
 
 def _bounds(m: Reading, places: _Places) -> set[Course]:
+    """Find the courses that have all these places on their right."""
     sides = m.once(known_sides)
     return {course for course, beside in sides.items() if places <= beside.keys()}
 
@@ -169,10 +171,12 @@ def region_behind(m: Reading) -> Found:
 
 
 def _steps(m: Reading, places: Iterable[int]) -> list[int]:
+    """List the first step at each of these places."""
     return [step for place in places for step in m.steps_at(place)]
 
 
 def _told(places: _Places) -> str:
+    """Name places in words."""
     return f"place{'' if len(places) == 1 else 's'} {listed(sorted(places))}"
 
 

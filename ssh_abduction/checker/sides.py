@@ -2,8 +2,8 @@
 
 A turn puts a branch on one side of a path. The places ahead on the branch are on that side. No
 place is on both sides. A map does not list sides, so the check derives them. If the axioms put a
-place on a side that contradicts another axiom, the place is reported as a violation of each axiom
-that takes part: leaving out any of them resolves the contradiction.
+place on a side that contradicts another axiom, this is a violation of each axiom that takes part:
+without any one of them there is no contradiction.
 """
 
 from __future__ import annotations
@@ -151,6 +151,7 @@ def is_pair(pair: object) -> bool:
 
 
 def _sides(name: str, m: Reading) -> Found:
+    """Check the axiom `name` about sides."""
     for conflict in m.once(_conflicts):
         if name in conflict.axioms:
             yield conflict.steps, conflict.message

@@ -59,10 +59,11 @@ def _alike(place: int, seen: Sequence[tuple[Openings, int]]) -> Found:
 
 
 def gateways_by_drive(m: Reading) -> Iterator[tuple[int, str, list[tuple[Openings, int]]]]:
-    """Yield each place, each drive that was there in order, and what it saw there.
+    """For each place and each drive that was there, find what the drive saw there.
 
-    A drive is given by its name, and what it saw by the openings in the frame of the place and the
-    step.
+    Yields:
+        The place; the name of the drive; and a list of pairs: the openings, turned into slots of
+        the place, and the step. Places are sorted by number, the drives at a place by time.
     """
     seen: dict[tuple[int, int], list[tuple[Openings, int]]] = {}
     names = [m.trace.drive or m.trace.name or ALONE]
@@ -78,10 +79,11 @@ def gateways_by_drive(m: Reading) -> Iterator[tuple[int, str, list[tuple[Opening
 
 
 def changes(m: Reading) -> Iterator[tuple[int, int, int, str, str]]:
-    """Yield each gateway that differs between a drive and the one before at its place.
+    """Find the gateways that differ between a drive and the drive before it at the same place.
 
-    Each is a place, a slot, the first step of the later drive there, and what the earlier and the
-    later drive saw, in words.
+    Yields:
+        The place; the slot of the gateway; the first step of the later drive there; and what the
+        earlier and the later drive saw, in words.
     """
     last: dict[int, tuple[str, Openings]] = {}
     for p, name, seen in gateways_by_drive(m):
@@ -109,6 +111,12 @@ def _rotated(star: Openings, quarters: int) -> Openings:
 
 
 def _one_star(seen: Iterable[tuple[DState, Openings, int]], how: str) -> Found:
+    """Check that the stars seen at each place are equal.
+
+    Args:
+        seen: A dstate, a star in a form that all steps at its place share, and its first step.
+        how: How the stars were turned, for the message.
+    """
     known: dict[int, tuple[Openings, int]] = {}
     for s, star, i in seen:
         if s.place is not None:

@@ -187,7 +187,7 @@ def all_on_paths(m: Reading) -> Found:
 def course_needs_travel(m: Reading) -> Found:
     """Check that each dstate along a path is at an end of a travel (T5).
 
-    It is enough if turns around link it to such a dstate.
+    It may instead be linked by turns around to such a dstate.
     """
     linked: dict[int, list[int]] = defaultdict(list)
     for t in m.turns:

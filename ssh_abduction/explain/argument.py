@@ -15,7 +15,7 @@ no place on a path lies right or left of it
 
 The argument uses a minimal set of links. A link is an axiom at one step. Each line of the argument
 adds a link, and clingo finds the conclusions that hold in all maps that satisfy the links so far.
-So each line is a consequence of the lines before it and its link.
+So each line follows from the lines before it and its link.
 """
 
 from __future__ import annotations
@@ -37,10 +37,11 @@ from ssh_abduction.solver import facts
 # In a piece of at most this many steps, an argument may mention all steps. In a longer piece it
 # mentions only the steps of its links, to keep the number of conclusions small.
 FEW_STEPS = 14
-# Axioms that allow only one value of something per dstate (or per dstate and action). A map lists
-# only one value, so a map that the checker gets should satisfy these axioms.
+# Axioms that allow only one place, course, heading or view per dstate, or one end per dstate and
+# action. A map lists only one, so a map that the checker gets should satisfy these axioms.
 SHOWN = ("one_place", "one_course", "one_heading", "functional_view", "deterministic")
-# If one of several conclusions suffices as a premise, earlier ones in this list are preferred.
+# If one of several conclusions suffices as a premise, conclusions earlier in this list are
+# preferred.
 _PREFERRED = (
     "on",
     "right",
@@ -102,8 +103,8 @@ class _Line:
 class Argument:
     """The search for an argument about two steps.
 
-    Inside this class steps are counted in the piece. Words have the steps of the whole trace.
-    Parameters as in `derive`.
+    Inside this class steps have their numbers in the piece. In words they have their numbers in the
+    whole trace. Parameters as in `derive`.
     """
 
     def __init__(
@@ -128,7 +129,7 @@ class Argument:
         self._words = Words(piece, trace)
 
     def _named_steps(self) -> Iterable[int]:
-        """List the steps, counted in the piece, that conclusions may mention."""
+        """List the steps that conclusions may mention, by their numbers in the piece."""
         size = len(self._piece.steps)
         if size <= FEW_STEPS or self._piece.theory.level == "causal":
             return range(size)
@@ -164,10 +165,11 @@ class Argument:
     # Which conclusions follow from the links, in which order
 
     def _draw_all(self) -> None:
-        """Order the links such that each one, with those before it, gives a new conclusion.
+        """Make the lines: add links one by one, such that each gives a new conclusion.
 
-        First draw the conclusions that hold in every map. If they do not decide the pair, or only
-        by several links at once, suppose the opposite and go on until there is a contradiction.
+        First draw the conclusions that hold in every map. If they do not decide the pair, or if
+        only several links at once decide it, suppose the opposite, and go on until there is a
+        contradiction.
         """
         goal = facts.conclusion("one_dstate" if self._one else "two_dstates", *self._pair)
         left = list(self._links)
@@ -225,6 +227,13 @@ class Argument:
     def _add(
         self, group: tuple[tuple[str, int], ...], known: frozenset[clingo.Symbol], supposed: bool
     ) -> None:
+        """Add a line if some known conclusions are new.
+
+        Args:
+            group: The links of the line.
+            known: All conclusions that hold with these links.
+            supposed: Whether they hold only under the supposition.
+        """
         new = known - self._born.keys()
         if new:
             self._born.update(dict.fromkeys(new, len(self._lines)))
@@ -233,7 +242,11 @@ class Argument:
     # Which conclusions the argument needs
 
     def _told(self) -> tuple[tuple[Inference, ...], str]:
-        """Put the needed lines into words, each after its premises, and write the summary."""
+        """Put the lines that are needed into words, each after its premises.
+
+        Returns:
+            The lines, and the summary.
+        """
         last = self._lines[-1]
         goal = (
             None
@@ -277,6 +290,7 @@ class Argument:
         return inferences, self._summary(goal, premises, links)
 
     def _line_of(self, conclusion: clingo.Symbol | None) -> _Line:
+        """Return the line that draws a conclusion; None is the contradiction at the end."""
         return self._lines[-1 if conclusion is None else self._born[conclusion]]
 
     def _support(
@@ -342,6 +356,13 @@ class Argument:
         premises: tuple[int, ...],
         needed: Sequence[tuple[str, int]],
     ) -> Inference:
+        """Put a line into words.
+
+        Args:
+            conclusions: The conclusions of the line; None for the contradiction.
+            premises: The indices of the lines that it follows from.
+            needed: Its links.
+        """
         line = self._line_of(conclusions[0])
         known = [symbol for symbol, born in self._born.items() if born <= self._lines.index(line)]
         self._words.know(known)
@@ -367,7 +388,13 @@ class Argument:
         premises: dict[clingo.Symbol | None, list[clingo.Symbol]],
         links: dict[clingo.Symbol | None, tuple[tuple[str, int], ...]],
     ) -> str:
-        """Summarise the argument: the last inference with two or more premises, and its axioms."""
+        """Summarise the argument: the premises and axioms of the last line with several premises.
+
+        Args:
+            goal: The last conclusion; None for a contradiction.
+            premises: The premises of each conclusion.
+            links: The links of each conclusion.
+        """
         conclusion = goal
         while len(premises[conclusion]) == 1:
             conclusion = premises[conclusion][0]
@@ -443,4 +470,5 @@ class Argument:
 
 
 def _active(links: Iterable[tuple[str, int]]) -> list[clingo.Symbol]:
+    """Return the atoms that switch on some links."""
     return [facts.active(axiom, t) for axiom, t in links]

@@ -16,14 +16,15 @@ from ssh_abduction.theory.settle import displacement_of
 
 # Seconds between two calls of `stop` while clingo solves.
 POLL = 0.05
-# Steps that are grounded between two calls of `stop`.
+# The number of steps that are grounded between two calls of `stop`.
 AT_A_TIME = 8
-# At most this many rejected returns with the same last step get a sentence.
+# Say why at most this many returns with the same last step are rejected.
 MOST_SENTENCES = 3
 
 # An atom and whether it is true.
 Assumption: TypeAlias = tuple[clingo.Symbol, bool]
-# Equalities (two steps are one dstate or at one place, or not) that cannot all hold.
+# Equalities that cannot all hold. An equality says that two steps are, or are not, at one dstate or
+# place.
 Refusal: TypeAlias = frozenset[Equality]
 
 
@@ -67,6 +68,7 @@ class _Seen(NamedTuple):
 
     @classmethod
     def of(cls, model: clingo.Model) -> _Seen:
+        """Read a model of clingo."""
         return cls(*facts.read_argument(model))
 
     def suits(self, active: Sequence[clingo.Symbol], assumed: Sequence[Assumption]) -> bool:
@@ -84,8 +86,8 @@ class Axioms:
     """The axioms of a piece of a trace, in clingo.
 
     Some evidence can only judge a whole map. If it rejects a map of clingo, the reason is added as
-    a constraint, and clingo is asked again. An axiom that can be switched has an `active` atom for
-    each step.
+    a constraint, and clingo is asked again. Axioms that can be switched on and off (*relaxed*) have
+    an `active` atom for each step.
     """
 
     def __init__(self, piece: Piece, stop: Callable[[], bool], *, relaxed: bool = False) -> None:
@@ -94,7 +96,8 @@ class Axioms:
         Args:
             piece: The piece of a trace.
             stop: Called now and then. If it returns True, Interrupted is raised.
-            relaxed: Whether each axiom can be switched on or off at each step. Otherwise all hold.
+            relaxed: Whether each axiom can be switched on or off at each step. If False, all
+                axioms hold.
         """
         trace, theory = piece.trace, piece.theory
         self._trace, self._theory, self._names = trace, theory, piece.steps
@@ -162,7 +165,7 @@ class Axioms:
 
         Args:
             active: If the axioms are relaxed, the `active` atoms of those that have to hold.
-            assumed: Pairs of an atom and whether it has to be true in the map.
+            assumed: Pairs of an atom and whether it is true in the map.
         """
         return self.map_with(active, assumed) is not None
 
@@ -246,8 +249,8 @@ class Axioms:
 
         Args:
             active: The `active` atoms of the axioms that hold.
-            assumed: Pairs of an atom and whether it is true. Earlier pairs are preferred in the
-                subset.
+            assumed: Pairs of an atom and whether it is true. The subset has early pairs rather than
+                late ones.
 
         Returns:
             The subset, or None if the assumptions are consistent with the axioms.
@@ -361,7 +364,7 @@ class Axioms:
         return None
 
     def _judged_at(self, axiom: str, refusal: Refusal) -> int:
-        """Find the step at which the axiom has to be active for this rejection to count."""
+        """Return the step at which the axiom has to be active for a rejection to count."""
         return len(self._trace) - 1 if axiom == Planar.axiom else _last_step(refusal)
 
     def _refused_together(
@@ -396,14 +399,18 @@ class Axioms:
         self._control.ground([(name, [])])
 
     def sentences(self, clash: Sequence[tuple[str, int]]) -> tuple[str, ...]:
-        """Describe the returns that displacements reject in a clash, as `Explanation.sentences`.
+        """Describe the returns that displacements reject in a clash, for `Explanation.sentences`.
 
-        Without its displacements the clash has models. Each of these models has a return (two steps
-        at one dstate or at one place) that displacements reject. The method describes and forbids
-        the most clearly rejected return, and repeats this until no model is left.
+        Without displacements the axioms of the clash have models. Each of these models has a return
+        (two steps at one dstate or at one place) that displacements reject. This method describes
+        the return that is rejected most clearly, forbids it, and repeats this until no model is
+        left.
 
         Args:
-            clash: Pairs of an axiom and a step, counted in the piece.
+            clash: Pairs of an axiom and the number of a step in the piece.
+
+        Returns:
+            The sentences; empty if displacements do not take part in the clash.
         """
         displacement = displacement_of(self._problem)
         steps = [t for axiom, t in clash if displacement and axiom == displacement.axiom]

@@ -1,4 +1,4 @@
-"""Say which gateways changed between drives, what that costs, and the cost without changes.
+"""Say which gateways changed between drives, what that costs, and what a map costs without changes.
 
 A change is a fault of kind "changed": a gateway that was open on one drive and closed on another.
 """

@@ -23,9 +23,9 @@ class Link:
     Attributes:
         axiom: The name of the axiom.
         step: The step. If the axiom is about several steps at once, this is the last of them.
-        without: A map of the steps of the argument. It satisfies all other links, but not the
+        without: A map of the steps of the argument in which all other links hold, but not the
             conclusion.
-        violations: The violations that the checker finds in this map, by axioms of the argument.
+        violations: The violations of axioms of the argument that the checker finds in this map.
     """
 
     axiom: str
@@ -74,9 +74,9 @@ class Derivation:
         one: True if the steps are one dstate in every map, False if they differ in every map.
         links: The axioms, each at one step, that the argument needs. None can be left out.
         inferences: The argument, line by line.
-        supposition: The clause that the lines with `supposed` suppose; None if there is no such
-            line.
-        summary: The last inference with several premises, in one sentence.
+        supposition: The supposition of the lines with `supposed`, as a clause; None if there is no
+            such line.
+        summary: The last line with several premises, in one sentence.
     """
 
     steps: tuple[int, ...]
@@ -145,4 +145,5 @@ def _lines_of(inference: Inference, number: int) -> Iterator[str]:
 
 
 def _steps(steps: Sequence[int]) -> str:
+    """Name steps in words."""
     return f"step{'' if len(steps) == 1 else 's'} {', '.join(map(str, steps))}"

@@ -103,7 +103,7 @@ class TraceExplanation:
             known.
         clash: A stretch of the trace without a map, and a minimal set of axioms that clash there.
             None if the trace has a map, or if a limit ended the search before.
-        mends: The observations whose change gives a map, sorted by step.
+        mends: The observations whose change gives the trace a map, sorted by step.
         complete: Whether all observations of the stretch were tried.
         stopped: The limit that ended the search; None if it ended by itself.
     """
@@ -255,6 +255,7 @@ class TraceQuestion(Question[TraceExplanation]):
                     yield second, name, f"{first} and {second}", [(None, trace, left)]
 
     def _with_views(self, t: int) -> Iterator[tuple[str, Trace, Theory]]:
+        """Yield alternatives to the view of a step: all other views, and a new one."""
         step = self.trace.steps[t]
         views = [
             view
@@ -267,6 +268,7 @@ class TraceQuestion(Question[TraceExplanation]):
         yield NEW_VIEW, _with_step(self.trace, t, replace(step, view=new)), self.theory
 
     def _with_stars(self, t: int) -> Iterator[tuple[str, Trace, Theory]]:
+        """Yield alternatives to the star of a step: all other stars of the trace."""
         step = self.trace.steps[t]
         for star in dict.fromkeys(
             other.star for other in self.trace.steps if other.star is not None
@@ -276,6 +278,7 @@ class TraceQuestion(Question[TraceExplanation]):
                 yield _star(changed), _with_step(self.trace, t, changed), self.theory
 
     def _with_actions(self, t: int) -> Iterator[tuple[str | None, Trace, Theory]]:
+        """Yield alternatives to the action of a step: other actions, and an unknown one."""
         step = self.trace.steps[t]
         known = {action.name: action for action in self.trace.actions if not action.starts}
         if self.theory.level == "topological":
@@ -300,6 +303,7 @@ class TraceQuestion(Question[TraceExplanation]):
 
 
 def _with_step(trace: Trace, t: int, step: Step) -> Trace:
+    """Replace step t of a trace."""
     return replace(trace, steps=(*trace.steps[:t], step, *trace.steps[t + 1 :]))
 
 
@@ -313,4 +317,5 @@ def _names(stem: str) -> Iterator[str]:
 
 
 def _star(step: Step) -> str:
+    """Return the star of a step in words."""
     return str(step.to_json()["star"])

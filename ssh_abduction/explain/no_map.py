@@ -24,8 +24,8 @@ from ssh_abduction.solver import check_rules
 from ssh_abduction.theory.settle import displacement_of, settle
 from ssh_abduction.theory.theory import Theory
 
-# Stretches of so many steps are tried first. They overlap by a step, so that each action is in one.
-# A stretch takes about 30 ms. Shorter ones take 13 ms, and 16 steps take 120 ms.
+# Stretches of this many steps are tried first. They overlap by a step, so that each action is in
+# one. A stretch takes about 30 ms. Shorter ones take 13 ms, and 16 steps take 120 ms.
 STRETCH = 8
 
 
@@ -90,9 +90,9 @@ def explain(
 ) -> Explanation | None:
     """Explain why a trace has no map.
 
-    Stretches of a few steps are tried first, and then the whole trace. Steps are dropped from the
-    end and then from the start of what has no map, as long as the rest has none. Then axioms are
-    dropped one by one, until all that are left are needed for the clash.
+    First find a short stretch of steps without a map, or else try the whole trace. Then drop steps
+    from its end and from its start, as long as the other steps have no map. Then drop axioms one by
+    one, until each axiom that is left is needed for the clash.
 
     Args:
         trace: The trace, with views.
@@ -177,9 +177,9 @@ def why_apart(trace: Trace, first: int, second: int, theory: Theory | None = Non
 
 
 def shortest(longest: int, has_no_map: Callable[[int], bool]) -> int | None:
-    """Find the least number of steps that has no map, by doubling and bisection.
+    """Find the least number of steps without a map, by doubling and bisection.
 
-    This is exact: if some steps have no map, more steps have none either.
+    This is exact, because if some steps have no map, more steps have none either.
 
     Args:
         longest: The greatest number of steps to try.

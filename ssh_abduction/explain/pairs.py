@@ -37,12 +37,12 @@ from ssh_abduction.solver import EQUAL, Cost, Status, Stop, facts
 from ssh_abduction.theory.settle import displacement_of
 from ssh_abduction.theory.theory import Theory, checked_theory
 
-# Pieces of at most this many steps are tried before the whole trace. That takes less than a second.
+# Try pieces of at most this many steps before the whole trace. That takes less than a second.
 SMALL = 14
-# Pieces of at most this many steps are tried for the argument. Larger ones take minutes to ground.
+# Try pieces of at most this many steps for the argument. Larger ones take minutes to ground.
 LARGE = 40
-# Some theories allow no pieces: a map of the trace, cut to a piece, may break an axiom. Then a
-# trace of at most this many steps is tried as a whole.
+# For some theories pieces are of no use: a map of the trace, cut to a piece, may break an axiom.
+# Then try the whole trace if it has at most this many steps.
 UNCUT = 24
 # If a few steps decide the verdict, a search only confirms that the trace has a map. It may take
 # this many seconds, or a tenth of the time limit if that is more.
@@ -73,7 +73,7 @@ def explain_pair(
         time_limit: Seconds, as for `solve`. When a limit or Ctrl-C ends the search, the answer says
             what is known by then.
         memory_limit: MiB, as for `solve`.
-        max_maps: List at most this many minimal maps, to count those in which the steps are one
+        max_maps: List at most this many minimal maps, and count those in which the steps are one
             dstate; None for all.
 
     Returns:
@@ -164,7 +164,7 @@ class PairQuestion(Question[PairExplanation]):
         )
 
     def _loop(self) -> str | None:
-        """How far off the loop between the steps closes, in words; None without displacements."""
+        """Say how far off the loop between the steps closes; None without displacements."""
         evidence = displacement_of(self.problem)
         if evidence is None:
             return None
@@ -175,6 +175,7 @@ class PairQuestion(Question[PairExplanation]):
         return loop if match is None else f"{loop}, and {told(match, *pair)}"
 
     def _verdict(self) -> Verdict:
+        """Return the verdict, by what is known about both sides so far."""
         one, two = self._sides[True], self._sides[False]
         if one.possible is False or two.possible is False:
             if one.possible is two.possible:
@@ -278,6 +279,7 @@ class PairQuestion(Question[PairExplanation]):
             width += 1 + width // 2
 
     def _has_map(self, piece: Piece, one: bool) -> bool:
+        """Tell whether a piece has a map of the side `one`."""
         pair = piece.steps.index(self.first), piece.steps.index(self.second)
         return Axioms(piece, self._over).consistent(assumed=[(facts.are_one(*pair), one)])
 

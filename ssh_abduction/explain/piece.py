@@ -23,10 +23,10 @@ class Piece:
     Attributes:
         problem: A trace of these steps, numbered from 0, and the theory, with asserted pairs
             renumbered. Where steps are left out, the action and the displacement are unknown.
-        steps: The steps by their numbers in the whole trace, ascending. In words, those of several
-            drives have names of drives.
-        facts: Clingo facts: the pairs of steps that displacements rule out as one dstate or at one
-            place. Empty if no steps are left out between the first and the last.
+        steps: The steps by their numbers in the whole trace, ascending. In words, steps of several
+            drives are named by their drives.
+        facts: Clingo facts for the pairs of steps that by the displacements are not at one dstate,
+            or not at one place. Empty if no steps are left out between the first and the last.
     """
 
     problem: Problem

@@ -80,7 +80,7 @@ class Question(ABC, Generic[_Answer]):
 
     @abstractmethod
     def _find_out(self) -> None:
-        """Find the answer and store it in attributes. A limit raises an exception."""
+        """Find the answer and store it in attributes. At a limit, raise an exception."""
 
     def interrupt(self) -> None:
         """Make `answer` return soon. Call this from another thread or a signal handler."""

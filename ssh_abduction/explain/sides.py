@@ -5,8 +5,9 @@
 >>> print(explain_place(corner, 2, 0))
 place 2 lies right of path 0+: step 1 turned right from path 0+ onto path 1+ at place 1, and place 2 is ahead on path 1+
 
-Numbers are those of the first minimal map. In other maps the same place is the one of its first
-step, and the same path is the one that is faced at the first step along it.
+Numbers are those of the first minimal map. In another map, the same place is the one where that map
+has the first step at the place. The same path is the one that the robot faces in that map at the
+first step along the path.
 """  # noqa: E501 - one line of output
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from ssh_abduction.theory.theory import Theory, checked_theory
 
 # The side of a path on which a place is known to lie; "on" if it is on the path.
 _Side: TypeAlias = str | None
-LISTED = 100  # at most this many minimal maps are asked for the side
+LISTED = 100  # list at most this many minimal maps, to count those that agree on a side
 
 
 def explain_place(
@@ -75,8 +76,9 @@ class PathSide:
 
     Attributes:
         path: The id of the path.
-        side: "right" or "left" in direction +1, "on" if the place is on the path, None if unknown.
-        steps: The step whose turn shows the side and the next one; empty if no turn does.
+        side: "right" or "left" of the path in direction +1; "on" if the place is on the path; None
+            if unknown.
+        steps: The step of the turn that shows the side, and the next step; empty if no turn does.
         sentence: The side and its reason in words.
         agree: The number of listed minimal maps that have the same side.
     """
@@ -104,10 +106,10 @@ class PlaceExplanation:
 
     Attributes:
         place: The id of the place.
-        sides: The sides that were asked for.
-        regions: A sentence for each region that contains the place; empty if one path was asked.
+        sides: The side of the path that was given; else the known sides of all paths.
+        regions: A sentence for each region that contains the place; empty if a path was given.
         changes: Sentences about the gateways of the place that changed between drives, and what a
-            map costs without changes; empty if one path was asked.
+            map costs without changes; empty if a path was given.
         maps: The number of listed minimal maps; 0 if no map was found.
         possible: Whether the trace has a map; None if a limit ended the search before.
         stopped: The limit that ended the search; None if it ended by itself.
@@ -200,6 +202,7 @@ class PlaceQuestion(Question[PlaceExplanation]):
         )
 
     def _told(self) -> tuple[tuple[PathSide, ...], tuple[str, ...]]:
+        """Find the sides and the regions of the place. Raises MapError, as `known`."""
         first = self._maps[0]
         paths = [h.id for h in first.paths]
         _check("place", self._place, first.places)
@@ -230,7 +233,13 @@ def _check(name: str, number: int, known: Iterable[int]) -> None:
 
 
 def _path_side(readings: list[Reading], place: int, path: int) -> PathSide:
-    """Find the side of a path on which a place lies in the first map, and how many maps agree."""
+    """Find the side of a path on which a place lies in the first map, and how many maps agree.
+
+    Args:
+        readings: The trace, read with each map.
+        place: The place in the first map.
+        path: The path in the first map.
+    """
     first, *others = readings
     side, branch = _side_of(first, place, (path, 1))
     at = next(t for t, s in first.visited if s.place == place)
@@ -247,7 +256,10 @@ def _path_side(readings: list[Reading], place: int, path: int) -> PathSide:
 
 
 def _side_of(m: Reading, place: int, course: Course) -> tuple[_Side, Branch | None]:
-    """Find the side of a course on which a place lies, and the branch that leads to it."""
+    """Find the side of a course on which a place lies, and the branch that shows it.
+
+    Both are None if the side is unknown. The branch is None if the place is on the path.
+    """
     if place in m.along.get(course[0], ()):
         return "on", None
     sides = m.once(known_sides)

@@ -41,7 +41,7 @@ class Side:
         cost: The cost of the best known map of this side; None if no map is known.
         proven: Whether it is proven that no map of this side costs less.
         maps: The number of listed minimal maps that are on this side.
-        nats: The cost of the best known map in nats, if maps are compared by it; else None.
+        nats: The cost of the best known map in nats, if maps are weighed; else None.
     """
 
     possible: bool | None = None
@@ -51,7 +51,10 @@ class Side:
     nats: float | None = None
 
     def dearness(self, theory: Theory) -> tuple[float, ...] | None:
-        """The numbers that are compared to find the better side; None if no map is known."""
+        """Return the numbers by which the best maps of two sides are compared; None without a map.
+
+        Lower numbers are better. The first number decides, then the next.
+        """
         if self.nats is not None:
             return (self.nats,)
         return None if self.cost is None else self.cost.preferred_by(theory)
@@ -104,7 +107,7 @@ class PairExplanation:
 
     @property
     def proven(self) -> bool:
-        """Whether the verdict is final: anything but UNKNOWN."""
+        """Whether the verdict is proven, that is, anything but UNKNOWN."""
         return self.verdict is not Verdict.UNKNOWN
 
     @property
@@ -160,7 +163,7 @@ class PairExplanation:
         else:
             known = "the best map" if lost.proven else "the best map found"
             yield f"{known} {rival} has {_difference(lost.cost, won.cost, self.theory)}"
-            if not self.theory.has_faults:  # else disbelief in an observation may decide
+            if not self.theory.has_faults:  # with faults, a step that is treated as wrong may decide
                 yield "nothing observed decides this: it rests on minimality alone"
 
     def _weighed(self, lost: Side, won: Side) -> str:
@@ -192,9 +195,9 @@ class PairExplanation:
 
     @property
     def assuming(self) -> dict[str, str]:
-        """The cost, in words, of assuming something about the steps.
+        """What it costs to assume that the steps are one dstate, or that they are not, in words.
 
-        A dict with two keys: `same` (the steps are one dstate) and `different` (they are not).
+        The keys of the dict are `same` (the steps are one dstate) and `different` (they are not).
         """
         sides = {"same": self.same, "different": self.different}
         best = min(
@@ -261,12 +264,13 @@ def _in_words(cost: Cost, names: Iterable[str]) -> str:
 
 
 def _noun(name: str, number: float) -> str:
+    """Return the word for a count, in the singular or plural."""
     noun = "dstates with its faults" if name == "tenths" else name
     return noun.removesuffix("s") if number == 1 and name != "tenths" else noun
 
 
 def _effect(nats: float) -> str:
-    """A difference of costs in words."""
+    """Say in words that something costs, or saves, some nats."""
     return f"costs {nats:.1f} nats" if nats >= 0 else f"saves {-nats:.1f} nats"
 
 

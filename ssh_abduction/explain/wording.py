@@ -15,7 +15,7 @@ from ssh_abduction.solver import facts
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.fields import EXCUSED
 
-# Axioms that are broken at a step because of the action before it.
+# Axioms about actions. Their violation at a step is caused by the action before the step.
 OF_ACTIONS = EXCUSED["slipped"] | {"branch_side"}
 
 _WORDS = {
@@ -36,7 +36,7 @@ _WORDS = {
     "left": "step {0} {is} at a place to the left of {path1}",
     "turned": "steps {0} and {1} {are} at one place, and step {1} {faces} {turn} step {0}",
 }
-# How a step faces relative to another one, if it is turned 0, 1, 2 or 3 quarters clockwise.
+# How a step faces relative to another step, if it is turned 0, 1, 2 or 3 quarters clockwise.
 _TURNED = (
     "the same way as",
     "a quarter to the right of",
@@ -46,7 +46,7 @@ _TURNED = (
 
 
 class Words:
-    """A writer of English clauses for conclusions and axioms.
+    """Writes English clauses for conclusions and axioms.
 
     Args:
         piece: The piece of the trace that the argument is about.
@@ -71,7 +71,7 @@ class Words:
         """Put a conclusion into a clause.
 
         Args:
-            conclusion: The name of the conclusion and its steps, counted in the piece.
+            conclusion: The name of the conclusion, and its steps by their numbers in the piece.
             would: Whether to write "would be" instead of "is", because it is only supposed.
         """
         name, steps = conclusion
@@ -125,9 +125,9 @@ class Words:
 
         Args:
             axiom: The name of the axiom.
-            t: The step, counted in the piece.
-            said: The conclusions, each a name and its steps, counted in the piece.
-            pair: The two steps that the argument is about, counted in the piece.
+            t: The step, by its number in the piece.
+            said: The conclusions, each a name and steps by their numbers in the piece.
+            pair: The two steps that the argument is about, by their numbers in the piece.
             short: Whether to write only the sentence of the axiom, without what was seen or done.
         """
         steps, sentence = self._piece.steps, self._sentences.get(axiom, axiom).rstrip(".")
