@@ -23,8 +23,7 @@ MOST_SENTENCES = 3
 
 # An atom and whether it is true.
 Assumption: TypeAlias = tuple[clingo.Symbol, bool]
-# Equalities that cannot all hold. An equality says that two steps are, or are not, at one dstate or
-# place.
+# Equalities (two steps are one dstate or at one place, or are not) that cannot all hold.
 Refusal: TypeAlias = frozenset[Equality]
 
 
@@ -96,8 +95,7 @@ class Axioms:
         Args:
             piece: The piece of a trace.
             stop: Called now and then. If it returns True, Interrupted is raised.
-            relaxed: Whether each axiom can be switched on or off at each step. If False, all
-                axioms hold.
+            relaxed: Whether each axiom can be switched on or off at each step. If not, all hold.
         """
         trace, theory = piece.trace, piece.theory
         self._trace, self._theory, self._names = trace, theory, piece.steps

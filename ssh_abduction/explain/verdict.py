@@ -163,7 +163,7 @@ class PairExplanation:
         else:
             known = "the best map" if lost.proven else "the best map found"
             yield f"{known} {rival} has {_difference(lost.cost, won.cost, self.theory)}"
-            if not self.theory.has_faults:  # with faults, a step that is treated as wrong may decide
+            if not self.theory.has_faults:  # with faults, a step treated as wrong may decide
                 yield "nothing observed decides this: it rests on minimality alone"
 
     def _weighed(self, lost: Side, won: Side) -> str:
