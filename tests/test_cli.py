@@ -291,7 +291,7 @@ def test_one_is_not_many(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     maps = tmp_path / "maps.json"
     maps.write_text(capsys.readouterr().out)
     assert main(["check", "--bound", path, str(maps)]) == 0
-    assert "at least 1 dstate: as many steps" in capsys.readouterr().out
+    assert "at least 1 dstate: no two of 1 step" in capsys.readouterr().out
 
 
 def test_the_bound_of_an_answer_without_maps(

@@ -98,6 +98,38 @@ def test_scans_mend_the_odometry(hall: Path) -> None:
     assert (np.linalg.eigvalsh(closing) > 0).all()
 
 
+@pytest.mark.parametrize(
+    "words",
+    ["check", "show", "compare", "next --time-limit 20", "explain FOLDER 0 1", "view -o PAGE"],
+)
+def test_a_folder_of_map_stands_for_its_maps_and_its_trace(
+    runs: Path, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    verb, *others = words.replace("PAGE", str(tmp_path / "page.html")).split()
+    hall = runs / "hall"
+    maps, trace = str(hall / "maps.json"), str(hall / "trace.jsonl")
+    if verb == "explain":
+        short = ["explain", str(hall), "0", "1"]
+        full = ["explain", trace, "0", "1", "--theory", maps]
+    else:
+        traces = [] if verb in ("show", "compare") else [trace]
+        short, full = [verb, str(hall), *others], [verb, maps, *traces, *others]
+    code = main(short)
+    said = capsys.readouterr()
+    assert main(full) == code
+    assert capsys.readouterr().out == said.out
+    assert said.out
+
+
+def test_maps_without_a_trace_beside_them_need_one(
+    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    alone = tmp_path / "maps.json"
+    alone.write_bytes((runs / "hall" / "maps.json").read_bytes())
+    assert main(["check", str(alone)]) == 1
+    assert "trace: expected the trace of" in capsys.readouterr().err
+
+
 def test_a_drive_becomes_a_trace_of_the_places_it_passed(runs: Path) -> None:
     trace = Trace.load(runs / "hall" / "trace.jsonl")
     # Each visit has one step or two: the robot goes on straight, or it turns.

@@ -12,7 +12,7 @@ from ssh_abduction.checker.checker import check, unchecked
 from ssh_abduction.checker.claims import false_claims
 from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.cli.obeying import as_corrected
-from ssh_abduction.cli.options import Verbs, add_theory, in_order, theory_of
+from ssh_abduction.cli.options import Verbs, add_maps, add_theory, add_trace, theory_of, trace_of
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import MapError, brief, is_finite, printable
 from ssh_abduction.data.map_file import read_json
@@ -32,8 +32,8 @@ def add_parser(verbs: Verbs) -> None:
         "map breaks, and at which steps."
     )
     parser = verbs.add_parser("check", help="do these maps satisfy the axioms?", description=text)
-    parser.add_argument("maps", help="output of solve --json, or one saved map")
-    parser.add_argument("trace", help="trace file (JSON Lines), or - for standard input")
+    add_maps(parser)
+    add_trace(parser)
     parser.add_argument(
         "--bound",
         action="store_true",
@@ -48,8 +48,7 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    in_order(options)
-    trace = Trace.load(options.trace)
+    trace = Trace.load(trace_of(options))
     data = read_json(options.maps)
     found = data.get("theory") if isinstance(data, dict) else None
     solved = None if found is None else Theory.from_dict(found)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ssh_abduction.cli.options import Verbs
+from ssh_abduction.cli.options import MAPS_SAID, Verbs, maps_in
 from ssh_abduction.cli.text import compared, counted, depending
 from ssh_abduction.data.errors import brief, named, printable
 from ssh_abduction.data.files import json_line
@@ -28,13 +28,7 @@ def add_parser(verbs: Verbs) -> None:
     parser = verbs.add_parser(
         "compare", help="what do rival maps share, and where do they differ?", description=text
     )
-    parser.add_argument(
-        "maps",
-        help=(
-            "output of solve --json, one saved map, or a folder written by map; - for standard "
-            "input"
-        ),
-    )
+    parser.add_argument("maps", help=MAPS_SAID)
     parser.add_argument(
         "other",
         nargs="?",
@@ -63,10 +57,8 @@ def run(options: argparse.Namespace) -> int:
     from ssh_abduction.rivals.listing import Listing
     from ssh_abduction.rivals.sides import shared_sides
 
-    maps, others = (
-        within(options.maps),
-        within(options.other) if options.other is not None else None,
-    )
+    maps = maps_in(options.maps)
+    others = None if options.other is None else maps_in(options.other)
     told: dict[str, Any] = {}  # the output of --json
     if maps != options.maps and others != options.other:
         told["runs"] = differences(options.maps, options.other)
@@ -106,11 +98,6 @@ def run(options: argparse.Namespace) -> int:
     if listing.sureness:
         print(listing.sureness)
     return 0
-
-
-def within(name: str) -> str:
-    """Return the file of maps in the folder of a run. Return any other name unchanged."""
-    return str(Path(name) / "maps.json") if (Path(name) / "run.json").is_file() else name
 
 
 def differences(first: str, other: str) -> dict[str, tuple[Any, Any]]:

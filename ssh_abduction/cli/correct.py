@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from ssh_abduction.cli.options import Verbs, add_map
+from ssh_abduction.cli.options import Verbs, add_map, add_maps
 from ssh_abduction.cli.standing import Standing, told
 from ssh_abduction.data.corrections import PAIRS
 from ssh_abduction.data.errors import MapError, brief, named, printable
@@ -29,7 +29,7 @@ def add_parser(verbs: Verbs) -> None:
         "file if it writes its map beside it, or is given the file."
     )
     parser = verbs.add_parser("correct", help="say what a map has wrong", description=text)
-    parser.add_argument("maps", help="file that solve -o wrote, or a folder with maps.json")
+    add_maps(parser)
     for name, words in HELPS.items():
         metavar = "I,J" if name in PAIRS else "GATEWAY"
         parser.add_argument(

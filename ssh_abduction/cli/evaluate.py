@@ -6,7 +6,7 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from ssh_abduction.cli.options import Verbs, read_maps
+from ssh_abduction.cli.options import Verbs, add_maps, add_trace, read_maps, trace_of
 from ssh_abduction.cli.text import counted, table
 from ssh_abduction.data.errors import MapError, named
 from ssh_abduction.data.files import json_line
@@ -52,11 +52,8 @@ def add_parser(verbs: Verbs) -> None:
         "others are from it."
     )
     parser = verbs.add_parser("evaluate", help="how right are these maps?", description=text)
-    parser.add_argument(
-        "maps",
-        help="output of solve --json for this trace, or one saved map; - for standard input",
-    )
-    parser.add_argument("trace", help="trace file (JSON Lines) with truth")
+    add_maps(parser)
+    add_trace(parser, "trace file (JSON Lines) with truth")
     parser.add_setting(
         "near",
         "also judge by true poses; visits within this distance count as one place (default: 2)",
@@ -101,6 +98,7 @@ def run(options: argparse.Namespace) -> int:
     )
     from ssh_abduction.evaluation.pose_truth import NEAR
 
+    file = trace_of(options)
     data = read_maps(options.maps)
     maps = maps_of(data, str(options.maps))
     if not maps:
@@ -108,7 +106,7 @@ def run(options: argparse.Namespace) -> int:
             f"{options.maps}: maps: expected one to evaluate, got none; see the status that solve "
             "printed"
         )
-    trace = Trace.load(options.trace)
+    trace = Trace.load(file)
     if options.truth is not None:
         trace = Trajectory.load(options.truth).told_to(trace)
     relations = None if options.relations is None else Relations.load(options.relations)

@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.obeying import as_corrected
-from ssh_abduction.cli.options import Verbs, add_theory, number_steps, theory_of
+from ssh_abduction.cli.options import Verbs, add_theory, maps_in, number_steps, theory_of, trace_in
 from ssh_abduction.cli.outcome import dump, on_ctrl_c
 from ssh_abduction.data.drives import step_named
 from ssh_abduction.data.errors import AbductionError
@@ -46,7 +46,13 @@ def add_parser(verbs: Verbs) -> None:
         help="why are two steps one dstate, or not? why is there no map?",
         description=text,
     )
-    parser.add_argument("trace", help="trace file (JSON Lines), or - for standard input")
+    parser.add_argument(
+        "trace",
+        help=(
+            "trace file (JSON Lines), or - for standard input, or a folder that map wrote, for its "
+            "trace and the theory of its maps"
+        ),
+    )
     parser.add_argument(
         "steps",
         nargs="*",
@@ -103,7 +109,9 @@ def run(options: argparse.Namespace) -> int:
             f"steps: expected two, or none, got {len(options.steps)}; name the two steps that are "
             "to be explained, or a place and a path, as in p7 path2"
         )
-    trace = Trace.load(options.trace)
+    if Path(options.trace).is_dir():
+        options.theory = options.theory or maps_in(options.trace)
+    trace = Trace.load(trace_in(options.trace))
     number_steps(options, trace)
     maps = options.theory if options.theory and Path(options.theory).is_file() else None
     trace, theory = as_corrected(trace, theory_of(options), maps, options.corrections)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from ssh_abduction.cli.options import Verbs, add_map
+from ssh_abduction.cli.options import Verbs, add_map, add_maps
 from ssh_abduction.cli.parsing import true_or_false
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.trace import Trace
@@ -23,9 +23,7 @@ def add_parser(verbs: Verbs) -> None:
     parser = verbs.add_parser(
         "export", help="write a map for Nav2, tmap2, GraphML, DOT or networkx", description=text
     )
-    parser.add_argument(
-        "maps", help="output of solve --json, or one saved map; - for standard input"
-    )
+    add_maps(parser)
     parser.add_argument("--to", required=True, choices=FORMATS, help="the format to write")
     add_map(parser)
     parser.add_argument(

@@ -9,7 +9,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
-from ssh_abduction.cli.options import Verbs, check_number, check_picture, picture_file, read_maps
+from ssh_abduction.cli.options import (
+    Verbs,
+    add_maps,
+    check_number,
+    check_picture,
+    picture_file,
+    read_maps,
+)
 from ssh_abduction.cli.parsing import true_or_false
 from ssh_abduction.cli.text import table
 from ssh_abduction.data.errors import LocaliserError, MapError, named
@@ -35,9 +42,7 @@ def add_parser(verbs: Verbs) -> None:
     parser = verbs.add_parser(
         "localise", help="where in a known map is the robot?", description=text
     )
-    parser.add_argument(
-        "maps", help="output of solve --json for the trace that was mapped, or one saved map"
-    )
+    add_maps(parser)
     parser.add_argument(
         "other",
         help=(

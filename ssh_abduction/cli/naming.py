@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from ssh_abduction.cli.options import Verbs, add_map
+from ssh_abduction.cli.options import Verbs, add_map, add_maps
 from ssh_abduction.cli.standing import Standing
 from ssh_abduction.data.errors import named, printable
 
@@ -16,7 +16,7 @@ def add_parser(verbs: Verbs) -> None:
         "name stays with the place of its step."
     )
     parser = verbs.add_parser("name", help="name a place, path or region", description=text)
-    parser.add_argument("maps", help="file that solve -o wrote, or a folder with maps.json")
+    add_maps(parser)
     parser.add_argument(
         "what",
         help="a place such as p4, a path such as path2, a region such as region3, or a step such "

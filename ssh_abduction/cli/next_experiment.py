@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.options import Verbs, add_theory, in_order, theory_of
+from ssh_abduction.cli.options import Verbs, add_maps, add_theory, add_trace, theory_of, trace_of
 from ssh_abduction.cli.outcome import on_ctrl_c, warn
 from ssh_abduction.cli.text import table
 from ssh_abduction.data.errors import MapError, named, printable
@@ -41,11 +41,8 @@ def add_parser(verbs: Verbs) -> None:
     parser = verbs.add_parser(
         "next", help="what should the robot do to distinguish these maps?", description=text
     )
-    parser.add_argument(
-        "maps",
-        help="output of solve --json for this trace, or one saved map; - for standard input",
-    )
-    parser.add_argument("trace", help="trace file (JSON Lines), or - for standard input")
+    add_maps(parser)
+    add_trace(parser)
     parser.add_argument(
         "--time-limit",
         type=float,
@@ -75,8 +72,7 @@ def run(options: argparse.Namespace) -> int:
 
     check_limit("--time-limit", "seconds", options.time_limit)
     check_limit("--memory-limit", "MiB", options.memory_limit)
-    in_order(options)
-    trace = Trace.load(options.trace)
+    trace = Trace.load(trace_of(options))
     data = read_json(options.maps)
     maps = maps_of(data, str(options.maps))
     if not maps:

@@ -26,6 +26,14 @@ RULES = (
     "given again"
 )
 
+# The names of the files in a folder that map wrote.
+MAPS, TRACE, RUN = "maps.json", "trace.jsonl", "run.json"
+
+MAPS_SAID = (
+    "file of maps that solve -o wrote, one saved map, or a folder that map wrote; - for standard "
+    "input"
+)
+
 Verbs = Any  # the return type of argparse's add_subparsers is private
 
 
@@ -43,7 +51,7 @@ def add_theory(parser: Parser, default: str = "topological") -> None:
         metavar="PRESET|FILE",
         help=(
             f"a preset: {', '.join(PRESETS)}; or a .toml file with fields of a theory; or a file "
-            f"of maps, to use their theory (default: {default})"
+            f"of maps, or a folder that map wrote, to use their theory (default: {default})"
         ),
     )
     for name, text in (
@@ -113,6 +121,59 @@ def write(trace: Trace, target: str, said: str) -> None:
         print(f"{said} in {named(target)}")
 
 
+def add_maps(parser: argparse.ArgumentParser) -> None:
+    """Add the argument `maps`: a file of maps, or a folder with one."""
+    parser.add_argument("maps", type=maps_in, help=MAPS_SAID)
+
+
+def add_trace(parser: argparse.ArgumentParser, what: str = "trace file (JSON Lines)") -> None:
+    """Add the argument `trace`, which may be left out after a folder that map wrote (`trace_of`).
+
+    Args:
+        parser: The parser of a verb that has the argument `maps`.
+        what: The words of the help for the trace.
+    """
+    parser.add_argument(
+        "trace",
+        nargs="?",
+        type=trace_in,
+        help=f"{what}, or - for standard input (default: the trace in the folder of the maps)",
+    )
+
+
+def maps_in(text: str) -> str:
+    """Return the file of maps that an argument names: of a folder, its maps.json."""
+    return str(Path(text) / MAPS) if Path(text).is_dir() else text
+
+
+def trace_in(text: str) -> str:
+    """Return the trace file that an argument names: of a folder, its trace.jsonl."""
+    return str(Path(text) / TRACE) if Path(text).is_dir() else text
+
+
+def trace_of(options: argparse.Namespace) -> str:
+    """Return the trace file of a verb with `add_maps` and `add_trace`. Warn if they are swapped.
+
+    Raises:
+        AbductionError: There is no trace.
+    """
+    if options.trace is None and (beside := trace_beside(options.maps)) is not None:
+        return beside
+    if options.trace is None:
+        raise AbductionError(
+            f"trace: expected the trace of {named(options.maps)}, got none; name it after the maps"
+        )
+    _in_order(options)
+    return str(options.trace)
+
+
+def trace_beside(maps: str) -> str | None:
+    """Return the trace file beside a file of maps that map wrote; None for any other file."""
+    folder = Path(maps).parent
+    is_written = Path(maps).name == MAPS and (folder / RUN).is_file() and (folder / TRACE).is_file()
+    return str(folder / TRACE) if is_written else None
+
+
 def output(text: str) -> str:
     """Return the name of a file or folder to write. Raise ArgumentTypeError if it is none."""
     if not text or "\0" in text:
@@ -167,7 +228,7 @@ def check_number(number: int | None, maps: Sequence[object], where: str) -> None
         )
 
 
-def in_order(options: argparse.Namespace) -> None:
+def _in_order(options: argparse.Namespace) -> None:
     """Warn and swap `maps` and `trace` if the trace came first, as in version 0.1.0."""
     if options.maps == "-" or not _is_trace(options.maps) or _is_trace(options.trace):
         return
@@ -228,6 +289,7 @@ def theory_of(options: argparse.Namespace, found: Theory | None = None) -> Theor
         return PRESETS[named_theory]().replace(**chosen)
     if named_theory.endswith(".toml"):
         return Theory.from_toml(named_theory).replace(**chosen)
+    named_theory = maps_in(named_theory)
     if not (named_theory.endswith(".json") or Path(named_theory).is_file()):
         near = difflib.get_close_matches(named_theory, PRESETS, n=1)
         hint = f"; did you mean {near[0]}?" if near else ""

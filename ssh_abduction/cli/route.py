@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from ssh_abduction.cli.options import Verbs, add_map
+from ssh_abduction.cli.options import Verbs, add_map, add_maps
 from ssh_abduction.cli.text import course, table
 from ssh_abduction.data.errors import MapError, printable
 from ssh_abduction.data.files import json_line
@@ -17,9 +17,7 @@ def add_parser(verbs: Verbs) -> None:
         "regions the route leaves and enters, and which paths it passes."
     )
     parser = verbs.add_parser("route", help="which actions lead there?", description=text)
-    parser.add_argument(
-        "maps", help="output of solve --json, or one saved map; - for standard input"
-    )
+    add_maps(parser)
     parser.add_argument(
         "--from",
         dest="start",

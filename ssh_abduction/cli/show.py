@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from ssh_abduction.cli.options import Verbs, check_number
+from ssh_abduction.cli.options import Verbs, add_maps, check_number
 from ssh_abduction.cli.text import describe
 from ssh_abduction.data.corrections_file import named_beside
 from ssh_abduction.data.fields import FieldReader
@@ -19,7 +19,7 @@ def add_parser(verbs: Verbs) -> None:
     parser = verbs.add_parser(
         "show", help="print the dstates, places, paths and links of maps", description=text
     )
-    parser.add_argument("maps", help="output of solve --json, or one saved map")
+    add_maps(parser)
     parser.add_argument(
         "--map",
         type=int,

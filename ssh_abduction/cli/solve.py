@@ -15,7 +15,7 @@ from typing import Any
 
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.obeying import Obeying
-from ssh_abduction.cli.options import Verbs, add_theory, number_steps, theory_of
+from ssh_abduction.cli.options import Verbs, add_theory, maps_in, number_steps, theory_of, trace_in
 from ssh_abduction.cli.outcome import (
     Given,
     all_given,
@@ -66,6 +66,7 @@ def add_parser(verbs: Verbs) -> None:
         "traces",
         nargs="+",
         metavar="trace",
+        type=trace_in,
         help="trace file (JSON Lines), or - for standard input",
     )
     parser.add_argument(
@@ -91,6 +92,7 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.add_argument(
         "--onto",
+        type=maps_in,
         metavar="MAPS",
         help=(
             "add the trace to the first map in this file, which solve -o wrote, and keep its "

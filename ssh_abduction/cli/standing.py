@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ssh_abduction.cli.options import read_maps
+from ssh_abduction.cli.options import maps_in, read_maps
 from ssh_abduction.data.corrections import Corrections
 from ssh_abduction.data.corrections_file import (
     FILE,
@@ -23,7 +23,6 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.regions import region_of
 from ssh_abduction.rivals.listing import Listing
 
-MAPS = "maps.json"  # the name of the file of maps in a folder
 # Directions on the map as it is drawn, in degrees counterclockwise from east.
 COMPASS = {"east": 0.0, "north": 90.0, "west": 180.0, "south": 270.0}
 _THING = re.compile(r"(?P<kind>p|place|path|region) ?(?P<number>\d{1,9})")
@@ -60,7 +59,7 @@ class Standing:
             MapError: A file cannot be read; the maps do not say of which drives they are; or the
                 corrections are of another map.
         """
-        file = Path(path) / MAPS if Path(path).is_dir() else Path(path)
+        file = Path(maps_in(str(path)))
         data = read_maps(str(file), "give a file that solve -o wrote")
         listing = Listing.from_dict(data, named(file))
         known = {drive.name: drive.fingerprint for drive in listing.drives}

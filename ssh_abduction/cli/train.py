@@ -9,12 +9,14 @@ from typing import Any
 
 from ssh_abduction.cli.options import (
     Verbs,
+    add_maps,
+    add_trace,
     check_number,
     check_picture,
-    in_order,
     output,
     picture_file,
     seed,
+    trace_of,
 )
 from ssh_abduction.cli.text import counted, table
 from ssh_abduction.data.errors import MapError, named
@@ -81,8 +83,8 @@ def add_parser(verbs: Verbs) -> None:
     )
     apart.set_defaults(run=run_tell_apart)
     for parser in (train, curve, apart):
-        parser.add_argument("maps", help="output of solve --json for this trace, or one saved map")
-        parser.add_argument("trace", help="trace file with images")
+        add_maps(parser)
+        add_trace(parser, "trace file with images")
         parser.add_argument(
             "--map",
             type=int,
@@ -141,7 +143,7 @@ def _mapped(options: argparse.Namespace) -> tuple[Any, Any, SSHMap, Any]:
     from perception.images import images_of
     from ssh_abduction.learning.learner import labels_of
 
-    in_order(options)
+    options.trace = trace_of(options)
     trace = Trace.load(options.trace)
     data = read_json(options.maps)
     maps = maps_of(data, str(options.maps))

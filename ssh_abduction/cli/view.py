@@ -7,7 +7,7 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ssh_abduction.cli.options import Verbs, flags_of
+from ssh_abduction.cli.options import Verbs, add_maps, flags_of, trace_beside, trace_in
 from ssh_abduction.cli.parsing import true_or_false
 from ssh_abduction.data.errors import AbductionError, MapError, brief, is_whole, named
 
@@ -28,13 +28,15 @@ def add_parser(verbs: Verbs) -> None:
         "map alone, two maps side by side, and what happened at each step."
     )
     parser = verbs.add_parser("view", help="see rival maps in the browser", description=text)
-    parser.add_argument(
-        "maps", help="output of solve --json, or one saved map; - for standard input"
-    )
+    add_maps(parser)
     parser.add_argument(
         "trace",
         nargs="?",
-        help="the trace that was mapped; adds actions and laser images, and is needed for --serve",
+        type=trace_in,
+        help=(
+            "the trace that was mapped; adds actions and laser images, and is needed for --serve "
+            "(default: the trace in the folder of the maps, if map wrote it)"
+        ),
     )
     parser.add_argument(
         "-o", "--output", metavar="FILE", help="write the page to this file and do not open it"
@@ -93,6 +95,7 @@ def run(options: argparse.Namespace) -> int:
     from ssh_abduction.rivals.listing import Listing
     from ssh_abduction.theory.theory import Theory
 
+    options.trace = options.trace or trace_beside(options.maps)
     if options.serve and options.trace is None:
         raise AbductionError(
             "--serve: expected the trace that was mapped, got none; give it after the maps"
