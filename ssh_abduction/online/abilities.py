@@ -9,7 +9,7 @@ from ssh_abduction.rivals.machines import Seen
 
 
 class Abilities:
-    """The actions that a robot can do: now, ever, and wherever the same is seen.
+    """The actions that a robot can do: now, ever, and wherever it sees a view and a star.
 
     Attributes:
         here: The actions that the robot can do now, by name.
@@ -36,7 +36,7 @@ class Abilities:
             names.intersection_update(self.here)
 
     def names(self, seen: Seen) -> set[str]:
-        """The names of the actions that the robot could do at every step with this view and star.
+        """Return the names of the actions that the robot could do at every step with what is seen.
 
         The star is the set of openings that are seen. If the robot never saw this star with this
         view, the view alone decides.

@@ -17,8 +17,8 @@ class BackgroundTask(Generic[Result]):
     """Work that runs in a thread. It is stopped when this object is garbage collected.
 
     Args:
-        work: The function that does the work and returns its result. It should start a process for
-            what takes long, and stop when the watch that it is given is interrupted.
+        work: The function that does the work and returns its result. It gets a watch, and should
+            stop when the watch is interrupted. It should start a process for long work.
     """
 
     def __init__(self, work: Callable[[Watch], Result | None]) -> None:
@@ -29,6 +29,7 @@ class BackgroundTask(Generic[Result]):
         thread.start()
 
     def done(self) -> bool:
+        """Whether the work has ended."""
         return self._found.done()
 
     def result(self) -> Result | None:
@@ -37,6 +38,7 @@ class BackgroundTask(Generic[Result]):
 
 
 def _do(work: Callable[[Watch], Result | None], watch: Watch, found: Future[Result | None]) -> None:
+    """Do the work, and store its result or its exception in `found`."""
     try:
         found.set_result(work(watch))
     except LimitError:
@@ -46,5 +48,6 @@ def _do(work: Callable[[Watch], Result | None], watch: Watch, found: Future[Resu
 
 
 def _end(watch: Watch, thread: threading.Thread) -> None:
+    """Interrupt the work of a thread, and wait until it has ended."""
     watch.interrupted = True
     thread.join()

@@ -1,7 +1,8 @@
 """Make maps of a growing trace from guesses, in another process.
 
 A guess labels each step with a dstate (distinctive state: a place and a direction), and may
-contradict an axiom. This needs a theory that numbers the directions at each place (a frame).
+contradict an axiom. Guesses are made for theories with frames, which number the directions at each
+place.
 
 The maps satisfy the axioms of the theory (`solver/engines/framed.py`), but need not be minimal. To
 *mend* a map that later steps contradict, keep as many of its dstates as possible and add new
@@ -103,6 +104,7 @@ def _make(
     known: SSHMap | None,
     watch: Watch,
 ) -> SSHMap | None:
+    """Do the work of a `MapGuess`. Arguments are as there."""
     known = known or in_process(
         guessed_map, Trace(tuple(steps), odometry=odometry), theory, speedups, watch=watch
     )

@@ -17,8 +17,8 @@ from ssh_abduction.solver import Bound, Status, Stop, Watch, has_processors, in_
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 
-# A search in the background stops after this many seconds. The trace is much longer by then, and a
-# search for the longer trace is worth more.
+# A search in the background stops after this many seconds. By then the trace is much longer, and it
+# is better to search for a map of the longer trace.
 MEANWHILE = 60.0
 # After each search with a time limit the trace has to grow by this factor, and by at least this
 # many steps, before the next search.
@@ -65,7 +65,7 @@ def solved(
         limit: Seconds for the search; None for no limit.
         maps: List at most this many maps; None lists all.
         speedups: The speed-ups that are on.
-        watch: Not used. Functions that run in another process take it.
+        watch: Not used. It is here because `in_process` passes a watch as the last argument.
     """
     found = solve(
         trace, theory.of_steps(0, len(trace)), time_limit=limit, max_maps=maps, speedups=speedups
@@ -74,7 +74,7 @@ def solved(
 
 
 class BackgroundSolve(BackgroundTask[Solved]):
-    """A background task that solves a trace in another process, for at most 60 seconds.
+    """A background task that solves a trace in another process, for at most MEANWHILE seconds.
 
     Args:
         trace: The steps so far.

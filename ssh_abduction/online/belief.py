@@ -18,10 +18,10 @@ from ssh_abduction.data.errors import LocaliserError
 
 # The robot is located if one dstate has at least this probability.
 LOCATED = 0.9
-# A belief has collapsed if the observation is at most this factor times as probable as at an
-# unknown place: evidence of ten to one against the belief, which Jeffreys calls strong.
+# A belief has collapsed if by this belief the observation is less than this many times as probable
+# as at an unknown place. This is evidence of ten to one, which Jeffreys calls strong.
 COLLAPSED = 0.1
-# The share of unknown places that are akin to those of the map, before anything is seen there.
+# The probability that unknown places are akin to those of the map, before anything is seen there.
 AKIN = 0.5
 # A lost robot is found again if the entropy of its belief is at most this many bits higher than
 # before it was lost.
@@ -51,13 +51,13 @@ class Verdict(Enum):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Observation:
-    """How well an observation o fits each dstate x. `localiser.py` defines f and q.
+    """How well an observation o fits each of N dstates x. `localiser.py` defines f and q.
 
     Attributes:
         where: The ids of k dstates, (k,), or a slice of all dstates.
-        ratio: f(o|x) / q(o) for each of these dstates, (k,). For all others it is 0.
-        novel: Probability that the place looks like no dstate of the map, given o, if before o it
-            was as likely to look like each dstate as like none.
+        ratio: f(o|x) / q(o) for each of these dstates, (k,). For all other dstates it is 0.
+        novel: Probability, given o, that an unknown place looks like no dstate of the map. Before
+            o, it is as likely to look like each dstate as like none.
     """
 
     where: NDArray[np.intp] | slice
@@ -80,8 +80,8 @@ class Belief:
             probability at an unknown place: 1 / (α q(o)) of equation 2 in `localiser.py`. Below 0.1
             the belief has collapsed.
         sure: Entropy in bits of the last belief before the collapse; None if the robot is not lost.
-        akin: If the robot is nowhere, the probability that the places there follow each other as
-            those of the map do.
+        akin: If the robot is nowhere, the probability that the places there are *akin* to the map:
+            views follow each other there as in the map (`localiser.py`).
         seen: The last observation; None if there was none.
     """
 
@@ -121,7 +121,8 @@ class Belief:
     def collapsed(self) -> bool:
         """Whether `normaliser` is below 0.1: the observation shows that the last belief was wrong.
 
-        The observation is then ten times as probable at an unknown place as by that belief.
+        The observation is then more than ten times as probable at an unknown place as by that
+        belief.
         """
         return self.normaliser < COLLAPSED
 
@@ -178,7 +179,7 @@ class Belief:
         return tuple((int(s), float(self.probabilities[s])) for s in found)
 
     def to_dict(self) -> dict[str, Any]:
-        """The belief as a dict for JSON, as `localise --json` prints it.
+        """Return the belief as a dict for JSON, as `localise --json` prints it.
 
         docs/reference/formats.md describes the keys.
         """

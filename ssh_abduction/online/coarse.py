@@ -89,14 +89,15 @@ def coarse_route(ssh_map: SSHMap, start: int, goal: int) -> tuple[Leg, ...]:
 def off_the_way(ssh_map: SSHMap, start: int, goal: int) -> set[int]:
     """Find the places in regions behind one place that hold neither the start nor the goal.
 
-    A route that enters such a region comes back through its door. So the shortest route by places
-    never does: at the door it could have turned instead.
+    A route that enters such a region has to come back through its door. It would be shorter to turn
+    at the door. So the shortest route by places does not enter such regions.
     """
     closed = [r for r in _with_doors(ssh_map) if not {start, goal} & {*r.places}]
     return {place for region in closed for place in region.places}
 
 
 def _with_doors(ssh_map: SSHMap) -> list[Region]:
+    """List the regions behind one place, the largest first."""
     return [region for region in ssh_map.regions or () if region.door is not None]
 
 

@@ -1,9 +1,9 @@
 """Maps of a growing trace that satisfy the axioms, for when finding a minimal map takes too long.
 
 A dstate (distinctive state) is a place and a direction. A *sketch* (`solver/guesses/tree.py`) is
-made without a search: a step gets a new dstate unless the axioms imply which one it is at. A
-*draft* begins with a good map of the first steps, and goes on as a sketch does. A sketch from the
-first step on is larger than a draft, and is the last resort.
+made without a search: a step gets a new dstate unless the axioms imply at which known dstate it is.
+A *draft* is a sketch that begins with a good map of the first steps. A sketch that begins at the
+first step is mostly larger than a draft. It is used if there is no draft.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from ssh_abduction.theory.pairs import Pairs
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import row
 
-# At most this many drafts are kept, as each takes time at every step. Mostly one of the best
-# remains consistent for long.
+# Keep at most this many drafts, as each takes time at every step. Mostly at least one of the best
+# drafts remains consistent for long.
 DRAFTS = 3
 
 
@@ -69,11 +69,11 @@ class Drafts:
         return bool(self._drafts)
 
     def first(self) -> SSHMap | None:
-        """The best draft, which need not be consistent; None if there is no draft."""
+        """Return the map of the best draft. It need not be consistent. None without a draft."""
         return self._drafts[0].sketch.map() if self._drafts else None
 
     def maps(self) -> list[SSHMap]:
-        """The maps of all drafts, the best first. They need not be consistent."""
+        """Return the maps of all drafts, the best first. They need not be consistent."""
         return [draft.sketch.map() for draft in self._drafts]
 
     def follow(self, action: Action, step: Step) -> None:
@@ -106,7 +106,7 @@ class Drafts:
         self._drafts = []
 
     def best(self, trace: Trace, pairs: Pairs) -> SSHMap | None:
-        """The best consistent draft, else a consistent sketch, else None.
+        """Return the map of the best consistent draft, else of a consistent sketch, else None.
 
         Drafts that turn out to be inconsistent are dropped.
 
@@ -125,6 +125,7 @@ class Drafts:
         return None
 
     def _cost(self, draft: Draft) -> tuple[int, ...]:
+        """Count what the theory minimises in a draft."""
         return Cost.of(draft.sketch.map()).preferred_by(self._theory)
 
     def _is_consistent(self, draft: Draft, trace: Trace, pairs: Pairs) -> bool:

@@ -2,9 +2,9 @@
 
 A dstate (distinctive state) is a place and the direction that the robot faces there.
 
-If the map has poses, and turns with names of their own such as "turn 91.3", then no two drives have
-the same turns. So turns are compared by their angles: a turn leads to the dstates of its place that
-face the direction after the turn.
+A map may have poses, and turns with names of their own such as "turn 91.3". Then another drive
+hardly ever has turns of the same names. So turns are compared by their angles: a turn leads to the
+dstates of its place that face the direction after the turn.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class Moves:
         self._by_angle = _has_turns_of_its_own(ssh_map)
 
     def move(self, action: Action, turned: float | None = None) -> Move:
-        """The move of an action.
+        """Return the move of an action.
 
         Args:
             action: The action.
@@ -80,13 +80,17 @@ class Moves:
         return action.name if angle is None else round(angle) % 360
 
     def links(self, move: Move) -> Links | None:
-        """Where a move leads; None if the map has no such action."""
+        """Return where a move leads; None if the map has no such action."""
         if isinstance(move, int) and move not in self._links:
             self._links[move] = self._turn(move)
         return self._links.get(move)
 
     def _turn(self, degrees: int) -> Links:
-        """Where a turn by an angle leads: to dstates at the same place that face that way."""
+        """Find where a turn leads: to the dstates at the same place that face that way.
+
+        Args:
+            degrees: The angle of the turn, clockwise.
+        """
         sources, targets, angles = self._pairs
         off = (angles - degrees + 180) % 360 - 180
         near = np.abs(off) <= FACING * SPREAD
@@ -127,9 +131,9 @@ def _links_of(
     """Make the links of one action from weights of pairs of dstates.
 
     Args:
-        sources: Where the action begins, n.
-        targets: Where it ends, n.
-        weights: How likely each pair is, relative to the others with the same source, n.
+        sources: The dstates where the action begins, (n,).
+        targets: The dstates where it ends, (n,).
+        weights: How likely each pair is, relative to other pairs with the same source, (n,).
         number: The number of dstates.
     """
     totals = np.bincount(sources, weights, number)

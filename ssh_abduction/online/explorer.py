@@ -9,9 +9,9 @@ far.
 The explorer looks for a new experiment when the last one is done, when clingo has searched again,
 and when the number of maps has changed. It takes the first of these that exists:
 
-1. Known links whose ends differ between the minimal maps (`rivals/explore.py`).
-2. The shortest tour through all untried actions of the first map (`rivals/tour.py`). The tour does
-   not look around at a place yet if it comes back there later.
+1. Known links for which the minimal maps predict different views (`rivals/explore.py`).
+2. The shortest tour through all untried actions of the first map (`rivals/tour.py`). If the tour
+   comes back to a place later, the robot looks around there only then.
 3. An untried action for which the minimal maps predict different outcomes.
 4. Actions that distinguish the map from a map without one of its returns (`return_doubts.py`).
 
@@ -24,13 +24,14 @@ When it is done
    merged. So the explorer doubts each return of the map. It looks for the best map in which the two
    visits are not at one place (by the causal theory: the two steps are not one dstate). This map is
    a rival if it has at most `margin` dstates more than the minimal map. After an experiment that
-   distinguishes the two, the doubt is weighed again. The cost of such a rival can only grow with
-   the trace. So a dispelled doubt stays dispelled until the minimal maps have more dstates.
+   distinguishes the two, the explorer examines the doubt again. As the trace grows, such a rival
+   never gets cheaper. So a doubt that was dispelled stays so until the minimal maps have more
+   dstates.
 
 If no experiment distinguishes a rival from the minimal map, there are two cases. The two may be the
-same map and differ only in the past of the robot; that is no doubt. Or the rival is another map
-that is also closed and will always predict the same, as in a symmetric world. In this second case
-the exploration ends as `inseparable`, and not as `done`.
+same map and differ only in the past of the robot. Then there is no doubt. Or the rival is another
+map that is also closed and will always predict the same, as in a symmetric world. In this second
+case the exploration ends as `inseparable`, and not as `done`.
 
 This does not prove that the map is true. A world may have more than `margin` further dstates, and
 only the best rival without a return is examined. docs/how-to/exploring.md measures how often the
@@ -59,11 +60,11 @@ from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import Solution, Status, check_limit, find_backbone, solve
 from ssh_abduction.theory.theory import Theory, checked_theory
 
-# If nothing is left to do but the map is not proven minimal, solve the trace for this many times
-# the time limit of a step.
+# If nothing is left to do but the map is not proven minimal, solve the trace with a time limit that
+# is this many times that of a step.
 LONGER = 5
-# If a tour has seen at most this many dstates of a place, the place may still be another one than
-# the map says. A place with four sides has this many.
+# If a tour has seen at most this many dstates of a place, the map may still be wrong about which
+# place this is. A place with four directions has this many dstates.
 DOUBTED = 4
 
 Ending: TypeAlias = Literal["done", "inseparable", "steps", "time", "contradicted"]
@@ -87,7 +88,7 @@ class Robot(Protocol):
         """
 
     def can(self) -> Collection[Action | str]:
-        """Return the actions that are possible here, the same ones wherever `look` is the same."""
+        """Return the actions that are possible here. They depend only on what `look` returns."""
 
     def do(self, action: Action) -> None:
         """Do an action, and return when it is done."""
@@ -141,6 +142,7 @@ class Exploration:
         return f"{after} the minimal map is {unique}unique{truth}: {why}"
 
     def to_dict(self) -> dict[str, Any]:
+        """Return the result as plain data."""
         told = {name: getattr(self, name) for name in ("steps", "ending", "is_unique", "is_true")}
         told["rival"] = self.rival.to_dict() if self.rival else None
         return {**told, "summary": self.sentence, "solution": self.solution.to_dict()}
@@ -293,7 +295,7 @@ class Explorer:
 
     @property
     def result(self) -> Exploration:
-        """The result so far."""
+        """The result of the exploration so far."""
         solution = self.solution
         unique = _is_unique(solution)
         rival = next(iter(self._doubts.twins.values()), None)

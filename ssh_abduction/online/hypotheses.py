@@ -132,7 +132,7 @@ class Rival:
         return None if there is None or self.shows[there] == seen else there
 
     def is_unknown(self, action: str) -> bool:
-        """Whether there is no link for an action at the dstate where the robot is."""
+        """Whether the map has no link for an action at the dstate where the robot is."""
         return (self.here, action) not in self.links
 
     def future(self) -> tuple[object, ...]:
@@ -225,7 +225,7 @@ class Rival:
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """Computes the weights of rivals. The head of this module has the formula.
+    """Computes the weights of rivals, by the formula in the docstring of this module.
 
     Attributes:
         odds: Negative natural logarithm of the probability of the cheapest kind of fault.

@@ -29,7 +29,7 @@ class MapKeeper:
         before: The keeper of fewer steps that this one replaces; None for the first.
     """
 
-    standing = None  # only a theory with faults has one
+    standing = None  # only `Recovery`, for theories with faults, has a standing
 
     def __init__(
         self,
@@ -116,7 +116,7 @@ class MapKeeper:
         return self._solution(began)
 
     def _best_known(self) -> SSHMap | None:
-        """The first minimal map, else the best draft, else None."""
+        """Return the first minimal map, else the map of the best draft, else None."""
         if self.minimal.maps:
             return self.minimal.maps[0].map()
         return self.drafts.first()
@@ -150,7 +150,9 @@ class MapKeeper:
             self.drafts.add(found[0], self.trace)
 
     def _solution(self, began: float) -> Solution:
-        """The solution for the steps so far: the minimal maps, else one consistent map, else none.
+        """Make the solution for the steps so far.
+
+        It has the minimal maps, else one consistent map, else no map.
 
         Args:
             began: When the step began, by `time.perf_counter`.

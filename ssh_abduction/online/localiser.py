@@ -36,21 +36,22 @@ by a recogniser's distances (perception/likelihood.py). Then
     e(x')         = (1 - unmapped) / N,  e(nowhere) = unmapped
 
 e is the prior of global localisation. q(o) is the probability of an observation at an unknown
-place. Such a place looks like one of the N dstates or like none of them (g), all equally likely.
+place. Such a place looks like one of the N dstates, or like none of them (g). All these N + 1 cases
+are equally likely.
 
-There are two kinds of places outside the map, equally likely when the robot gets there. At a
-*strange* place, earlier observations predict nothing. At a place *akin* to the map, what follows is
-what follows in the map on average. The average is over the n dstates that look like o and have a
-link for a:
+There are two kinds of places outside the map, which are equally likely when the robot leaves the
+map. At a *strange* place, earlier observations predict nothing. At a place *akin* to the map, the
+next observation is distributed as in the map on average. The average is over the n dstates that
+look like o and have a link for a:
 
     p(o'|strange) = q(o')
     p(o'|akin)    = (n · mean over these x of Σ_x' f(x'|x,a) f(o'|x') + q(o')) / (n + 1)
                     of a novel o': q(o')
 
 Without the second kind, a robot in another maze would be located in this one, because the views
-after turns fit any maze. All p(o|·) are divided by q(o), which changes no belief. It has two
-effects: views and images have weights of one scale, and the normaliser compares the probability of
-an observation with that at an unknown place.
+after turns fit any maze. All p(o|·) are divided by q(o), which changes no belief. This has two
+purposes: the weights of views and of images are comparable, and the normaliser compares the
+probability of an observation with that at an unknown place.
 """
 
 from __future__ import annotations
@@ -117,7 +118,7 @@ class Localiser:
             )
         self._shown = view_ratios(ssh_map, trace)
         self._moves = Moves(ssh_map, trace)
-        # Results of _alike for views, which recur.
+        # The results of `_alike` for views, as the same views occur again and again.
         self._followed: dict[tuple[Observation, Move, Observation], float] = {}
         self._seen = None if recogniser is None else self._likelihood(recogniser)
 
@@ -231,6 +232,7 @@ class Localiser:
         return self._of_view(Step(view).view)
 
     def _of_view(self, view: View | None) -> Observation | None:
+        """Return the observation of a view; None without a view."""
         return None if view is None else self._shown.get(view, NOVEL)
 
     def _spread(self, ratios: NDArray[np.float64]) -> Observation:
@@ -394,5 +396,6 @@ def _checked(ssh_map: object) -> SSHMap:
 
 
 def _frozen(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Make an array read-only, and return it."""
     values.flags.writeable = False
     return values

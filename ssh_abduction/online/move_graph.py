@@ -139,7 +139,7 @@ class MoveGraph:
         return sum(isinstance(node, int) for node in reached)
 
     def action(self, source: Node, target: Node) -> str | None:
-        """The name of the action of a move; None if paths imply the move but not its action."""
+        """Return the name of the action of a move; None if the map does not imply it."""
         action: str | None = self._graph.edges[source, target]["action"]
         return action
 
@@ -148,14 +148,14 @@ class MoveGraph:
         return not self._graph.edges[source, target]["implied"]
 
     def course(self, node: Node) -> tuple[int | None, int | None, int | None]:
-        """The place, path and direction of a node. Each is None if the node has none."""
+        """Return the place, path and direction of a node. Each is None if the node has none."""
         if isinstance(node, tuple):
             return node
         s = self.map.dstates[node]
         return s.place, s.path, s.direction
 
     def metres(self, source: Node, target: Node) -> float | None:
-        """The straight distance of a move in metres; None if the map has no poses.
+        """Return the straight distance of a move in metres; None if the map has no poses.
 
         A lift has the length 0, as floors have no common frame.
         """
@@ -167,7 +167,7 @@ class MoveGraph:
         return math.hypot(a.x - b.x, a.y - b.y)
 
     def _floor(self, node: Node) -> int | None:
-        """The floor of a node; None if the map has no floors."""
+        """Return the floor of a node; None if the map has no floors."""
         if not isinstance(node, tuple):
             return self.map.dstates[node].floor
         return next((s.floor for s in self.map.dstates if s.place == node[0]), None)
@@ -214,7 +214,7 @@ class MoveGraph:
     def _imply(self, source: Node, target: Node, action: str | None) -> None:
         """Add a move that the paths of the map imply, unless the map has a link for it.
 
-        Paths do not lead to another floor: nothing shows that one goes on there.
+        Add no move to another floor, as paths do not lead there.
 
         Args:
             source: The start.
@@ -247,10 +247,11 @@ class MoveGraph:
         return move + (self._travel_cost if travels else 0.0)
 
     def _only_action(self, *, onward: bool) -> str | None:
-        """Find the only action that moves on along a path, or the only one that turns around.
+        """Find the only action of its kind, if there is only one.
 
         Args:
-            onward: Whether to find the action from place to place, or the one that turns around.
+            onward: True for the action that leads on along a path to another place. False for the
+                action that turns around.
 
         Returns:
             The name of the action; None if the links of the map have none or several.
@@ -283,16 +284,17 @@ class MoveGraph:
         return members
 
     def _place(self, node: Node) -> int:
-        """The place of a node. A dstate without a place gets a negative number of its own."""
+        """Return the place of a node. A dstate without a place gets its own negative number."""
         place = self.course(node)[0]
         return -1 - int(node) if place is None and isinstance(node, int) else int(place or 0)
 
     def _pose(self, node: Node, poses: tuple[Pose, ...]) -> Pose:
-        """The pose of a dstate. A course has the pose of the first dstate at its place."""
+        """Return the pose of a dstate. A course has the pose of the first dstate at its place."""
         if isinstance(node, int):
             return poses[node]
         return poses[next(s.id for s in self.map.dstates if s.place == node[0])]
 
 
 def _is_number(text: str) -> bool:
+    """Whether a text is a whole number, 0 or more, of fewer than ten digits."""
     return text.isascii() and text.isdecimal() and len(text) < 10

@@ -20,13 +20,13 @@ The paper's own future work is "robust error-recovery during exploration, by fal
 logical inference to Markov localisation when low-probability events violate the abstraction, until
 the logical representation can be restored" (Kuipers & Beeson 2002). This module keeps three things:
 
-* **Minimal maps**, proven, with their faults. As long as some of them predict what is seen, they
+* **Minimal maps**, proven, with their faults. As long as some of them predict what is seen, these
   stay minimal by the claim in `mapper.py`. The claim also holds with faults: suppose that a minimal
   map of the longer trace treats the last step as wrong. Without that step it would cost less than
-  the minimum. By the causal theory no minimal map is lost if an action was never tried, because
-  only a link to a dstate that looks right costs nothing. If no minimal map predicts the step, solve
-  the trace again: within the time of a step, or in another process while the robot drives
-  (`background_solve.py`).
+  the minimum, which is impossible. If an action was never tried, the causal theory loses no minimal
+  map, as a new link to a dstate that looks right costs nothing, and nothing else does. If no
+  minimal map predicts the step, the trace is solved again: within the time of a step, or in another
+  process while the robot drives (`background_solve.py`).
 * **Rivals** (`rival_maps.py`): besides the minimal maps, explanations that cost a little more,
   each with its probability (`hypotheses.py`).
 * **Where the robot is** (`standing.py`), by Markov localisation in the best map. It begins just
@@ -81,7 +81,7 @@ class Recovery:
         return self.solver.searches
 
     def restarted(self, problem: Problem) -> Recovery:
-        """Make a Recovery for a theory that changed with the last step. Nothing is proven there.
+        """Make a Recovery for a theory that changed with the last step. It has no proofs yet.
 
         Args:
             problem: The steps so far, with one more, and the new theory.
@@ -89,7 +89,7 @@ class Recovery:
         return Recovery(problem, self._options, before=self)
 
     def take(self, problem: Problem) -> None:
-        """Add the last step: extend all rivals by it, and note if it contradicts the best map.
+        """Add the last step: extend all rivals by it, and record if it contradicts the best map.
 
         Args:
             problem: The steps so far, with one more, and the theory.
@@ -128,7 +128,7 @@ class Recovery:
             self.solver.begin_in_background(self._trace, self._theory)
 
     def _solution(self, began: float) -> Solution:
-        """The solution for the steps so far: the minimal maps, else the best rival, else no map.
+        """Make the solution for the steps so far: the minimal maps, else the best rival, else none.
 
         Args:
             began: When the step began, by `time.perf_counter`.
@@ -159,7 +159,7 @@ class Recovery:
         )
 
     def _status(self) -> Status:
-        """The status of the solution: how much is proven about its maps."""
+        """Return the status of the solution: how much is proven about its maps."""
         if self._maps.is_proven:
             return Status.OPTIMAL
         if self._maps.rivals:

@@ -41,9 +41,7 @@ class ReturnDoubts:
         self._least: dict[Doubt, int] = {}  # lower bound of the dstates of a map without the return
 
     def open(self, ssh_map: SSHMap, trace: Trace) -> Iterator[Doubt]:
-        """Yield the returns of a map that are in doubt, the latest first.
-
-        The least is known about the latest ones.
+        """Yield the returns of a map that are in doubt, the latest first: least is known of them.
 
         Args:
             ssh_map: A minimal map.
@@ -80,7 +78,8 @@ class ReturnDoubts:
             dstates: The number of dstates of a minimal map.
 
         Returns:
-            The map; None if it has more than `margin` dstates too many, or was not found in time.
+            The map; None if it has more than `margin` dstates more than a minimal map, or was not
+            found in time.
         """
         kind = "different" if theory.level == "causal" else "elsewhere"
         denied = theory.replace(**{kind: (*getattr(theory, kind), doubt)})

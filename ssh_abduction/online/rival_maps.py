@@ -139,7 +139,7 @@ class RivalMaps:
         return Change(lost_proof)
 
     def absorb(self, found: Solved) -> None:
-        """Take in a result of the solver: add its maps to the rivals, and note what is proven.
+        """Use a result of the solver: add its maps to the rivals, and record what is proven.
 
         Args:
             found: The result for the steps so far, or for the first of them. In the second case,
@@ -188,7 +188,7 @@ class RivalMaps:
         )
 
     def drop_inconsistent(self) -> None:
-        """Drop the best rival, again and again, until the checker finds the best one consistent.
+        """Drop the best rival until the checker accepts the best one that is left.
 
         This is not needed if the maps are proven, or if only the causal axioms hold.
         """
@@ -199,7 +199,7 @@ class RivalMaps:
             del self.rivals[0]
 
     def undecided(self) -> tuple[list[Rival], list[float]]:
-        """The rivals that later steps have to decide between.
+        """List the rivals that later steps have to decide between.
 
         Among rivals with the same faults, only the cheapest ones by the theory count, because no
         evidence ever refutes a superfluous dstate.

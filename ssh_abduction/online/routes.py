@@ -65,7 +65,7 @@ class Move:
     metres: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """The move as a dict for JSON, with its attributes as keys."""
+        """Return the move as a dict for JSON, with its attributes as keys."""
         return {name: getattr(self, name) for name in self.__slots__ if name != "metres"} | (
             {} if self.metres is None else {"metres": round(self.metres, 4)}
         )
@@ -152,7 +152,7 @@ class Route:
         return f"from dstate {self.start} to {self.goal}: {', '.join(parts)}"
 
     def to_dict(self) -> dict[str, Any]:
-        """The route as a dict for JSON, as `route --json` prints it.
+        """Return the route as a dict for JSON, as `route --json` prints it.
 
         docs/reference/formats.md describes the keys.
         """
@@ -225,8 +225,8 @@ def route(
     aside: set[Node] = set()
     legs: tuple[Leg, ...] = ()
     if start_place is not None and goal_place is not None:
-        # First the coarse route by regions, then the fine one. Without implied turns, a robot may
-        # have to enter a region only to turn around, so nothing is closed then.
+        # First plan the coarse route by regions, then the route itself. By links alone, a robot may
+        # have to enter a region only to turn around. So close regions only for a route by places.
         legs = coarse_route(ssh_map, start_place, goal_place)
         if by == "places":
             aside = graph.nodes_in(off_the_way(ssh_map, start_place, goal_place))

@@ -68,6 +68,7 @@ class TheorySettler:
         return bool(self._theory.returns) or theory.returns == self._count(trace, theory, problem)
 
     def _count(self, trace: Trace, theory: Theory, known: Problem | None) -> int:
+        """Count the returns of the robot that may be true. Arguments are as for `settled`."""
         evidence = evidence_of(theory, known.evidence if known else ())
         return count_returns(Problem(trace, theory, evidence))
 

@@ -76,9 +76,9 @@ class Standing:
 def chances_of(theory: Theory) -> Chances:
     """Convert the prices of faults in a theory to probabilities for localisation.
 
-    A fault that costs twice as much as another one is as rare as two of the other kind. If the
+    A fault that costs twice as much as another kind is as rare as two faults of that kind. If the
     theory allows only one kind of fault, the other kind gets twice its price. Otherwise
-    localisation would take every error for the only kind that it knows.
+    localisation would explain every error by the one kind that is allowed.
     """
     cheapest = min(price for price in (theory.misread, theory.slipped) if price)
     misread, slipped = (
