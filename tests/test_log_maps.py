@@ -121,6 +121,26 @@ def test_a_folder_of_map_stands_for_its_maps_and_its_trace(
     assert said.out
 
 
+def test_what_the_map_says_about_the_places_of_two_steps(
+    runs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The listed maps, and nothing else, say how probable it is that the steps are at one place."""
+    weighed = Solution.load(runs / "hall" / "maps.json").weighed
+    assert weighed is not None
+    first, second, probability = weighed.joins[0]
+    others = [r.nats for r in weighed.rivals if r.places[first] != r.places[second]]
+    for i, j, is_one in ((first, second, True), (0, second, weighed.rivals[0].places[second] == 0)):
+        assert main(["explain", str(runs / "hall"), str(i), str(j), "--json"]) == 0
+        told = json.loads(capsys.readouterr().out)["map"]
+        assert told["same_place"] == is_one
+        assert told["probability"] == pytest.approx(weighed.probability(i, j, "place"))
+        if (i, j) == (first, second):
+            assert told["probability"] == pytest.approx(probability)
+            assert told["nats"] == pytest.approx(min(others) - weighed.nats)
+    main(["explain", str(runs / "hall"), str(first), str(second)])
+    assert "\nmap 1 has both steps at one place; the probability" in capsys.readouterr().out
+
+
 def test_maps_without_a_trace_beside_them_need_one(
     runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import argparse
 import re
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.obeying import as_corrected
@@ -23,7 +25,10 @@ from ssh_abduction.explain.pairs import PairQuestion
 from ssh_abduction.explain.sides import PlaceExplanation, PlaceQuestion
 from ssh_abduction.explain.verdict import PairExplanation, Verdict
 from ssh_abduction.runtime.program import interrupted_code
-from ssh_abduction.solver import Stop
+from ssh_abduction.solver import Stop, probability_in_words
+
+if TYPE_CHECKING:
+    from ssh_abduction.rivals.listing import Listing
 
 EXIT_NO_MAP, EXIT_UNKNOWN = 20, 30
 # A place, and perhaps a path, in the words of the command line: "p7 path2".
@@ -131,7 +136,11 @@ def run(options: argparse.Namespace) -> int:
         )
     else:
         question = TraceQuestion(trace, theory, **limits)
-    told = _as_json if options.json else _as_text
+    from ssh_abduction.rivals.listing import Listing  # loads numpy
+
+    listing = Listing.load(maps) if maps and options.steps and not named else None
+    pair = None if listing is None else _InMap.of(listing, first, second)
+    told = partial(_as_json if options.json else _as_text, pair)
 
     def last_words(why: Stop) -> tuple[str, int]:
         known = question.known(why)
@@ -146,12 +155,55 @@ def run(options: argparse.Namespace) -> int:
     return _exit_code(answer)
 
 
-def _as_text(explanation: Answer) -> str:
-    return f"{explanation}\n"
+@dataclass(frozen=True, slots=True)
+class _InMap:
+    """What the first map of a file says about the places of two steps.
+
+    Attributes:
+        is_one_place: Whether the two steps are at one place.
+        probability: The probability that they are; None if maps were not compared by cost.
+        nats: How many nats more the best known map costs that says otherwise; None if no such map
+            is known.
+    """
+
+    is_one_place: bool
+    probability: float | None
+    nats: float | None
+
+    @classmethod
+    def of(cls, listing: Listing, first: int, second: int) -> _InMap | None:
+        """Compare the places of two steps; None without places."""
+        at = [listing.maps[0].place_of(step) for step in (first, second)]
+        if None in at:
+            return None
+        weighed = listing.weighed
+        return cls(
+            at[0] == at[1],
+            None if weighed is None else weighed.probability(first, second, "place"),
+            None if weighed is None else weighed.nats_if_other(first, second),
+        )
+
+    def __str__(self) -> str:
+        told = f"map 1 has both steps at {'one place' if self.is_one_place else 'two places'}"
+        if self.probability is not None:
+            told += f"; the probability of one place is {probability_in_words(self.probability)}"
+        if self.nats is not None:
+            other = "two places" if self.is_one_place else "one place"
+            told += f"; the best known map with {other} costs {self.nats:.1f} nats more"
+        return told
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as plain data."""
+        return {"same_place": self.is_one_place, "probability": self.probability, "nats": self.nats}
 
 
-def _as_json(explanation: Answer) -> str:
-    return dump(explanation.to_dict()) + "\n"
+def _as_text(in_map: _InMap | None, explanation: Answer) -> str:
+    return f"{explanation}\n" + (f"{in_map}\n" if in_map else "")
+
+
+def _as_json(in_map: _InMap | None, explanation: Answer) -> str:
+    told = explanation.to_dict()
+    return dump(told | ({"map": in_map.to_dict()} if in_map else {})) + "\n"
 
 
 def _exit_code(explanation: Answer) -> int:

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
         Status,
         cost_as_counted,
     )
-    from ssh_abduction.solver.weighed import EQUAL, Weighed
+    from ssh_abduction.solver.weighed import EQUAL, Weighed, probability_in_words
     from ssh_abduction.solver.writing import ending, opening, summary_of, written_map
 
 _HOMES = {  # module: the names that this package exports from it
@@ -128,6 +128,7 @@ _HOMES = {  # module: the names that this package exports from it
     "weighed": (
         "EQUAL",
         "Weighed",
+        "probability_in_words",
     ),
     "values": (
         "Bound",
@@ -197,6 +198,7 @@ __all__ = [
     "obeyed",
     "observation",
     "opening",
+    "probability_in_words",
     "resident_memory",
     "sketch_beyond",
     "sketches_of",

@@ -127,6 +127,21 @@ class Weighed:
             if name[first] == name[second]
         )
 
+    def nats_if_other(self, first: int, second: int) -> float | None:
+        """How many nats more a map costs that has two steps at one place if the best map has not.
+
+        Or that has them at two places if the best map has them at one. Maps without places are
+        compared by dstates. None if no such map is known.
+        """
+        at = [rival.places or rival.dstates for rival in self.rivals]
+        is_one = at[0][first] == at[0][second]
+        others = [
+            rival.nats
+            for rival, names in zip(self.rivals, at, strict=True)
+            if (names[first] == names[second]) != is_one
+        ]
+        return min(others) - self.nats if others else None
+
     @cached_property
     def joins(self) -> tuple[tuple[int, int, float], ...]:
         """The joins of the best map, each with its probability, the least probable one first.
@@ -150,7 +165,7 @@ class Weighed:
         if self.doubt is not None:
             return f"no probability is given, as {self.doubt}"
         told = (
-            f"the best map has probability {_percent(self.confidence)}"
+            f"the best map has probability {probability_in_words(self.confidence)}"
             if self.proven or self.searched
             else f"a map that costs {self.nats - self.bound:.1f} nats less may exist"
         )
@@ -163,7 +178,7 @@ class Weighed:
         first, second, probability = self.joins[0]
         return (
             f"{told}; the most doubtful join is of steps {first} and {second} "
-            f"({_percent(probability)})"
+            f"({probability_in_words(probability)})"
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -214,8 +229,10 @@ class Weighed:
         return cls(bound, within, rivals, searched, broken, excess, doubt, drives)
 
 
-def _percent(probability: float) -> str:
-    """Return a probability with two digits as text, but never 1, as nothing is certain."""
+def probability_in_words(probability: float) -> str:
+    """A probability with two digits, but never 0 or 1, as nothing is certain."""
+    if probability < 0.005:
+        return "below 0.01"
     return "above 0.99" if probability >= 0.995 else f"{probability:.2f}"
 
 
