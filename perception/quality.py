@@ -339,7 +339,7 @@ class _Cells:
         return search.best, self.order[search.ends]
 
     def _compare(self, a: int, b: int, search: _Search) -> float:
-        """Compare all pairs of images of two cells; return the new bound for these cells."""
+        """Compare all images of two cells, a and b; return the new bound for these cells."""
         rows, columns = self.slices[a], self.slices[b]
         squares = self.images[rows] @ self.images[columns].T
         squares *= -2

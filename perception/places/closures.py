@@ -191,7 +191,7 @@ class _Gates:
 
 
 class _Corrected:
-    """Where visits are by the track, if each closure corrects the poses after it.
+    """The positions of visits by the track, if each closure corrects the poses after it.
 
     Args:
         visits: The visits, in order.

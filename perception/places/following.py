@@ -257,8 +257,8 @@ def _bridged(
 def _carried(log: RobotLog, track: Track) -> list[int]:
     """Find scans to which the robot was carried while nothing was logged.
 
-    That scan and the next ones show nothing that was seen before, although the odometer does not
-    jump.
+    Such a scan and the scans after it show nothing that was seen before, although the odometer does
+    not jump.
     """
     found: list[int] = []
     for i in np.flatnonzero(track.shares < STRANGE).tolist():

@@ -119,7 +119,7 @@ class Beams:
         return self._known[i]
 
     def _cells(self, i: int) -> tuple[Cells, Cells]:
-        """Compute the result of `of`."""
+        """Compute what `of` returns for a scan."""
         scan, pose = self._recent.scan(i), self._recent.poses(i, i + 1)[0]
         cos, sin = math.cos(pose[2]), math.sin(pose[2])
         x = pose[0] + cos * scan.laser.mount[0] - sin * scan.laser.mount[1]

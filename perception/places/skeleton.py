@@ -100,10 +100,12 @@ def junctions(patch: Patch, room: float) -> list[Junction]:
 
 
 def _with_mouths(found: list[Fork], mouths: list[Fork], far: float) -> list[Fork]:
-    """Replace the junctions in front of ways into an open space by the mouths of these ways.
+    """Combine the junctions of a skeleton without shores and with shores.
+
+    Those with shores are taken. A junction amid an open space, far from all of these, is kept.
 
     Args:
-        found: The junctions of the skeleton.
+        found: The junctions of the skeleton without shores.
         mouths: The junctions of the skeleton with shores.
         far: Distance of a shore from obstacles, in cells.
     """

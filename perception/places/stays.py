@@ -169,7 +169,7 @@ class Stays:
         return max(self._done, self._before_turns(limit))
 
     def _before_turns(self, limit: int) -> int:
-        """The last scan up to a limit that does not split turns near each other."""
+        """Find the last scan up to a limit that does not separate turns near each other."""
         first: _Turn | None = None  # of the turns near each other
         last = -math.inf
         for turn in self._turns:
@@ -253,7 +253,7 @@ class Stays:
         return math.atan2(y, x)
 
     def _comes_back(self, visit: Visit) -> bool:
-        """Whether the robot left the disc of its last place, but went to no other place."""
+        """Whether a visit continues the last one: the robot left the disc, and soon came back."""
         last = self._staying
         soon = self._recent.way(visit.scan) <= self._left + STAY
         return last is not None and soon and _are_near(last, visit)

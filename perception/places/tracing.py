@@ -173,7 +173,10 @@ def _pose(track: Track, scan: int) -> Pose:
 
 
 def _star(visit: Visit, heading: float) -> tuple[Gateway, ...]:
-    """The ways out of a place as seen with a heading, clockwise; an uncertain one may not exist."""
+    """Make the star of a place as seen with a heading: its ways out, clockwise from the back.
+
+    A way that is not sure becomes a gateway that was not observed.
+    """
     seen = [(-math.degrees(wrapped(way.bearing - heading)), way.sure) for way in visit.ways]
     return tuple(
         Gateway(round(bearing, 1), SPREAD, open=True if sure else None)

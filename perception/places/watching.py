@@ -100,7 +100,7 @@ def watched(scans: Iterable[Scan], tell: Teller, source: str = "") -> Iterator[S
 
 
 def _first_of(coming: Iterator[Scan]) -> list[Scan]:
-    """Take the scans that show the units of the odometry."""
+    """Take the first scans of a drive, until they show the units of the odometry."""
     first: list[Scan] = []
     moves, way = 0, 0.0
     for scan in coming:

@@ -309,8 +309,8 @@ class _ScanPoses:
 
     Attributes:
         odometry: Poses by the odometer.
-        corrections: Transforms to the frame of the odometry from its parent, from the parent of
-            that to the parent, and so on; empty if the robot was not localised.
+        corrections: The transform from the parent of the odometry's frame to this frame, then that
+            from the grandparent to the parent, and so on; empty if the robot was not localised.
         mounts: For each frame of scans, the pose of the laser in the frame of the robot, and
             whether it hangs upside down.
         by_stamp: Whether times are those of headers, instead of those of recording.

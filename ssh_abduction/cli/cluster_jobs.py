@@ -178,7 +178,7 @@ def _on_workers(
         most: The largest number of files on the cluster at a time.
         absence: Says when to stop waiting for a worker.
         tasks: The files.
-        killed: The list to which files are appended whose worker was killed.
+        killed: Receives the files whose worker was killed.
     """
     from distributed import KilledWorker, as_completed
 

@@ -489,8 +489,8 @@ def _theory(options: argparse.Namespace) -> tuple[Theory | None, dict[str, Any]]
     """Find the theory that the options ask for.
 
     Returns:
-        The theory, and no further fields. If the user names no theory: None, as it depends on the
-        log, and the fields that the user set.
+        The theory and an empty dict, if the user names a theory. Otherwise None, as the theory then
+        depends on the log, and the fields that the user set.
 
     Raises:
         TheoryError: A choice is wrong, or contradicts another one.

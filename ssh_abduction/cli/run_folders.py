@@ -226,7 +226,7 @@ def _run_in(folder: Path) -> dict[str, Any]:
 
 
 def _content(logs: Sequence[str]) -> str | None:
-    """Compute the digest of logs; None if one cannot be read, or only once."""
+    """Compute the digest of logs; None if a log cannot be read, or can be read only once."""
     with suppress(OSError, AbductionError):
         return digest(logs)
     return None

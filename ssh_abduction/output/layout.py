@@ -241,7 +241,7 @@ class _Drawing:
         return Layout({}, tuple((float(x), float(y), None) for x, y in at / nearest))
 
     def _course(self, s: DState, whole: bool) -> tuple[Course, float]:
-        """Find what is drawn straight with a dstate, its course.
+        """Find the course of a dstate: the path, or part of a path, that is drawn straight.
 
         Args:
             s: The dstate.

@@ -28,8 +28,8 @@ class _Counts:
         dstates: The number of maps with each dstate.
         places: The number of maps with each place.
         streets: The number of maps with each street.
-        along: For each dstate or street with a path: the number of maps in which this path has the
-            same steps. Keys also have a number for these steps.
+        along: For each dstate or street, and each set of steps along its path: the number of maps
+            with both. A key has a number in place of these steps.
     """
 
     def __init__(self) -> None:

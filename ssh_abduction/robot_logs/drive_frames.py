@@ -124,7 +124,16 @@ def _fitted(
 
 
 def _turned(ssh_map: SSHMap | None, first: int, second: int) -> float:
-    """By how many radians the second of two steps at a place faces to the left of the first."""
+    """Compute the heading at one step minus that at another step of the same place, in radians.
+
+    Args:
+        ssh_map: The map.
+        first: The step that is subtracted.
+        second: The other step.
+
+    Returns:
+        Radians counterclockwise; 0 if the map has no poses.
+    """
     assert ssh_map is not None
     if ssh_map.fit is None or not ssh_map.fit.poses:
         return 0.0

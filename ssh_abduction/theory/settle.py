@@ -148,9 +148,10 @@ def displacement_of(problem: Problem) -> Displacement | None:
 
 
 def _weigh_of(theory: Theory, displacement: str) -> Literal["cost", "count"]:
-    """How to compare maps. Without displacements there is no misfit to weigh, so maps are counted.
+    """Choose how to compare maps: by their cost in nats, or by their counts.
 
-    If the user chose in `prefer` what to minimise, `auto` counts that.
+    Without displacements there is no misfit, so maps are compared by counts. With `auto` they are,
+    too, if the user chose in `prefer` what to minimise.
     """
     chosen = theory.weigh == "cost" or (
         theory.weigh == "auto" and theory.prefer == AUTO and can_weigh(theory)

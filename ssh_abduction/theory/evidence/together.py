@@ -187,7 +187,7 @@ class Together:
         return later[these], earlier[others]
 
     def _is_safe(self, share: Array, squares: Array, number: int) -> Mask:
-        """Whether a bound shows, for each pair, that it is not rejected.
+        """Mark the pairs of returns that a bound shows not to be rejected.
 
         Args:
             share: An upper bound on s squared (see the head of this module).
