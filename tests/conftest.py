@@ -5,14 +5,18 @@ import contextlib
 import gc
 import math
 import signal
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import Any
+from unittest.mock import patch
 
 import pytest
 from hypothesis import HealthCheck, settings
 from threadpoolctl import threadpool_limits
 from worlds import rectangle
 
-from ssh_abduction.cli import verbosity, view
+from ssh_abduction.cli import jobs, verbosity, view
 
 # No example takes too long, nor does it take too long to draw one. And the examples are the same in
 # each run: of traces at random, some take clingo a hundred times as long as others.
@@ -42,6 +46,37 @@ def pytest_collection_finish() -> None:
     threadpool_limits(1)
     gc.freeze()
     gc.set_threshold(50_000, 20, 50)
+
+
+def _answers(
+    work: Callable[..., Any],
+    tasks: Sequence[tuple[Any, ...]],
+    processes: int,
+    stopped: Callable[[], bool],
+    *_: object,
+) -> Iterator[Any]:
+    """`workers.answers` without processes."""
+    for task in tasks:
+        if not stopped():
+            yield work(*task, lambda: False)
+
+
+@pytest.fixture(scope="session")
+def in_this_process() -> Callable[[], AbstractContextManager[object]]:
+    """A context in which many files are answered here: to begin a process takes a second.
+
+    Tests of processes do without it, and one of them compares the answers.
+    """
+    return lambda: patch.object(jobs.workers, "answers", _answers)
+
+
+@pytest.fixture
+def without_processes(
+    in_this_process: Callable[[], AbstractContextManager[object]],
+) -> Iterator[None]:
+    """The same for a whole test."""
+    with in_this_process():
+        yield
 
 
 @pytest.fixture

@@ -15,7 +15,6 @@ from typing import Any
 
 import bench
 import conformance
-import plot
 import pruning
 import pytest
 import readme
@@ -307,5 +306,7 @@ def test_following_is_no_speedup_of_a_user_and_can_be_left_out() -> None:
 
 def test_the_picture_of_growth_is_drawn_from_the_run(tmp_path: Path) -> None:
     picture = tmp_path / "growth.png"
+    import plot  # loads matplotlib
+
     plot.draw(json.loads(stored(readme.PAGES["peers"].read_text(), "peers").read_text()), picture)
     assert picture.stat().st_size > 10_000

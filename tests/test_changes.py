@@ -109,7 +109,7 @@ def _changes(trace: Trace, at: list[int], headings: tuple[int, ...]) -> Iterator
     yield count
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(st.data())
 def test_the_solver_lists_the_maps_with_changes_of_the_brute_force(data: st.DataObject) -> None:
     trace = data.draw(drives_with_stars(), label="trace")

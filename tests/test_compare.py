@@ -206,7 +206,7 @@ def naive_differing(maps: Sequence[SSHMap]) -> dict[str, set[int]]:
     return {sort: differing for sort, differing in found.items() if differing}
 
 
-@settings(max_examples=20)
+@settings(max_examples=12)
 @given(st.data())
 def test_what_is_said_of_maps_is_so_in_the_explicit_list(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=6), label="trace")

@@ -44,7 +44,7 @@ def traces_with_lifts(draw: st.DrawFn) -> Trace:
     return replace(trace, steps=tuple(steps))
 
 
-@settings(max_examples=15)
+@settings(max_examples=10)
 @given(st.data())
 def test_the_solver_lists_the_maps_with_floors_of_the_brute_force(data: st.DataObject) -> None:
     trace = data.draw(traces_with_lifts(), label="trace")

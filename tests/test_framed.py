@@ -197,7 +197,7 @@ def test_a_trace_that_grows_has_the_maps_of_the_plain_encoding(
 def test_a_maze_is_mapped_while_it_is_explored() -> None:
     """Long enough for cores, for visits told to be transitive, and for paths, all of which the
     longer trace keeps."""
-    trace = maze(3, 3, steps=48, seed=0, stars=True).trace
+    trace = maze(3, 3, steps=36, seed=0, stars=True).trace
     first, *rest = trace.steps
     paths = set()
     with (
@@ -230,7 +230,7 @@ def test_a_maze_is_mapped_while_it_is_explored() -> None:
 def test_each_speedup_off_alone() -> None:
     """On walks long enough for cores, for visits that have to be told to be transitive, and for
     maps that are found nearby."""
-    trace = maze(2, 2, steps=45, seed=0, stars=True).trace
+    trace = maze(2, 2, steps=36, seed=0, stars=True).trace
     expected = solve(trace, Theory.topological(), max_maps=None, speedups=Speedups.without("names"))
     for off in ("", "clique", "core_guided", "sides"):
         with patch.object(same, "MANY", 1), patch.object(transitive, "AT_A_TIME", 5):
@@ -334,9 +334,8 @@ def test_mazes_are_mapped(seed: int, counts: tuple[int, int, int]) -> None:
         assert check(walk.trace, ssh_map, Theory.topological()) == ()
 
 
-@pytest.mark.parametrize(("seed", "pinned", "stretches"), [(13, 4, 7), (41, 3, 5)])
-def test_pinned_stretches_leave_all_maps(seed: int, pinned: int, stretches: int) -> None:
-    trace = maze(4, 4, steps=100, seed=seed, stars=True).trace
+def test_pinned_stretches_leave_all_maps() -> None:
+    trace = maze(4, 4, steps=100, seed=41, stars=True).trace
     given: list[tuple[list[int], Sequence[int]]] = []
 
     def rivals(
@@ -351,7 +350,7 @@ def test_pinned_stretches_leave_all_maps(seed: int, pinned: int, stretches: int)
 
     with patch.object(paths_module, "pairwise_distinct", rivals):
         maps = solve(trace, max_maps=None).maps
-    assert any((len(found), len(among)) == (pinned, stretches) for found, among in given)
+    assert any((len(found), len(among)) == (3, 5) for found, among in given)
     assert len(maps) > 1
     assert set(maps) == set(solve(trace, max_maps=None, speedups=Speedups.without("clique")).maps)
 
@@ -790,10 +789,9 @@ def test_places_that_a_guess_has_for_one_are_told_apart(size: int, steps: int, s
         assert len(set(labels)) <= len(set(truth))
 
 
-@pytest.mark.parametrize(("loops", "most"), [(0.1, 1.1), (0.3, 1.2)])
-def test_a_guess_with_wrong_travels_leads_to_a_map_with_streets(loops: float, most: float) -> None:
+def test_a_guess_with_wrong_travels_leads_to_a_map_with_streets() -> None:
     """Annealing ends early, so some travels do not lead where they should."""
-    walk = maze(5, 5, steps=700, seed=1, stars=True, loops=loops)
+    walk = maze(5, 5, steps=700, seed=1, stars=True, loops=0.3)
     asked = framed_engine(walk.trace, Theory.topological())
     chart = asked._charted(len(walk.trace), None)
     assert chart
@@ -811,4 +809,4 @@ def test_a_guess_with_wrong_travels_leads_to_a_map_with_streets(loops: float, mo
         labels = asked._fitting.paths.guessed_labels(chart, Watch())
     assert failed[0] > 0
     assert asked._fitting.paths.has_separate(chart, labels)
-    assert len(set(labels)) < most * len(set(walk.truth))
+    assert len(set(labels)) < 1.2 * len(set(walk.truth))

@@ -212,8 +212,8 @@ def test_the_learner_is_an_estimator(run: Trace) -> None:
     assert (
         cross_val_score(
             BootstrapLearner(VIEWS_ALONE, ViewClusterer(k=4, random_state=0)),
-            [run, other, other],
-            cv=3,
+            [run, other],
+            cv=2,
         ).min()
         > 0.85
     )
@@ -592,7 +592,7 @@ def test_from_simulation_to_recognition_in_the_shell(
                 "simulate",
                 "notched-rectangle",
                 "--tours",
-                "10",
+                "6",
                 "--seed",
                 "3",
                 "-o",
@@ -601,7 +601,7 @@ def test_from_simulation_to_recognition_in_the_shell(
         )
         == 0
     )
-    assert "80 images of notched rectangle" in capsys.readouterr().out
+    assert "48 images of notched rectangle" in capsys.readouterr().out
     assert (
         main(
             [
@@ -618,7 +618,7 @@ def test_from_simulation_to_recognition_in_the_shell(
         == 0
     )
     out = capsys.readouterr().out
-    assert "4 views of 80 images" in out
+    assert "4 views of 48 images" in out
     assert out.splitlines()[0].split() == ["k", "M", "trimmed", "U"]
     assert (tmp_path / "fig.png").read_bytes().startswith(b"\x89PNG")
     assert main(["solve", path("views.jsonl"), "--json", "--set", "displacement=none"]) == 0
@@ -626,11 +626,11 @@ def test_from_simulation_to_recognition_in_the_shell(
     assert (
         main(["train", path("maps.json"), path("views.jsonl"), "-o", path("recogniser.skops")]) == 0
     )
-    assert "8 dstates learnt from 80 images" in capsys.readouterr().out
+    assert "8 dstates learnt from 48 images" in capsys.readouterr().out
     assert main(["evaluate", path("maps.json"), path("views.jsonl")]) == 0
     told = capsys.readouterr().out
     assert told.startswith(
-        "map 1 is the true one, of 1 map\nthe truth, known at 80 of 80 steps: 8 dstates, 4 "
+        "map 1 is the true one, of 1 map\nthe truth, known at 48 of 48 steps: 8 dstates, 4 "
         "places, 4 paths; 14 % of"
     )
     assert (
@@ -650,7 +650,7 @@ def test_from_simulation_to_recognition_in_the_shell(
     )
     curve = json.loads(capsys.readouterr().out)
     assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
-    assert curve["sizes"][-1] == 80
+    assert curve["sizes"][-1] == 48
     assert curve["mean"][-1] > 0.8
     folds = ["--set", "folds=2"]
     assert main(["learning-curve", path("maps.json"), path("views.jsonl"), *folds]) == 0
@@ -848,22 +848,13 @@ def five_circuits() -> tuple[Trace, BootstrapLearner]:
     return trace, BootstrapLearner().fit(trace)
 
 
-@pytest.mark.parametrize("kind", ["person", "random"])
 def test_bad_images_are_disbelieved_where_views_may_be_misread(
-    kind: str, five_circuits: tuple[Trace, BootstrapLearner]
+    five_circuits: tuple[Trace, BootstrapLearner],
 ) -> None:
     trace, without = five_circuits
-    images, bad, rng = (
-        images_of(trace).copy(),
-        [9, 30],
-        np.random.default_rng(0),
-    )  # one of twenty
-    for i in bad:
-        images[i] = (
-            np.minimum(images[i], np.where(abs(np.arange(180) - 90) < 20, 0.4, np.inf))
-            if kind == "person"
-            else rng.uniform(0.1, 8, 180)
-        )
+    images, bad = images_of(trace).copy(), [9, 30]  # one of twenty
+    for i in bad:  # somebody stands before the laser
+        images[i] = np.minimum(images[i], np.where(abs(np.arange(180) - 90) < 20, 0.4, np.inf))
     spoilt = replace(
         trace,
         steps=tuple(

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import math
 import shutil
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -59,26 +61,18 @@ def hall(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def runs(hall: Path) -> Path:
+def imported_hall(hall: Path) -> Imported:
+    return import_log(read_log(hall))
+
+
+@pytest.fixture(scope="module")
+def runs(hall: Path, in_this_process: Callable[[], AbstractContextManager[object]]) -> Path:
     """The output of `map` for it, and for a log that cannot be read."""
     bad = hall.with_name("bad.log")
     bad.write_text("nothing\n")
-    assert (
-        main(
-            [
-                "map",
-                str(hall),
-                str(bad),
-                "-o",
-                str(hall.parent / "runs"),
-                "--set",
-                "ladder=false",
-                "--time-limit",
-                "1000",
-            ]
-        )
-        == 1
-    )
+    words = ["-o", str(hall.parent / "runs"), "--set", "ladder=false", "--time-limit", "1000"]
+    with in_this_process():
+        assert main(["map", str(hall), str(bad), *words]) == 1
     return hall.parent / "runs"
 
 
@@ -242,6 +236,7 @@ def test_a_log_of_a_robot_that_stands_or_passes_nothing_is_an_error() -> None:
         import_log(RobotLog(tuple(onward), source="corridor.log"))
 
 
+@pytest.mark.usefixtures("without_processes")
 def test_a_run_is_done_once_and_bad_logs_do_not_stop_the_others(
     hall: Path, runs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -335,10 +330,10 @@ def test_a_log_has_a_twentieth_of_its_drive_to_be_mapped_in_less_what_the_import
 
 @pytest.mark.parametrize("is_reliable", [True, False])
 def test_a_map_on_an_unreliable_track_has_no_probability(
-    hall: Path, monkeypatch: pytest.MonkeyPatch, is_reliable: bool
+    hall: Path, imported_hall: Imported, monkeypatch: pytest.MonkeyPatch, is_reliable: bool
 ) -> None:
-    imported = import_log(read_log(hall))
-    imported = replace(imported, track=replace(imported.track, is_reliable=is_reliable))
+    track = replace(imported_hall.track, is_reliable=is_reliable)
+    imported = replace(imported_hall, track=track)
     monkeypatch.setattr(log_maps, "import_log", lambda *_: imported)
     solution = map_log(read_log(hall), time_limit=5, max_maps=1, with_ladder=False).solution
     said = "no probability is given, as the track is unreliable" in solution.sureness
@@ -347,8 +342,13 @@ def test_a_map_on_an_unreliable_track_has_no_probability(
 
 @pytest.mark.parametrize(("limit", "searches"), [(None, 3), (5.0, 1)])
 def test_without_a_limit_the_search_goes_on_until_it_has_a_map(
-    hall: Path, monkeypatch: pytest.MonkeyPatch, limit: float | None, searches: int
+    hall: Path,
+    imported_hall: Imported,
+    monkeypatch: pytest.MonkeyPatch,
+    limit: float | None,
+    searches: int,
 ) -> None:
+    monkeypatch.setattr(log_maps, "import_log", lambda *_: imported_hall)
     asked: list[float] = []
     solve = LogMapping.solve
 
@@ -429,7 +429,7 @@ def test_a_process_of_its_own_maps_a_log_and_one_that_is_killed_loses_its_log_al
 ) -> None:
     question = MapQuestion(None, {}, {}, 0.5, 1000.0, 1, False)
     small = tmp_path / "small.log"
-    small.write_text("\n".join(hall.read_text().splitlines()[:150]) + "\n")
+    small.write_text("\n".join(hall.read_text().splitlines()[:80]) + "\n")
     (answer,) = answers_here(question, [str(small)], 2, StopFlag())
     assert answer.code in (0, 10)
     assert dict(answer.files)["run.json"]

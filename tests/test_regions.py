@@ -196,7 +196,7 @@ def as_set(ssh_map: SSHMap) -> set[brute_regions.Found]:
     return {(frozenset(r.places), frozenset(r.bounds), r.door) for r in ssh_map.regions}
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(
     trace=st.builds(walk, st.integers(0, 10_000), st.integers(2, 16)),
     boundary=st.sampled_from(("strict", "defeasible", "none")),

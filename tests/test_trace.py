@@ -364,7 +364,7 @@ def test_a_prefix_ends_without_an_action() -> None:
     assert trace.prefix(3) == trace
 
 
-@settings(max_examples=75)
+@settings(max_examples=40)
 @given(
     st.binary(max_size=200)
     | st.binary(max_size=50).map(lambda line: f"{HEADER}\n".encode() + line)

@@ -34,7 +34,7 @@ def hidden(trace: Trace, steps: set[int]) -> Trace:
     return trace.with_views([None if t in kept else view for t, view in enumerate(trace.views)])
 
 
-@settings(max_examples=20)
+@settings(max_examples=12)
 @given(st.data())
 def test_solver_and_checker_agree_with_the_brute_force(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=6), label="trace")

@@ -1,17 +1,6 @@
 """Find an argument why two steps are different dstates in every map, or one dstate in every map.
 
->>> from ssh_abduction import Theory, Trace
->>> from ssh_abduction.explain.piece import Piece
->>> from ssh_abduction.theory.settle import settle
->>> actions = ["right", "travel", "right", "travel"]
->>> trace = Trace.from_steps(views=["v0", "v1", "v2", "v3", "v0"], actions=actions)
->>> problem = settle(trace)
->>> argument = derive(Piece.of(problem, range(5)), trace, 0, 4, one=False)
->>> for part in argument.summary.split("; "):
-...     print(part)
-step 0 is at a place on the path that steps 1 and 2 define
-step 4 would be at a place to the right of that path
-no place on a path lies right or left of it
+`explain_pair` returns such an argument as `PairExplanation.derivation`.
 
 The argument uses a minimal set of links. A link is an axiom at one step. Each line of the argument
 adds a link, and clingo finds the conclusions that hold in all maps that satisfy the links so far.
