@@ -91,6 +91,7 @@ def test_adventure(tmp_path: Path) -> None:
     assert (tmp_path / "again.jsonl").read_text() == (EXAMPLES / "adventure.jsonl").read_text()
 
 
+@pytest.mark.slow
 def test_the_notebook_tells_what_it_shows(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each cell prints and returns what is stored beside it. Drawings are not compared."""
     monkeypatch.setattr(streets, "WORK", 0)

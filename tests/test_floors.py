@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from unittest.mock import patch
 
@@ -59,7 +60,7 @@ def test_the_solver_lists_the_maps_with_floors_of_the_brute_force(data: st.DataO
         agree(trace, theory)
 
 
-@settings(max_examples=8)
+@settings(max_examples=5)
 @given(st.data())
 def test_the_checker_rejects_maps_with_floors_that_the_brute_force_does_not_find(
     data: st.DataObject,
@@ -178,11 +179,17 @@ def test_floors_are_drawn_below_each_other_and_exported() -> None:
     assert "floor" not in to_svg(solve(trace[:2]).maps[0])
 
 
+@cache
+def driven(floors: int) -> Trace:
+    """A drive through a tower."""
+    return simulate(World.named(f"tower-{floors}"), seed=3)
+
+
 @pytest.mark.parametrize(("floors", "dstates"), [(2, 42), (3, 60)])
 def test_a_robot_in_a_simulated_tower_changes_floors_by_lifts_only(
     floors: int, dstates: int
 ) -> None:
-    trace = simulate(World.named(f"tower-{floors}"), seed=3)
+    trace = driven(floors)
     found = [step.truth["dstate"] for step in trace.steps]
     assert len(set(found)) == dstates
     for t, action in enumerate(trace.actions):
@@ -195,7 +202,7 @@ def test_a_robot_in_a_simulated_tower_changes_floors_by_lifts_only(
 
 @pytest.mark.parametrize("theory", [Theory.causal(), Theory(displacement="none")])
 def test_the_map_of_a_simulated_tower_is_true(theory: Theory) -> None:
-    trace = simulate(World.named("tower-2"), seed=3)
+    trace = driven(2)
     trace = trace.with_views([str(step.star) for step in trace.steps])
     solution = solve(trace, theory, max_maps=1)
     assert solution.status is Status.OPTIMAL
@@ -210,7 +217,7 @@ def test_the_map_of_a_simulated_tower_is_true(theory: Theory) -> None:
 def test_signs_at_the_lifts_tell_three_floors_apart() -> None:
     """Without signs, the third floor may be the first one, if the robot came by the second."""
     tower = World.named("tower-3")
-    trace = simulate(tower, seed=3)
+    trace = driven(3)
     truth = [(step.truth["dstate"], step.truth["place"]) for step in trace.steps]
     starts = {lift.start for lift in tower.lifts}
     lifts = {place for place, at in tower.places.items() if tuple(at) in starts}

@@ -78,13 +78,16 @@ def of_two_clocks(scans: Scans) -> Scans:
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        (backwards, "drives backwards all the way"),
-        (in_degrees, "headings of the odometry are read as degrees"),
-        (sideways, "headings are wrong: write them in radians"),
+        (lambda scans: backwards(scans[:150]), "drives backwards all the way"),
+        (lambda scans: in_degrees(scans[:150]), "headings of the odometry are read as degrees"),
+        (lambda scans: sideways(scans[:150]), "headings are wrong: write them in radians"),
         (kidnapped, "before and after scan 100 (line or message 171) contradict each other"),
         (of_two_lasers, "The laser changes before scan 150"),
         (of_two_clocks, "The clock starts anew before scan 150"),
-        (lambda scans: with_poses(scans, lambda x, y, h: (0.0, 0.0, 0.0)), "Record the odometry"),
+        (
+            lambda scans: with_poses(scans[:150], lambda x, y, h: (0.0, 0.0, 0.0)),
+            "Record the odometry",
+        ),
         (lambda scans: scans[::20], "Take all scans of the drive"),
         (lambda scans: scans[::8], "take all scans of the drive, at least one a metre"),
         (lambda scans: scans[:80], "never comes back to where it was"),
@@ -102,7 +105,8 @@ def test_a_good_drive_is_not_doubted(scans: tuple[Scan, ...]) -> None:
 
 def test_headings_in_degrees_are_read_as_such(scans: tuple[Scan, ...]) -> None:
     good, other = (
-        tracked(RobotLog(tuple(some), source="drive"))[1] for some in (scans, in_degrees(scans))
+        tracked(RobotLog(tuple(some), source="drive"))[1]
+        for some in (scans[:150], in_degrees(scans[:150]))
     )
     assert other.poses == pytest.approx(good.poses, abs=0.01)
 
@@ -124,7 +128,7 @@ def test_a_log_whose_scans_do_not_match_is_refused(
         import_log(log)
     # The laser of a robot whose beams are mirrored sees what the odometry contradicts.
     monkeypatch.setattr(log_checks, "SPARSE", 1e9)
-    mirrored = [replace(scan, ranges=scan.ranges[::-1].copy()) for scan in scans]
+    mirrored = [replace(scan, ranges=scan.ranges[::-1].copy()) for scan in scans[:80]]
     assert "contradicts the odometry in" in notes_of(mirrored)
     drives = [RobotLog(tuple(some), source="drive") for some in (scans, mirrored)]
     assert [tracked(drive)[1].is_reliable for drive in drives] == [True, False]

@@ -36,6 +36,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return unpacked
 
 
+@pytest.mark.slow
 def test_the_wheel_holds_the_encodings_the_examples_and_the_wings(
     installed: Path, tmp_path: Path
 ) -> None:
@@ -66,6 +67,7 @@ def test_the_wheel_holds_the_encodings_the_examples_and_the_wings(
     assert done.stdout == "3\n"
 
 
+@pytest.mark.slow
 def test_the_first_commands_of_the_readme_run_where_the_wheel_is_installed(
     installed: Path, tmp_path: Path
 ) -> None:

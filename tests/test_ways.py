@@ -254,8 +254,8 @@ def test_what_ends_the_settling_of_dstates_leaves_the_map(name: str) -> None:
 def test_a_robot_that_goes_on_where_that_ended() -> None:
     """The first search of a mapper may be of many steps; what it proved holds for the steps that
     come."""
-    trace = maze(2, 2, steps=36, seed=1).trace
-    first = trace.prefix(32)
+    trace = maze(2, 2, steps=30, seed=1).trace
+    first = trace.prefix(26)
     with patch.object(choosing, "STEPWISE", -1.0):
         search = Search(first, max_maps=None)
         before = search.solution(tuple(search))

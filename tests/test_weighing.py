@@ -123,7 +123,7 @@ def subsets(steps: list[int]) -> list[tuple[int, ...]]:
     return [some for size in range(len(steps) + 1) for some in combinations(steps, size)]
 
 
-@settings(max_examples=6)
+@settings(max_examples=4)
 @given(st.data())
 def test_faults_are_weighed_beside_misfit(data: st.DataObject) -> None:
     trace = data.draw(
@@ -160,7 +160,7 @@ def test_faults_are_weighed_beside_misfit(data: st.DataObject) -> None:
 PRICES = [(8.0, 8.0, 0.0), (1.0, 2.0, 0.5), (3.0, 0.0, 0.0)]
 
 
-@settings(max_examples=8)
+@settings(max_examples=5)
 @given(st.data())
 def test_the_cheapest_maps_are_those_of_plain_least_squares(data: st.DataObject) -> None:
     trace = data.draw(
@@ -190,9 +190,14 @@ DEFAULT = {**truth.NOISE, "scale": 0.05, "bend": 0.0035}
 
 @pytest.fixture(scope="module")
 def route() -> truth.Known:
-    """The ACES3 route with noisy displacements, of which the map with fewest dstates is false."""
+    """Most of the ACES3 route with noisy displacements. Its map with fewest dstates is false."""
     (known,) = truth.aces3([3], truth.Noise(Odometry(**DEFAULT)))
-    return known
+    return replace(
+        known,
+        trace=known.trace.prefix(20),
+        dstates=known.dstates[:20],
+        places=known.places[:20],
+    )
 
 
 @pytest.fixture(scope="module")
@@ -215,8 +220,8 @@ def test_the_cheapest_map_is_true_where_the_smallest_is_not(
 def test_probabilities_are_of_steps_of_the_trace(weighed_route: Solution) -> None:
     assert weighed_route.probability(0, 12) > 0.9
     assert weighed_route.probability(0, 1) < 0.1
-    with pytest.raises(SolverError, match="second: expected a whole number from 0 to 22, got 23"):
-        weighed_route.probability(0, 23)
+    with pytest.raises(SolverError, match="second: expected a whole number from 0 to 19, got 20"):
+        weighed_route.probability(0, 20)
     with pytest.raises(SolverError, match="of: expected dstate or place, got 'path'"):
         weighed_route.probability(0, 1, of="path")
     counted = solve(Trace.from_steps("aba", ["travel", "travel"]))

@@ -128,7 +128,7 @@ def test_near_minimal_maps_of_a_longer_trace_are_those_that_a_rule_for_their_num
 
     The rule is one of a user's own, which no speed-up knows.
     """
-    trace = Trace.load(EXAMPLE).prefix(30)
+    trace = Trace.load(EXAMPLE).prefix(20)
     if theory.star == "frame":
         trace = Trace.load(ACES3)[:16]
     solution = solve(trace, theory, within=1, max_maps=None)
