@@ -77,6 +77,7 @@ def test_maxsat_needs_no_more_faults_than_the_truth(case: Case) -> None:
     assert {kind for _, kind in explanation.faults} <= {kind for _, kind in case.faults}
 
 
+@pytest.mark.slow
 def test_a_cell_says_what_came_of_it_and_ends_at_its_limit() -> None:
     found = faults.measured("rectangle n=400, 4 jumps", faults.TOLD, 500, 20, 4096)
     assert (

@@ -203,6 +203,7 @@ def test_localised_means_sure_and_right_for_five_steps() -> None:
     assert judged("rrrrrrr").localised(0, 7) is None
 
 
+@pytest.mark.slow
 def test_a_run_compares_all_methods_and_can_be_saved(
     monkeypatch: pytest.MonkeyPatch, tmp_path: object, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -244,10 +244,9 @@ def test_a_laser_that_hangs_upside_down_is_said(coarse: tuple[Scan, ...]) -> Non
     assert "--set fov=180" in doubt(tuple(Told(fov=-180).placed(scan) for scan in coarse))
 
 
-@pytest.mark.parametrize("angle", [-90.0, 60.0])
-def test_a_wrong_mount_is_said_with_the_likely_one(coarse: tuple[Scan, ...], angle: float) -> None:
+def test_a_wrong_mount_is_said_with_the_likely_one(coarse: tuple[Scan, ...]) -> None:
     """The laser truly looks ahead."""
-    said = doubt(tuple(Told(mount=(0, 0, angle)).placed(scan) for scan in coarse))
+    said = doubt(tuple(Told(mount=(0, 0, 60.0)).placed(scan) for scan in coarse))
     (looks,) = map(float, re.findall(r"--set mount=0,0,(-?\d+)\)", said))
     assert abs(looks) <= 10
 

@@ -109,6 +109,7 @@ def test_the_notched_rectangle_is_learnt_from_its_images_alone(
     assert recognised.mean() > 0.9
 
 
+@pytest.mark.slow
 def test_the_hall_is_learnt_with_the_openings_seen(hall: Trace) -> None:
     learner = BootstrapLearner(Theory.topological().replace(displacement="none")).fit(hall)
     assert learner.clusterer_.k_ == 10
@@ -565,6 +566,7 @@ def test_recognition_by_poor_labels_is_poor(run: Trace) -> None:
     assert rate(images, np.zeros_like(codes), truth, 0) == pytest.approx(1 / 8, abs=0.05)
 
 
+@pytest.mark.slow
 def test_outcomes_differ_over_notch_and_spread(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(
         EXPERIMENTS, "notched-rectangle", replace(EXPERIMENTS["notched-rectangle"], tours=10)

@@ -123,7 +123,7 @@ def test_the_search_ends_in_time_with_its_best_map(noisy: Path) -> None:
 
 @pytest.mark.parametrize(
     "case",
-    list(cases(6, seed=1, longest=300, seconds=(0.3, 0.5))),
+    list(cases(4, seed=1, longest=300, seconds=(0.3, 0.5))),
     ids=lambda case: f"{case.family}, {len(case.trace)} steps",
 )
 @POSIX
@@ -159,8 +159,8 @@ def test_rules_of_ones_own_that_are_too_large_end_with_the_limit(
 
 
 @POSIX
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_who_is_interrupted_prints_what_is_known(number: int, code: int, noisy: Path) -> None:
+def test_who_is_ended_prints_what_is_known(noisy: Path) -> None:
+    """tests/test_cli.py does the same with Ctrl-C, and tests/test_batch.py with several traces."""
     command = [sys.executable, "-m", "ssh_abduction", "-v", "solve", "--json", str(noisy)]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -169,50 +169,15 @@ def test_who_is_interrupted_prints_what_is_known(number: int, code: int, noisy: 
         assert any(
             "progress: prefix" in line for line in process.stderr
         )  # the search is under way, and will not end by itself
-        process.send_signal(number)
+        process.send_signal(signal.SIGTERM)
         out, _ = process.communicate(timeout=SOON)
-    assert process.returncode == code
+    assert process.returncode == 143
     printed = json.loads(out)
     assert (printed["status"], printed["stopped"], len(printed["maps"])) == (
         "feasible",
         "interrupted",
         1,
     )
-
-
-@POSIX
-def test_who_is_interrupted_prints_what_is_known_of_two_traces_at_a_time(
-    noisy: Path, tmp_path: Path
-) -> None:
-    quick = tmp_path / "quick.jsonl"
-    rectangle(8).save(quick)
-    command = [
-        sys.executable,
-        "-m",
-        "ssh_abduction",
-        "solve",
-        "--json",
-        str(quick),
-        str(noisy),
-        str(noisy),
-        "--jobs",
-        "2",
-    ]
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout
-        assert json.loads(process.stdout.readline())["status"] == "optimal"
-        process.send_signal(signal.SIGTERM)
-        out, _ = process.communicate(timeout=SOON)
-    assert process.returncode == 143
-    for line in out.splitlines():
-        printed = json.loads(line)
-        assert (printed["status"], printed["stopped"], len(printed["maps"])) == (
-            "feasible",
-            "interrupted",
-            1,
-        )
 
 
 @POSIX

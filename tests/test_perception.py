@@ -822,6 +822,7 @@ def test_what_could_not_be_read_is_not_written(tmp_path: Path) -> None:
 # the benchmark and the docstrings
 
 
+@pytest.mark.slow
 def test_the_benchmark_runs(capsys: pytest.CaptureFixture[str]) -> None:
     benchmark.search("dstates", 60)
     assert "60 images" in capsys.readouterr().out
