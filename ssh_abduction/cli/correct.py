@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import shlex
+from pathlib import Path
 
-from ssh_abduction.cli.options import Verbs, add_map, add_maps
+from ssh_abduction.cli.options import Verbs, add_map, add_maps, trace_beside
 from ssh_abduction.cli.standing import Standing, told
 from ssh_abduction.data.corrections import PAIRS
 from ssh_abduction.data.errors import MapError, brief, named, printable
@@ -65,10 +67,17 @@ def run(options: argparse.Namespace) -> int:
         print("\n".join(map(printable, told(said))) or "nothing was said")
         return 0
     file = standing.save(said)
-    print(
-        printable(f"{named(file)}: {counted(sum(1 for _ in told(said)), 'sentences')}; solve again")
-    )
+    sentences = counted(sum(1 for _ in told(said)), "sentences")
+    print(printable(f"{named(file)}: {sentences}; {_how_to_obey(standing.file)}"))
     return 0
+
+
+def _how_to_obey(maps: Path) -> str:
+    """Say how a person solves again, so that the corrections beside a file of maps are obeyed."""
+    if trace_beside(str(maps)) is None:
+        return f"solve again with -o {shlex.quote(str(maps))}"
+    folder = shlex.quote(str(maps.parent))
+    return f"to obey: ssh-abduction solve {folder} --theory {folder} -o {shlex.quote(str(maps))}"
 
 
 def _pair(standing: Standing, kind: str, pair: str) -> tuple[str, str]:
