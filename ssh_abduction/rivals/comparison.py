@@ -72,8 +72,8 @@ class Choice:
     Attributes:
         questions: Some of the questions in `Comparison.deciding`.
         options: The ways in which maps answer these questions, the way of map 1 first.
-        differing: For each sort (faults, dstates, places, paths, courses) the steps whose group
-            depends only on this choice.
+        differing: For each sort (faults, dstates, places, paths, courses) the steps that maps group
+            differently, if how a map groups them depends only on this choice.
     """
 
     questions: tuple[Question, ...]
@@ -154,9 +154,10 @@ class Comparison:
         shared: What all minimal maps share. If `shared.proven` is False, this is known only of the
             listed maps.
         listed: What the listed maps share.
-        variants: For each sort, the number of different ways in which the listed maps group steps.
+        variants: For each sort, the number of different groupings of the steps by listed maps.
         choices: The independent choices. Each combination of their options is one listed map.
-        together: For each sort, the steps whose group depends on several choices together.
+        together: For each sort, the steps that maps group differently, if how a map groups them
+            depends on several choices together.
         deciding: Questions that distinguish all listed maps, in the order in which to ask them. The
             first ones distinguish all labelings. None is superfluous, but a smaller set may exist.
         sizes: Pairs of a size (numbers of dstates, places and paths) and the number of maps with
@@ -357,12 +358,20 @@ def _depending(
 
 
 def _in_order(steps: dict[Matter, set[int]]) -> dict[Matter, tuple[int, ...]]:
+    """Sort the sorts in the order of causes, and the steps of each in ascending order."""
     return {sort: tuple(sorted(steps[sort])) for sort in MATTERS if sort in steps}
 
 
 def _choice(
     asked: Sequence[Asked], option: NDArray[np.intp], differing: dict[Matter, tuple[int, ...]]
 ) -> Choice:
+    """Make a choice.
+
+    Args:
+        asked: The questions of the choice, with the answers of the maps.
+        option: The option of each map.
+        differing: The value for `Choice.differing`.
+    """
     members = members_of(option.tolist())
     options = [
         Option(tuple(bool(a.column[maps[0]]) for a in asked), tuple(i + 1 for i in maps))
@@ -372,7 +381,7 @@ def _choice(
 
 
 def _variants(table: Table, maps: Sequence[SSHMap]) -> dict[Matter, int]:
-    """For each sort, count the different ways in which maps group steps."""
+    """For each sort, count the different groupings of the steps by maps."""
     faults: dict[Matter, int] = (
         {"faults": len({m.faults for m in maps})} if any(m.faults for m in maps) else {}
     )
@@ -380,6 +389,7 @@ def _variants(table: Table, maps: Sequence[SSHMap]) -> dict[Matter, int]:
 
 
 def _sizes(maps: Sequence[SSHMap]) -> tuple[tuple[tuple[int, int, int], int], ...]:
+    """Count the maps of each size, for `Comparison.sizes`."""
     counts = Counter(
         (len(ssh_map.dstates), len(ssh_map.places), len(ssh_map.paths)) for ssh_map in maps
     )
@@ -387,6 +397,7 @@ def _sizes(maps: Sequence[SSHMap]) -> tuple[tuple[tuple[int, int, int], int], ..
 
 
 def _others(here: Listing, there: Listing) -> Others:
+    """Compare two lists of maps of one trace."""
     number = {ssh_map.renumbered(): i for i, ssh_map in reversed(list(enumerate(there.maps, 1)))}
     both = {i: number.get(ssh_map.renumbered()) for i, ssh_map in enumerate(here.maps, 1)}
     pairs = tuple((i, j) for i, j in both.items() if j)

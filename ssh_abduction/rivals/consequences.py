@@ -4,8 +4,9 @@ If the action was tried at a dstate, its link is known. Otherwise the axioms, or
 path, may still tell where the action leads:
 
 - A turn, if places have frames (numbered directions): it leads to the slot that lies one, two or
-  three quarters on (axiom turn_rotates). If the map has a dstate there, it is the only one
-  (one_dstate_per_heading). If not, the star there is still known: the star of the place, turned.
+  three quarters on (axiom turn_rotates). At most one dstate has that slot as its heading
+  (one_dstate_per_heading). If the map has none, the star there is still known: the star of another
+  dstate at the place, rotated by the turns between the two.
 - A turn around at a dstate along a path: it leads back along the path (turn_around_reverses), and
   at most one dstate is there (one_dstate_per_course).
 - A travel along a path: it leads to the next place in the order of the path. This is only expected,
@@ -142,6 +143,7 @@ class Consequences:
         )
 
     def _turned(self, s: DState, action: Action) -> Consequence:
+        """Predict where a turn leads from a dstate that has no link for it."""
         assert action.turn is not None
         if s.place in self._seen_at and s.heading is not None and action.in_quarters:
             slot = (s.heading + QUARTERS[action.turn]) % 4
@@ -160,6 +162,7 @@ class Consequences:
         return OPEN
 
     def _travelled(self, s: DState) -> Consequence:
+        """Predict a travel from a dstate that has no link for it: to the next place of its path."""
         order = self._orders.get(s.path or 0, ())
         if s.place not in order:
             return OPEN
@@ -170,6 +173,7 @@ class Consequences:
         return OPEN if there is None else self._to(there, "expected")
 
     def _to(self, dstate: int, how: How) -> Consequence:
+        """Predict that an action leads to this dstate."""
         return Consequence(how, dstate, self._looks[dstate])
 
 

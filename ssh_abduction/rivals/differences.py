@@ -92,8 +92,8 @@ class Difference:
         faults: For each map, the faults that the other map lacks.
         chi2: The chi-square of each map; None if one of them has no fit.
         has_places: For each map, whether it has places.
-        sides: For each map, the places that it knows to lie beside a path and the other one does
-            not; empty if a map has no regions.
+        sides: For each map, the places beside paths that only this map knows; empty if a map has
+            no regions.
     """
 
     ids: tuple[str, str]
@@ -273,6 +273,15 @@ def _changes(table: Table, sort: Sort) -> Iterable[Change]:
 
 
 def _groups(classes: Sequence[int], ones: Sequence[int]) -> list[list[int]]:
+    """Group classes that are one in a map.
+
+    Args:
+        classes: The classes to group.
+        ones: The row of a map in `Table.ones`.
+
+    Returns:
+        The groups, without the classes that have no place, path or course in the map.
+    """
     groups: dict[int, list[int]] = {}
     for c in classes:
         if ones[c] != NONE:
@@ -302,6 +311,7 @@ def _unmoved(first: SSHMap, other: SSHMap) -> set[int]:
 
 
 def _size(ssh_map: SSHMap) -> tuple[int, int, int, int]:
+    """Return the numbers of dstates, places, paths and links of a map."""
     return len(ssh_map.dstates), len(ssh_map.places), len(ssh_map.paths), len(ssh_map.links)
 
 

@@ -1,4 +1,4 @@
-"""Which places two drives of a joint trace have in common: in all maps, in some, or in none.
+"""Find the places that two drives of a joint trace share: in all maps, in some, or in none.
 
 >>> from ssh_abduction import Theory, Trace, solve
 >>> from ssh_abduction.rivals.listing import Listing
@@ -29,13 +29,13 @@ _Placing: TypeAlias = Sequence[int]  # the place of each step by one map; withou
 
 @dataclass(frozen=True, slots=True)
 class DriveJoin:
-    """A step of one drive and a step of another that some map has at one place.
+    """A step of one drive and a step of another drive that are at one place in some map.
 
     Attributes:
         first: The number of the step in its own drive.
         second: The number of the other step in its own drive.
-        share: The share of the maps that have both at one place. If maps were weighed, this is the
-            probability that they are.
+        share: The share of the maps, 0 to 1, in which both are at one place. If maps were weighed,
+            this is the probability that they are.
     """
 
     first: int
@@ -45,7 +45,7 @@ class DriveJoin:
 
 @dataclass(frozen=True, slots=True)
 class DrivePair:
-    """What two drives have in common. A visit to a place counts once for each drive.
+    """The places that two drives share. A place counts once, however often a drive visits it.
 
     Attributes:
         first: The name of the earlier drive.
@@ -76,6 +76,7 @@ class DrivePair:
         return f"{self.first} and {self.second}: {told}"
 
     def _named(self, joins: Sequence[DriveJoin]) -> str:
+        """Put joins into words: "monday:2 = tuesday:0". At most SHOWN of them are named."""
         shown = [
             f"{self.first}:{join.first} = {self.second}:{join.second}"
             + ("" if join.share == 1 else f", {join.share:.0%}")
@@ -108,7 +109,11 @@ def joins_of_drives(listing: Listing) -> tuple[DrivePair, ...]:
 
 
 def _placings(listing: Listing) -> tuple[list[_Placing], list[float], bool]:
-    """Find where each map has the steps, the weight of each map, and whether these are all maps."""
+    """Find the place of each step in each map.
+
+    Returns:
+        For each map the place of each step, the weight of each map, and whether these are all maps.
+    """
     weighed = listing.weighed
     if weighed is not None:
         rivals = weighed.rivals
@@ -134,7 +139,16 @@ def _pair(
     of: str,
     proven: bool,
 ) -> DrivePair:
-    """Compare two drives."""
+    """Find the places that two drives share.
+
+    Args:
+        one: The earlier drive.
+        other: The later drive.
+        placings: For each map, the place of each step.
+        weights: The weight of each map. The weights sum to 1.
+        of: "place"; or "dstate", if maps have no places.
+        proven: Whether these are all maps.
+    """
     forced: list[DriveJoin] = []
     possible: list[DriveJoin] = []
     excluded = 0
@@ -154,7 +168,10 @@ def _pair(
 
 
 def _stations(drive: Drive, placings: Sequence[_Placing]) -> list[int]:
-    """The first step of a drive at each of its places. Places differ if some map tells them so."""
+    """Return the first step of a drive at each of its places.
+
+    Two steps are at one place here if they are at one place in all maps.
+    """
     first: dict[tuple[int, ...], int] = {}
     for t in range(drive.first, drive.stop):
         first.setdefault(tuple(at[t] for at in placings), t)

@@ -228,6 +228,7 @@ class Experiment:
 
 
 def _sentence(experiment: Experiment) -> str:
+    """Put an experiment into words, for `Experiment.sentence`."""
     plan, count = experiment.plan, experiment.count
     if count == 1:
         return f"1 map: there is nothing to tell apart; {_untried_in_words(plan.untried)}"
@@ -255,6 +256,7 @@ def _sentence(experiment: Experiment) -> str:
 
 
 def _untried_in_words(untried: Untried | None) -> str:
+    """Put an untried action and the way to it into words."""
     if untried is None:
         return "known links lead to no untried action"
     way = f", after {_acts(untried.way)}" if untried.way else ""
@@ -266,6 +268,7 @@ def _untried_in_words(untried: Untried | None) -> str:
 
 
 def _acts(actions: Sequence[str]) -> str:
+    """Join the names of actions with commas."""
     return printable(", ".join(actions))
 
 

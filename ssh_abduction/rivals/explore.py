@@ -344,8 +344,8 @@ class Laboratory:
         """Find what rivals predict for an action at a joint state (a state of each machine).
 
         Returns:
-            A dict from each prediction to the rivals that make it. None if the action is impossible
-            there, or if all rivals are sure of the same outcome.
+            A dict from each prediction to the rivals that make it, as indices from 0. None if the
+            action is impossible there, or if all rivals are sure of the same outcome.
         """
         here = int(self._table.sights[machines[0], states[0]])
         done = self._actions[action]
@@ -367,6 +367,7 @@ class Laboratory:
         return said
 
     def _consequence(self, rival: int, dstate: int, action: int) -> Consequence:
+        """Return the prediction of a rival for an action at a dstate of its map."""
         key = rival, dstate, action
         if key not in self._said:
             self._said[key] = self._consequences[rival].of(dstate, self._actions[action])

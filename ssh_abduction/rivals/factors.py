@@ -3,7 +3,7 @@
 A question is a column of truth values: the answer of each map. A set of questions *decides* if no
 two maps give the same answers to all of them. Questions are chosen greedily: the next one
 distinguishes the most pairs of maps that are not distinguished yet, and ties go to the earliest.
-Then superfluous questions are dropped. A smaller set may exist, but to find the smallest one is
+Then superfluous questions are dropped. A smaller set may exist, but finding the smallest one is
 NP-hard (minimum test set, Garey & Johnson 1979, SP6).
 
 A *choice* is a set of questions, and its *options* are the different answers that maps give to

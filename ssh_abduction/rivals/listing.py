@@ -304,11 +304,13 @@ class Listing:
         return found[0]
 
     def _name(self, i: int) -> str:
+        """Name the map with index i, for messages."""
         return f"maps[{i}]" if self.source == "maps" else f"{self.source}: maps[{i}]"
 
     def _raise_other_trace(
         self, first: tuple[View | None, ...], seen: tuple[View | None, ...], i: int
     ) -> None:
+        """Raise MapError, as map i has other views than the first map."""
         step = next(t for t, (a, b) in enumerate(zip(first, seen, strict=True)) if a != b)
         raise MapError(
             f"{self._name(i)}: expected the view {brief(first[step])} at step {step}, as "
@@ -321,11 +323,12 @@ Maps: TypeAlias = Solution | Listing | SSHMap | Iterable[SSHMap]
 
 
 def _has_one_view(theory: Theory) -> bool:
+    """Tell whether each dstate has one view by this theory, and all views are known."""
     return "functional_view" not in theory.without and not theory.unknown_views
 
 
 def _seen(ssh_map: SSHMap) -> tuple[View | None, ...]:
-    """List the view at each step, from a map whose dstates have one view each."""
+    """List the view seen at each step, by a map whose dstates have one view each."""
     views = [s.view for s in ssh_map.dstates]
     seen = [views[label] for label in ssh_map.dstate_at]
     for fault in ssh_map.faults:

@@ -69,6 +69,7 @@ Can: TypeAlias = Callable[[Seen], Iterable[str]]
 
 
 def _entry(entry: Any) -> Any:
+    """Return an entry of a star as JSON has it. An opening is 1 if it is open, else 0."""
     return (
         entry.to_json()
         if hasattr(entry, "to_json")
@@ -79,6 +80,7 @@ def _entry(entry: Any) -> Any:
 
 
 def _star_text(star: Sequence[Any]) -> str:
+    """Put a star into words: its open directions, or the number of its gateways."""
     if all(isinstance(entry, bool) for entry in star):
         ways = [
             name
@@ -118,18 +120,21 @@ class Sights:
         ]
 
     def _of(self, ssh_map: SSHMap, trace: Trace | None, reading: _Reading | None) -> list[int]:
+        """Return the number of the observation at each dstate of a map."""
         stars = _first_steps(ssh_map) if trace is not None and reading is not None else {}
         return [self._number(s.view, stars.get(s.id), trace, reading) for s in ssh_map.dstates]
 
     def _number(
         self, view: View | None, step: int | None, trace: Trace | None, reading: _Reading | None
     ) -> int:
+        """Return the number of an observation, from a view and the step that shows the star."""
         if step is None or trace is None or reading is None:
             return self._add((view, None), Seen(view))
         key, star = reading(step)
         return self._add((view, key), Seen(view, star))
 
     def _add(self, key: object, seen: Seen) -> int:
+        """Return the number of an observation. A key that is new gets the next number."""
         number = self._numbers.setdefault(key, len(self._numbers))
         if number == len(self.seen):
             self.seen.append(seen)
@@ -147,6 +152,7 @@ class _Reading:
         self._classes = _classes(trace, steps) if theory.star in IN_TOLERANCE else {}
 
     def __call__(self, step: int) -> tuple[object, tuple[Any, ...] | None]:
+        """Return a key of the star of a step, and the star."""
         if self._theory.star in IN_TOLERANCE:
             return self._classes[step], self._trace.steps[step].star
         _, key = observation(self._trace.steps[step], self._theory)
@@ -201,10 +207,10 @@ def _first_steps(ssh_map: SSHMap) -> dict[int, int]:
 
 
 def _classes(trace: Trace, steps: Sequence[int]) -> dict[int, int]:
-    """Number these steps by what is seen.
+    """Group these steps by what is seen, and name each group by one of its steps.
 
-    Steps with the same view have the same number if their stars could be equal, directly or through
-    the stars of other steps.
+    Steps with the same view are in one group if their stars could be equal, directly or through the
+    stars of other steps.
     """
     stars = {t: trace.steps[t].gateways or Star(()) for t in steps}
     groups: dict[object, list[list[int]]] = {}  # for each view

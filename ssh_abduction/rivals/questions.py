@@ -72,6 +72,7 @@ class Question:
         return f"{there} {verb} {same}"
 
     def _at(self, side: int) -> str:
+        """Put the places of one side (0 for `here`, 1 for `there`) into words, in brackets."""
         places = self.places[side] if self.places else ()
         return (
             f" ({'place' if len(places) == 1 else 'places'} {stretches(places)})" if places else ""
@@ -185,4 +186,5 @@ def members_of(numbers: Sequence[int]) -> dict[int, list[int]]:
 
 
 def _steps(steps: Sequence[int]) -> str:
+    """Put the numbers of steps into words: "step 1", or "steps 1–3 and 7"."""
     return f"{'step' if len(steps) == 1 else 'steps'} {stretches(steps)}"

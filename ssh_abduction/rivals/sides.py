@@ -1,4 +1,4 @@
-"""Which places rival maps know to lie right or left of a path: all maps, or some.
+"""Find the places that rival maps know to lie right or left of a path: in all maps, or in some.
 
 >>> from ssh_abduction import Trace, solve
 >>> found = shared_sides(Listing.of(solve(Trace.load("examples/aces3-route.jsonl"))))
@@ -38,7 +38,7 @@ class Beside:
         step: The first step at the place.
         along: The first step along the path.
         side: The side of the path on which the place lies.
-        share: The share of the compared maps that know it.
+        share: The share of the compared maps that know this, 0 to 1.
     """
 
     step: int
@@ -60,8 +60,8 @@ class SharedSides:
     """The places beside paths that minimal maps know.
 
     Attributes:
-        forced: Those that all of these maps know.
-        possible: Those that some maps know.
+        forced: The places beside paths that all of these maps know.
+        possible: The places beside paths that some of these maps know, but not all.
         proven: Whether these are all minimal maps, and all of them list regions.
     """
 
@@ -140,7 +140,12 @@ def only_in(
 def _sides(
     maps: Sequence[SSHMap], steps: Sequence[int]
 ) -> dict[tuple[int, int], list[_Side | None]]:
-    """For each place and path, named by steps, the side of the path in each map."""
+    """Find on which side of a path each place lies in each map.
+
+    Returns:
+        A dict from the first step at a place and the first step along a path to the side in each
+        map; None in a map that does not know the side. Pairs that no map knows are left out.
+    """
     beside = [
         {
             (path.id, d): {*right_of(m.regions or (), path.id, d)}
@@ -171,12 +176,20 @@ def _sides(
 
 
 def _course(path: int | None, direction: int | None) -> tuple[int, int] | None:
+    """Return a path with a direction along it; None if one of the two is None."""
     return None if path is None or direction is None else (path, direction)
 
 
 def _side(
     right: dict[tuple[int, int], set[int]], place: int | None, course: tuple[int, int] | None
 ) -> _Side | None:
+    """Return the side of a course on which a place lies; None if it is unknown.
+
+    Args:
+        right: For each course of a map, the places that lie right of it.
+        place: The place.
+        course: The course: a path and a direction.
+    """
     if course is None:
         return None
     if place in right[course]:

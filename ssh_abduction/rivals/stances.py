@@ -52,8 +52,8 @@ class Move:
 class Stances:
     """The stances of a map: places and headings where a robot may stand.
 
-    The first stances are the dstates of the map, with the same numbers. The others were never seen:
-    turns lead there from seen ones.
+    The first stances are the dstates of the map, with the same numbers. The robot was never in the
+    others: turns lead there from dstates.
 
     Args:
         ssh_map: The map.
@@ -228,6 +228,7 @@ class Stances:
 
 
 def _frame(star: Star | None) -> Frame | None:
+    """Return the first frame of a star; None without a star."""
     return None if star is None else star.frames[0]
 
 

@@ -77,13 +77,13 @@ class Table:
         return len(np.unique(self.ones[sort], axis=0))
 
     def heads(self, sort: Sort) -> Ints:
-        """For each class, find the first class that all maps treat in the same way.
+        """Group the classes that all maps treat in the same way.
 
         Two classes are treated in the same way if in each map they are one, or both have no place,
         path or course.
 
         Returns:
-            That first class of each class, shape (classes,).
+            For each class the first class of its group, shape (classes,).
         """
         _, first, inverse = np.unique(
             self.ones[sort], axis=1, return_index=True, return_inverse=True
@@ -121,6 +121,11 @@ class Table:
         )
 
     def _shared(self, ones: Ints) -> Shared:
+        """Find what the maps share of one sort.
+
+        Args:
+            ones: The array of the sort in `ones`.
+        """
         _, column = np.unique(ones, axis=1, return_inverse=True)
         number: dict[Hashable, int] = {}
         named = (ones != NONE).all(axis=0).tolist()
@@ -167,6 +172,7 @@ def _firsts_of(names: Sequence[Hashable]) -> Ints:
 
 
 def _name(dstate: DState, sort: Sort) -> Hashable:
+    """Return a key of a dstate, or of its place, path or course; None if it has none."""
     if sort == "dstates":
         return dstate.id
     if sort == "places":

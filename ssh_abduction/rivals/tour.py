@@ -15,11 +15,11 @@ tried one by one. Expected ends of moves are guesses for the plan only. No concl
 them, and the robot plans again after each surprise.
 
 A map with the fewest dstates may merge places that only look alike. So the tour doubts each return
-to a place until enough is seen there. Suppose that an unknown move leads to a place that the map
-takes for a known one. Then the plan treats it as a new place, until this place and the doubted
-places beside it have more than `margin` dstates. Meanwhile the robot explores it. If they are two
-places, the robot sees something new. If they are one, it confirms the return. A travel back to
-where the robot came from is not doubted.
+to a place until enough is seen there. Suppose that an unknown move leads to a place, and the map
+says that it is an earlier one. Then the plan treats it as a new place, until this place and the
+doubted places beside it have more than `margin` dstates. Meanwhile the robot explores it. If they
+are two places, the robot sees something new. If they are one, it confirms the return. A travel back
+to where the robot came from is not doubted.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from ssh_abduction.rivals.stances import Stances
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory
 
-# A place, and 0, or the step of a doubted return to the place, which gets a copy of the place.
+# A place and 0. If a return to the place is doubted, a copy: the place and the step of the return.
 Copy: TypeAlias = tuple[int, int]
 # With more moves than this a flow takes about a second or more. Then the robot goes to the nearest
 # untried move instead.
@@ -147,12 +147,16 @@ def with_doubted_returns(ssh_map: SSHMap, trace: Trace, margin: int) -> SSHMap:
 
 
 def _copies(ssh_map: SSHMap, trace: Trace, believed: Collection[int]) -> list[Copy]:
-    """Find the place of each step, if all returns but those at the steps `believed` are doubted."""
+    """Find the place of each step if returns to places are doubted.
+
+    A step that returns to an earlier place is then at a new copy of it. Returns at the steps
+    `believed` are not doubted.
+    """
     places = [ssh_map.dstates[label].place or 0 for label in ssh_map.dstate_at]
     at: list[Copy] = [(places[0], 0)]
     known = {places[0]}
     leads: dict[tuple[Copy, int, str], Copy] = {}
-    came: dict[Copy, list[Copy]] = {}  # from where the robot came to a place
+    came: dict[Copy, list[Copy]] = {}  # the places from which the robot came to each place
     for t, action in enumerate(trace.actions, 1):
         here, place = at[-1], places[t]
         if place == places[t - 1]:
