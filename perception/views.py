@@ -384,7 +384,7 @@ def _check_distinct(k: int, images: NDArray[np.float64], distinct: int | None = 
 
 
 def _with_noise(inside: NDArray[np.bool_], labels: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Labels for all images, (n,): `labels` where the mask `inside` is true, elsewhere noise."""
+    """Label all images, (n,): those in the mask `inside` by `labels`, all others as noise."""
     every = np.full(len(inside), NOISE, np.intp)
     every[inside] = labels
     return every

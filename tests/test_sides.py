@@ -177,7 +177,7 @@ def test_compare_two_files_that_differ_in_sides_only(
     assert main(["compare", "maps.json", "blind.json"]) == 0
     out = capsys.readouterr().out
     assert "the map is the same in both" in out
-    assert "the first maps of both differ in what follows from them:" in out
+    assert "the first maps of both are the same, except:" in out
 
 
 def test_a_name_of_a_region_stands_everywhere(

@@ -152,7 +152,7 @@ class _Gates:
     Args:
         track: Trajectory of the robot.
         visits: The visits, in order.
-        apart: Least number of metres of way between two visits.
+        apart: Metres that the robot drove at least between two visits to be matched.
     """
 
     def __init__(self, track: Track, visits: Sequence[Visit], apart: float) -> None:

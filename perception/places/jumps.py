@@ -346,9 +346,9 @@ def _moved_while_still(
     """Find stretches in which the odometer stands still, but the laser shows a motion.
 
     Returns:
-        Scans after a pause to which the robot was moved, and the first and last scan of each
-        stretch with a motion. Both are empty if the odometer mostly stands still, because then
-        there is no odometry.
+        The scans before which there was a pause and somebody moved the robot; and the first and
+        last scan of each stretch with a motion. Both are empty if the odometer mostly stands
+        still, because then there is no odometry.
     """
     still = stands_still(log)
     if is_missing(log):

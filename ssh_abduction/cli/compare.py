@@ -166,5 +166,5 @@ def _lines(found: Comparison) -> Iterator[str]:
         yield found.others.sentence
         best = found.others.best
         if best.lines:
-            yield f"the first maps of both differ{' in what follows from them' * best.same}:"
+            yield f"the first maps of both {'are the same, except' if best.same else 'differ'}:"
             yield from (f"  {line}" for line in best.lines)
