@@ -8,7 +8,6 @@ from itertools import combinations
 from unittest.mock import patch
 
 import clingo
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -18,7 +17,6 @@ from strategies import STARS
 from ssh_abduction import OnlineMapper, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.proof import check_bound
-from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.online.keeper import MapKeeper
 from ssh_abduction.solver import Search, Start, Status, choosing
 from ssh_abduction.solver.asp.facts import paths_lp, sides_lp, visits_lp
@@ -39,10 +37,10 @@ from ssh_abduction.solver.engines.sides import FramedSides
 from ssh_abduction.solver.engines.visit_labels import VisitLabels
 from ssh_abduction.solver.engines.visit_program import VisitProgram
 from ssh_abduction.solver.guesses import annealing, sampling
-from ssh_abduction.solver.guesses.annealing import Guess, attempts
-from ssh_abduction.solver.guesses.merging import kept, merged_near
+from ssh_abduction.solver.guesses.annealing import annealed
+from ssh_abduction.solver.guesses.merging import merged_near
 from ssh_abduction.solver.prefixes import Prefixes
-from ssh_abduction.solver.steps.chart import QUARTERS, Chart, FramedChart, numbered
+from ssh_abduction.solver.steps.chart import QUARTERS, Chart, FramedChart
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory import Speedups, encodings
 from ssh_abduction.theory.settle import Problem, settle
@@ -138,11 +136,6 @@ def test_lists_the_maps_of_the_plain_encoding(
         patch.object(transitive, "AT_A_TIME", at_a_time),
         patch.multiple(framed_paths, **fitted),
         patch.multiple(framed, MANY_PAIRS=many_pairs),
-        patch.object(paths_module, "SECONDS", 0.0),
-        patch.object(
-            annealing, "ANNEALED", ((0.5, data.draw(st.integers(1, 20), label="sweeps")),)
-        ),
-        patch.object(sampling, "LAST", 2),
         patch.object(FramedEngine, "_charted", charted),
     ):
         search = Search(trace, theory, max_maps=None, speedups=Speedups.without(off))
@@ -637,8 +630,7 @@ def test_what_fails_to_be_transitive_is_among_the_scattered(
 def test_annealing_finds_the_places_of_a_maze() -> None:
     walk = maze(4, 4, steps=800, seed=0, stars=True)
     chart = Chart.framed(walk.trace, Log(walk.trace, Theory(star="frame")))
-    with patch.object(annealing, "ANNEALED", ((0.5, 500),)):
-        guess = next(guess for failed, guess in attempts(chart) if not failed)
+    guess = annealed(chart)
     assert guess.sure.all()
     guessed = (guess.states // 4).tolist()
     assert (
@@ -656,23 +648,17 @@ def test_a_guess_holds_the_stars(trace: Trace, sweeps: int) -> None:
     if chart is None:
         return
     with (
-        patch.object(annealing, "ANNEALED", ((0.5, sweeps),)),
+        patch.object(annealing, "STAGES", ((0.5, sweeps),)),
+        patch.object(annealing, "SECONDS", 0.0),
         patch.object(sampling, "LAST", 1),
     ):
-        _, guess = next(attempts(chart))
+        guess = annealed(chart)
     assert len(guess.states) == len(guess.sure) == len(chart.stars)
     stars: dict[int, tuple[int, ...]] = {}
     for state, star in zip(guess.states.tolist(), chart.stars, strict=True):
         place, turned = divmod(state, 4)
         framed_star = tuple(star[(slot - turned) % 4] for slot in range(4))
         assert stars.setdefault(place, framed_star) == framed_star
-
-
-@st.composite
-def loosened_labels(draw: st.DrawFn, labels: Sequence[int]) -> list[int]:
-    """These, where some nodes have labels of their own."""
-    loose = draw(st.sets(st.sampled_from(range(len(labels)))))
-    return [len(labels) + node if node in loose else label for node, label in enumerate(labels)]
 
 
 def framed_engine(trace: Trace, theory: Theory) -> FramedEngine:
@@ -686,127 +672,18 @@ def framed_engine(trace: Trace, theory: Theory) -> FramedEngine:
     return found
 
 
-def node_labels(ssh_map: SSHMap, chart: FramedChart) -> list[int]:
-    return [ssh_map.labels[chart.node_of.index(node)] for node in range(len(chart.seen))]
-
-
-@settings(max_examples=8)
-@given(framed_traces(), framed_theories(), st.data())
-def test_what_is_told_of_loose_dstates_holds_in_each_map(
-    trace: Trace, theory: Theory, data: st.DataObject
-) -> None:
-    """So merging by evidence may keep to it."""
-    for ssh_map in solve(trace, theory, max_maps=3, speedups=PLAIN).maps:
-        asked = framed_engine(trace, theory)
-        chart = asked._chart
-        labels = node_labels(ssh_map, chart)
-        loosened = numbered(data.draw(loosened_labels(labels)))
-        loose = [node for node in range(len(labels)) if loosened.count(loosened[node]) == 1]
-        told = asked._fitting.paths.told(chart, loosened, loose)
-        assert told is not None
-        apart, one = told
-        place = {s.id: s.place for s in ssh_map.dstates}
-        assert all(
-            place[labels[a]] != place[labels[b]] for a, b in zip(*np.nonzero(apart), strict=True)
-        )
-        assert all(labels[a] == labels[b] for a, b in one)
-
-
 @settings(max_examples=10)
-@given(
-    framed_traces(),
-    framed_theories(),
-    st.lists(st.integers(-1, 4), min_size=9, max_size=9),
-    st.booleans(),
-)
-def test_any_guess_is_merged_to_a_map(
-    trace: Trace, theory: Theory, guess: list[int], told: bool
-) -> None:
-    """Of the causal axioms; and where separate paths fit it, others do."""
+@given(framed_traces(), framed_theories(), st.lists(st.integers(-1, 4), min_size=9, max_size=9))
+def test_any_guess_is_merged_to_a_map(trace: Trace, theory: Theory, guess: list[int]) -> None:
+    """Of the causal axioms. A guess that is a map stays as it is."""
     asked = framed_engine(trace, theory)
     if asked._visits._program is None:
         return  # the trace fits no frame
     chart = asked._chart
     apart = chart.apart()
-    start = guess[: len(chart.seen)]
-    labels = (
-        asked._fitting.paths.labels_near(chart, apart, start)
-        if told
-        else merged_near(apart, chart.links, start)
-    )
-    if labels is None:
-        return
+    labels = merged_near(apart, chart.links, guess[: len(chart.seen)])
     assert chart.is_map(labels)
     assert not any(
         apart[i, j] for i in range(len(labels)) for j in range(i) if labels[i] == labels[j]
     )
-    singles = asked._fitting.paths.has_separate(chart, labels)
-    if singles or not told:
-        with patch.object(framed_paths, "MANY_DSTATES", 100):
-            assert (asked._fitting.some(chart, labels) is not None) >= singles
-
-
-def test_a_true_guess_stays_as_it_is() -> None:
-    """Also where the dstates of some visits are left open, if these went on for long."""
-    walk = maze(4, 4, steps=400, seed=1, stars=True)
-    asked = framed_engine(walk.trace, Theory.topological())
-    chart = asked._chart
-    truth = numbered([walk.truth[chart.node_of.index(node)] for node in range(len(chart.seen))])
-    apart = chart.apart()
-    assert merged_near(apart, chart.links, truth) == truth
-    some = [-1 if 20 <= node < 60 else label for node, label in enumerate(truth)]
-    assert asked._fitting.paths.labels_near(chart, apart, some) == truth
-
-
-@pytest.mark.parametrize(("size", "steps", "seed"), [(6, 300, 2)])
-def test_places_that_a_guess_has_for_one_are_told_apart(size: int, steps: int, seed: int) -> None:
-    """Where the causal axioms do not show that they are two, but paths do."""
-    walk = maze(size, size, steps=steps, seed=seed, stars=True)
-    asked = framed_engine(walk.trace, Theory.topological())
-    chart, known = asked._chart, asked._fitting.paths
-    truth = numbered([walk.truth[chart.node_of.index(node)] for node in range(len(chart.seen))])
-    apart = chart.apart()
-    nodes = np.array(truth)
-    rivals = [
-        (a, b)
-        for a, b in combinations(range(max(truth) + 1), 2)
-        if chart.seen[truth.index(a)] == chart.seen[truth.index(b)]
-        and not apart[np.ix_(nodes == a, nodes == b)].any()
-    ]
-    wrong = [[a if label == b else label for label in truth] for a, b in rivals]
-    wrong = [
-        guess for guess in wrong if len(set(kept(apart, chart.links, guess))) < len(set(truth))
-    ]
-    without_streets = [
-        guess for guess in wrong if not known.may_fit(chart, kept(apart, chart.links, guess), [])
-    ]
-    assert without_streets
-    for guess in without_streets[:2]:
-        labels = known.labels_near(chart, apart, guess)
-        assert labels
-        assert chart.is_map(labels)
-        assert known.has_separate(chart, labels)
-        assert len(set(labels)) <= len(set(truth))
-
-
-def test_a_guess_with_wrong_travels_leads_to_a_map_with_streets() -> None:
-    """Annealing ends early, so some travels do not lead where they should."""
-    walk = maze(5, 5, steps=700, seed=1, stars=True, loops=0.3)
-    asked = framed_engine(walk.trace, Theory.topological())
-    chart = asked._charted(len(walk.trace), None)
-    assert chart
-    failed: list[int] = []
-
-    def counted(*arguments: object) -> Iterator[tuple[int, Guess]]:
-        for wrong, guess in annealing.attempts(*arguments):  # type: ignore[arg-type]
-            failed.append(wrong)
-            yield wrong, guess
-
-    with (
-        patch.object(annealing, "ANNEALED", ((0.5, 100),)),
-        patch.object(paths_module, "attempts", counted),
-    ):
-        labels = asked._fitting.paths.guessed_labels(chart, Watch())
-    assert failed[0] > 0
-    assert asked._fitting.paths.has_separate(chart, labels)
-    assert len(set(labels)) < 1.2 * len(set(walk.truth))
+    assert merged_near(apart, chart.links, labels) == labels

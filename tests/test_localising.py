@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable
-from itertools import pairwise
 from unittest.mock import patch
 
 import pytest
@@ -13,14 +11,10 @@ from benchmarks.instances import Walk, maze
 from ssh_abduction import Theory, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.solver import Search
-from ssh_abduction.solver.asp.limits import Watch
-from ssh_abduction.solver.engines import paths as paths_module
 from ssh_abduction.solver.engines import visit_labels as same
 from ssh_abduction.solver.engines.framed import FramedEngine
-from ssh_abduction.solver.engines.paths import Paths
-from ssh_abduction.solver.guesses import annealing
 from ssh_abduction.solver.steps.chart import Chart, FramedChart, numbered
-from ssh_abduction.solver.steps.localising import Located, State, faced, located, states_of, tracked
+from ssh_abduction.solver.steps.localising import Located, State, faced, located
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.speedups import Speedups
 
@@ -105,71 +99,3 @@ def test_a_long_trace_is_solved_from_few_of_its_visits() -> None:
     assert set(maps) == set(expected.maps)
     assert search.bound == expected.bound
     assert check(trace, maps[0], search.theory) == ()
-
-
-@pytest.mark.parametrize(("seed", "steps", "guesses"), [(1, 700, 1), (3, 500, 2)])
-def test_the_beginning_of_a_long_trace_is_guessed(seed: int, steps: int, guesses: int) -> None:
-    """The number of guessed visits doubles until the rest follows. The result has paths."""
-    walk = maze(3, 3, steps=steps, seed=seed, stars=True)
-    chart = charted(walk)
-    guessed: list[int] = []
-    begun = Paths._guessed
-
-    def counted(self: Paths, part: FramedChart, check: Callable[[], None]) -> list[int]:
-        guessed.append(len(part.stars))
-        return begun(self, part, check)
-
-    asked = Paths(walk.trace, FRAMED)
-    fewer_sweeps = patch.object(annealing, "ANNEALED", ((0.5, 700),))
-    with (
-        fewer_sweeps,
-        patch.object(paths_module, "FIRST_PAIRS", 300),
-        patch.object(Paths, "_guessed", counted),
-    ):
-        found = asked.guessed_labels(chart, Watch())
-    assert guessed[0] < len(chart.stars) / 2
-    assert len(guessed) == guesses
-    assert all(later in {2 * earlier, len(chart.stars)} for earlier, later in pairwise(guessed))
-    assert chart.is_map(found)
-    assert asked.has_separate(chart, found)
-    assert len(set(found)) <= 1.05 * len(set(walk.truth))
-
-
-def test_a_beginning_is_the_chart_of_a_prefix() -> None:
-    walk = maze(3, 3, steps=200, seed=1, stars=True)
-    chart = charted(walk)
-    steps = next(t for t, node in enumerate(chart.node_of) if chart.facing[node][0] == 20)
-    part, expected = chart.beginning(20), Chart.framed(walk.trace, Log(walk.trace, FRAMED), steps)
-    assert part == expected
-    assert chart.beginning(len(chart.stars)) == chart
-
-
-def test_tracked_states_are_true() -> None:
-    """The map is a true one of the first visits. States at other places are unknown."""
-    walk = maze(5, 5, steps=1000, seed=1, stars=True)
-    chart = charted(walk)
-    states = true_states(walk, chart)
-    assert max(states) > max(states[:60])
-    found = tracked(chart, dict(enumerate(states[:60])))
-    assert found[:60] == states[:60]
-    elsewhere = [
-        i
-        for i, state in enumerate(states)
-        if state // 4 not in {known // 4 for known in states[:60]}
-    ]
-    assert sum(a == b for a, b in zip(found, states, strict=True)) > 0.8 * (
-        len(states) - len(elsewhere)
-    )
-    assert any(found[i] == -1 for i in elsewhere)
-
-
-def test_places_of_labels_are_numbered_without_gaps() -> None:
-    """A state without visits would fit any visit."""
-    walk = maze(3, 3, steps=300, seed=1, stars=True)
-    chart = charted(walk)
-    truth = dict(zip(chart.node_of, walk.truth, strict=True))
-    states = states_of(chart, numbered(truth[node] for node in range(len(chart.seen))))
-    assert {state // 4 for state in states} == set(range(max(states) // 4 + 1))
-    turned: dict[int, int] = {}  # the rotation of the frame of each place
-    for state, true in zip(states, true_states(walk, chart), strict=True):
-        assert turned.setdefault(state // 4, (true - state) % 4) == (true - state) % 4

@@ -6,11 +6,9 @@ import math
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -23,16 +21,13 @@ from worlds import TOURS, drive, rectangle
 from ssh_abduction import OnlineMapper, Solution, SSHMap, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data import Action, Odometry, Step, TheoryError, TraceError
-from ssh_abduction.online import background_guess as guessing
-from ssh_abduction.online import guesser
+from ssh_abduction.online.background_mending import mended_map
 from ssh_abduction.online.keeper import MapKeeper
 from ssh_abduction.solver import Status
-from ssh_abduction.solver.engines.base import Task
-from ssh_abduction.solver.guesses import annealing
 from ssh_abduction.solver.guesses.tree import Sketch
 from ssh_abduction.solver.steps.chart import Chart
 from ssh_abduction.solver.steps.log import Log
-from ssh_abduction.theory.settle import Problem, settle
+from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.speedups import Speedups
 
 NO_TIME = 1e-9  # seconds: every search is stopped before it begins
@@ -76,14 +71,8 @@ def limit_steps(mapper: OnlineMapper, limit: float | None) -> None:
     """Give each further step so many seconds."""
     keeper = mapper._keeper
     assert isinstance(keeper, MapKeeper)
-    for part in (keeper.solver, keeper.guesser):
+    for part in (keeper.solver, keeper.mender):
         part.options = replace(part.options, time_limit=limit)
-
-
-def guess_of(mapper: OnlineMapper) -> guessing.MapGuess | None:
-    """The guess that is under way."""
-    assert isinstance(mapper._keeper, MapKeeper)
-    return mapper._keeper.guesser.guess
 
 
 def sketched(mapper: OnlineMapper) -> SSHMap:
@@ -321,32 +310,6 @@ def explore(trace: Trace, mapper: OnlineMapper) -> list[Solution]:
     ]
 
 
-def test_maps_are_guessed_while_the_robot_drives() -> None:
-    """Without time for clingo. The guess is made for some of the steps; its map goes on."""
-    walk = maze(4, 4, steps=50, seed=1, stars=True)
-    trace = walk.trace
-    with (
-        patch.object(guessing, "has_processors", lambda: True),
-        patch.object(guesser, "GUESSED", 35),
-    ):
-        mapper = OnlineMapper(
-            trace.steps[0].view or "", star=trace.steps[0].star, time_limit=NO_TIME
-        )
-        explore(trace.prefix(40), mapper)
-        guess = guess_of(mapper)
-        assert guess is not None
-        assert guess.result() is not None  # waits for it
-        answers = explore(trace, mapper)
-    for i, answer in enumerate(answers, 41):
-        assert answer.status is Status.FEASIBLE
-        assert check(trace.prefix(i), answer.maps[0], mapper.theory) == ()
-    assert (
-        len(answers[0].maps[0].dstates)
-        <= 1.2 * len(set(walk.truth))
-        < len(sketched(mapper).dstates)
-    )
-
-
 def test_a_map_that_is_contradicted_is_mended() -> None:
     """A map of fewer steps is kept as far as possible, and what does not fit is new."""
     without = contradicted = 0
@@ -361,7 +324,7 @@ def test_a_map_that_is_contradicted_is_mended() -> None:
             min(len(predicted) + 1, len(trace)),
             min(len(predicted) + 20, len(trace)),
         ):
-            found = guessing.mended_map(trace.prefix(steps), theory, known, Speedups())
+            found = mended_map(trace.prefix(steps), theory, known, Speedups())
             if found is None:
                 without += 1
                 continue
@@ -375,43 +338,31 @@ def test_a_map_that_is_contradicted_is_mended() -> None:
     assert without < 3 < contradicted
 
 
-@pytest.mark.parametrize("off", ["annealed", "processes"])
-def test_nothing_is_guessed_where_that_is_switched_off(off: str) -> None:
-    trace = maze(2, 2, steps=60, seed=0, stars=True).trace
-    with patch.object(guesser, "GUESSED", 10):
-        mapper = OnlineMapper(
-            trace.steps[0].view or "",
-            star=trace.steps[0].star,
-            time_limit=NO_TIME,
-            speedups=Speedups.without(off),
-        )
-        explore(trace, mapper)
-    assert guess_of(mapper) is None
-
-
-def test_a_guess_ends_with_its_mapper_and_with_the_program() -> None:
+def test_mending_in_another_process_ends_with_its_mapper_and_with_the_program() -> None:
+    """Without time for clingo or to mend at once. Without `processes`, nothing is begun."""
     program = """
 import threading
 from instances import maze
-from ssh_abduction import OnlineMapper
-from ssh_abduction.online import background_guess as guessing, guesser
-guessing.has_processors = lambda: True
-guesser.GUESSED = 30
+from ssh_abduction import OnlineMapper, solve
+from ssh_abduction.online import background_mending
+from ssh_abduction.theory import Speedups
+background_mending.has_processors = lambda: True
 
-def begun():
-    trace = maze(10, 10, steps=40, seed=1, stars=True).trace
-    mapper = OnlineMapper(trace.steps[0].view, star=trace.steps[0].star, time_limit=1e-9)
-    for action, step in zip(trace.actions, trace.steps[1:]):
-        mapper.observe(action, step.view, star=step.star)
+def begun(**options):
+    trace = maze(10, 10, steps=200, seed=1, stars=True).trace
+    mapper = OnlineMapper(trace.steps[0].view, star=trace.steps[0].star, **options)
+    known = solve(trace.prefix(30), max_maps=1)[0]
+    mapper._keeper.mender.mended(trace, mapper.theory, known, 0.0)
     return mapper
 
+assert begun(speedups=Speedups.without("processes"))._keeper.mender.mending is None
 mapper = begun()
 assert threading.active_count() == 2
 del mapper
 assert threading.active_count() == 1
 mapper = begun()
-guess = mapper._keeper.guesser.guess
-assert guess and not guess.done()
+mending = mapper._keeper.mender.mending
+assert mending and not mending.done()
 """
     folder = Path(__file__).parent.parent / "benchmarks"
     done = subprocess.run(
@@ -566,45 +517,6 @@ def test_displacements_may_be_asked_for_before_the_first_one_comes() -> None:
     assert set(answers[-1].maps) == set(solve(trace, theory, max_maps=None).maps)
     assert mapper.theory == settle(trace, theory).theory
     assert follow(trace, Theory(displacement="none"))[0].theory.displacement == "none"
-
-
-def test_maps_with_displacements_are_guessed_while_the_robot_drives() -> None:
-    """Without time for clingo, all maps are guessed or sketched, and displacements refuse none.
-
-    That includes maps of steps before the threshold changed.
-    """
-    trace = maze(4, 4, steps=32, seed=1, stars=True, odometry=Odometry(along=0.02)).trace
-    given: list[Trace] = []
-
-    def guessed_map(trace: Trace, *others: Any) -> SSHMap | None:
-        given.append(trace)
-        return guessing.FramedEngine(Task.of(Problem.of(trace, others[0]))).map_of_guess().map  # type: ignore[union-attr]
-
-    def at_once(function: Callable[..., SSHMap | None], *args: Any, watch: object) -> SSHMap | None:
-        return (guessed_map if function is guessing.guessed_map else function)(*args)
-
-    with (
-        patch.object(guessing, "has_processors", lambda: True),
-        patch.object(guessing, "in_process", at_once),
-        patch.object(guesser, "GUESSED", 25),
-        patch.object(annealing, "ANNEALED", ((0.5, 50),)),
-    ):
-        mapper = OnlineMapper(
-            trace.steps[0].view or "",
-            star=trace.steps[0].star,
-            odometry=trace.odometry,
-            time_limit=NO_TIME,
-        )
-        for action, step in zip(trace.actions, trace.steps[1:], strict=True):
-            answer = observed(mapper, action, step)
-            assert answer.status is Status.FEASIBLE
-            if answer.steps % 10 == 1:
-                assert check(trace.prefix(answer.steps), answer.maps[0], mapper.theory) == ()
-            if guess := guess_of(mapper):
-                guess.result()
-    assert given
-    assert all(seen.odometry == trace.odometry for seen in given)
-    assert len(answer.maps[0].dstates) < len(sketched(mapper).dstates)
 
 
 def test_the_first_step_settles_the_stars() -> None:

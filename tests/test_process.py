@@ -12,14 +12,9 @@ from pathlib import Path
 from unittest.mock import patch
 
 import pytest
-from instances import maze
 
 from ssh_abduction.solver.asp.limits import LimitError, Watch, peak_memory
 from ssh_abduction.solver.asp.process import in_process
-from ssh_abduction.solver.engines.paths import Paths
-from ssh_abduction.solver.steps.chart import Chart
-from ssh_abduction.solver.steps.log import Log
-from ssh_abduction.theory.settle import settle
 
 
 def double_and_tell_where(values: list[int], watch: Watch) -> tuple[list[int], int]:
@@ -137,12 +132,3 @@ def test_what_is_left_of_the_memory_is_that_of_the_process() -> None:
     with pytest.raises(LimitError, match="memory"):
         in_process(use_memory, 400, watch=limited)
     del held
-
-
-def test_a_guess_is_the_same_in_another_process() -> None:
-    trace = maze(2, 2, steps=60, seed=1, stars=True).trace
-    theory = settle(trace).theory
-    streets, chart = Paths(trace, theory), Chart.framed(trace, Log(trace, theory))
-    assert chart.misfits.any()  # which does not go along
-    here = streets.guessed_labels(chart, Watch())
-    assert in_process(streets.guessed_labels, chart, watch=Watch()) == here

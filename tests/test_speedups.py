@@ -166,7 +166,6 @@ def hurried() -> Iterator[None]:
     with (
         patch.multiple(choosing, FEW_STEPS=0, STEPWISE=-1.0),
         patch.multiple(name_search, PATIENCE=0, CORES=0),
-        patch.object(annealing, "ANNEALED", ((0.5, 50),)),
     ):
         yield
 
@@ -183,8 +182,9 @@ def reads_of(case: str) -> list[str]:
 def test_each_speedup_is_asked_for_in_some_case() -> None:
     """Else the cases below would say nothing of it."""
     read = {name for case in CASES for name in reads_of(case)}
-    # Only the online mapper asks for `processes`. tests/test_onto.py has cases with `digest`.
-    assert read == set(NAMES) - {"processes", "digest"}
+    # Only the online mapper asks for `processes`. tests/test_onto.py has cases with `digest`, and
+    # tests/test_nearby.py has cases with `annealed`.
+    assert read == set(NAMES) - {"processes", "digest", "annealed"}
 
 
 @pytest.mark.slow

@@ -10,8 +10,8 @@ import time
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.online.drafts import DRAFTS, Drafts
-from ssh_abduction.online.guesser import Guesser
 from ssh_abduction.online.incremental import IncrementalSolver
+from ssh_abduction.online.mender import Mender
 from ssh_abduction.online.options import StepOptions
 from ssh_abduction.online.replay import MinimalMaps
 from ssh_abduction.solver import Cost, Effort, Judging, Seconds, Solution, Status
@@ -45,7 +45,7 @@ class MapKeeper:
         self.solver: IncrementalSolver = IncrementalSolver(
             options, before.solver.searches if before else 0
         )
-        self.guesser: Guesser = before.guesser if before else Guesser(trace, options)
+        self.mender: Mender = before.mender if before else Mender(options)
         self._previous: SSHMap | None = None  # the best map of the steps before the last
         self._spent = 0.0  # seconds that all steps took
 
@@ -75,13 +75,12 @@ class MapKeeper:
         """
         trace = problem.trace
         keeper = MapKeeper(problem, self._options, before=self)
-        keeper.guesser.follow(trace)
         keeper._previous = self._best_known()
         if self.theory.displacement == "use":
             for ssh_map in [m.map() for m in self.minimal.maps[:DRAFTS]] + self.drafts.maps():
                 keeper.drafts.add(ssh_map, trace)
         else:
-            keeper.guesser.guess = None
+            keeper.mender.mending = None
         return keeper
 
     def take(self, problem: Problem) -> None:
@@ -92,7 +91,6 @@ class MapKeeper:
         """
         self._previous = self._best_known()
         self._problem, trace = problem, problem.trace
-        self.guesser.follow(trace)
         action = trace.steps[-2].action
         assert action
         if self.minimal.is_impossible:
@@ -122,17 +120,16 @@ class MapKeeper:
         return self.drafts.first()
 
     def _find(self, began: float) -> None:
-        """Search for minimal maps with clingo. If it runs out of time, guess or mend a map."""
+        """Search for minimal maps with clingo. If it runs out of time, mend a map."""
         if not self.minimal.is_settled(self._options.max_maps) and self.solver.is_due(self.trace):
             self._ask()
-        guessed = self.guesser.finished()
+        finished = self.mender.finished()
         if self.minimal.status is not Status.UNKNOWN:
             return
-        if guessed:
-            self.drafts.add(guessed, self.trace)
-        if self.guesser.suits(self.theory):
-            contradicted = None if self.drafts else self._previous
-            mended = self.guesser.mend_or_guess(self.trace, self.theory, contradicted, began)
+        if finished:
+            self.drafts.add(finished, self.trace)
+        if self._previous and not self.drafts and self.mender.suits(self.trace, self.theory):
+            mended = self.mender.mended(self.trace, self.theory, self._previous, began)
             if mended:
                 self.drafts.add(mended, self.trace)
 

@@ -49,8 +49,8 @@ When time is short
 ------------------
 A map that predicts the step is minimal even if there is no time to look for others. When no map
 predicts the step and time is short, the answer is *feasible*: it has a consistent map, and the last
-bound, which holds for the longer trace by (1). The map is a draft (`drafts.py`), or is guessed or
-mended (`guesser.py`). clingo searches again when the trace has grown (`incremental.py`). It
+bound, which holds for the longer trace by (1). The map is a draft (`drafts.py`), or is mended
+(`mender.py`). clingo searches again when the trace has grown (`incremental.py`). It
 continues from the state in which it stopped, and may prove a map minimal again.
 
 If faults are allowed
@@ -263,4 +263,4 @@ def _preload_engine(theory: Theory) -> None:
     if theory.level == "causal":
         importlib.import_module("ssh_abduction.solver.engines.causal")
     elif row("visits").holds_for(theory):
-        importlib.import_module("ssh_abduction.online.background_guess")
+        importlib.import_module("ssh_abduction.online.background_mending")

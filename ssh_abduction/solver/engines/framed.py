@@ -164,19 +164,6 @@ class FramedEngine:
         first_accepted(self._visits.fewest, why_not, self._refuse)
         return fitted[0] if fitted else None
 
-    def map_of_guess(self) -> Found | None:
-        """Make a map of the whole trace from guessed labels, without a search for the fewest.
-
-        Returns:
-            The map; None if the steps fit no frames, or no paths fit the guess. Paths are only
-            merged if they must be one.
-        """
-        chart = self._charted(len(self._task.trace), None)
-        if chart is None:
-            return None
-        labels = self._fitting.paths.guessed_labels(chart, self.asker.watch)
-        return self._fitting.separate(chart, labels)
-
     def map_mended_from(self, known: Sequence[int]) -> Found | None:
         """Make a map of the whole trace that keeps known dstates of the first steps if possible.
 

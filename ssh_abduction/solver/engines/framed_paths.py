@@ -254,10 +254,7 @@ class FramedPaths:
         """
         if before is not None:
             return chart.with_elsewhere(before.elsewhere)
-        nodes = range(len(chart.seen))
-        control = self.paths.telling(chart, nodes, nodes)
+        control = self.paths.apart(chart)
         self._asker.watch.check()
-        _, elsewhere, _ = next(
-            self._asker.answers(paths_lp.read_told, "ignore", 1, control=control)
-        )
+        elsewhere = next(self._asker.answers(paths_lp.read_elsewhere, "ignore", 1, control=control))
         return chart.with_elsewhere(elsewhere)

@@ -33,10 +33,6 @@ def maps_with_frames(problem: Problem, watch: Watch, speedups: Speedups) -> Iter
     """
     task = Task.of(problem.changed(theory=problem.theory.with_frames()), watch, speedups)
     engine = FramedEngine(task)
-    guess = engine.map_of_guess() if task.speedups.annealed else None
-    if guess is not None:
-        yield guess.map.without_headings()
     engine.grow(len(problem.trace))
     for found in engine.improving_maps():
-        if guess is None or found.cost < guess.cost:
-            yield found.map.without_headings()
+        yield found.map.without_headings()

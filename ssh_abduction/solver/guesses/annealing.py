@@ -37,7 +37,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain, cycle, pairwise, repeat
+from itertools import chain, cycle, repeat
 from typing import TypeVar
 
 import numpy as np
@@ -49,21 +49,17 @@ from ssh_abduction.solver.steps.chart import Chart, FramedChart, numbered
 
 # The fewest spare names of a kind of place. With four, different places of mazes were merged.
 SPARES = 6
-# A kind of place with many visits has more spare names, so that each has about this many visits.
-VISITS = 12
 # Successive attempts multiply SPARES by these factors, in a cycle. Places with few visits need more
 # names.
 MORE = 1, 2, 4
-# The stages of a careful guess: the power of probabilities in the first sweep (a high temperature),
-# and the number of sweeps. Of nine guesses at mazes of 10 x 10 cells, two could be completed to
-# maps after 300 sweeps, six after 700, and all after 1,500.
-ANNEALED = ((0.5, 1500),)
-# The stages of a rough guess. It is taken after the first stage at which it is good enough.
-ROUGH = (0.6, 300), *10 * ((0.75, 150),)
-# The visits of each name in a rough guess. Fewer names take fewer sweeps.
-ROUGH_VISITS = 40
-# A rough guess is good enough if at most one in this many travels contradicts the majority. The
-# guess is mended afterwards anyway.
+# The stages of a guess: the power of probabilities in the first sweep (a high temperature), and the
+# number of sweeps. The guess is taken after the first stage at which it is good enough.
+STAGES = (0.6, 300), *10 * ((0.75, 150),)
+# A kind of place with many visits has more spare names, so that each has about this many visits.
+# Fewer names take fewer sweeps.
+VISITS = 40
+# A guess is good enough if at most one in this many travels contradicts the majority. The guess is
+# mended afterwards anyway.
 FEW = 200
 # The stages of a guess in which each step is a visit. The last one is repeated.
 STEPS = (0.75, 1500), (0.75, 500)
@@ -72,7 +68,7 @@ ENTRIES = 60_000_000
 # Nor if the table of transitions (states x actions x states) has more entries than this. It is
 # built for each sweep, with some 20 bytes an entry: 40 MB.
 TABLE = 2_000_000
-# A rough guess takes the best attempt so far after this many seconds.
+# The guess is the best attempt so far after this many seconds.
 SECONDS = 10.0
 _Kind = TypeVar("_Kind")
 
@@ -101,34 +97,11 @@ class Guess:
             for visit, slot in chart.facing
         ]
 
-    def loosened(self, chart: FramedChart, travels: int) -> Guess:
-        """Return the same guess, but not sure of visits near a contradiction.
-
-        A contradiction is a travel that leads from one state of a place to several places.
-
-        Args:
-            chart: The chart of the guess.
-            travels: Also be unsure of places up to this many travels away from a contradiction.
-        """
-        states = self.states.tolist()
-        leads: dict[tuple[int, int, int], set[int]] = {}
-        for visit, (slot, action) in chart.leaves.items():
-            here = states[visit]
-            leads.setdefault((here // 4, (here + slot) % 4, action), set()).add(states[visit + 1])
-        loose = {
-            place
-            for (here, *_), there in leads.items()
-            if len(there) > 1
-            for place in (here, *(state // 4 for state in there))
-        }
-        joined = [(here // 4, there // 4) for here, there in pairwise(states)]
-        for _ in range(travels):
-            loose |= {place for pair in joined if loose.intersection(pair) for place in pair}
-        return Guess(self.states, self.sure & ~np.isin(self.states // 4, list(loose)))
-
 
 def annealed(chart: FramedChart, check: Callable[[], None] = lambda: None) -> Guess:
-    """Guess the states of all visits roughly.
+    """Guess the states of all visits.
+
+    A travel is bad if it leads elsewhere than most travels with the same state and action.
 
     Args:
         chart: The chart of the visits.
@@ -140,30 +113,20 @@ def annealed(chart: FramedChart, check: Callable[[], None] = lambda: None) -> Gu
     """
     found: dict[int, Guess] = {}
     began = time.perf_counter()
-    for failed, guess in attempts(chart, check, rough=True):
+    for failed, guess in _attempts(chart, check):
         found.setdefault(failed, guess)
         if failed <= len(chart.travels) // FEW or time.perf_counter() - began > SECONDS:
             return found[min(found)]
     raise AssertionError
 
 
-def attempts(
-    chart: FramedChart, check: Callable[[], None] = lambda: None, *, rough: bool = False
-) -> Iterator[tuple[int, Guess]]:
-    """Yield guesses without end, each with the number of its bad travels.
-
-    A travel is bad if it leads elsewhere than most travels with the same state and action.
-
-    Args:
-        chart: The chart of the visits.
-        check: Called now and then; may raise to stop.
-        rough: Whether to use fewer names and sweeps, which suffices for places visited often.
-    """
+def _attempts(chart: FramedChart, check: Callable[[], None]) -> Iterator[tuple[int, Guess]]:
+    """Yield guesses without end, each with the number of its bad travels."""
     leaves = list(chart.leaves.values())
     for attempt, more in enumerate(cycle(MORE), 1):
-        options = _options(chart, SPARES * more, ROUGH_VISITS if rough else VISITS)
+        options = _options(chart, SPARES * more)
         drawn = Sampler(options, leaves, 4, np.random.default_rng(attempt))
-        for first, sweeps in ROUGH if rough else ANNEALED:
+        for first, sweeps in STAGES:
             drawn.anneal(first, sweeps, check)
             yield drawn.failed(), Guess(drawn.labels, drawn.sure())
 
@@ -195,13 +158,12 @@ def annealed_steps(
         yield np.where(drawn.sure(), drawn.labels, -1).tolist()
 
 
-def _options(chart: FramedChart, spares: int, visits_each: int) -> States:
+def _options(chart: FramedChart, spares: int) -> States:
     """List the possible states of each visit.
 
     Args:
         chart: The chart of the visits.
         spares: The least number of spare names of each kind of place.
-        visits_each: A kind with many visits gets about one name for this many visits.
 
     Returns:
         An array with a row for each visit, padded with -1.
@@ -214,7 +176,7 @@ def _options(chart: FramedChart, spares: int, visits_each: int) -> States:
     ]
     kinds = [min(stars) for stars in turned]
     pinned = clique(np.logical_and.reduce(misfits), numbered(kinds))
-    spare = _spare(kinds, pinned, spares, visits_each)
+    spare = _spare(kinds, pinned, spares)
     # Visits x states of pinned places.
     known = ~misfits[:, :, pinned].transpose(1, 2, 0).reshape(len(kinds), -1)
     known[pinned] = False
@@ -240,7 +202,7 @@ def _step_options(chart: Chart, clique: Sequence[int], may_be: Sequence[Sequence
         An array with a row for each step, padded with -1.
     """
     pinned = set(clique)
-    spare = _spare(chart.seen, clique, SPARES, ROUGH_VISITS)
+    spare = _spare(chart.seen, clique, SPARES)
     return _padded(
         [
             [*options, *(() if step in pinned else spare[chart.seen[step]])]
@@ -249,22 +211,19 @@ def _step_options(chart: Chart, clique: Sequence[int], may_be: Sequence[Sequence
     )
 
 
-def _spare(
-    kinds: Sequence[_Kind], pinned: Sequence[int], spares: int, visits_each: int
-) -> dict[_Kind, range]:
+def _spare(kinds: Sequence[_Kind], pinned: Sequence[int], spares: int) -> dict[_Kind, range]:
     """Return the spare names of each kind of place. Pinned visits have the names before them.
 
     Args:
         kinds: The kind of the place of each visit.
         pinned: Visits that are pairwise distinct.
         spares: The least number of spare names of a kind.
-        visits_each: A kind gets one more name for each further group of this many visits.
     """
     named = Counter(kinds[visit] for visit in pinned)
     spare: dict[_Kind, range] = {}
     names = len(pinned)
     for kind, visits in Counter(kinds).items():
-        spare[kind] = range(names, names + spares + max(0, visits // visits_each - named[kind]))
+        spare[kind] = range(names, names + spares + max(0, visits // VISITS - named[kind]))
         names = spare[kind].stop
     return spare
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,13 +37,6 @@ DEMANDS = (
 # By how much the evidence for a merge of two known dstates has to exceed that of the next best
 # merge, when a map is thinned. The numbers are tried in this order.
 THINNED = 10, 5, 3, 0
-
-# The fields of Classes that merges change.
-Snapshot: TypeAlias = tuple[
-    NDArray[np.int_], NDArray[np.bool_], Matrix, list[NDArray[np.int_]], list[dict[int, int]]
-]
-# Two steps whose classes are merged. If their class is the same, it becomes a known dstate.
-Merge: TypeAlias = tuple[int, int]
 
 
 class Classes:
@@ -89,7 +81,7 @@ class Classes:
         self._undo: list[
             tuple[int, int, bool, NDArray[np.bool_], dict[int, int], NDArray[np.int_]]
         ] = []
-        self._made: list[Merge] = []
+        self._has_merged = False
         self._check = check
 
     def take(self, guess: Sequence[int]) -> None:
@@ -127,18 +119,17 @@ class Classes:
 
     def _advanced(self, step: Callable[[], None]) -> bool:
         """Call `step`, and return whether it made any merges."""
-        self._made = []
+        self._has_merged = False
         step()
-        return bool(self._made)
+        return self._has_merged
 
-    def make(self, merge: Merge) -> None:
-        """Merge the classes of two steps. If their class is the same, make it a known dstate."""
-        a, b = (int(self.root[t]) for t in merge)
+    def make(self, a: int, b: int) -> None:
+        """Merge two classes, given by their roots. If they are one, make it a known dstate."""
         if a == b:
             self.known[a] = True
         else:
             self.merge(a, b, forced=True)
-        self._made.append(merge)
+        self._has_merged = True
 
     def unsettled(self) -> NDArray[np.int_]:
         """List the steps whose classes are not known dstates."""
@@ -166,9 +157,9 @@ class Classes:
                 continue
             ranked = self._ranked(root, fits)
             if not ranked:
-                self.make((root, root))
+                self.make(root, root)
             elif _is_ahead(ranked, evidence):
-                self.make((ranked[0][1], root))
+                self.make(ranked[0][1], root)
 
     def settle_at_any_rate(self) -> None:
         """Merge the class of the first step that is not at a known dstate with the best one.
@@ -178,7 +169,7 @@ class Classes:
         for t in self.unsettled()[:1].tolist():
             root = int(self.root[t])
             ranked = self._ranked(root, self._fitting(root))
-            self.make((ranked[0][1] if ranked else root, root))
+            self.make(ranked[0][1] if ranked else root, root)
 
     def thin(self, evidence: int) -> None:
         """Merge each known dstate with another one, if the evidence for it is clear enough.
@@ -196,7 +187,7 @@ class Classes:
                     root, [dstate for dstate in self._fitting(root) if dstate != root], forced=True
                 )
                 if ranked and _is_ahead(ranked, evidence):
-                    self.make((ranked[0][1], root))
+                    self.make(ranked[0][1], root)
 
     def _fitting(self, root: int) -> list[int]:
         """List the known dstates from which no step of the class of a root is apart."""
@@ -268,22 +259,6 @@ class Classes:
             self._members[a] = np.concatenate([self._members[a], self._members[b]])
         return confirmed + len(self._undo)
 
-    def separate(self, first: NDArray[np.int_], second: NDArray[np.int_]) -> None:
-        """Mark all steps of two classes as apart.
-
-        Args:
-            first: The steps of one class, as an array.
-            second: The steps of the other class.
-        """
-        self._apart[np.ix_(first, second)] = self._apart[np.ix_(second, first)] = True
-        self._apart[self.root[first[0]], second] = self._apart[self.root[second[0]], first] = True
-
-    def separate_all(self, apart: Matrix) -> None:
-        """Mark further pairs of steps as apart, given as a matrix of steps x steps."""
-        self._apart |= apart
-        for root in np.flatnonzero(np.bincount(self.root) > 1):
-            self._apart[root] |= apart[self._members[root]].any(axis=0)
-
     def _take_back(self) -> None:
         """Undo the last merge."""
         for a, b, known, apart, leads, members in reversed(self._undo):
@@ -295,29 +270,6 @@ class Classes:
             )
             self.root[self._members[b]] = b
         self._undo = []
-
-    def restore(self, before: Snapshot, merges: Iterable[Merge]) -> None:
-        """Go back to a snapshot, and then make some merges."""
-        root, known, apart, members, leads = before
-        self.root, self.known, self._apart, self._members, self._leads = (
-            root.copy(),
-            known.copy(),
-            apart.copy(),
-            list(members),
-            list(leads),
-        )
-        for merge in merges:
-            self.make(merge)
-
-    def snapshot(self) -> Snapshot:
-        """Copy everything that merges change, for `restore`."""
-        return (
-            self.root.copy(),
-            self.known.copy(),
-            self._apart.copy(),
-            list(self._members),
-            list(self._leads),
-        )
 
 
 def _is_ahead(ranked: Sequence[tuple[int, int]], evidence: int) -> bool:

@@ -18,9 +18,7 @@ and steps that fit several known dstates if the evidence for one of them is clea
 step that fits no known dstate becomes one.
 
 A guess is completed in the same way. First, nodes with one label in the guess are merged if they
-can be one dstate. They become known dstates. After merges, a caller that knows further axioms may
-say which nodes are apart, or one dstate, because of these merges. If the caller finds a
-contradiction instead, the merge that led to it is undone.
+can be one dstate. They become known dstates.
 
 A map is thinned in the same way. The dstates with the fewest nodes are merged first, each with the
 dstate for which there is most evidence, while the result is still a map.
@@ -32,26 +30,14 @@ trace instead of at a root.
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ssh_abduction.solver.guesses.classes import Classes, Merge, Snapshot
+from ssh_abduction.solver.guesses.classes import Classes
 from ssh_abduction.solver.steps.apart import Matrix
 from ssh_abduction.solver.steps.chart import Chart, Link, numbered
-
-# Give up a guess after this many merges that the caller contradicted.
-TAKEN_BACK = 20
-# Stop thinning after this many merges that the caller contradicted. With 40, maps had at most 1 %
-# fewer dstates, and thinning took twice as long.
-THIN_ENOUGH = 5
-
-# The answer of a caller: which nodes are apart (a matrix), and pairs of nodes that are one dstate.
-Told: TypeAlias = tuple[Matrix, Sequence[tuple[int, int]]]
 
 
 def merged(
@@ -97,43 +83,6 @@ def merged_near(
     """
     classes = _from_guess(apart, links, guess, check)
     classes.settle_all()
-    return classes.labels()
-
-
-def merged_as_told(
-    apart: Matrix,
-    links: Iterable[Link],
-    guess: Sequence[int],
-    tell: Callable[[Sequence[int], Sequence[int]], Told | None],
-    fits: Callable[[Sequence[int], Sequence[int]], bool],
-    check: Callable[[], None] = lambda: None,
-) -> list[int] | None:
-    """Find a small map near a guess that agrees with further axioms, which the caller knows.
-
-    Args:
-        apart: The pairs of nodes that are apart, as a matrix of nodes x nodes.
-        links: Triples (node, action, node).
-        guess: The label of each node, -1 if it is unknown.
-        tell: Called after merges, with the labels of all nodes and the nodes that are not yet at a
-            known dstate. Returns which nodes are apart (a matrix) and which are one dstate (pairs),
-            or None if the labels contradict the axioms.
-        fits: A faster form of `tell`, with the same arguments. Returns only whether the labels
-            agree with the axioms.
-        check: Called now and then; may raise to stop.
-
-    Returns:
-        The dstate of each node in a thinned map; None if the guess contradicts the axioms, or no
-        map is found soon.
-    """
-    classes = _ToldClasses(apart, links, tell, fits, check)
-    classes.take(guess)
-    try:
-        classes.settle_all()
-    except _Contradicted:
-        return None
-    with suppress(_Contradicted):
-        classes.may_take_back = THIN_ENOUGH
-        classes.thin_all()
     return classes.labels()
 
 
@@ -263,93 +212,3 @@ def _from_guess(
     classes = Classes(apart, links, check)
     classes.take(guess)
     return classes
-
-
-class _Contradicted(Exception):  # noqa: N818 - not an error
-    """The guess contradicts the axioms of the caller, or too many merges were undone."""
-
-
-class _ToldClasses(Classes):
-    """Classes near a guess, checked by a caller that knows further axioms.
-
-    After merges, the caller returns which nodes are apart, or one, because of them. Merges that
-    contradict its axioms are undone.
-    """
-
-    def __init__(
-        self,
-        apart: Matrix,
-        links: Iterable[Link],
-        tell: Callable[[Sequence[int], Sequence[int]], Told | None],
-        fits: Callable[[Sequence[int], Sequence[int]], bool],
-        check: Callable[[], None],
-    ) -> None:
-        super().__init__(apart, links, check)
-        self._tell = tell
-        self._fits = fits
-        self.may_take_back = TAKEN_BACK
-
-    def settle_all(self) -> None:
-        if not self._keeps_what_is_told():
-            raise _Contradicted
-        super().settle_all()
-
-    def _advanced(self, step: Callable[[], None]) -> bool:
-        before = self.snapshot()
-        advanced = super()._advanced(step)
-        if advanced and not self._keeps_what_is_told():
-            self._take_back_first_wrong(before, tuple(self._made))
-        return advanced
-
-    def _take_back_first_wrong(self, before: Snapshot, made: Sequence[Merge]) -> None:
-        """Undo the first merge that contradicts the caller and all later ones.
-
-        The two classes of that first merge are marked as apart.
-
-        Args:
-            before: The classes before the merges.
-            made: The merges, in order.
-
-        Raises:
-            _Contradicted: That merge only made a class known, or too many merges were undone.
-        """
-
-        def fits(merges: int) -> bool:
-            self._check()
-            self.restore(before, made[:merges])
-            return self._fits(self.labels(), self.unsettled().tolist())
-
-        right = first_failing(fits, 1, len(made)) - 1
-        self.restore(before, made[:right])
-        self.may_take_back -= 1
-        a, b = (self._members[self.root[t]] for t in made[right])
-        if a is b or not self.may_take_back:
-            raise _Contradicted
-        self.separate(a, b)
-
-    def _keeps_what_is_told(self) -> bool:
-        """Ask the caller which nodes are apart and which are one, and apply the answer.
-
-        Returns:
-            False if the classes contradict the axioms of the caller.
-        """
-        self._check()
-        told = self._tell(self.labels(), self.unsettled().tolist())
-        if told is None:
-            return False
-        apart, one = told
-        self.separate_all(apart)
-        for a, b in one:
-            self.merge(a, b, forced=True)
-        return True
-
-
-def first_failing(holds: Callable[[int], bool], first: int, last: int) -> int:
-    """Find the first number from `first` to `last` for which `holds` is false, by bisection.
-
-    Args:
-        holds: A condition on a number. If it is false for a number, it is false for larger ones.
-        first: The least number.
-        last: The greatest number. `holds` is taken to be false for it, and is not called.
-    """
-    return first + bisect_left(range(first, last), True, key=lambda number: not holds(number))

@@ -288,33 +288,6 @@ class FramedChart(Chart):
         steps = zip(pairwise(self.node_of), trace.actions, strict=False)
         return list(dict.fromkeys((s, action.turn, x) for (s, x), action in steps if action.turn))
 
-    def beginning(self, visits: int) -> FramedChart:
-        """Return the chart of the first `visits` visits."""
-        nodes = next(
-            (node for node, (visit, _) in enumerate(self.facing) if visit == visits),
-            len(self.facing),
-        )
-        steps = next(
-            (step for step, node in enumerate(self.node_of) if node >= nodes), len(self.node_of)
-        )
-        # Nodes are numbered by their visits, so a beginning has the first nodes.
-        links = tuple(link for link in self.links if max(link[0], link[2]) < nodes)
-        elsewhere, away, excluded = (
-            frozenset(pair for pair in pairs if max(pair) < nodes)
-            for pairs in (self.elsewhere, self.away, self.excluded)
-        )
-        return FramedChart(
-            self.seen[:nodes],
-            links,
-            self.node_of[:steps],
-            self.facing[:nodes],
-            self.stars[:visits],
-            self.travels[: visits - 1],
-            elsewhere,
-            away,
-            excluded=excluded,
-        )
-
     def visits_with(self, pairs: int) -> int:
         """Find the most first visits of which at most `pairs` pairs may be at one place."""
         import numpy as np

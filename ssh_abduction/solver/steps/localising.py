@@ -12,7 +12,7 @@ needs this visit, and enough visits before it to localise it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -58,47 +58,6 @@ def located(chart: FramedChart, states: Mapping[int, State]) -> Located:
     return _Localiser(chart, states).located()
 
 
-def tracked(chart: FramedChart, states: Mapping[int, State]) -> list[State]:
-    """Localise each visit by the visits before it. Arguments are as for `located`.
-
-    Returns:
-        The state of each visit; -1 if several states are possible.
-    """
-    return _Localiser(chart, states).tracked()
-
-
-def states_of(chart: FramedChart, labels: Sequence[int]) -> list[State]:
-    """Turn labels into states: two visits are at one place if nodes of both have the same label.
-
-    Args:
-        chart: The chart of the visits.
-        labels: The dstate of each node.
-
-    Returns:
-        The state of each visit.
-    """
-    at: dict[int, list[tuple[int, int]]] = {}  # the visits and slots that have each label
-    labelled: dict[int, list[tuple[int, int]]] = {}  # the slots of each visit and their labels
-    for (visit, slot), label in zip(chart.facing, labels, strict=True):
-        at.setdefault(label, []).append((visit, slot))
-        labelled.setdefault(visit, []).append((slot, label))
-    states: dict[int, State] = {}
-    places = 0
-    for first in labelled:
-        if first in states:
-            continue
-        states[first] = 4 * places
-        places += 1
-        work = [first]
-        for visit in work:
-            for slot, label in labelled[visit]:
-                for other, turned in at.pop(label, ()):
-                    if other not in states:
-                        states[other] = faced(states[visit], slot - turned)
-                        work.append(other)
-    return [states[visit] for visit in range(len(states))]
-
-
 class _Localiser:
     """Localises visits in the map that the known states of some visits make."""
 
@@ -117,15 +76,6 @@ class _Localiser:
             for slot, action in [self._leaves[visit]]
         }
         self._fits = _fitting(chart, states)
-
-    def tracked(self) -> list[State]:
-        """The state of each visit; -1 if several states are possible."""
-        possible = self._anywhere(0)
-        found = [possible]
-        for visit in range(1, len(self._slots)):
-            possible = self._after(possible, visit - 1) or self._anywhere(visit)
-            found.append(possible)
-        return [next(iter(states)) if len(states) == 1 else -1 for states in found]
 
     def located(self) -> Located:
         """Find the states of all visits, or the visits that are missed."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from clingo import Control, Function, Model
+from clingo import Control, Model
 
 from ssh_abduction.data.floors import stretches_of
 from ssh_abduction.data.trace import Action, Trace
@@ -217,29 +217,15 @@ def pinned_facts(segments: Iterable[int]) -> str:
     return " ".join(f"pinned({segment})." for segment in segments)
 
 
-def read_told(model: Model) -> tuple[bool, list[tuple[int, int]], list[tuple[int, int]]]:
-    """Read the conclusions that paths_framed.lp draws from the labels of nodes.
+def read_elsewhere(model: Model) -> list[tuple[int, int]]:
+    """Read the pairs of dstates that are at different places by paths_framed.lp.
 
-    Returns:
-        True if no places and paths fit the labels, and two empty lists. Else False, the pairs of
-        dstates that are at different places, and the pairs of labels that must be one dstate.
+    If no places and paths fit the dstates, the list is empty.
     """
-    found: dict[str, list[tuple[int, int]]] = {"elsewhere": [], "one": []}
-    for name, args in map(read_atom, model.symbols(shown=True)):
-        if name == "violated":
-            return True, [], []
-        found[name].append((args[0], args[1]))
-    return False, found["elsewhere"], found["one"]
-
-
-def is_violated(control: Control) -> bool:
-    """Whether grounding alone shows that no places and paths fit the labels of nodes."""
-    return control.symbolic_atoms[Function("violated")] is not None
-
-
-def loose(labels: Iterable[int]) -> str:
-    """The facts that name labels which may still be merged with other labels."""
-    return "\n".join(f"loose({label})." for label in labels)
+    found = [read_atom(symbol) for symbol in model.symbols(shown=True)]
+    if any(name == "violated" for name, _ in found):
+        return []
+    return [(args[0], args[1]) for _, args in found]
 
 
 def settled_labels(labels: Iterable[tuple[int, int]]) -> str:
