@@ -31,17 +31,17 @@ LAGS, ALIKE = (2, 4, 8), 1.3
 FAILING, OVERRIDING, CONTRADICTS = 0.05, 0.08, 25.0
 # A log is refused if more than this share of its scans fails to match.
 HOPELESS = 0.5
-# The odometry over every second scan is at least 0.98 times as long in good logs.
+# In good logs, the way by odometry over every second scan is at least 0.98 times the way over all.
 TO_AND_FRO = 0.8
 # A log is out of order if the times of more than this share of its scans run backwards.
 RUNS_BACK = 0.05
-# A robot returns if it comes within NEAR metres, plus DRIFT of the way between, of a point where it
-# was at least AWAY metres of way before.
+# A robot returns if it comes near a point where it was before, and drove at least AWAY metres in
+# between. Near is within NEAR metres, plus DRIFT metres for each metre driven in between.
 NEAR, DRIFT, AWAY = 3.0, 0.02, 15.0
 # A scan contradicts the scans before it if less than the share POORLY of its points matches, and
 # more than the share INTRUDING of the points of either side lies in the free space of the other, at
 # least MARGIN metres from walls. BESIDE scans on each side are compared. In good logs, scans that
-# match so badly have at most the share 0.27 there.
+# match so badly have at most 27 % of their points there.
 INTRUDING, MARGIN, POORLY, BESIDE = 0.3, 0.4, 0.6, 3
 
 

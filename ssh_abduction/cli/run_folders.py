@@ -23,7 +23,7 @@ from ssh_abduction.data.files import write_file
 
 RUN = "run.json"  # written last: it marks a run as finished
 FILES = ("trace.jsonl", "maps.json", "page.html", "report.html", RUN)
-LONGEST = 255  # bytes of the name of a folder, at most
+LONGEST = 255  # the most bytes of the name of a folder
 DIGITS = 8  # of a log's digest, appended to its name if another log has the same name
 
 

@@ -88,7 +88,7 @@ def settle(trace: Trace, theory: Theory | None = None, known: Problem | None = N
     displacement = theory.displacement
     if displacement == "auto":
         displacement = "use" if trace.has_displacements else "none"
-    # If the theory gives `returns`, the trace may be a part of one, without displacements.
+    # If the number of returns is given, a part of a trace may do without displacements.
     if displacement == "use" and not trace.has_displacements and not theory.returns:
         mend = f"add them to the steps, or take {choice('displacement', 'none')}"
         raise TheoryError(
