@@ -160,6 +160,17 @@ def why_apart(trace: Trace, first: int, second: int, theory: Theory | None = Non
         TraceError: The trace has no such step, or both steps are the same.
     """
     problem = settle(trace, theory)
+    check_two_steps(trace, first, second)
+    displacement = displacement_of(problem)
+    return (
+        displacement.returns_of(trace).why_apart(min(first, second), max(first, second))
+        if displacement
+        else None
+    )
+
+
+def check_two_steps(trace: Trace, first: object, second: object) -> None:
+    """Raise TraceError if these are not two different steps of a trace."""
     for step in (first, second):
         if not is_whole(step) or not 0 <= step < len(trace):
             raise TraceError(
@@ -168,12 +179,6 @@ def why_apart(trace: Trace, first: int, second: int, theory: Theory | None = Non
             )
     if first == second:
         raise TraceError(f"step: expected two steps, got {first} twice; take another one")
-    displacement = displacement_of(problem)
-    return (
-        displacement.returns_of(trace).why_apart(min(first, second), max(first, second))
-        if displacement
-        else None
-    )
 
 
 def shortest(longest: int, has_no_map: Callable[[int], bool]) -> int | None:

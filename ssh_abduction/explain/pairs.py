@@ -22,13 +22,13 @@ from dataclasses import replace
 from ssh_abduction.data.checks import a_count_of_maps
 from ssh_abduction.data.closure import told
 from ssh_abduction.data.drives import drives_of, named_steps
-from ssh_abduction.data.errors import SolverError, TraceError, brief, is_whole
+from ssh_abduction.data.errors import SolverError
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.argument import derive
 from ssh_abduction.explain.axioms import Axioms
 from ssh_abduction.explain.derivation import Derivation
-from ssh_abduction.explain.no_map import Explanation, explain
+from ssh_abduction.explain.no_map import Explanation, check_two_steps, explain
 from ssh_abduction.explain.piece import Piece
 from ssh_abduction.explain.question import Question
 from ssh_abduction.explain.verdict import PairExplanation, Side, Verdict
@@ -117,14 +117,7 @@ class PairQuestion(Question[PairExplanation]):
         max_maps: int | None = 100,
     ) -> None:
         super().__init__(trace, theory, time_limit, memory_limit)
-        for step in (first, second):
-            if not is_whole(step) or not 0 <= step < len(trace):
-                raise TraceError(
-                    f"step: expected a step from 0 to {len(trace) - 1}, got {brief(step)}; "
-                    "steps are counted from 0"
-                )
-        if first == second:
-            raise TraceError(f"step: expected two steps, got {first} twice; take another one")
+        check_two_steps(trace, first, second)
         names = named_steps(drives_of(trace), len(trace))
         self.first, self.second = names[min(first, second)], names[max(first, second)]
         self._maps = max_maps

@@ -120,11 +120,6 @@ class NameProgram:
         """Whether clingo has all links of the chart."""
         return len(self._known.links) == len(self.chart.links)
 
-    @property
-    def links_given(self) -> int:
-        """The number of links that clingo has."""
-        return len(self._known.links)
-
     def tell_all(self, links: Iterable[Link]) -> None:
         """Give a new control some links, and all rules that forbid something."""
         self.add(links)
