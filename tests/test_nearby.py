@@ -159,7 +159,7 @@ def test_some_maps_where_the_search_near_a_guess_has_the_proof(seed: int) -> Non
 def test_a_causal_maze_is_guessed_by_its_turns() -> None:
     """Annealing, from views and turns alone, comes near what the robot was in; from there to the
     proof that no fewer dstates will do."""
-    walk = maze(3, 3, steps=600, seed=1)
+    walk = maze(3, 3, steps=400, seed=1)
     log = Log(walk.trace, CAUSAL)
     chart = Chart.turned(walk.trace, log, len(log.seen))
     labels = annealed(chart).labels(chart)
@@ -177,7 +177,7 @@ def test_a_causal_maze_is_guessed_by_its_turns() -> None:
 def test_a_limit_leaves_the_small_map_found_near_a_guess() -> None:
     """It has no more dstates than the states that the robot was in; what is merged at once has more
     than twice as many."""
-    walk = maze(4, 4, steps=800, seed=1)
+    walk = maze(4, 4, steps=500, seed=1)
     best: list[int] = []
 
     def stop(self: NearbySearch, *_: object) -> Generator[list[int], None, str]:
@@ -216,7 +216,7 @@ def test_a_search_of_the_whole_trace_keeps_no_time_back() -> None:
     to. So it may use the whole limit from its start, and
     where it is stopped before it has a map, no other search for any map follows.
     """
-    trace = maze(10, 10, steps=1000, seed=0, stars=True).trace
+    trace = maze(10, 10, steps=500, seed=0, stars=True).trace
     begun: list[tuple[bool, bool]] = []
     minimise = Prefixes.minimise
 
@@ -315,7 +315,7 @@ def test_a_guess_at_the_beginning_of_a_long_trace_goes_on_if_it_can(
 def test_of_a_long_trace_clingo_is_given_some_links_at_a_time() -> None:
     """The simplest come first, and the search may end before all are given. The map is that of a
     guess at the beginning, or clingo's."""
-    walk = maze(3, 3, steps=1000, seed=1, loops=0.3)
+    walk = maze(3, 3, steps=700, seed=1, loops=0.3)
     given: list[int] = []
     add = name_program.NameProgram.add
 
