@@ -316,7 +316,7 @@ def test_joins_of_drives_are_forced_possible_or_excluded(
     maps = str(tmp_path / "maps.json")
     solution.save(maps)
     assert main(["compare", maps]) == 0
-    said = "monday and tuesday: 1 dstate in common in all maps (monday:4 = tuesday:0); 2 dstates"
+    said = "monday and tuesday: 1 dstate in common in all maps (monday:4 = tuesday:0); 2 possible"
     assert said in capsys.readouterr().out
     assert main(["compare", maps, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["drives"][0]["excluded"] == 7

@@ -11,6 +11,7 @@ monday and tuesday: 1 dstate in common in all maps (monday:2 = tuesday:0)
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import combinations
@@ -45,7 +46,7 @@ class DriveJoin:
 
 @dataclass(frozen=True, slots=True)
 class DrivePair:
-    """The places that two drives share. A place counts once, however often a drive visits it.
+    """The places that two drives share: for each two places of the first map, the surest join.
 
     Attributes:
         first: The name of the earlier drive.
@@ -68,10 +69,12 @@ class DrivePair:
     def __str__(self) -> str:
         maps = "maps" if self.proven else "maps that were found"
         parts = []
-        for joins, where in ((self.forced, f"all {maps}"), (self.possible, f"some {maps}")):
-            if joins:
-                number = counted(len(joins), f"{self.of}s")
-                parts.append(f"{number} in common in {where} ({self._named(joins)})")
+        if self.forced:
+            number = counted(len(self.forced), f"{self.of}s")
+            parts.append(f"{number} in common in all {maps} ({self._named(self.forced)})")
+        if self.possible:
+            number = counted(len(self.possible), "possible joins")
+            parts.append(f"{number}, in some {maps} ({self._named(self.possible)})")
         told = "; ".join(parts) or f"nothing in common in any of the {maps}"
         return f"{self.first} and {self.second}: {told}"
 
@@ -79,7 +82,7 @@ class DrivePair:
         """Put joins into words: "monday:2 = tuesday:0". At most SHOWN of them are named."""
         shown = [
             f"{self.first}:{join.first} = {self.second}:{join.second}"
-            + ("" if join.share == 1 else f", {join.share:.0%}")
+            + ("" if joins is self.forced else f", {_percent(join.share)}")
             for join in joins[:SHOWN]
         ]
         more = len(joins) - SHOWN
@@ -152,27 +155,54 @@ def _pair(
     forced: list[DriveJoin] = []
     possible: list[DriveJoin] = []
     excluded = 0
-    for i in _stations(one, placings):
-        for j in _stations(other, placings):
-            have = [at[i] == at[j] for at in placings]
-            share = sum(weight for weight, has in zip(weights, have, strict=True) if has)
-            join = DriveJoin(i - one.first, j - other.first, 1.0 if all(have) else share)
-            if all(have):
-                forced.append(join)
-            elif any(have):
-                possible.append(join)
-            else:
+    for here in _visits(one, placings):
+        for there in _visits(other, placings):
+            join = _surest(here, there, placings, weights)
+            if join.share == 0:
                 excluded += 1
+                continue
+            first, second = join.first - one.first, join.second - other.first
+            is_forced = all(at[join.first] == at[join.second] for at in placings)
+            (forced if is_forced else possible).append(
+                DriveJoin(first, second, 1.0 if is_forced else join.share)
+            )
     possible.sort(key=lambda join: -join.share)
     return DrivePair(one.name, other.name, of, tuple(forced), tuple(possible), excluded, proven)
 
 
-def _stations(drive: Drive, placings: Sequence[_Placing]) -> list[int]:
-    """Return the first step of a drive at each of its places.
+def _visits(drive: Drive, placings: Sequence[_Placing]) -> list[list[int]]:
+    """List the steps of a drive at each place of the first map.
 
-    Two steps are at one place here if they are at one place in all maps.
+    Of steps that no map tells apart, list the first one.
     """
     first: dict[tuple[int, ...], int] = {}
     for t in range(drive.first, drive.stop):
         first.setdefault(tuple(at[t] for at in placings), t)
-    return list(first.values())
+    by_place: dict[int, list[int]] = {}
+    for names, t in first.items():
+        by_place.setdefault(names[0], []).append(t)
+    return list(by_place.values())
+
+
+def _surest(
+    here: Sequence[int],
+    there: Sequence[int],
+    placings: Sequence[_Placing],
+    weights: Sequence[float],
+) -> DriveJoin:
+    """Find the pair of steps, one of each list, that is most probably at one place."""
+    joins = (
+        DriveJoin(
+            i,
+            j,
+            math.fsum(w for w, at in zip(weights, placings, strict=True) if at[i] == at[j]),
+        )
+        for i in here
+        for j in there
+    )
+    return max(joins, key=lambda join: join.share)
+
+
+def _percent(share: float) -> str:
+    """Write a share in percent, but never as 100 %, as some map differs."""
+    return "above 99%" if share >= 0.995 else f"{share:.0%}"
