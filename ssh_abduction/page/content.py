@@ -27,6 +27,7 @@ from ssh_abduction.page.replays import Run, replays
 from ssh_abduction.rivals.comparison import compare
 from ssh_abduction.rivals.drive_joins import DrivePair, joins_of_drives
 from ssh_abduction.rivals.listing import Listing, Maps
+from ssh_abduction.solver import probability_in_words
 
 DRAWING = 3.0  # processor seconds for the drawings of all maps except the first
 DRAWN = 10_000  # dstates of all drawings together; more would make the page too large
@@ -139,7 +140,7 @@ def _shared(listing: Listing) -> dict[str, Any] | None:
     return None if dstates.untold else {"always": dstates.always, "sometimes": dstates.sometimes}
 
 
-def _joins(listing: Listing) -> list[tuple[int, int, float | None]]:
+def _joins(listing: Listing) -> list[tuple[int, int, str | None]]:
     """List the joins of the first map that a reader may doubt, the most doubtful ones first.
 
     Each is two steps and the probability of their join; None if the join rests on minimality alone.
@@ -147,7 +148,7 @@ def _joins(listing: Listing) -> list[tuple[int, int, float | None]]:
     if listing.weighed is None or listing.weighed.doubt:
         return [(join.first, join.second, None) for join in listing.by_minimality[:JOINS]]
     doubted = [join for join in listing.weighed.joins if join[2] < DOUBTED]
-    return [(first, second, round(share, 2)) for first, second, share in doubted[:JOINS]]
+    return [(i, j, probability_in_words(share)) for i, j, share in doubted[:JOINS]]
 
 
 def _drives(listing: Listing) -> dict[str, Any]:
@@ -163,7 +164,7 @@ def _drives(listing: Listing) -> dict[str, Any]:
             {
                 "sentence": f"{pair.first} and {pair.second}: {_shared_by(pair)}",
                 "joins": [
-                    (first[pair.first] + j.first, first[pair.second] + j.second, round(j.share, 2))
+                    (first[pair.first] + j.first, first[pair.second] + j.second, j.percent)
                     for j in (*pair.forced, *pair.possible)[:JOINS]
                 ],
             }
@@ -176,12 +177,9 @@ def _shared_by(pair: DrivePair) -> str:
     """Say how many places two drives share."""
     if not pair.forced and not pair.possible:
         return f"no {pair.of} in common in any map"
-    told = [
-        f"{counted(len(joins), f'{pair.of}s')} in common in {where}"
-        for joins, where in ((pair.forced, "all maps"), (pair.possible, "some maps"))
-        if joins
-    ]
-    return ", ".join(told)
+    told = [f"{counted(len(pair.forced), f'{pair.of}s')} in common in all maps"]
+    told += [f"{counted(len(pair.possible), 'possible joins')}, in some maps"]
+    return "; ".join(told[not pair.forced : 1 + bool(pair.possible)])
 
 
 class _Pool:

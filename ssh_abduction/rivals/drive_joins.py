@@ -23,6 +23,7 @@ from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.words import counted
 from ssh_abduction.rivals.listing import Listing
 
+ALMOST = 1 - 1e-9  # a join that some map has not
 SHOWN = 6  # a sentence names at most this many joins of a kind
 
 _Placing: TypeAlias = Sequence[int]  # the place of each step by one map; without places, the dstate
@@ -42,6 +43,11 @@ class DriveJoin:
     first: int
     second: int
     share: float
+
+    @property
+    def percent(self) -> str:
+        """The share in percent. Below 100 %, it is not rounded up to it."""
+        return "above 99%" if 0.995 <= self.share < 1 else f"{self.share:.0%}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +88,7 @@ class DrivePair:
         """Put joins into words: "monday:2 = tuesday:0". At most SHOWN of them are named."""
         shown = [
             f"{self.first}:{join.first} = {self.second}:{join.second}"
-            + ("" if joins is self.forced else f", {_percent(join.share)}")
+            + ("" if joins is self.forced else f", {join.percent}")
             for join in joins[:SHOWN]
         ]
         more = len(joins) - SHOWN
@@ -164,7 +170,7 @@ def _pair(
             first, second = join.first - one.first, join.second - other.first
             is_forced = all(at[join.first] == at[join.second] for at in placings)
             (forced if is_forced else possible).append(
-                DriveJoin(first, second, 1.0 if is_forced else join.share)
+                DriveJoin(first, second, 1.0 if is_forced else min(join.share, ALMOST))
             )
     possible.sort(key=lambda join: -join.share)
     return DrivePair(one.name, other.name, of, tuple(forced), tuple(possible), excluded, proven)
@@ -201,8 +207,3 @@ def _surest(
         for j in there
     )
     return max(joins, key=lambda join: join.share)
-
-
-def _percent(share: float) -> str:
-    """Write a share in percent, but never as 100 %, as some map differs."""
-    return "above 99%" if share >= 0.995 else f"{share:.0%}"

@@ -139,7 +139,7 @@ def _joins_of_drives(solution: Solution) -> str:
         (
             f"{pair.first}:{join.first}",
             f"{pair.second}:{join.second}",
-            f"{join.share:.2f}",
+            join.percent,
             "" if join not in pair.forced else "forced" if pair.proven else "in all maps found",
         )
         for pair in pairs

@@ -54,7 +54,7 @@ function tellDrives() {
       element(
         "button",
         { title: "choose these two steps" },
-        `${called(a)} = ${called(b)}: ${share.toFixed(2)}`,
+        `${called(a)} = ${called(b)}: ${share}`,
         item,
       ).addEventListener("click", () => {
         state.picked = [a, b];

@@ -67,7 +67,7 @@ function tellDoubts() {
     ? "The best map joins these steps. Their probability, by the maps that are known:"
     : "These joins of map 1 rest on minimality alone. The others follow from them:";
   for (const [a, b, probability] of data.joins) {
-    const text = `steps ${called(a)} and ${called(b)}${weighed ? `: ${probability.toFixed(2)}` : ""}`;
+    const text = `steps ${called(a)} and ${called(b)}${weighed ? `: ${probability}` : ""}`;
     const item = element("li", {}, null, $("joins"));
     element("button", {}, text, item).addEventListener("click", () => {
       state.picked = [a, b];
