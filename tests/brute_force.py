@@ -302,7 +302,7 @@ def _labellings(trace: Trace, on: Axioms) -> Iterator[Labels]:
     def allowed(labels: Labels) -> bool:
         last = len(labels) - 1
         for i in range(last):
-            # C1: a dstate has one view. A view that is unknown may be any.
+            # C1: a dstate has one view. An unknown view may be any view.
             if (
                 "functional_view" in on
                 and labels[i] == labels[last]
