@@ -110,6 +110,11 @@ def test_a_robot_that_was_carried_away_finds_its_circuit_again() -> None:
     )
     assert SSHMap.from_dict(solution.maps[0].to_dict()).faults == (fault,)
     assert check(trace, solution.maps[0], solution.theory) == ()
+
+
+@pytest.mark.slow
+def test_speedups_change_no_map_of_a_robot_that_was_carried_away() -> None:
+    trace, solution = circuit(18, (9,)), carried()
     plain = solve(trace, solution.theory, speedups=Speedups.without(SPEEDUPS), max_maps=None)
     assert plain.maps == solution.maps
 

@@ -424,16 +424,19 @@ def test_two_runs_are_compared(
     assert told["count"] == len(told["others"]["both"])
 
 
-def test_a_process_of_its_own_maps_a_log_and_one_that_is_killed_loses_its_log_alone(
-    hall: Path, tmp_path: Path
-) -> None:
+@pytest.mark.slow
+def test_a_process_of_its_own_maps_a_log(hall: Path, tmp_path: Path) -> None:
     question = MapQuestion(None, {}, {}, 0.5, 1000.0, 1, False)
     small = tmp_path / "small.log"
     small.write_text("\n".join(hall.read_text().splitlines()[:80]) + "\n")
     (answer,) = answers_here(question, [str(small)], 2, StopFlag())
     assert answer.code in (0, 10)
     assert dict(answer.files)["run.json"]
-    lost = question.lost(workers.Lost(0, late=False), str(small))
+
+
+def test_a_process_that_is_killed_loses_its_log_alone(hall: Path) -> None:
+    question = MapQuestion(None, {}, {}, 0.5, 1000.0, 1, False)
+    lost = question.lost(workers.Lost(0, late=False), str(hall))
     assert (lost.code, "got killed" in lost.line) == (1, True)
 
 

@@ -25,7 +25,7 @@ from ssh_abduction.robot_logs.log_report import report
 @pytest.fixture(scope="module")
 def house() -> LogMap:
     """The map of a drive through a house of six rooms and a hall."""
-    scans = every_second_beam(scans_of(record(World.named("doors"), every=0.5)))
+    scans = every_second_beam(scans_of(record(World.named("doors"), every=0.8)))
     return map_log(RobotLog(scans, source="house"), time_limit=20, with_ladder=False)
 
 

@@ -68,6 +68,7 @@ def joint(halves: tuple[RobotLog, RobotLog]) -> tuple[RobotLog, Imported, list[I
     return *join_logs(halves, parts), parts
 
 
+@pytest.mark.slow
 def test_joint_logs_number_scans_and_visits_over_all_drives(
     joint: tuple[RobotLog, Imported, list[Imported]], halves: tuple[RobotLog, RobotLog]
 ) -> None:

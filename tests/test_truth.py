@@ -85,6 +85,7 @@ def test_a_map_is_true_if_its_dstates_and_its_places_are() -> None:
     assert not truth.is_true(ssh_map, replace(known, places=("here",) * len(known.places)))
 
 
+@pytest.mark.slow
 def test_the_table_says_which_maps_are_true(capsys: pytest.CaptureFixture[str]) -> None:
     """On the route of ACES3 views and openings alone are explained by 19 dstates, of which no map
     is true."""

@@ -5,7 +5,7 @@ contradicts all minimal maps, the mapper keeps several explanations with probabi
 steps decide which map is right. A dstate (distinctive state) is a place and a direction.
 
 >>> from ssh_abduction import OnlineMapper, Theory
->>> mapper = OnlineMapper("v0", Theory.causal().replace(misread=1.5, slipped=3))
+>>> mapper = OnlineMapper("v0", Theory.causal().replace(misread=1.5, slipped=3), time_limit=10)
 >>> for t in range(1, 20):
 ...     _ = mapper.observe(("right", "travel")[(t - 1) % 2], f"v{t % 4}" if t != 17 else "v3")
 ...     if t >= 16:
