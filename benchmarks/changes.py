@@ -1,6 +1,7 @@
 """Are the gateways found that changed between two drives?
 
     python benchmarks/changes.py [--cells 4] [--steps 60] [--seeds 20] [--first SEED] [--most 3]
+    python benchmarks/changes.py --plans FOLDER [--steps 60] [--seeds 1] [--first SEED] [--most 3]
 
 Two robots drive through a maze with stars and noisy displacements, and start anywhere. Before the
 second drive, 0 to `--most` ways between cells are closed or opened, at a cell that the first drive
@@ -9,6 +10,9 @@ prints a row in Markdown for each number of changes: how many gateways changed a
 drives saw, how many of these the first map names, and how many others it names. It names each map
 that is false, and each change that is missed.
 
+With --plans, the robots drive through each floor plan of a folder. Stars are the bearings of open
+doors. Some doors are closed on one of the two drives: on the second one if the seed is even.
+
 With --beam, only the beams of width 1 and of this width search, without a time limit. So the load
 of the machine does not matter. Their cheapest map is judged.
 """
@@ -16,25 +20,35 @@ of the machine does not matter. Their cheapest map is judged.
 from __future__ import annotations
 
 import argparse
+import math
 import random
 import sys
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from itertools import product
+from pathlib import Path
 
+import networkx as nx
+import numpy as np
 from instances import HEADINGS, doors_of, maze
 from together import joined
-from truth import NOISE, Known, is_true
+from truth import NOISE, Known, is_true, told
 
+from simulator.motion import between, reported
+from simulator.plan_tours import Floor, Stand
+from simulator.plans import Plan
 from ssh_abduction import SSHMap, Theory, Trace, solve
-from ssh_abduction.data import Odometry
+from ssh_abduction.data import Action, Odometry, Step
+from ssh_abduction.data.star import Gateway as Sighted
 from ssh_abduction.solver.guesses.beam import Beam
 from ssh_abduction.solver.misfit import Misfit
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import settle
 
 Cell = tuple[int, int]
-Gateway = tuple[Cell, int]  # a cell, and 0 to 3 for north, east, south, west
+# A cell, and 0 to 3 for north, east, south, west; or a room, and a door of the plan.
+Gateway = tuple[Cell, int] | tuple[str, int]
 
 
 @dataclass(frozen=True)
@@ -84,6 +98,161 @@ def _other(gateway: Gateway) -> Gateway:
     return (x + HEADINGS[way][0], y + HEADINGS[way][1]), (way + 2) % 4
 
 
+def case_of_plan(plan: Plan, steps: int, seed: int, changes: int, views: int) -> Case:
+    """Make two drives through a plan. Some doors are closed on one of them.
+
+    The doors are those of rooms that the other drive saw, without which the plan is in one piece.
+    """
+    plan, chance = plan.told_apart(), random.Random(f"{plan.name}, {seed}, {changes}")
+    looks: dict[str, str] = {}
+    closed: list[int] = []
+    drives: list[Known] = []
+    for number in range(2):
+        trace = _plan_drive(plan, steps, (seed, number), closed)
+        states = [step.truth["dstate"] for step in trace.steps]
+        for state in sorted({*states} - looks.keys()):
+            looks[state] = f"v{chance.randrange(views)}"
+        drives.append(told("", trace.with_views([looks[state] for state in states])))
+        if not number:
+            closed = _closable(plan, {*drives[0].places}, changes, chance)
+    both = {*drives[0].places} & {*drives[1].places}
+    ends = {(f"room {room}", door) for door in closed for room in plan.doors[door].rooms}
+    name = f"{plan.name}, {seed}, {changes} changes"
+    known = joined(name, drives[:: 1 if seed % 2 == 0 else -1])
+    return Case(known, frozenset(end for end in ends if end[0] in both))
+
+
+def _closable(plan: Plan, seen: Collection[object], count: int, chance: random.Random) -> list[int]:
+    """Choose doors of rooms that were seen, without which the plan is still connected.
+
+    No path leads straight on through such a door: a robot that comes to a closed door ahead would
+    not know how the path bends.
+    """
+    bent = {g.door for found in plan.gateways for g in found if g.opposite is not None}
+    doors = [
+        d
+        for d, door in enumerate(plan.doors)
+        if d not in bent and {f"room {r}" for r in door.rooms} & {*seen}
+    ]
+    graph, found = nx.MultiGraph(plan.graph.subgraph(plan.connected)), list[int]()
+    for door in chance.sample(doors, len(doors)):
+        ends = plan.doors[door].rooms
+        if len(found) < count and {*ends} <= {*graph}:
+            graph.remove_edge(*ends, door)
+            if nx.is_connected(graph):
+                found.append(door)
+            else:
+                graph.add_edge(*ends, door)
+    return found
+
+
+def _plan_drive(plan: Plan, steps: int, seed: tuple[int, int], closed: Collection[int]) -> Trace:
+    """Drive through a plan with some closed doors, which stars lack.
+
+    The name of a turn has its angle, too.
+    """
+    floor, noise = Floor(plan), Odometry(**NOISE)
+    walk, drawn, sighted = (np.random.default_rng([*seed, k]) for k in range(3))
+    logged: list[Step] = []
+    before = None
+    for stand, action in _rounds(floor, steps, walk, closed):
+        heading = _heading(plan, stand)
+        pose = (
+            *plan.rooms[stand.room].centre,
+            math.remainder(math.radians(90 - heading), math.tau),
+        )
+        moved = None if before is None else between(before, pose)
+        if moved is not None:
+            moved = reported(moved, noise, drawn)
+        truth = {
+            "place": f"room {stand.room}",
+            "dstate": f"room {stand.room}, {stand.gateway}, {stand.faces}",
+            "heading": heading,
+        }
+        star = _open_gateways(floor, stand, closed, sighted)
+        logged.append(Step("?", action, star, moved, truth=truth))
+        before = pose
+    return Trace(tuple(logged), odometry=noise)
+
+
+def _heading(plan: Plan, stand: Stand) -> float:
+    gateway = plan.gateways[stand.room][stand.gateway]
+    return (gateway.bearing + (0 if stand.faces else 180)) % 360
+
+
+def _open_gateways(
+    floor: Floor, stand: Stand, closed: Collection[int], chance: np.random.Generator
+) -> tuple[Sighted, ...]:
+    """The star of a room without its closed doors. Each bearing is off by at most the spread."""
+    found, heading = floor.plan.gateways[stand.room], _heading(floor.plan, stand)
+    is_open = [k for k, gateway in enumerate(found) if gateway.door not in closed]
+    off = chance.uniform(-floor.spread, floor.spread, len(found)).tolist()
+    bearing = {k: round(found[k].bearing - heading + off[k], 3) % 360 for k in is_open}
+    order = sorted(is_open, key=lambda k: bearing[k])
+    opposite = {k: found[k].opposite for k in order}
+    return tuple(
+        Sighted(bearing[k], floor.spread, order.index(x) if (x := opposite[k]) in order else None)
+        for k in order
+    )
+
+
+def _rounds(
+    floor: Floor, steps: int, chance: np.random.Generator, closed: Collection[int]
+) -> Iterator[tuple[Stand, Action | None]]:
+    """Drive to the open door that was passed least often; yield each state and the next action."""
+    plan = floor.plan
+    usable = [[k for k, g in enumerate(r) if g.door not in closed] for r in plan.gateways]
+    room = int(chance.choice([room for room in plan.connected if usable[room]]))
+    stand, came_by = Stand(room, usable[room][0]), None
+    passed: Counter[int] = Counter()
+    while True:
+        found = plan.gateways[stand.room]
+        choices = [k for k in usable[stand.room] if found[k].door != came_by]
+        choices = choices or usable[stand.room]
+        least = min(passed[found[k].door] for k in choices)
+        goal = int(chance.choice([k for k in choices if passed[found[k].door] == least]))
+        for action, after in floor.way_through(stand, goal):
+            if steps == 0:
+                yield stand, None
+                return
+            yield stand, _renamed(action, plan, stand, goal, closed)
+            stand, steps = after, steps - 1
+        came_by = found[goal].door
+        passed[came_by] += 1
+
+
+def _renamed(
+    action: Action, plan: Plan, stand: Stand, goal: int, closed: Collection[int]
+) -> Action:
+    """A turn right or left, with its number among the open doors, and its angle in its name.
+
+    Where a door is closed, the numbers of others change. So the numbers alone would name turns to
+    several doors from one dstate.
+    """
+    if action.turn not in ("right", "left"):
+        return action
+    found, heading = plan.gateways[stand.room], _heading(plan, stand)
+    bearings = {k: round((g.bearing - heading) % 360, 3) % 360 for k, g in enumerate(found)}
+    beside = sorted(
+        (bearings[k] for k, g in enumerate(found) if bearings[k] > 0 and g.door not in closed),
+        reverse=action.turn == "left",
+    )
+    number = beside.index(bearings[goal]) + 1
+    name = f"{action.turn} by {bearings[goal]:.0f} to gateway {number}"
+    return Action.of({"name": name, "kind": "turn", "turn": action.turn, "gateway": number})
+
+
+def named_doors(ssh_map: SSHMap, known: Known, plan: Plan) -> Iterator[Gateway]:
+    """The doors that a map says to have changed, by the true room and heading of the place."""
+    plan = plan.told_apart()
+    for fault in ssh_map.faults:
+        first = next(t for t, _ in enumerate(known.trace) if ssh_map.place_of(t) == fault.place)
+        room = int(str(known.places[fault.step]).split()[1])
+        heading = known.trace.steps[first].truth["heading"] + (fault.bearing or 0)
+        off = [abs((g.bearing - heading + 180) % 360 - 180) for g in plan.gateways[room]]
+        yield f"room {room}", plan.gateways[room][off.index(min(off))].door
+
+
 def named(ssh_map: SSHMap, known: Known) -> Iterator[Gateway]:
     """The gateways that a map says to have changed, by the true cell and heading of the step."""
     for fault in ssh_map.faults:
@@ -116,32 +285,44 @@ def main() -> None:
     parser.add_argument("--least", type=int, default=0, metavar="N", help="the fewest changes")
     parser.add_argument("--price", type=float, default=1.2, metavar="DSTATES")
     parser.add_argument("--limit", type=float, default=20, metavar="S", help="seconds for each")
+    parser.add_argument("--plans", type=Path, metavar="FOLDER", help="tours of floor plans")
     parser.add_argument("--beam", type=int, metavar="WIDTH", help="search by beams alone")
     options = parser.parse_args()
+    plans = sorted(options.plans.glob("*.xml")) if options.plans else []
     theory = Theory(changed=options.price, star="frame")
+    if plans:
+        theory = Theory(changed=options.price, star="gateways", boundary="none")
     print("| changes | true maps | changed gateways | named | others named | maps that name none |")
     print("|---|---|---|---|---|---|")
     for changes in range(options.least, options.most + 1):
         true = changed = found = others = none = 0
-        for seed in range(options.first, options.first + options.seeds):
-            one = case(options.cells, options.steps, seed, changes, options.views)
+        seeds = range(options.first, options.first + options.seeds)
+        rows = [*product([Plan.load(path) for path in plans] or [None], seeds)]
+        for plan, seed in rows:
+            one = (
+                case(options.cells, options.steps, seed, changes, options.views)
+                if plan is None
+                else case_of_plan(plan, options.steps, seed, changes, options.views)
+            )
             trace = one.known.trace
             best = (
                 solve(trace, theory, time_limit=options.limit).maps[0]
                 if options.beam is None
                 else cheapest(trace, theory, options.beam)
             )
-            told = set(named(best, one.known))
-            if told != one.changed or not is_true(best, one.known):
-                missed, more = sorted(one.changed - told), sorted(told - one.changed)
+            said = {
+                *(named(best, one.known) if plan is None else named_doors(best, one.known, plan))
+            }
+            if said != one.changed or not is_true(best, one.known):
+                missed, more = sorted(one.changed - said), sorted(said - one.changed)
                 print(f"{one.known.name}: missed {missed}, others {more}", file=sys.stderr)
             true += is_true(best, one.known)
             changed += len(one.changed)
-            found += len(told & one.changed)
-            others += len(told - one.changed)
-            none += not told
+            found += len(said & one.changed)
+            others += len(said - one.changed)
+            none += not said
         print(
-            f"| {changes} | {true} of {options.seeds} | {changed} | {found} | {others} | {none} |",
+            f"| {changes} | {true} of {len(rows)} | {changed} | {found} | {others} | {none} |",
             flush=True,
         )
 

@@ -22,13 +22,14 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from itertools import combinations, permutations, product
+from itertools import combinations, pairwise, permutations, product
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from brute_geometry import Geometry
 from scipy.special import chdtri
 
+from ssh_abduction.data.drives import drives_of
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.star import Gateway, Openings, Star
@@ -520,6 +521,64 @@ def _named(
     return extend({})
 
 
+def fewest_gateway_changes(
+    trace: Trace, labels: Labels, places: tuple[int, ...], courses: Courses, on: Axioms
+) -> int | None:
+    """The fewest gateways that differ between drives, over all readings; None if there are none.
+
+    At most two differ between two drives at a place. Paths may end anywhere.
+    """
+    at = [places[label] for label in labels]
+    total = 0
+    for place in set(at):
+        steps = [t for t in range(len(labels)) if at[t] == place]
+        counts = list(_counts_of_changes(steps, trace, labels, courses, on))
+        if not counts:
+            return None
+        total += min(counts)
+    return total
+
+
+def _counts_of_changes(
+    steps: list[int], trace: Trace, labels: Labels, courses: Courses, on: Axioms
+) -> Iterator[int]:
+    """Yield the number of changes at a place for each reading of its steps."""
+    drive = {t: k for k, d in enumerate(drives_of(trace)) for t in range(d.first, d.stop)}
+
+    def extend(chosen: dict[int, tuple[Named, ...]]) -> Iterator[int]:
+        shut = {drive[i]: {k for k, g in enumerate(seen) if g[0] < 0} for i, seen in chosen.items()}
+        if len(chosen) == len(steps):
+            counts = [len(a ^ b) for a, b in pairwise(shut[d] for d in sorted(shut))]
+            if max(counts, default=0) <= 2:
+                yield sum(counts)
+            return
+        step = steps[len(chosen)]
+        for reading in {r for plain in _readings(trace.steps[step]) for r in _with_closed(plain)}:
+            for k in range(max(len(reading), 1)) if chosen else (0,):
+                turned = reading[k:] + reading[:k]
+                here = {j for j, g in enumerate(turned) if g[0] < 0}
+                if shut.get(drive[step], here) == here and all(
+                    _agree(
+                        i, seen, step, turned, trace, labels, courses, on, drive[i] == drive[step]
+                    )
+                    for i, seen in chosen.items()
+                ):
+                    yield from extend({**chosen, step: turned})
+
+    return extend({})
+
+
+def _with_closed(reading: tuple[Named, ...]) -> Iterator[tuple[Named, ...]]:
+    """A reading with up to two closed gateways, in any direction, anywhere between the others."""
+    closed: Named = (-1, 0, 180)
+    yield reading
+    for k in range(max(len(reading), 1)):
+        one = (*reading[: k + 1], closed, *reading[k + 1 :])
+        yield one
+        for j in range(max(len(reading), 1)):
+            yield (*one[: j + 1], closed, *one[j + 1 :])
+
+
 def _readings(step: Step) -> list[tuple[Named, ...]]:
     """The gateways (number in the star, bearing, spread) from ahead clockwise, with or without each
     that was not observed."""
@@ -553,8 +612,9 @@ def _agree(
     labels: Labels,
     courses: Courses,
     on: Axioms,
+    one_drive: bool = True,
 ) -> bool:
-    """Whether steps i < t at one place may see so."""
+    """Whether steps i < t at one place may see so. Closed gateways have the number -1."""
     stars = [Star.of(trace.steps[step].star or ()).gateways for step in (i, t)]
     rotations: set[int] = set()
     if len(seen_i) == len(seen_t):
@@ -565,18 +625,21 @@ def _agree(
                 _off(b, c + r) <= d + e for (_, b, d), (_, c, e) in zip(seen_i, seen_t, strict=True)
             )
         }
-        pairs = {(a[0], b[0]) for a, b in zip(seen_i, seen_t, strict=True)}
+        both = [(a[0], b[0]) for a, b in zip(seen_i, seen_t, strict=True)]
+        pairs = {(j, k) for j, k in both if j >= 0 and k >= 0}
         for j, k in pairs:
             there = [(stars[0][j].opposite, stars[1][k].opposite)]
             known = [
                 (a, b)
                 for a, b in there
-                if a in {p for p, _ in pairs} and b in {q for _, q in pairs}
+                if a in {g[0] for g in seen_i} and b in {g[0] for g in seen_t}
             ]
             if any(pair not in pairs for pair in known):
                 rotations = set()
     if "gateway_frame" in on and not rotations:
         return False
+    alike = seen_i == seen_t
+    seen_i, seen_t = (tuple(g for g in seen if g[0] >= 0) for seen in (seen_i, seen_t))
     if (
         "gateway_turn" in on
         and t == i + 1
@@ -601,7 +664,7 @@ def _agree(
     if "gateway_heading" in on and one:
         if not facing["same"][0]:
             return False
-        if stars[0] == stars[1] and seen_i != seen_t:
+        if one_drive and stars[0] == stars[1] and not alike:
             return False
     if "gateway_dstate" in on and facing["same"][1] and not one:
         return False

@@ -17,11 +17,13 @@ from brute_force import (
     _goes_straight,
     _headings,
     consistent_maps,
+    fewest_gateway_changes,
     key,
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import STARS, traces
+from test_gateways import traces as bearings
 
 from ssh_abduction import SSHMap, Theory, Trace, explain_pair, solve
 from ssh_abduction.checker.checker import check
@@ -132,6 +134,45 @@ def test_the_solver_lists_the_maps_with_changes_of_the_brute_force(data: st.Data
         assert 10 * len(ssh_map.dstates) + sum(10 * f.cost for f in ssh_map.faults) == least[0]
 
 
+@st.composite
+def drives_at_bearings(draw: st.DrawFn) -> Trace:
+    """Tiny traces of two drives, whose stars are bearings. The second may lack a gateway."""
+    trace = draw(bearings().filter(lambda trace: 2 < len(trace) < 5))
+    start = draw(st.integers(1, len(trace) - 1))
+    steps = list(trace.steps)
+    for t in range(start, len(steps)):
+        star = steps[t].star or ()
+        if draw(st.booleans()) and all(getattr(g, "opposite", None) is None for g in star):
+            steps[t] = replace(steps[t], star=star[: draw(st.integers(0, len(star)))])
+    steps[start - 1] = replace(steps[start - 1], action=Action("tuesday", "start"))
+    return Trace(tuple(steps))
+
+
+@settings(max_examples=25)
+@given(drives_at_bearings(), st.sampled_from([0.5, 1.0, 2.0]))
+def test_maps_with_changes_at_bearings_are_those_of_the_brute_force(
+    trace: Trace, price: float
+) -> None:
+    theory = Theory(changed=price, star="gateways", boundary="none")
+    on = frozenset(settle(trace, theory).theory.axioms)
+    bare = theory.replace(changed=0.0, star="none")
+    costs: dict[Key, tuple[float, ...]] = {}
+    for found, counts in consistent_maps(trace, bare):
+        labels, places, courses = found
+        at = tuple(p for p in places if p is not None)
+        changes = fewest_gateway_changes(trace, labels, at, courses, on)
+        if changes is not None:
+            tenths = 10 * counts.dstates + round(10 * price) * changes
+            costs[found] = (tenths, counts.paths, counts.places)
+    least = min(costs.values(), default=(0.0,))
+    solution = solve(trace, theory, max_maps=None, time_limit=100)
+    assert solution.complete
+    assert {key(m) for m in solution.maps} == {k for k, cost in costs.items() if cost == least}
+    for ssh_map in solution.maps:
+        assert check(trace, ssh_map, theory) == ()
+        assert 10 * len(ssh_map.dstates) + sum(10 * f.cost for f in ssh_map.faults) == least[0]
+
+
 def test_a_change_has_a_name_and_a_place(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -220,7 +261,7 @@ def test_the_checker_judges_changes(faults: tuple[Fault, ...], said: str) -> Non
     [
         ({"changed": 1.5, "misread": 1.5}, "without other faults, .* got misread"),
         ({"changed": -1}, "changed: expected a number of dstates"),
-        ({"changed": 1.5, "star": "none"}, "read by star=frame, got star=none"),
+        ({"changed": 1.5, "star": "none"}, "read by star=frame or gateways, got"),
     ],
 )
 def test_theories_that_know_no_gateways_are_refused(theory: dict[str, Any], said: str) -> None:
@@ -283,3 +324,62 @@ def test_the_beam_finds_two_changes_where_a_drive_starts() -> None:
     ssh_map = next(beam.maps())
     assert ssh_map.labels == tuple(range(8)) * 8
     assert [(fault.kind, fault.place) for fault in ssh_map.faults] == [("changed", 0)] * 2
+
+
+THREE = [(0, 120, 240), (180,), (0,), (60, 180, 300)]
+
+
+def at_bearings(name: str, stars: list[Any]) -> Trace:
+    """A drive along a corridor and back. Its stars are bearings."""
+    return Trace.from_steps("abcd", ["travel", "around", "travel"], stars=stars, name=name)
+
+
+def test_a_change_at_a_bearing_has_a_name_and_a_place(tmp_path: Path) -> None:
+    """Gateways of three drives: one closes on Tuesday, and opens again on Wednesday."""
+    closed = [(0, 120.5), (180,), (0,), (180, 300)]
+    names = "monday", "tuesday", "wednesday"
+    again = [(0.5, 120, 240), *THREE[1:]]
+    drives = [at_bearings(n, s) for n, s in zip(names, (THREE, closed, again), strict=True)]
+    theory = Theory(changed=0.5)
+    solution = solve(drives, theory)
+    (ssh_map,) = solution.maps
+    assert ssh_map.dstate_at == tuple(range(4)) * 3
+    gateway = "the gateway at 240 degrees of place 0 was"
+    assert [*map(str, ssh_map.faults)] == [
+        f"{gateway} open on monday and closed on tuesday",
+        f"{gateway} closed on tuesday and open on wednesday",
+    ]
+    data = json.loads(json.dumps(ssh_map.to_dict()))
+    assert data["faults"][0]["bearing"] == 240
+    assert SSHMap.from_dict(data) == ssh_map
+    data["faults"][0]["bearing"] = 360
+    with pytest.raises(MapError, match="bearing: expected degrees, 0 to 359"):
+        SSHMap.from_dict(data)
+    trace = together(drives)
+    assert check(trace, ssh_map, theory) == ()
+    for faults, said in (
+        ((), "was open on monday and closed on tuesday: the map hides it"),
+        ((replace(ssh_map.faults[0], bearing=120),), "but no drives show it"),
+        ((*ssh_map.faults, ssh_map.faults[0]), "twice"),
+    ):
+        wrong = replace(ssh_map, faults=faults)
+        assert any(said in v.message for v in check(trace, wrong, theory))
+    assert {"gateway_frame"} <= {v.axiom for v in check(trace, ssh_map, Theory())}
+
+
+def test_a_path_leads_on_by_a_gateway_that_is_closed_on_a_drive() -> None:
+    """The second drive starts where the gateway ahead is closed, and comes by it later."""
+    go = ["around", "travel", "travel"]
+    monday = Trace.from_steps("xabc", go, stars=[(180,), (0,), (0, 180), (180,)], name="monday")
+    tuesday = Trace.from_steps("b", [], stars=[(180,)], name="tuesday")
+    theory = Theory(changed=0.5, star="gateways")
+    (ssh_map, *_) = solve([monday, tuesday], theory).maps
+    assert ssh_map.labels == ((0, 1, 2, 3), (2,))
+    assert [fault.bearing for fault in ssh_map.faults] == [0]
+
+
+def test_three_changes_at_one_place_are_too_many() -> None:
+    four = at_bearings("monday", [(0, 60, 120, 240), *THREE[1:3], (60, 180, 240, 300)])
+    one = at_bearings("tuesday", [(0,), *THREE[1:3], (180,)])
+    (ssh_map, *_) = solve([four, one], Theory(changed=0.1, star="gateways")).maps
+    assert ssh_map.place_of(0) != ssh_map.place_of(4)

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from functools import partial
 
 from ssh_abduction.checker.reading import Check, Found, Reading
-from ssh_abduction.data.gateways import Sight, Turns, by_place, fit, sights_of
+from ssh_abduction.data.drives import drives_of
+from ssh_abduction.data.gateways import Sight, Turns, by_place, changes_of, fit, sights_of
 
 NAMES = (
     "gateway_frame",
@@ -71,7 +72,31 @@ def clashes(sights: Sequence[Sight], turns: Turns, axioms: Collection[str]) -> I
 
 def _clashes_of(m: Reading) -> list[Clash]:
     """List the clashes of a map."""
-    return list(clashes(*sights_of(m.trace, m.map, m.onward), m.axioms))
+    return list(clashes(*_sights_of(m), m.axioms))
+
+
+def _sights_of(m: Reading) -> tuple[list[Sight], Turns]:
+    """The sights of a map; with a price of changes, each drive has its own."""
+    return sights_of(m.trace, m.map, m.onward, bool(m.theory.changed))
+
+
+def changes(m: Reading) -> Iterator[tuple[int, int, int, str, str]]:
+    """Yield each gateway at a bearing that differs between a drive and the one before at its place.
+
+    Each is a place, a bearing, the first step of the later drive there, and what the earlier and
+    the later drive saw, in words.
+    """
+    names = [drive.name for drive in drives_of(m.trace)]
+    for found in changes_of(*_sights_of(m), m.axioms):
+        was, now = (names[drive] for drive in found.drives)
+        is_open, was_open = (("closed", "open"), ("open", "closed"))[found.is_open]
+        yield (
+            found.place,
+            found.bearing,
+            found.step,
+            f"{was_open} on {was}",
+            f"{is_open} on {now}",
+        )
 
 
 def _gateways(name: str, m: Reading) -> Found:

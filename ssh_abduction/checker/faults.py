@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
+from ssh_abduction.checker import clashes
 from ssh_abduction.checker.reading import Found, Reading
 from ssh_abduction.checker.stars import changes
 from ssh_abduction.data.maps import Fault
@@ -15,12 +17,12 @@ def faults_are_allowed(m: Reading) -> Found:
     A fault must be listed once, with the view or action that the trace has at its step, and with
     the cost that the theory sets. If gateways may change, all changes must be listed.
     """
-    steps, named = m.trace.steps, set[tuple[str, int, int | None]]()
+    steps, named = m.trace.steps, set[tuple[object, ...]]()
     for fault in m.map.faults:
         i, kind = m.named(fault.step), fault.kind
         if what := _what_is_wrong(m, fault):
             yield [i] if 0 <= i < len(steps) else [], what
-        elif (kind, i, fault.gateway) in named:
+        elif (kind, i, fault.gateway, fault.bearing) in named:
             yield [i], f"The map names the fault of step {i} ({kind}) twice."
         if _is_allowed(m, kind) and 0 <= i < len(steps):
             price = m.theory.fault_tenths(kind, steps[i])
@@ -30,13 +32,26 @@ def faults_are_allowed(m: Reading) -> Found:
                     f"The fault of step {i} ({kind}) costs {fault.cost:g} dstates in the map, and "
                     f"{price / 10:g} by the theory.",
                 )
-        named.add((kind, i, fault.gateway))
+        named.add((kind, i, fault.gateway, fault.bearing))
     if m.theory.changed:
-        told = {(f.place, f.gateway, f.step, f.expected, f.seen) for f in m.map.faults}
-        for change in changes(m):
+        told = {_told(f) for f in m.map.faults}
+        for change in _changes(m):
             if change not in told:
                 p, slot, i, was, now = change
-                yield [i], f"Gateway {slot} of place {p} was {was} and {now}: the map hides it."
+                way = f"{slot} degrees" if m.theory.star == "gateways" else f"slot {slot}"
+                said = f"The gateway at {way} of place {p} was {was} and {now}: the map hides it."
+                yield [i], said
+
+
+def _changes(m: Reading) -> Iterator[tuple[int, int, int, str, str]]:
+    """Yield the gateways that differ between drives."""
+    return clashes.changes(m) if m.theory.star == "gateways" else changes(m)
+
+
+def _told(fault: Fault) -> tuple[object, ...]:
+    """What a map says of a change."""
+    where = fault.gateway if fault.bearing is None else fault.bearing
+    return fault.place, where, fault.step, fault.expected, fault.seen
 
 
 def _is_allowed(m: Reading, kind: str) -> bool:
@@ -78,10 +93,9 @@ def _what_is_wrong(m: Reading, fault: Fault) -> str | None:
                 f"{s.view if s else None!r}."
             )
     if kind == "changed":
-        told = (fault.place, fault.gateway, i, fault.expected, fault.seen)
         return (
             None
-            if told in list(changes(m))
+            if _told(fault) in list(_changes(m))
             else f"The map says that {fault}, but no drives show it."
         )
     if kind == "slipped" and step.action and fault.seen != step.action.name:

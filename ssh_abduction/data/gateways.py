@@ -1,13 +1,5 @@
 """Fit the stars seen at each place of a map into one frame, for theories with star=gateways.
 
->>> from ssh_abduction.data.gateways import rotations
->>> from ssh_abduction.data.star import Star
->>> corner = Star.of((0, 120)).frames[0]
->>> min(rotations(corner, corner, 0)), max(rotations(corner, corner, 0))
-(0, 359)
->>> rotations(corner, corner, 1)
-frozenset()
-
 A star is all gateways (ways out of a place) seen at a step, each with a bearing. A sight is a
 dstate (distinctive state: a place and a heading) with a star that is seen there. A sight numbers
 its gateways; the numbers are its slots. The sights at a place see the same gateways, but a
@@ -17,14 +9,16 @@ frame (which gateways exist) and a shift of the slots for each sight, such that 
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import combinations
+from itertools import combinations, pairwise
 
 from ssh_abduction.data.maps import DState, SSHMap
-from ssh_abduction.data.star import SPREAD, Frame, Star
+from ssh_abduction.data.rotations import leads, middle, rotations, turns_so, ways
+from ssh_abduction.data.star import CLOSED, MOST_CLOSED, Frame, Star
 from ssh_abduction.data.trace import Action, Trace
 from ssh_abduction.runtime.clock import look_at_clock
 
@@ -40,11 +34,12 @@ class Sight:
     Attributes:
         dstate: The dstate.
         star: The star.
-        step: The first step with this dstate and star.
+        step: The first step with this dstate and star, on this drive.
         shows: Whether this is the first sight of its dstate. That sight fixes the dstate's heading.
         first: Whether this is the first sight at its place. That sight has heading 0.
         onward: The directions in which the dstate's path goes on, in degrees: 0 (ahead), 180
             (behind), both or neither.
+        drive: The number of the drive; 0 for all if gateways cannot change between drives.
     """
 
     dstate: DState
@@ -53,6 +48,7 @@ class Sight:
     shows: bool
     first: bool
     onward: tuple[int, ...] = ()
+    drive: int = 0
 
     def __hash__(self) -> int:
         """Hash few fields. Sights are often hashed, and few of a map share these."""
@@ -63,18 +59,22 @@ Turns = Mapping[tuple[Sight, Sight], Collection[Action]]
 Turned = tuple[Frame, int]  # what a sight sees, and the shift of its slots
 
 
-def turned(trace: Trace, ssh_map: SSHMap, axioms: Collection[str]) -> SSHMap | None:
+def turned(
+    trace: Trace, ssh_map: SSHMap, axioms: Collection[str], changes: bool = False
+) -> SSHMap | None:
     """Replace the headings of a map by headings that all stars (gateways seen) of the trace allow.
 
     Args:
         trace: The trace, with stars.
         ssh_map: A map of the trace. Its own headings are ignored.
         axioms: Names of the axioms that hold.
+        changes: Whether gateways may change between drives.
 
     Returns:
         The map with new headings, or None if the stars of some place allow none.
     """
-    found = headings(*sights_of(trace, ssh_map, _onward_of(trace, ssh_map, axioms)), axioms)
+    onward = _onward_of(trace, ssh_map, axioms)
+    found = headings(*sights_of(trace, ssh_map, onward, changes), axioms)
     if any(s.place is not None and s.id not in found for s in ssh_map.dstates):
         return None
     return replace(
@@ -83,7 +83,10 @@ def turned(trace: Trace, ssh_map: SSHMap, axioms: Collection[str]) -> SSHMap | N
 
 
 def sights_of(
-    trace: Trace, ssh_map: SSHMap, onward: Callable[[DState], tuple[int, ...]]
+    trace: Trace,
+    ssh_map: SSHMap,
+    onward: Callable[[DState], tuple[int, ...]],
+    changes: bool = False,
 ) -> tuple[list[Sight], dict[tuple[Sight, Sight], set[Action]]]:
     """List the sights of a map (dstates with stars), and the turns between sights at one place.
 
@@ -91,24 +94,28 @@ def sights_of(
         trace: The trace, with stars.
         ssh_map: A map of the trace.
         onward: Returns `Sight.onward` for a dstate.
+        changes: Whether gateways may change between drives. Then each drive has sights of its own.
 
     Returns:
         The sights, sorted by first step; and a dict from pairs of sights to the turns that lead
         from the first sight of the pair to the second.
     """
     states = {s.id: s for s in reversed(ssh_map.dstates)}
-    sights: dict[tuple[int, Star], Sight] = {}
+    sights: dict[tuple[int, Star, int], Sight] = {}
     seen: list[Sight | None] = []
     shown: set[int] = set()
     places: set[int | None] = set()
+    drive = 0
     for i, (label, step) in enumerate(zip(ssh_map.dstate_at, trace.steps, strict=False)):
         s, star = states.get(label), step.gateways or Star(())
-        if s and (label, star) not in sights:
+        key = label, star, drive
+        if s and key not in sights:
             first = s.place not in places
-            sights[label, star] = Sight(s, star, i, label not in shown, first, onward(s))
+            sights[key] = Sight(s, star, i, label not in shown, first, onward(s), drive)
             shown.add(label)
             places.add(s.place)
-        seen.append(sights.get((label, star)))
+        seen.append(sights.get(key))
+        drive += changes and step.action is not None and step.action.starts
     turns: dict[tuple[Sight, Sight], set[Action]] = defaultdict(set)
     for a, b, action in zip(seen, seen[1:], trace.actions, strict=False):
         if a and b and action.kind == "turn" and a.dstate.place == b.dstate.place:
@@ -172,7 +179,7 @@ def headings(sights: Sequence[Sight], turns: Turns, axioms: Collection[str]) -> 
         fitted = fit(seen, turns, axioms, as_shown=False)
         for sight, (frame, shift) in zip(seen, fitted, strict=True) if fitted else ():
             if fitted and sight.shows:
-                found[sight.dstate.id] = _middle(rotations(fitted[0][0], frame, shift))
+                found[sight.dstate.id] = middle(rotations(fitted[0][0], frame, shift))
     return found
 
 
@@ -192,18 +199,21 @@ class Facing:
     ends: list[tuple[int, int]]
 
 
-def facing(trace: Trace, ssh_map: SSHMap, axioms: Collection[str]) -> Facing | None:
+def facing(
+    trace: Trace, ssh_map: SSHMap, axioms: Collection[str], changes: bool = False
+) -> Facing | None:
     """Fit the stars of a map in which some paths are not yet known to be one.
 
     Args:
         trace: The trace, with stars.
         ssh_map: A map of the trace. Its headings are ignored.
         axioms: Names of the axioms that hold.
+        changes: Whether gateways may change between drives.
 
     Returns:
         How the dstates face; None if no frame fits the stars of some place.
     """
-    sights, turns = sights_of(trace, ssh_map, lambda s: ())
+    sights, turns = sights_of(trace, ssh_map, lambda s: (), changes)
     found = Facing({}, [], [])
     held = {COURSE, *axioms} - {"gateway_end"}
     for seen in by_place(sights).values():
@@ -215,7 +225,7 @@ def facing(trace: Trace, ssh_map: SSHMap, axioms: Collection[str]) -> Facing | N
             found.ends.extend(
                 (s, towards)
                 for towards in (0, 180)
-                if not any(leads(frame, towards) for frame in sight.star.frames)
+                if not changes and not any(leads(frame, towards) for frame in sight.star.frames)
             )
         for (a, seen_a), (b, seen_b) in combinations(zip(seen, fitted, strict=True), 2):
             if are_opposite(seen_a, seen_b):
@@ -228,7 +238,7 @@ def are_opposite(seen_a: Turned, seen_b: Turned) -> bool:
     (first, back), (then, on) = seen_a, seen_b
     shift = (on - back) % max(first.slots, 1)
     found = rotations(first, then, shift)
-    return _ways(first, then, shift, found)[1] and not found & {90, 270}
+    return ways(first, then, shift, found)[1] and not found & {90, 270}
 
 
 def by_place(sights: Sequence[Sight]) -> dict[int, list[Sight]]:
@@ -245,6 +255,8 @@ def fit(
 ) -> list[Turned] | None:
     """Find a frame and a shift for each sight at a place so that all pairs satisfy the axioms.
 
+    Of several solutions, it has the fewest gateways that change between drives.
+
     Args:
         sights: The sights at one place.
         turns: The turns between sights.
@@ -259,8 +271,12 @@ def fit(
         (a, b, frozenset(actions)) for a in sights for b in sights if (actions := turns.get((a, b)))
     )
     headings = tuple(sight.dstate.heading for sight in sights) if as_shown else None
-    found = _fitted(tuple(sights), headings, made, frozenset(axioms))
-    return None if found is None else list(found)
+    drives = len({sight.drive for sight in sights})
+    for most in range(MOST_CLOSED * max(drives - 1, 0) + 1):
+        found = _fitted(tuple(sights), headings, made, frozenset(axioms), most)
+        if found is not None:
+            return list(found)
+    return None
 
 
 @lru_cache(maxsize=2**12)
@@ -269,6 +285,7 @@ def _fitted(
     headings: tuple[int | None, ...] | None,
     made: tuple[tuple[Sight, Sight, frozenset[Action]], ...],
     axioms: frozenset[str],
+    most: int,
 ) -> tuple[Turned, ...] | None:
     """Do what `fit` does, with a cache: maps of growing prefixes have many places in common.
 
@@ -278,15 +295,18 @@ def _fitted(
             that differ only in their heading are equal, so it is an argument of its own.
         made: Pairs of these sights, and the turns that lead from the first to the second.
         axioms: Names of the axioms that hold.
+        most: How many gateways may change between drives.
     """
     turns = {(a, b): actions for a, b, actions in made}
 
-    def extended(chosen: list[Turned]) -> tuple[Turned, ...] | None:
+    def extended(
+        chosen: list[Turned], closed: dict[int, frozenset[int]]
+    ) -> tuple[Turned, ...] | None:
         """Choose frames and shifts for the sights after the first `chosen`; None if none fit."""
         if len(chosen) == len(sights):
             return tuple(chosen)
         sight = sights[len(chosen)]
-        for frame in sight.star.frames:
+        for frame in _frames(sight.star, most):
             if "gateway_end" in axioms and not all(
                 leads(frame, towards) for towards in sight.onward
             ):
@@ -295,28 +315,112 @@ def _fitted(
             for shift in range(max(frame.slots, 1)) if chosen else (0,):
                 look_at_clock()
                 here = (frame, shift)
+                on_drives = {**closed, sight.drive: _closed(here)} if most else closed
+                # The steps of a drive see the same gateways.
+                if most and (
+                    closed.get(sight.drive, on_drives[sight.drive]) != on_drives[sight.drive]
+                    or _changes(on_drives) > most
+                ):
+                    continue
                 before = zip([*sights[: len(chosen)], sight], [*chosen, here], strict=True)
                 if all(
                     _allowed(other, turned, sight, here, turns, axioms, headings is not None)
                     for other, turned in before
                 ):
-                    read = extended([*chosen, here])
+                    read = extended([*chosen, here], on_drives)
                     if read is not None:
                         return read
         return None
 
-    return extended([])
+    return extended([], {})
 
 
-def _middle(found: Collection[int]) -> int:
-    """Return the middle of the longest arc in a set of rotations, in whole degrees.
+@lru_cache(maxsize=2**12)
+def _frames(star: Star, most: int) -> tuple[Frame, ...]:
+    """The frames of a star, also those with up to `most` gateways that are closed on its drive.
 
-    It is 0 if the set contains all rotations or none.
+    Each of these is open on another drive, and so counts as a change.
     """
-    starts = [r for r in sorted(found) if (r - 1) % 360 not in found]
-    ends = [next(d for d in range(1, 361) if (r + d) % 360 not in found) for r in starts]
-    length, start = max(zip(ends, [-r for r in starts], strict=True), default=(1, 0))
-    return (-start + (length - 1) // 2) % 360
+    if not most:
+        return star.frames
+    every = (wider for frame in star.frames for wider in frame.with_closed)
+    few = [frame for frame in every if frame.spreads.count(CLOSED) <= most]
+    return tuple(sorted(few, key=lambda frame: frame.spreads.count(CLOSED)))
+
+
+def _closed(read: Turned) -> frozenset[int]:
+    """The gateways that are closed, by their slots in the first sight of the place."""
+    frame, shift = read
+    return frozenset((k + shift) % frame.slots for k in range(frame.slots) if frame.is_closed(k))
+
+
+def _changes(closed: Mapping[int, frozenset[int]]) -> float:
+    """How many gateways differ between a drive and the one before at a place.
+
+    It is inf if too many differ between two drives.
+
+    Args:
+        closed: For each drive at the place, the gateways that are closed.
+    """
+    in_order = [closed[drive] for drive in sorted(closed)]
+    counts = [len(a ^ b) for a, b in pairwise(in_order)]
+    return sum(counts) if max(counts, default=0) <= MOST_CLOSED else math.inf
+
+
+@dataclass(frozen=True)
+class Change:
+    """A gateway that is open on one drive and closed on the drive that came there before or after.
+
+    Attributes:
+        place: The place.
+        bearing: Its direction in degrees, clockwise from the heading of the first dstate there.
+        step: The first step of the later drive there.
+        drives: The numbers of the earlier drive and of the later one.
+        is_open: Whether it is open on the later drive.
+    """
+
+    place: int
+    bearing: int
+    step: int
+    drives: tuple[int, int]
+    is_open: bool
+
+
+def changes_in(trace: Trace, ssh_map: SSHMap, axioms: Collection[str]) -> Iterator[Change]:
+    """Yield the gateways of a map that change between drives, as `changes_of`.
+
+    Args:
+        trace: The trace, with stars.
+        ssh_map: A map of the trace, with headings.
+        axioms: Names of the axioms that hold.
+    """
+    onward = _onward_of(trace, ssh_map, axioms)
+    yield from changes_of(*sights_of(trace, ssh_map, onward, changes=True), axioms)
+
+
+def changes_of(sights: Sequence[Sight], turns: Turns, axioms: Collection[str]) -> Iterator[Change]:
+    """Yield the gateways that change between drives, by a fit to the headings of the dstates.
+
+    Args:
+        sights: The sights of a map, with changes.
+        turns: The turns between sights at one place.
+        axioms: Names of the axioms that hold.
+    """
+    for place, seen in by_place(sights).items():
+        fitted = fit(seen, turns, axioms) or []
+        first_of = {s.drive: k for k, s in reversed([*enumerate(seen)])}
+        bearing: dict[int, int] = {}
+        for frame, shift in fitted:
+            turn = middle(rotations(fitted[0][0], frame, shift))
+            for k in range(frame.slots):
+                if not frame.is_closed(k):
+                    at = (frame.bearings[k] + turn) % 360
+                    bearing.setdefault((k + shift) % frame.slots, at)
+        for a, b in pairwise(sorted(first_of) if fitted else ()):
+            was, now = (_closed(fitted[first_of[drive]]) for drive in (a, b))
+            for slot in sorted(was ^ now):
+                step = seen[first_of[b]].step
+                yield Change(place, bearing[slot], step, (a, b), slot in was)
 
 
 def _allowed(
@@ -345,14 +449,14 @@ def _allowed(
     if "gateway_frame" in axioms and not found:
         return False
     if "gateway_turn" in axioms and not (
-        all(_turns_so(action, first, found) for action in turns.get((a, b), ()))
+        all(turns_so(action, first, found) for action in turns.get((a, b), ()))
         and all(
-            _turns_so(action, then, frozenset(-r % 360 for r in found))
+            turns_so(action, then, frozenset(-r % 360 for r in found))
             for action in turns.get((b, a), ())
         )
     ):
         return False
-    alike, opposite = _ways(first, then, shift, found)
+    alike, opposite = ways(first, then, shift, found)
     sure = not found & {90, 270}  # if it may have turned by a right angle, its way is uncertain
     s, x = a.dstate, b.dstate
     if "gateway_heading" in axioms:
@@ -375,126 +479,3 @@ def _allowed(
 def _is_shown(heading: int | None, found: Collection[int]) -> bool:
     """Whether a dstate has a heading, and it is one of the rotations found (if there are any)."""
     return heading is not None and 0 <= heading < 360 and (heading in found or not found)
-
-
-@lru_cache(maxsize=2**14)
-def rotations(first: Frame, then: Frame, shift: int) -> frozenset[int]:
-    """Find by which angles the robot may have turned between two sights of a place.
-
-    Args:
-        first: The gateways in the earlier sight.
-        then: The gateways in the later sight.
-        shift: Gateway k of `then` is taken to be gateway k + shift of `first`.
-
-    Returns:
-        The angles in whole degrees, clockwise, 0 to 359; empty if the gateways do not match.
-    """
-    n = first.slots
-    if then.slots != n:
-        return frozenset()
-    pairs = [((k + shift) % n, k) for k in range(n)]
-    for j, k in pairs:
-        a, b = first.opposite[j], then.opposite[k]
-        if a is not None and b is not None and (a, b) not in pairs:
-            return frozenset()
-    found: Collection[int] = range(360)
-    for j, k in pairs:
-        centre, most = first.bearings[j] - then.bearings[k], first.spreads[j] + then.spreads[k]
-        arc = {(centre + off) % 360 for off in range(-most, most + 1)}
-        found = arc.intersection(found)
-        if not found:
-            break
-    return frozenset(found)
-
-
-def _between(a: float, b: float) -> float:
-    """Return the angle between two bearings, 0 to 180 degrees."""
-    return min((a - b) % 360, (b - a) % 360)
-
-
-def _turns_so(action: Action, before: Frame, found: frozenset[int]) -> bool:
-    """Whether an action can turn the robot by one of some angles.
-
-    Args:
-        action: The turn.
-        before: The gateways that the robot saw before the turn.
-        found: The angles in degrees, clockwise.
-    """
-    # the bearing or the gateway of a turn is more precise than right, left and around
-    if action.bearing is not None:
-        return any(_between(r, round(action.bearing)) <= SPREAD for r in found)
-    if action.gateway is not None:
-        beside = [
-            (bearing, spread)
-            for bearing, spread in zip(before.bearings, before.spreads, strict=True)
-            if _between(bearing, 0) > spread
-        ]
-        if action.turn == "left":
-            beside.reverse()
-        return action.gateway <= len(beside) and any(
-            _between(r, beside[action.gateway - 1][0]) <= beside[action.gateway - 1][1]
-            for r in found
-        )
-    if action.turn == "around":
-        behind = [
-            (before.bearings[other], before.spreads[other])
-            for bearing, spread, other in zip(
-                before.bearings, before.spreads, before.opposite, strict=True
-            )
-            if other is not None and _between(bearing, 0) <= spread
-        ][:1]
-        return any(
-            _between(r, bearing) <= spread for r in found for bearing, spread in [(180, 0), *behind]
-        )
-    sides = (r if action.turn == "right" else 360 - r for r in found)
-    return any(2 * SPREAD < side < 180 - 2 * SPREAD for side in sides)
-
-
-@lru_cache(maxsize=2**14)
-def _ways(first: Frame, then: Frame, shift: int, found: frozenset[int]) -> tuple[bool, bool]:
-    """Return two flags: may the robot face the same way in both sights, and opposite ways?
-
-    The flags are true if 0, or 180, is in `found`. They are also true if gateways that are declared
-    opposite match in this way: they are on one path, which may bend.
-
-    Args:
-        first: The gateways in the earlier sight.
-        then: The gateways in the later sight.
-        shift: Gateway k of `then` is taken to be gateway k + shift of `first`.
-        found: By how many degrees the robot may have turned.
-    """
-    alike, opposite = 0 in found, 180 in found
-    here, there = _passes(first), _passes(then)
-    if found and here and there:
-        ahead, behind = ((k + shift) % first.slots for k in there)
-        if ahead == here[0]:
-            alike = True
-        elif behind == here[0]:
-            opposite = True
-    return alike, opposite
-
-
-def leads(frame: Frame, towards: int) -> bool:
-    """Whether the robot's path may go on by some gateway ahead (`towards` 0) or behind (180)."""
-    return _passes(frame) is not None or any(
-        _between(bearing, towards) <= 2 * spread
-        for bearing, spread in zip(frame.bearings, frame.spreads, strict=True)
-    )
-
-
-@lru_cache(maxsize=2**12)
-def _passes(frame: Frame) -> tuple[int, int] | None:
-    """Return the slots of two gateways that are declared opposite, one ahead and one behind.
-
-    The robot must face the first one, or have the second one straight behind it. None if there is
-    no such pair.
-    """
-    for k, (bearing, spread, other) in enumerate(
-        zip(frame.bearings, frame.spreads, frame.opposite, strict=True)
-    ):
-        if other is not None and (
-            _between(bearing, 0) <= spread
-            or _between(frame.bearings[other], 180) <= frame.spreads[other]
-        ):
-            return k, other
-    return None

@@ -283,15 +283,21 @@ def _fault(read: FieldReader, value: Any, steps: int, name: str) -> Fault:
         for part in ("seen", "expected")
     )
     cost = read.number(record.get("cost", 0), f"{name}.cost")
-    place, gateway = (
-        read.optional(record.get(part), f"{name}.{part}") for part in ("place", "gateway")
+    place, gateway, bearing = (
+        read.optional(record.get(part), f"{name}.{part}")
+        for part in ("place", "gateway", "bearing")
     )
-    if record["kind"] == "changed" and (place is None or gateway not in (0, 1, 2, 3)):
-        raise read.wrong(f"{name}.gateway", "a slot, 0 to 3, and a place, for a change", gateway)
+    if record["kind"] == "changed":
+        if bearing is None and (place is None or gateway not in (0, 1, 2, 3)):
+            what = "a slot, 0 to 3, and a place, for a change"
+            raise read.wrong(f"{name}.gateway", what, gateway)
+        if bearing is not None and (place is None or not 0 <= bearing < 360):
+            what = "degrees, 0 to 359, and a place, for a change"
+            raise read.wrong(f"{name}.bearing", what, bearing)
     towards = record.get("towards")
     if not isinstance(towards, str | None):
         raise read.wrong(f"{name}.towards", "a text", towards)
-    return Fault(step, record["kind"], seen, expected, cost, place, gateway, towards)
+    return Fault(step, record["kind"], seen, expected, cost, place, gateway, towards, bearing)
 
 
 def _regions(

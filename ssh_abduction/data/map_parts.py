@@ -90,8 +90,10 @@ class Fault:
             saw, such as "open on monday".
         cost: The cost of the fault, in dstates.
         place: For a change, the number of the place.
-        gateway: For a change, the slot of the gateway at the place. Slots are numbered 0 to 3,
-            clockwise from the heading of the first dstate there.
+        gateway: For a change of one of four openings, the slot of the gateway at the place. Slots
+            are numbered 0 to 3, clockwise from the heading of the first dstate there.
+        bearing: For a change of a gateway at a bearing, its direction in degrees, clockwise from
+            the heading of the first dstate at the place.
         towards: For a change in a map with poses, where the gateway is: north is up in pictures.
     """
 
@@ -103,8 +105,14 @@ class Fault:
     place: int | None = None
     gateway: int | None = None
     towards: str | None = field(default=None, compare=False)
+    bearing: int | None = None
 
     def __str__(self) -> str:
+        if self.kind == "changed" and self.bearing is not None:
+            return (
+                f"the gateway at {self.bearing} degrees of place {self.place} was {self.expected} "
+                f"and {self.seen}"
+            )
         if self.kind == "changed":
             way = self.towards or SLOTS[self.gateway or 0]
             of = "of" if self.towards else "at the first dstate of"

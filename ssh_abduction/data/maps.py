@@ -395,7 +395,9 @@ class SSHMap:
 
 def _changed(fault: Fault) -> tuple[int | None, ...]:
     """What distinguishes two faults "changed" at one step: place and gateway; else empty."""
-    return (fault.place, fault.gateway) if fault.kind == "changed" else ()
+    if fault.kind != "changed":
+        return ()
+    return (fault.place, fault.gateway if fault.bearing is None else fault.bearing)
 
 
 def _numbered(ids: Iterable[int | None]) -> dict[int | None, int]:

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import combinations
+from itertools import combinations, combinations_with_replacement
 from math import ceil
 from typing import Any, TypeAlias
 
@@ -36,6 +36,10 @@ SPREAD = 10.0
 QUARTER = 20.0
 # The largest spread in degrees: a gateway that was not observed may be anywhere in a half circle.
 WIDEST = 90.0
+# The spread of a gateway that is closed on a drive: it may be in any direction.
+CLOSED = 180
+# At most this many gateways of a place change between two drives.
+MOST_CLOSED = 2
 # The most unobserved gateways of a star. Each may exist or not, so a star has up to 2**6 frames.
 MOST_UNKNOWN = 6
 _FIELDS = ("bearing", "spread", "opposite", "open")
@@ -96,17 +100,30 @@ class Frame:
             turn: "right" to count gateways clockwise; anything else to count counterclockwise.
             number: Which gateway, from 1. A gateway straight ahead is not counted.
         """
-        beside = [k for k in range(self.slots) if not self.faces(k)]
+        beside = [k for k in range(self.slots) if not (self.faces(k) or self.is_closed(k))]
         order = beside if turn == "right" else beside[::-1]
         return order[number - 1] if number <= len(order) else None
 
     def faces(self, slot: int) -> bool:
         """Whether the gateway with this slot is straight ahead of the robot."""
-        return abs((self.bearings[slot] + 180) % 360 - 180) <= self.spreads[slot]
+        return (
+            not self.is_closed(slot)
+            and abs((self.bearings[slot] + 180) % 360 - 180) <= self.spreads[slot]
+        )
 
     def has_behind(self, slot: int) -> bool:
         """Whether the gateway with this slot is straight behind the robot."""
-        return abs(self.bearings[slot] % 360 - 180) <= self.spreads[slot]
+        is_behind = abs(self.bearings[slot] % 360 - 180) <= self.spreads[slot]
+        return is_behind and not self.is_closed(slot)
+
+    def is_closed(self, slot: int) -> bool:
+        """Whether the gateway with this slot is closed on this drive, and open on another."""
+        return self.spreads[slot] == CLOSED
+
+    @property
+    def with_closed(self) -> tuple[Frame, ...]:
+        """This frame, and all with up to MOST_CLOSED closed gateways between the others."""
+        return _with_closed(self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,6 +218,34 @@ def _frames_of(star: Star) -> tuple[Frame, ...]:
     )
     every = range(len(star.gateways))
     return tuple(dict.fromkeys(star.frame([k for k in every if k not in o]) for o in left_out))
+
+
+@lru_cache(maxsize=2**12)
+def _with_closed(frame: Frame) -> tuple[Frame, ...]:
+    """The frames with closed gateways, see `Frame.with_closed`."""
+    behind = range(max(frame.slots, 1))  # the slots after which a closed gateway may come
+    return tuple(
+        _inserted(frame, after)
+        for count in range(MOST_CLOSED + 1)
+        for after in combinations_with_replacement(behind, count)
+    )
+
+
+def _inserted(frame: Frame, after: Sequence[int]) -> Frame:
+    """Insert a closed gateway after each of these slots of a frame."""
+    order: list[int | None] = []
+    for slot in range(max(frame.slots, 1)):
+        order += [slot] if frame.slots else []
+        order += [None] * after.count(slot)
+    number = {slot: k for k, slot in enumerate(order)}
+    return Frame(
+        tuple(0 if k is None else frame.bearings[k] for k in order),
+        tuple(CLOSED if k is None else frame.spreads[k] for k in order),
+        tuple(
+            None if k is None or (other := frame.opposite[k]) is None else number[other]
+            for k in order
+        ),
+    )
 
 
 def is_four(entries: Sequence[Entry]) -> bool:

@@ -52,7 +52,7 @@ EXCUSED = {
         "turn_rotates",
     },
     "jumped": {"one_pose"},
-    "changed": {"star_pattern", "star_frame"},
+    "changed": {"star_pattern", "star_frame", "gateway_frame"},
 }
 DEAREST = 1000.0  # the most dstates that a fault may cost
 # The fields that are covered by the axioms of a theory. Speed-ups must name any other field that
@@ -173,9 +173,10 @@ def _check_faults(theory: Theory) -> None:
             "prefer: expected dstates first where faults are allowed, got "
             f"{', '.join(theory.prefer) or 'nothing'}; faults cost dstates"
         )
-    if theory.star == "gateways":
+    others = [kind for kind in EXCUSED if kind != "changed" and getattr(theory, kind)]
+    if theory.star == "gateways" and others:
         raise TheoryError(
-            "star: expected another value where faults are allowed, got gateways; "
+            "star: expected another value where such faults are allowed, got gateways; "
             f"take {choice('star', 'alike')}"
         )
     if theory.boundary == "defeasible":
@@ -188,7 +189,6 @@ def _check_faults(theory: Theory) -> None:
             "jumped: expected displacements to be used, which may be wrong, got "
             f"displacement=none; leave it out, or take {choice('displacement', 'auto')}"
         )
-    others = [kind for kind in EXCUSED if kind != "changed" and getattr(theory, kind)]
     if theory.changed and (others or theory.level == "causal"):
         raise TheoryError(
             "changed: expected a topological theory without other faults, as gateways of places "

@@ -115,11 +115,14 @@ def settle(trace: Trace, theory: Theory | None = None, known: Problem | None = N
             "slipped: expected no actions that slip where a trace has lifts, as they could lead to "
             f"other floors, got {settled.slipped:g}; leave it out (--set slipped=0)"
         )
-    if settled.changed and star != "frame":
+    if settled.changed and star not in ("frame", "gateways"):
         raise TheoryError(
-            "changed: expected a trace with stars of four openings and turns by right angles, "
-            f"read by star=frame, got star={star}; leave it out (--set changed=0)"
+            "changed: expected a trace with stars, read by star=frame or gateways, got "
+            f"star={star}; leave it out (--set changed=0)"
         )
+    if settled.changed and star == "gateways" and "gateway_end" not in settled.without:
+        # A path may lead on by a gateway that is closed on a drive.
+        settled = replace(settled, without=(*settled.without, "gateway_end"))
     counts = ["dstates" if count == "tenths" else count for count in settled.priorities]
     prefer = tuple(c for c in counts if c in theory.prefer or c != "excuses")
     settled = replace(settled, prefer=prefer)

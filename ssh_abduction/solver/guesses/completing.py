@@ -77,7 +77,7 @@ def completed(
         return None
     found = replace(_on(bare, courses, facing_of.headings), paths=orders)
     if theory.star == "gateways":
-        turned = gateways.turned(trace, found, theory.axioms)
+        turned = gateways.turned(trace, found, theory.axioms, bool(theory.changed))
         return None if turned is None else turned.renumbered()
     return found.renumbered()
 
@@ -110,7 +110,7 @@ def _facing(
         frames. None if no frame fits the stars.
     """
     if theory.star == "gateways":
-        return gateways.facing(trace, ssh_map, theory.axioms)
+        return gateways.facing(trace, ssh_map, theory.axioms, bool(theory.changed))
     found = Facing({}, [], [])
     if theory.star == "frame":
         first: dict[int | None, float] = {}

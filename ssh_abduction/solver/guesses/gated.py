@@ -29,8 +29,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Self
 
-from ssh_abduction.data.gateways import Sight, are_opposite, fit, headings, leads
+from ssh_abduction.data.gateways import Sight, are_opposite, fit, headings
 from ssh_abduction.data.maps import DState, SSHMap
+from ssh_abduction.data.rotations import leads
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Action, Step, Trace
 from ssh_abduction.solver.guesses.tree import Contradiction, Sketch

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from functools import lru_cache
-from itertools import product
+from itertools import combinations, product
 
 from ssh_abduction.data.drives import starts_of
-from ssh_abduction.data.gateways import rotations
-from ssh_abduction.data.star import Star
+from ssh_abduction.data.star import Frame, Star
 from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.solver.guesses.reckoning import Hypothesis
 from ssh_abduction.solver.steps.chart import numbered
+from ssh_abduction.solver.steps.frames import rotations
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.theory import Theory
 
@@ -63,7 +63,11 @@ class Sights:
         if self._misreads or _agree(sight, own):
             return 0.0
         is_one_drive = found.drives[place] == self.drive[t]
-        if not self._price or is_one_drive or not isinstance(sight, tuple):
+        if not self._price or is_one_drive:
+            return math.inf
+        if isinstance(sight, Star) and isinstance(own, Star):
+            return self._price * _fewest_closed(sight, own)
+        if not isinstance(sight, tuple) or not isinstance(own, tuple):
             return math.inf
         return self._price * _fewest_changes(sight, own)
 
@@ -92,10 +96,51 @@ def _fewest_changes(first: tuple[bool, ...], second: tuple[bool, ...]) -> int:
 
 
 @lru_cache(maxsize=2**14)
+def _fewest_closed(first: Star, second: Star) -> float:
+    """The fewest gateways that changed between two stars with bearings; inf if more than CHANGES.
+
+    These are the gateways without which the stars agree.
+    """
+    return next(
+        (
+            count
+            for count in range(1, CHANGES + 1)
+            for less in range(count + 1)
+            for frame, other in product(_smaller(first, less), _smaller(second, count - less))
+            if _turns(frame, other)
+        ),
+        math.inf,
+    )
+
+
+@lru_cache(maxsize=2**14)
+def _smaller(star: Star, less: int) -> tuple[Frame, ...]:
+    """The frames of a star without some of its gateways.
+
+    Args:
+        star: The star.
+        less: How many gateways are left out.
+    """
+    return tuple(
+        Frame(
+            tuple(frame.bearings[k] for k in kept),
+            tuple(frame.spreads[k] for k in kept),
+            (None,) * len(kept),
+        )
+        for frame in star.frames
+        if frame.slots >= less
+        for kept in combinations(range(frame.slots), frame.slots - less)
+    )
+
+
+def _turns(frame: Frame, other: Frame) -> bool:
+    """Whether two frames agree with some shift of their gateways."""
+    return frame.slots == other.slots and any(
+        rotations(frame, other, shift) for shift in range(max(frame.slots, 1))
+    )
+
+
+@lru_cache(maxsize=2**14)
 def _may_fit(first: Star, second: Star) -> bool:
     """Whether two stars agree with some shift of their gateways."""
-    return any(
-        rotations(frame, other, shift)
-        for frame, other in product(first.frames, second.frames)
-        for shift in range(max(frame.slots, 1))
-    )
+    return any(_turns(frame, other) for frame, other in product(first.frames, second.frames))

@@ -10,6 +10,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 from ssh_abduction.data.drives import drives_of, starts_of
+from ssh_abduction.data.gateways import changes_in
 from ssh_abduction.data.maps import Fault, SSHMap
 from ssh_abduction.data.odometry import in_words
 from ssh_abduction.data.trace import Trace, View
@@ -90,6 +91,8 @@ def with_changes(ssh_map: SSHMap, trace: Trace, theory: Theory) -> SSHMap | None
     """
     if not theory.changed:
         return ssh_map
+    if theory.star == "gateways":
+        return _with_changed_bearings(ssh_map, trace, theory)
     begins = starts_of(trace)
     names = [drive.name for drive in drives_of(trace)]
     last: dict[int | None, tuple[int, tuple[bool, ...]]] = {}  # what was last seen at each place
@@ -112,6 +115,25 @@ def with_changes(ssh_map: SSHMap, trace: Trace, theory: Theory) -> SSHMap | None
     return replace(ssh_map, faults=tuple(faults))
 
 
+def _with_changed_bearings(ssh_map: SSHMap, trace: Trace, theory: Theory) -> SSHMap:
+    """Do what `with_changes` does for gateways at bearings. The map has headings in degrees."""
+    names = [drive.name for drive in drives_of(trace)]
+    faults = []
+    for found in changes_in(trace, ssh_map, theory.axioms):
+        was, now = (
+            f"{'open' if is_open else 'closed'} on {names[drive]}"
+            for drive, is_open in zip(found.drives, (not found.is_open, found.is_open), strict=True)
+        )
+        cost = theory.fault_tenths("changed", trace.steps[found.step]) / 10
+        at = found.place, None, None, found.bearing
+        faults.append(Fault(found.step, "changed", now, was, cost, *at))
+    return replace(ssh_map, faults=tuple(sorted(faults, key=_in_order)))
+
+
+def _in_order(fault: Fault) -> tuple[int, int]:
+    return fault.step, fault.bearing or 0
+
+
 def with_compass(ssh_map: SSHMap) -> SSHMap:
     """Add to each "changed" fault of a map with poses which way its gateway is; y is north.
 
@@ -124,7 +146,7 @@ def with_compass(ssh_map: SSHMap) -> SSHMap:
     faults = []
     for fault in ssh_map.faults:
         towards = None
-        if fault.kind == "changed" and (s := first.get(fault.place)) is not None:
+        if fault.gateway is not None and (s := first.get(fault.place)) is not None:
             clockwise = (fault.gateway or 0) - (s.heading or 0)
             quarters = round(poses[s.id].heading / (math.pi / 2)) - clockwise
             towards = COMPASS[quarters % 4]

@@ -39,6 +39,8 @@ class Frames:
     Args:
         trace: The trace.
         stop: Use only this many first steps; None for all.
+        changes: Whether gateways may change between drives. Then a star has more frames, with
+            gateways that are closed on its drive.
 
     Attributes:
         stars: The number of the star of each step.
@@ -46,7 +48,7 @@ class Frames:
         frames: All frames, by number.
     """
 
-    def __init__(self, trace: Trace, stop: int | None = None) -> None:
+    def __init__(self, trace: Trace, stop: int | None = None, *, changes: bool = False) -> None:
         numbers: dict[Frame, int] = {}
         number_of: dict[Star, int] = {}
         self.stars = [
@@ -54,7 +56,11 @@ class Frames:
             for step in trace.steps[:stop]
         ]
         self.looks = [
-            tuple(numbers.setdefault(frame, len(numbers)) for frame in star.frames)
+            tuple(
+                numbers.setdefault(frame, len(numbers))
+                for plain in star.frames
+                for frame in (plain.with_closed if changes else (plain,))
+            )
             for star in number_of
         ]
         self.frames: tuple[Frame, ...] = tuple(numbers)

@@ -48,7 +48,7 @@ def read_map(model: Model, trace: Trace, theory: Theory) -> SSHMap:
         elif name in FAULTS:
             faults.append((args[0], name))
     if theory.star == "gateways":
-        found = frames.Frames(trace, len(is_at)).frames
+        found = frames.Frames(trace, len(is_at), changes=bool(theory.changed)).frames
         heading = {
             t: frames.heading(found[shape[p]], found[shape[t]], heading[t])
             for t, p in place.items()

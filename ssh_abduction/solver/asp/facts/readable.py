@@ -126,14 +126,14 @@ def trace_facts(problem: Problem, start: int, stop: int) -> str:
             _kind_fact(action) for action in dict.fromkeys(done.values()) if action.kind is not None
         ]
     if theory.star == "gateways":
-        facts += _gateway_facts(trace, start, stop)
+        facts += _gateway_facts(trace, start, stop, changes=bool(theory.changed))
     return "\n".join([*facts, *_evidence_facts(problem, start, stop)])
 
 
-def _gateway_facts(trace: Trace, start: int, stop: int) -> Iterator[str]:
+def _gateway_facts(trace: Trace, start: int, stop: int, *, changes: bool) -> Iterator[str]:
     """Yield facts for gateways.lp: what steps see, and how that fits what earlier steps see."""
-    found = frames.Frames(trace, stop)
-    known = len(frames.Frames(trace, start).frames)
+    found = frames.Frames(trace, stop, changes=changes)
+    known = len(frames.Frames(trace, start, changes=changes).frames)
     yield from (f"star({t},{found.stars[t]})." for t in range(start, stop))
     yield from (
         f"looks({star},{x})."
@@ -142,6 +142,13 @@ def _gateway_facts(trace: Trace, start: int, stop: int) -> Iterator[str]:
     )
     yield from (
         f"slots({x},{max(frame.slots, 1)})." for x, frame in enumerate(found.frames) if x >= known
+    )
+    yield from (
+        f"closed({x},{slot})."
+        for x, frame in enumerate(found.frames)
+        if x >= known
+        for slot in range(frame.slots)
+        if frame.is_closed(slot)
     )
     yield from (
         f"ends({x},{way})."

@@ -1,0 +1,154 @@
+"""By which angles a robot may have turned between two frames of one place.
+
+A frame is the gateways that are seen at a step, each with a bearing in tolerance (`star.py`). The
+gateways of two frames match in clockwise order, by some shift of their slots.
+
+>>> from ssh_abduction.data.star import Star
+>>> corner = Star.of((0, 120)).frames[0]
+>>> min(rotations(corner, corner, 0)), max(rotations(corner, corner, 0))
+(0, 359)
+>>> rotations(corner, corner, 1)
+frozenset()
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from functools import lru_cache
+
+from ssh_abduction.data.star import SPREAD, Frame
+from ssh_abduction.data.trace import Action
+
+
+@lru_cache(maxsize=2**14)
+def rotations(first: Frame, then: Frame, shift: int) -> frozenset[int]:
+    """Find by which angles the robot may have turned between two sights of a place.
+
+    Args:
+        first: The gateways in the earlier sight.
+        then: The gateways in the later sight.
+        shift: Gateway k of `then` is taken to be gateway k + shift of `first`.
+
+    Returns:
+        The angles in whole degrees, clockwise, 0 to 359; empty if the gateways do not match.
+    """
+    n = first.slots
+    if then.slots != n:
+        return frozenset()
+    pairs = [((k + shift) % n, k) for k in range(n)]
+    for j, k in pairs:
+        a, b = first.opposite[j], then.opposite[k]
+        if a is not None and b is not None and (a, b) not in pairs:
+            return frozenset()
+    found: Collection[int] = range(360)
+    for j, k in pairs:
+        centre, most = first.bearings[j] - then.bearings[k], first.spreads[j] + then.spreads[k]
+        arc = {(centre + off) % 360 for off in range(-most, most + 1)}
+        found = arc.intersection(found)
+        if not found:
+            break
+    return frozenset(found)
+
+
+def between(a: float, b: float) -> float:
+    """Return the angle between two bearings, 0 to 180 degrees."""
+    return min((a - b) % 360, (b - a) % 360)
+
+
+def turns_so(action: Action, before: Frame, found: frozenset[int]) -> bool:
+    """Whether an action can turn the robot by one of some angles.
+
+    Args:
+        action: The turn.
+        before: The gateways that the robot saw before the turn.
+        found: The angles in degrees, clockwise.
+    """
+    # the bearing or the gateway of a turn is more precise than right, left and around
+    if action.bearing is not None:
+        return any(between(r, round(action.bearing)) <= SPREAD for r in found)
+    if action.gateway is not None:
+        beside = [
+            (bearing, spread)
+            for bearing, spread in zip(before.bearings, before.spreads, strict=True)
+            if between(bearing, 0) > spread
+        ]
+        if action.turn == "left":
+            beside.reverse()
+        return action.gateway <= len(beside) and any(
+            between(r, beside[action.gateway - 1][0]) <= beside[action.gateway - 1][1]
+            for r in found
+        )
+    if action.turn == "around":
+        behind = [
+            (before.bearings[other], before.spreads[other])
+            for bearing, spread, other in zip(
+                before.bearings, before.spreads, before.opposite, strict=True
+            )
+            if other is not None and between(bearing, 0) <= spread
+        ][:1]
+        return any(
+            between(r, bearing) <= spread for r in found for bearing, spread in [(180, 0), *behind]
+        )
+    sides = (r if action.turn == "right" else 360 - r for r in found)
+    return any(2 * SPREAD < side < 180 - 2 * SPREAD for side in sides)
+
+
+@lru_cache(maxsize=2**14)
+def ways(first: Frame, then: Frame, shift: int, found: frozenset[int]) -> tuple[bool, bool]:
+    """Return two flags: may the robot face the same way in both sights, and opposite ways?
+
+    The flags are true if 0, or 180, is in `found`. They are also true if gateways that are declared
+    opposite match in this way: they are on one path, which may bend.
+
+    Args:
+        first: The gateways in the earlier sight.
+        then: The gateways in the later sight.
+        shift: Gateway k of `then` is taken to be gateway k + shift of `first`.
+        found: By how many degrees the robot may have turned.
+    """
+    alike, opposite = 0 in found, 180 in found
+    here, there = passes(first), passes(then)
+    if found and here and there:
+        ahead, behind = ((k + shift) % first.slots for k in there)
+        if ahead == here[0]:
+            alike = True
+        elif behind == here[0]:
+            opposite = True
+    return alike, opposite
+
+
+def leads(frame: Frame, towards: int) -> bool:
+    """Whether the robot's path may go on by some gateway ahead (`towards` 0) or behind (180)."""
+    return passes(frame) is not None or any(
+        between(bearing, towards) <= 2 * spread
+        for bearing, spread in zip(frame.bearings, frame.spreads, strict=True)
+    )
+
+
+@lru_cache(maxsize=2**12)
+def passes(frame: Frame) -> tuple[int, int] | None:
+    """Return the slots of two gateways that are declared opposite, one ahead and one behind.
+
+    The robot must face the first one, or have the second one straight behind it. None if there is
+    no such pair.
+    """
+    for k, (bearing, spread, other) in enumerate(
+        zip(frame.bearings, frame.spreads, frame.opposite, strict=True)
+    ):
+        if other is not None and (
+            between(bearing, 0) <= spread
+            or between(frame.bearings[other], 180) <= frame.spreads[other]
+        ):
+            return k, other
+    return None
+
+
+def middle(found: Collection[int]) -> int:
+    """Return the middle of the longest arc in a set of rotations, in whole degrees.
+
+    It is 0 if the set contains all rotations or none.
+    """
+    starts = [r for r in sorted(found) if (r - 1) % 360 not in found]
+    ends = [next(d for d in range(1, 361) if (r + d) % 360 not in found) for r in starts]
+    length, start = max(zip(ends, [-r for r in starts], strict=True), default=(1, 0))
+    return (-start + (length - 1) // 2) % 360
