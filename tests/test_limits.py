@@ -213,11 +213,11 @@ def test_a_snapshot_waits_for_the_sketch_that_is_under_way(
     sketches = []
     attempts = Candidates._attempts
 
-    def slowly(candidates: Candidates) -> list[Callable[[], None]]:
+    def slowly(candidates: Candidates, beams: bool) -> list[Callable[[], None]]:
         sketches.append(candidates)
         begun.set()
         time.sleep(0.2)
-        return attempts(candidates)
+        return attempts(candidates, beams)
 
     monkeypatch.setattr(Candidates, "_attempts", slowly)
     search = Search(Trace.load(noisy))

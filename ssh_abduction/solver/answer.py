@@ -75,6 +75,8 @@ class Answer:
         levels = tuple(replace(level, complete=parts.rivals.listed) for level in self._levels)
         asker = parts.engine.asker
         seconds = Seconds(parts.watch.elapsed(), asker.ground_seconds, asker.solve_seconds)
+        # If a limit came first, the evidence said nothing yet.
+        kinds = task.problem.evidence if task.log.has_pairs else ()
         return Solution(
             status=known.status,
             maps=maps,
@@ -87,7 +89,7 @@ class Answer:
                 parts.engine.size,
                 seconds,
                 asker.grounding if grounding is None else grounding,
-                said_by(task.problem.evidence, task.trace, known.refused),
+                said_by(kinds, task.trace, known.refused),
             ),
             stopped=known.stopped,
             partial=None if known.best else known.partial,

@@ -133,6 +133,9 @@ class Candidates:
             whole = Watch().part(seconds)
             *smaller, surest = self._attempts(beams)
             for attempt in (surest, *smaller):
+                # The others take longer than the surest one.
+                if self._known.best is not None and whole.left() < whole.elapsed():
+                    return
                 before, share = (
                     self._known.best,
                     1.0 if attempt in (surest, *smaller[-1:]) else SKETCH_SHARE,

@@ -44,19 +44,21 @@ def estimated(
     for step, begin in enumerate(_begins(at, visit)):
         if begin == step:
             visits.setdefault(at[step], []).append(step)
-    watch = Watch().part(seconds)
+    watch, slowest = Watch().part(seconds), 0.0
     tried: set[Course] = {(best.dstates, best.places)}
     for name, begins in visits.items():
         singly = [{begin} for begin in begins[1:]]
         from_then_on = [set(begins[i:]) for i in range(1, len(begins) - 1)]
         for moved in (*singly, *from_then_on) if len(begins) > 1 else ():
-            if not watch.allows(0.0):
+            if not watch.allows(slowest):
                 return
             dstates, places = course = _moved(best, visit, name, moved)
             if course in tried:
                 continue
             tried.add(course)
+            began = watch.elapsed()
             nats = cost_of(dstates, places)
+            slowest = max(slowest, watch.elapsed() - began)
             if nats < best.nats + CERTAIN:
                 yield Rival(nats, dstates, places, True, best.faults)
 

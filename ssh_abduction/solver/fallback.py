@@ -46,7 +46,8 @@ def fall_back(parts: Parts, answer: Answer, *, may_search: bool) -> None:
     )
     parts.watch.start()  # what is done after the limit counts, too
     with suppress(KeyboardInterrupt):
-        parts.candidates.sketch(_overtime(parts))
+        # A search by cost tried beams before.
+        parts.candidates.sketch(_overtime(parts), beams=parts.task.theory.weigh == "count")
     if may_salvage:
         salvage(parts)
     answer.count_apart()

@@ -49,7 +49,7 @@ SWEEPS, HELD = 20, 1e-2
 # Levenberg-Marquardt: the least and the highest damping, and the most rounds. It ends if a round
 # lowers the sum of squares by less than the share STILL, or NEARLY for a hypothesis. HELD_STILL is
 # a weight that keeps poses in place if no equation determines them.
-LEAST_DAMPING, MOST_DAMPING, ROUNDS, STILL, NEARLY = 1e-9, 1e8, 100, 1e-13, 1e-4
+LEAST_DAMPING, MOST_DAMPING, ROUNDS, STILL, NEARLY = 1e-9, 1e8, 100, 1e-10, 1e-4
 HELD_STILL = 1e-9
 
 
@@ -388,11 +388,13 @@ class Poses:
         used = np.unique(self._place[said])
         parts = len(np.unique(self._parts()[used]))
         exact = (1 / np.sqrt((self._whitening**2).sum(1)) < EXACT).ravel()
-        settled = (
-            int(np.linalg.matrix_rank(as_dense(self._jacobian(unknown)[: len(exact)][exact])))
-            if exact.any()
-            else 0
-        )
+        settled = 0
+        if exact.any():
+            look_at_clock()
+            rows = as_dense(self._jacobian(unknown)[: len(exact)][exact])
+            # Turns at one place say nothing about positions. So most rows and columns are zero.
+            rows = rows[rows.any(axis=1)][:, rows.any(axis=0)]
+            settled = int(np.linalg.matrix_rank(rows)) if rows.size else 0
         return int(
             len(exact)
             - exact.sum()

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.sparse import coo_array, csr_array, diags_array
-from scipy.sparse.linalg import lsqr, splu
+from scipy.sparse.linalg import splu
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -18,6 +18,8 @@ Array: TypeAlias = NDArray[np.float64]
 DENSE = 60
 # With at most this many unknowns, compute an inverse from a dense matrix.
 DENSE_INVERSE = 3000
+# The share of the diagonal that least squares add to it, far above the rounding errors.
+DAMPING = 1e-10
 
 
 def matrix(entries: tuple[Any, tuple[Any, Any]], shape: tuple[int, int]) -> Any:
@@ -61,7 +63,7 @@ def solved(square: Any, added: Array, right: Any) -> Any:
 
 
 def least_squares(some: Any, values: Array, weights: Array) -> Array:
-    """Solve a system by weighted least squares. Of several solutions, return the smallest.
+    """Solve a system by weighted least squares. Of several solutions, return nearly the smallest.
 
     Args:
         some: The matrix of the system.
@@ -71,9 +73,10 @@ def least_squares(some: Any, values: Array, weights: Array) -> Array:
     system = weighted(some, weights)
     if isinstance(system, np.ndarray):
         return np.linalg.lstsq(system, values, rcond=1e-12)[0].astype(float)
-    found: Array = lsqr(system, values, atol=1e-10, btol=1e-10, iter_lim=4 * system.shape[1] + 100)[
-        0
-    ]
+    normal = system.T @ system
+    scale = normal.diagonal()
+    # A little damping makes the matrix regular.
+    found: Array = solved(normal, DAMPING * (scale + scale.max()), system.T @ values)
     return found
 
 

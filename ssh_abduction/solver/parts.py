@@ -48,12 +48,13 @@ class Parts:
         speedups: Speedups,
         on_progress: Callable[[Progress], None] | None,
         start: Start,
+        began: float,
     ) -> None:
         self.limits, self.speedups = limits, speedups
         self.watch = Watch(limits.time_limit, limits.memory_limit, self.report)
         self._on_progress = on_progress
         self._news: tuple[Cost | None, Bound] = (None, Bound())  # what the last report said
-        self.watch.start()  # what follows compares pairs of steps, which may take long
+        self.watch.start(began)  # settling the theory compares pairs of steps, which may take long
         self.task = Task.of(problem, self.watch, speedups)
         self.known = Known(problem.theory)
         self.judging = Judging(problem)

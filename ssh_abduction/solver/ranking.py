@@ -32,6 +32,7 @@ STANDING = 2.0
 NEVER_LESS = 0.01  # the least factor to name, as it would be 0 if displacements agree exactly
 
 OVERTIME = 0.3  # seconds beyond the limit for the fit of the first map
+LATEST = 0.6  # no fit ends later than this many seconds beyond the limit
 
 _Key: TypeAlias = tuple[tuple[int, ...], tuple[int | None, ...], tuple[int, ...]]
 
@@ -55,19 +56,26 @@ class Ranking:
             self._known[key] = fit(self._trace.without_displacements_at(jumped(ssh_map)), ssh_map)
         return with_compass(replace(ssh_map, fit=self._known[key]))
 
-    def ranked(self, maps: Iterator[SSHMap], over: Callable[[], bool]) -> Iterator[SSHMap]:
+    def ranked(
+        self,
+        maps: Iterator[SSHMap],
+        over: Callable[[], bool],
+        left: Callable[[], float],
+    ) -> Iterator[SSHMap]:
         """Yield the same maps with their fit, the one with the least chi-square first.
 
         Args:
             maps: The maps as they are found. Only the first RANKED of them are sorted.
             over: Returns whether a limit is reached. From then on, maps get no fit and keep their
                 order. Only the fit of the first map may take OVERTIME seconds more.
+            left: Returns the seconds left until the limit, less than 0 beyond it. The fit of the
+                first map ends LATEST seconds beyond it.
         """
         overtime = Watch(OVERTIME)
 
         def look(first: bool) -> None:
             if over():
-                if not first:
+                if not first or left() < -LATEST:
                     raise LimitError("time limit")
                 if not overtime.running:
                     overtime.start()

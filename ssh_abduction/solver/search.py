@@ -8,6 +8,7 @@ whole trace (`fallback.py`). `prefixes.py` proves that it is enough to solve the
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import replace
@@ -89,6 +90,7 @@ class Search:
         on_progress: Callable[[Progress], None] | None = None,
         _start: Start = ANEW,
     ) -> None:
+        began = time.perf_counter()
         checked_trace(trace)
         self.limits = Limits(time_limit, memory_limit, max_maps, within)
         if on_progress is not None and not callable(on_progress):
@@ -108,7 +110,9 @@ class Search:
         self.trace = trace
         self._begun = False
         self._reasons = _start.reasons
-        self._parts = Parts(problem, self.limits, checked_speedups(speedups), on_progress, _start)
+        self._parts = Parts(
+            problem, self.limits, checked_speedups(speedups), on_progress, _start, began
+        )
         self._stages = Stages(self._parts, self._solve_mended, goes_on=_start.after is not None)
         self._answer = Answer(self._parts)
         self._weighing: Weighing | None = None
@@ -232,10 +236,10 @@ class Search:
 
     def _given(self, ranking: Ranking | None) -> Iterator[SSHMap]:
         """Yield the maps. `ranking` sorts maps of one cost; None keeps their order."""
-        drives = drives_of(self.trace)
+        drives, left = drives_of(self.trace), self._parts.watch.left
         for cost, level in groupby(self._found(), key=lambda priced: priced[1]):
             maps = (ssh_map for ssh_map, _ in level)
-            for ssh_map in ranking.ranked(maps, self.over) if ranking else maps:
+            for ssh_map in ranking.ranked(maps, self.over, left) if ranking else maps:
                 told = _told(ssh_map, self.trace, drives)
                 self._answer.take_down(told, cost)
                 yield told

@@ -74,7 +74,7 @@ EXCESS = 2.25
 # Without a time limit, give up after PATIENCE seconds plus MORE times the time of the best map.
 PATIENCE, MORE = 10.0, 5.0
 # Estimating rivals may end OVERTIME seconds late. It gets LEAST_ESTIMATING to ESTIMATING seconds.
-OVERTIME, LEAST_ESTIMATING, ESTIMATING = 1.0, 0.1, 0.5
+OVERTIME, LEAST_ESTIMATING, ESTIMATING = 0.7, 0.1, 0.5
 
 # Lists the minimal maps of a trace and a theory within some seconds, and says whether they are
 # proven.

@@ -86,10 +86,14 @@ class Watch:
         self._stage_ends = math.inf
         self.interrupted = False
 
-    def start(self) -> None:
-        """Let the clock run. If it runs already, do nothing."""
+    def start(self, since: float | None = None) -> None:
+        """Let the clock run. If it runs already, do nothing.
+
+        Args:
+            since: Count from this value of `time.perf_counter`; None for now.
+        """
         if self._started is None:
-            self._started = time.perf_counter()
+            self._started = time.perf_counter() if since is None else since
 
     @property
     def has_reserve(self) -> bool:

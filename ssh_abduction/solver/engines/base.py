@@ -85,7 +85,7 @@ class Task:
             speedups = replace(speedups, sides=False)
         return Task(
             problem,
-            Log(problem.trace, problem.theory, problem.pairs),
+            Log(problem.trace, problem.theory, evidence=problem.evidence),
             watch or Watch(),
             speedups,
         )

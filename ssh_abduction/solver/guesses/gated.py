@@ -112,6 +112,8 @@ class GatewaySketch(Sketch):
         self._shown: dict[int, _Place] = defaultdict(_Place)  # by place
         self._last: _Seen | None = None  # what the last step saw
         self._turn_made: Action | None = None  # the turn after it, if it was one
+        self._star_seen = first.gateways or Star(())  # what the present step sees
+        self._axioms = frozenset(name for name in theory.axioms if name.startswith("gateway"))
         super().__init__(first, theory, homing)
         self._must_show(0, first)
 
@@ -122,38 +124,41 @@ class GatewaySketch(Sketch):
         sketch._shown, sketch._last = defaultdict(_Place), None
         for t, (label, step) in enumerate(zip(ssh_map.dstate_at, trace.steps, strict=True)):
             place = sketch._states[label].place
-            sketch._shown[place] = sketch._grown(place, label, step, t)
-            sketch._last = label, step.gateways or Star(())
+            sketch._star_seen = step.gateways or Star(())
+            sketch._shown[place] = sketch._grown(place, label, t)
+            sketch._last = label, sketch._star_seen
             sketch._turn_made = _turn_of(step.action)
         return sketch
 
     def extend(self, action: Action, step: Step) -> bool:
-        self._turn_made = _turn_of(action)
+        self._turn_made, self._star_seen = _turn_of(action), step.gateways or Star(())
         return super().extend(action, step)
 
     def _must_show(self, there: int, step: Step) -> None:
         super()._must_show(there, step)
-        if not self._may_show(there, step):
+        if not self._may_show(there):
             raise Contradiction
         place = self._states[there].place
-        self._shown[place] = self._grown(place, there, step, len(self.labels))
-        self._last = there, step.gateways or Star(())
+        self._shown[place] = self._grown(place, there, len(self.labels))
+        self._last = there, self._star_seen
 
-    def _may_show(self, there: int, step: Step) -> bool:
-        """Whether what a step sees fits a dstate, and what was seen at its place."""
+    def _may_show(self, there: int) -> bool:
+        """Whether what the present step sees fits a dstate, and what was seen at its place."""
         place = self._states[there].place
-        grown = self._grown(place, there, step, len(self.labels))
+        grown = self._grown(place, there, len(self.labels))
         known = self._shown[place]
         if len(grown.sights) == len(known.sights) and grown.turns == known.turns:
             return True
-        return fit(*self._sights(grown), self._theory.axioms, as_shown=False) is not None
+        if not known.sights and not self._onward(there):
+            return True
+        return fit(*self._sights(grown), self._axioms, as_shown=False) is not None
 
-    def _grown(self, place: int, there: int, step: Step, t: int) -> _Place:
-        """What was seen at a place, and at a step there."""
+    def _grown(self, place: int, there: int, t: int) -> _Place:
+        """What was seen at a place, and at step t, the present one, at a dstate there."""
         move = None
         if self._turn_made and self._last and self._states[self._last[0]].place == place:
             move = self._last, self._turn_made
-        return self._shown[place].with_sight((there, step.gateways or Star(())), t, move)
+        return self._shown[place].with_sight((there, self._star_seen), t, move)
 
     def _sights(self, place: _Place) -> tuple[list[Sight], dict[tuple[Sight, Sight], set[Action]]]:
         """The sights of a place and the turns between them, as `fit` takes them."""
@@ -189,21 +194,19 @@ class GatewaySketch(Sketch):
     def _may_be_new(self, place: int, step: Step) -> bool:
         """Whether a step may be at a new dstate of a known place."""
         there = self._new(step, place, 0)
-        fits = self._may_show(there, step)
+        fits = self._may_show(there)
         self._states.pop()
         return fits
 
     def _first_of(self, known: Iterable[int], step: Step) -> int | None:
         """The first of some dstates at which a step may be; None if there is none."""
         seen = observation(step, self._theory)
-        return next(
-            (x for x in known if self._states[x].seen == seen and self._may_show(x, step)), None
-        )
+        return next((x for x in known if self._states[x].seen == seen and self._may_show(x)), None)
 
     def _course_through(self, here: int) -> tuple[int, int] | None:
         place = self._shown[self._states[here].place]
         sights, turns = self._sights(place)
-        read = fit(sights, turns, self._theory.axioms, as_shown=False) or []
+        read = fit(sights, turns, self._axioms, as_shown=False) or []
         own = [
             turned for sight, turned in zip(sights, read, strict=False) if sight.dstate.id == here
         ]
@@ -214,7 +217,7 @@ class GatewaySketch(Sketch):
         return None
 
     def _travel(self, here: int, step: Step) -> int:
-        if "gateway_end" not in self._theory.axioms or _leads_on(step.gateways, 0):
+        if "gateway_end" not in self._axioms or _leads_on(self._star_seen, 0):
             return super()._travel(here, step)
         path, direction = self._find_course(here)
         order = self._orders[path]
@@ -263,7 +266,7 @@ class GatewaySketch(Sketch):
             seen, made = self._sights(place)
             sights.extend(seen)
             turns.update(made)
-        found = headings(sights, turns, self._theory.axioms)
+        found = headings(sights, turns, self._axioms)
         dstates = tuple(replace(s, heading=found.get(s.id)) for s in ssh_map.dstates)
         return replace(ssh_map, dstates=dstates)
 
@@ -272,6 +275,6 @@ def _turn_of(action: Action | None) -> Action | None:
     return action if action is not None and action.kind == "turn" else None
 
 
-def _leads_on(star: Star | None, towards: int) -> bool:
+def _leads_on(star: Star, towards: int) -> bool:
     """Whether some gateway of a star may lead on ahead (`towards` 0) or behind (180)."""
-    return any(leads(frame, towards) for frame in (star or Star(())).frames)
+    return any(leads(frame, towards) for frame in star.frames)

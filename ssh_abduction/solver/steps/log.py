@@ -11,9 +11,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from functools import partial
 
 from ssh_abduction.data.trace import Step, Trace
-from ssh_abduction.theory.evidence import pairs_of
+from ssh_abduction.theory.evidence import Evidence, pairs_of
 from ssh_abduction.theory.pairs import Pairs
 from ssh_abduction.theory.theory import Theory
 
@@ -71,15 +72,40 @@ class Log:
     Attributes:
         actions: The action after each step but the last.
         seen: The observation (view, and perhaps star) at each step.
-        pairs: The evidence about pairs of steps: which cannot be, or must be, one dstate or place.
     """
 
-    def __init__(self, trace: Trace, theory: Theory, pairs: Pairs | None = None) -> None:
-        self.pairs = pairs_of(trace, theory) if pairs is None else pairs
+    def __init__(
+        self,
+        trace: Trace,
+        theory: Theory,
+        pairs: Pairs | None = None,
+        evidence: tuple[Evidence, ...] | None = None,
+    ) -> None:
+        """Number the actions and observations.
+
+        Args:
+            trace: The trace.
+            theory: The theory, in which no field is "auto".
+            pairs: The evidence about pairs of steps; None to find it when it is first used.
+            evidence: The evidence of the theory; None to make it.
+        """
+        self._pairs, self._find = pairs, partial(pairs_of, trace, theory, evidence)
         actions: dict[str, int] = {}
         seen: dict[object, int] = {}
         self.actions = [actions.setdefault(a.name, len(actions)) for a in trace.actions]
         self.seen = [seen.setdefault(observation(step, theory), len(seen)) for step in trace.steps]
+
+    @property
+    def pairs(self) -> Pairs:
+        """The evidence about pairs of steps: which cannot be, or must be, one dstate or place."""
+        if self._pairs is None:
+            self._pairs = self._find()
+        return self._pairs
+
+    @property
+    def has_pairs(self) -> bool:
+        """Whether the evidence about pairs of steps is found already."""
+        return self._pairs is not None
 
     def replay(
         self,
