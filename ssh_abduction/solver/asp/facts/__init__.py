@@ -4,7 +4,7 @@ Only this package knows the names of predicates. Each family of encodings has a 
 packages import the functions for the readable encodings (`encodings/*.lp`), which are listed below.
 
 The fast encodings (`encodings/fast/*.lp`) have a step as an argument of a fact. So one call grounds
-the rules for many steps. The readable encodings have a program part for each step. To ground them
+the rules for many steps. The readable encodings have a program part for each step. Grounding them
 takes about thirty times as long, but mostly they are grounded only for short prefixes of a trace.
 """
 

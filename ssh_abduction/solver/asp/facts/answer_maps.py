@@ -135,7 +135,7 @@ def _map(
 def views_of(
     labels: Mapping[int, int], trace: Trace, faults: Iterable[tuple[int, str]] = ()
 ) -> dict[int, View | None]:
-    """The view of each dstate: the first view there that is known and not treated as wrong.
+    """Return the view of each dstate: the first view there that is known and not treated as wrong.
 
     Args:
         labels: The dstate of each step.

@@ -10,12 +10,13 @@ COURSE = {"pos": 1, "neg": -1}
 
 
 def constant(value: str | int) -> str:
+    """Return a number or a text as a constant of clingo."""
     return str(Number(value) if isinstance(value, int) else String(value))
 
 
 @lru_cache(maxsize=2**14)
 def read_atom(symbol: Symbol) -> tuple[str, tuple[int, ...]]:
-    """The name of an atom and its arguments as numbers; pos is 1 and neg is -1.
+    """Return the name of an atom and its arguments as numbers; pos is 1 and neg is -1.
 
     Results are cached: answers share most atoms, and each part of an atom takes a call to clingo.
     """
@@ -29,5 +30,5 @@ _number = cache(Number)  # takes half the time of making a new number
 
 
 def numbers(*arguments: int) -> list[Symbol]:
-    """Numbers as clingo's symbols, for the arguments of a program part or of an atom."""
+    """Return numbers as clingo's symbols, for the arguments of a program part or of an atom."""
     return [_number(argument) for argument in arguments]

@@ -14,28 +14,28 @@ from ssh_abduction.solver.asp.facts.atoms import numbers
 
 
 def active(axiom: str, t: int) -> Symbol:
-    """The atom that says that an axiom must hold at step t (explain.lp)."""
+    """Return the atom that says that an axiom must hold at step t (explain.lp)."""
     return Function("active", [Function(axiom), *numbers(t)])
 
 
 def told_of(steps: Iterable[int]) -> str:
-    """The facts that name the steps that conclusions may be about."""
+    """Return the facts that name the steps that conclusions may be about."""
     return " ".join(f"told_of({t})." for t in sorted(set(steps)))
 
 
 def conclusion(name: str, *steps: int) -> Symbol:
-    """The atom of a conclusion, such as `one_dstate`, about some steps."""
+    """Return the atom of a conclusion, such as `one_dstate`, about some steps."""
     return Function("so", [Function(name, numbers(*steps))])
 
 
 def read_conclusion(symbol: Symbol) -> tuple[str, tuple[int, ...]]:
-    """The name and the steps of a conclusion, from its atom."""
+    """Return the name and the steps of a conclusion, from its atom."""
     said = symbol.arguments[0]
     return said.name, tuple(argument.number for argument in said.arguments)
 
 
 def conclusions_of(control: Control) -> list[Symbol]:
-    """The atoms of all conclusions that are possible in a ground control."""
+    """Return the atoms of all conclusions that are possible in a ground control."""
     return [atom.symbol for atom in control.symbolic_atoms.by_signature("so", 1)]
 
 
@@ -58,17 +58,17 @@ def read_argument(model: Model) -> tuple[frozenset[Symbol], frozenset[Symbol], f
 
 
 def picked(symbol: Symbol) -> Symbol:
-    """The external atom that picks a conclusion. At least one picked conclusion is to fail."""
+    """Return the external atom that picks a conclusion. At least one picked one is to fail."""
     return Function("picked", [symbol])
 
 
 def some_fail() -> Symbol:
-    """The atom that holds if at least one of the picked conclusions does not hold."""
+    """Return the atom that holds if at least one of the picked conclusions does not hold."""
     return Function("some_fail")
 
 
 def may_fail(conclusions: Iterable[Symbol]) -> str:
-    """The rules that define `some_fail` and `picked` for some conclusions."""
+    """Return the rules that define `some_fail` and `picked` for some conclusions."""
     return "\n".join(
         f"#external {picked(c)}. {some_fail()} :- {picked(c)}, not {c}. "
         f"#heuristic {c} : {picked(c)}. [1,false]"

@@ -37,12 +37,17 @@ def faulty_rests(names: Mapping[int, int]) -> Iterator[tuple[int, int]]:
 
 
 def at_most_faults(most: int) -> str:
-    """The rule that the steps given so far have at most this many faults."""
+    """Return the rule that the steps given so far have at most this many faults."""
     return f":- #count {{ T,misread : misreads(T); T,slipped : slips(T) }} > {most}."
 
 
 def dstates_and_faults_up_to(dstates: int, tenths: int) -> str:
-    """The rules that limit the number of dstates, and the cost of faults in tenths of a dstate."""
+    """Return the rules that limit the number of dstates and the cost of faults.
+
+    Args:
+        dstates: The greatest number of dstates.
+        tenths: The greatest cost of all faults, in tenths of a dstate.
+    """
     faults = (
         "W,T,misread : misreads(T), price(misread,T,W); W,T,slipped : slips(T), price(slipped,T,W)"
     )
@@ -53,7 +58,7 @@ def dstates_and_faults_up_to(dstates: int, tenths: int) -> str:
 
 
 def faulty_base(actions: Iterable[int], names: Mapping[int, int], kinds: Iterable[str]) -> str:
-    """The facts for the names, the actions and the allowed kinds of faults.
+    """Return the facts for the names, the actions and the allowed kinds of faults.
 
     Args:
         actions: The actions as numbers.
@@ -80,7 +85,7 @@ def faulty_batch(
     price: Mapping[str, Sequence[int]],
     full: Collection[int] = (),
 ) -> str:
-    """The facts for a batch: some further steps of a trace.
+    """Return the facts for a batch: some further steps of a trace.
 
     Args:
         batch: The number of the batch.
@@ -119,7 +124,7 @@ def faulty_batch(
 
 
 def not_all_one(equalities: Collection[Equality]) -> str:
-    """The rule that some equalities of steps do not all hold. All of the steps must be given."""
+    """Return the rule that some equalities of steps do not all hold. Clingo must have the steps."""
     body = (f"is({e.first},S{k}), is({e.second},S{k})" for k, e in enumerate(equalities))
     return f":- {', '.join(body)}."
 

@@ -23,7 +23,7 @@ def name_facts(
     choices: Sequence[Sequence[int]],
     ordered: bool = True,
 ) -> str:
-    """The facts that hold for all batches.
+    """Return the facts that hold for all batches.
 
     Args:
         names: Pairs of a name and its view.
@@ -64,7 +64,7 @@ def batch_facts(
     links: Iterable[tuple[int, int, int]],
     apart: Iterable[tuple[int, int]],
 ) -> str:
-    """The facts for one batch of nodes.
+    """Return the facts for one batch of nodes.
 
     Args:
         batch: The number of the batch.
@@ -84,22 +84,22 @@ def batch_facts(
 
 
 def resting(batch: int) -> Symbol:
-    """The atom that says that some step of the batches up to this one is at a rest."""
+    """Return the atom that says that some step of the batches up to this one is at a rest."""
     return Function("resting", numbers(batch))
 
 
 def ordered() -> Symbol:
-    """The atom that says that steps use the spare names of a view in the order of the names."""
+    """Return the atom that says that steps use the spare names of a view in their order."""
     return Function("ordered")
 
 
 def named(t: int, name: int) -> Symbol:
-    """The atom that says that step t is at the dstate of that name."""
+    """Return the atom that says that step t is at the dstate of that name."""
     return Function("is", numbers(t, name))
 
 
 def used(name: int) -> Symbol:
-    """The atom that says that a spare name is used."""
+    """Return the atom that says that a spare name is used."""
     return Function("used", numbers(name))
 
 
@@ -166,7 +166,7 @@ class NameReader:
 
 
 def not_together(number: int, pairs: Sequence[tuple[int, int]]) -> str:
-    """The rules that forbid that all of some pairs of steps are one dstate.
+    """Return the rules that forbid that all of some pairs of steps are one dstate.
 
     Two steps at a rest do not count as one dstate.
 
@@ -186,7 +186,7 @@ def not_together(number: int, pairs: Sequence[tuple[int, int]]) -> str:
 def forbidden_links(
     links: Iterable[tuple[int, int, int]], placed: Iterable[tuple[int, int]] = ()
 ) -> str:
-    """The rule that some links do not all hold while some steps are at certain dstates.
+    """Return the rule that some links do not all hold while some steps are at certain dstates.
 
     Args:
         links: Triples of a name, an action, and the name that it leads to.

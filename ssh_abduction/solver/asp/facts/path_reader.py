@@ -31,8 +31,8 @@ class PathAnswer:
     """The places and paths in an answer of paths_framed.lp or paths_frameless.lp.
 
     Attributes:
-        at: For each place that turns join, the place of the map, and by how many quarters the frame
-            of one is turned against that of the other.
+        at: For each place that turns join, the place of the map, and the quarters clockwise from
+            the frame of the place of the map to its own frame.
         part: For each segment, its path, and its direction on the path (1 or -1).
         order: For each path, its places in order.
     """
@@ -46,8 +46,8 @@ class PathReader:
     """Reads maps from answers of paths_framed.lp or paths_frameless.lp, for fixed labels.
 
     It asks clingo whether single atoms are in an answer, beginning with the atoms of the last
-    answer. That takes a third of the time of reading all atoms. Whatever follows from the labels is
-    computed once.
+    answer. That takes a third of the time of reading all atoms. Values that follow from the labels
+    are computed once.
     """
 
     def __init__(
@@ -86,10 +86,10 @@ class PathReader:
         self._made: dict[tuple[object, ...], DState] = {}
 
     def condition(self, sort: str, i: int, j: int) -> str | None:
-        """The body of a rule that holds if two dstates share a place, path or course.
+        """Return the body of a rule that holds if two dstates share a place, path or course.
 
         Args:
-            sort: What they share: "places", "paths" or "courses".
+            sort: "places", "paths" or "courses".
             i: The number of one dstate.
             j: The number of the other.
 
@@ -110,7 +110,7 @@ class PathReader:
         return f"course({g},H,D), course({h},H,E){same_way}"
 
     def read(self, model: Model) -> PathAnswer:
-        """Read the values of an answer that `map_of` needs. clingo may then change the answer."""
+        """Read everything that `map_of` needs from an answer. Then clingo may change the answer."""
         at, part = self._at.made_in(model), self._part.made_in(model)
         on: dict[int, dict[int, None]] = {}  # for each path, the places on it
         for segment, component in self._passes:
@@ -140,6 +140,7 @@ class PathReader:
         return order
 
     def _is_before(self, model: Model, ahead: _Ahead) -> bool:
+        """Tell whether an answer has the first of two places of a path before the second."""
         literal = self._before.get(ahead)
         if literal is None:
             atom = model.context.symbolic_atoms[Function("before", numbers(*ahead))]
@@ -225,9 +226,9 @@ class _Choices:
             self._among.setdefault(a, []).append((literal, (b, c)))
 
     def made_in(self, model: Model) -> dict[int, tuple[int, int]]:
-        """The other two arguments that an answer chooses, by the first argument."""
+        """Return the other two arguments that an answer chooses, by the first argument."""
         made = {}
-        # Ask first whether the choices are those of the last answer.
+        # Ask first about the atoms that the last answer had.
         for a, among in self._among.items():
             if len(among) > 1 and not model.is_true(among[0][0]):
                 taken = next(i for i, (literal, _) in enumerate(among) if model.is_true(literal))
@@ -237,7 +238,7 @@ class _Choices:
 
 
 def _literals(control: Control, name: str) -> dict[tuple[int, int, int], int]:
-    """The literals of all atoms of a predicate with three arguments, by its arguments."""
+    """Return the literals of all atoms of a predicate with three arguments, by its arguments."""
     found = {}
     for atom in control.symbolic_atoms.by_signature(name, 3):
         a, b, c = read_atom(atom.symbol)[1]

@@ -25,7 +25,7 @@ from ssh_abduction.theory.theory import Theory
 def paths_framed_facts(
     trace: Trace, theory: Theory, chart: FramedChart, forbidden: Sequence[Collection[Equality]] = ()
 ) -> str:
-    """The facts for paths_framed.lp about the nodes of a chart: turns, travels and evidence.
+    """Return the facts for paths_framed.lp about the nodes of a chart: turns, travels and evidence.
 
     Args:
         trace: The trace.
@@ -65,7 +65,7 @@ def paths_frameless_facts(
     *,
     single: bool = False,
 ) -> str:
-    """The facts for paths_frameless.lp about dstates and their links.
+    """Return the facts for paths_frameless.lp about dstates and their links.
 
     Args:
         theory: The theory, in which no field is "auto".
@@ -117,7 +117,7 @@ def settled_facts(
     *,
     single: bool = False,
 ) -> str:
-    """The facts for paths_framed.lp about the labels of some nodes.
+    """Return the facts for paths_framed.lp about the labels of some nodes.
 
     Args:
         theory: The theory, in which no field is "auto".
@@ -140,7 +140,7 @@ def settled_facts(
 
 
 def stretch_facts(trace: Trace, theory: Theory, labels: Iterable[int]) -> str:
-    """The facts that say on which stretches between lifts the dstates of steps are.
+    """Return the facts that say on which stretches between lifts the dstates of steps are.
 
     Args:
         trace: The trace.
@@ -203,7 +203,7 @@ class Segments:
 
 
 def tight_facts(homes: Mapping[int, Iterable[int]]) -> str:
-    """The facts for paths_frameless.lp that say which fixed places each place may be.
+    """Return the facts for paths_frameless.lp that say which fixed places each place may be.
 
     Fixed places are pairwise different, and with these facts there are no other places.
     """
@@ -213,7 +213,7 @@ def tight_facts(homes: Mapping[int, Iterable[int]]) -> str:
 
 
 def pinned_facts(segments: Iterable[int]) -> str:
-    """The facts for paths_framed.lp that name segments which are pairwise different paths."""
+    """Return the facts for paths_framed.lp that name segments on pairwise different paths."""
     return " ".join(f"pinned({segment})." for segment in segments)
 
 
@@ -229,12 +229,16 @@ def read_elsewhere(model: Model) -> list[tuple[int, int]]:
 
 
 def settled_labels(labels: Iterable[tuple[int, int]]) -> str:
-    """The facts that give some nodes their dstates. `labels` has pairs of a node and its dstate."""
+    """Return the facts that give some nodes their dstates.
+
+    Args:
+        labels: Pairs of a node and its dstate.
+    """
     return "\n".join(f"is({node},{label})." for node, label in labels)
 
 
 def open_labels(labels: Sequence[int]) -> str:
-    """The rules that let clingo keep or drop the label of each node.
+    """Return the rules that let clingo keep or drop the label of each node.
 
     An answer is a set of kept labels that no places and paths fit.
 

@@ -18,12 +18,12 @@ from ssh_abduction.theory.fields import Count
 
 
 def are_one(first: int, second: int) -> Symbol:
-    """The atom that says that two steps are one dstate. The first step must be the earlier one."""
+    """Return the atom that says that two steps are one dstate. The first is the earlier step."""
     return Function("same", numbers(first, second))
 
 
 def forbidden_equalities(equalities: Iterable[Equality], where: Symbol | None = None) -> str:
-    """The rule that some equalities of steps do not all hold.
+    """Return the rule that some equalities of steps do not all hold.
 
     Args:
         equalities: The equalities.
@@ -40,12 +40,12 @@ def forbidden_equalities(equalities: Iterable[Equality], where: Symbol | None = 
 
 
 def rests_on(axiom: str, t: int, other: str) -> str:
-    """The rule that if an axiom is active at step t, another axiom holds at every step."""
+    """Return the rule that if an axiom is active at step t, another axiom holds at every step."""
     return f":- {active(axiom, t)}, violation({other},T)."
 
 
 def doubt(number: int, part: int, condition: str | None, *, one: bool) -> str:
-    """The rules for a doubt about two things, such as two steps.
+    """Return the rules for a doubt about two things, such as two steps.
 
     If the doubt is open and true in an answer, `some_doubt` is true.
 
@@ -71,7 +71,7 @@ def doubt(number: int, part: int, condition: str | None, *, one: bool) -> str:
 
 
 def doubts_before(part: int) -> str:
-    """The rule that some doubt of the parts up to this one holds if one of an earlier part does."""
+    """Return the rule that `some_doubt` of this part is true if that of the part before is true."""
     return (
         f"{some_doubt(part)} :- {some_doubt(part - 1)}."
         if part > 1
@@ -80,7 +80,7 @@ def doubts_before(part: int) -> str:
 
 
 def steps_are_one(sort: str, i: int, j: int) -> str:
-    """The body of a rule that holds if two steps share a dstate, place, path or course.
+    """Return the body of a rule that holds if two steps share a dstate, place, path or course.
 
     Args:
         sort: What they share: "dstates", "places", "paths" or "courses".
@@ -97,17 +97,17 @@ def steps_are_one(sort: str, i: int, j: int) -> str:
 
 
 def open_doubt(number: int) -> Symbol:
-    """The external atom that says that a doubt is open: an answer may make it true."""
+    """Return the external atom that says that a doubt is open: an answer may make it true."""
     return Function("open_doubt", numbers(number))
 
 
 def some_doubt(part: int) -> Symbol:
-    """The atom that says that an open doubt of this program part or of an earlier one holds."""
+    """Return the atom that says that an open doubt of this program part or an earlier one holds."""
     return Function("some_doubt", numbers(part))
 
 
 def exactly(number: int, count: Count) -> str:
-    """The rule that a map has this many dstates, places or paths, if `of_number` is true.
+    """Return the rule that a map has this many dstates, places or paths, if `of_number` is true.
 
     Args:
         number: The number.
@@ -123,5 +123,5 @@ def exactly(number: int, count: Count) -> str:
 
 
 def of_number(number: int, count: Count) -> Symbol:
-    """The external atom that switches the rule of `exactly` on."""
+    """Return the external atom that switches the rule of `exactly` on."""
     return Function("of_number", [Function(count), *numbers(number)])

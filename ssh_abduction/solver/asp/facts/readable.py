@@ -24,12 +24,12 @@ from ssh_abduction.theory.theory import Theory
 
 
 def encoding_names(theory: Theory) -> tuple[str, ...]:
-    """The names of the encodings that a theory needs, in the order to load them."""
+    """Return the names of the encodings that a theory needs, in the order to load them."""
     return (*encodings.needed_by(vars(theory)), "preference", "show")
 
 
 def theory_facts(theory: Theory, paths: int) -> str:
-    """The facts for a theory: its axioms, its preference, and names for paths.
+    """Return the facts for a theory: its axioms, its preference, and names for paths.
 
     Args:
         theory: The theory, in which no field is "auto".
@@ -44,7 +44,7 @@ def theory_facts(theory: Theory, paths: int) -> str:
 
 
 def preferred(theory: Theory) -> list[str]:
-    """The facts for the counts that a theory minimises: the first one has the highest level."""
+    """Return the facts for the counts that a theory minimises. The first has the highest level."""
     return [
         f"prefer({count},{len(theory.priorities) - i})."
         for i, count in enumerate(theory.priorities)
@@ -57,12 +57,12 @@ def own_rules(theory: Theory) -> str:
 
 
 def run_by_steps() -> Symbol:
-    """The external atom that allows answers. It says that the parts of all steps are grounded."""
+    """Return the external atom that allows answers: the parts of all steps are grounded."""
     return Function("run_by_steps")
 
 
 def most_paths(trace: Trace, theory: Theory, steps: int) -> int:
-    """The greatest number of paths that a map of the first steps can have.
+    """Return the greatest number of paths that a map of the first steps can have.
 
     A path can begin only at the first step of a drive, and where a turn right or left, a lift, or
     an action that slipped ends.
@@ -81,7 +81,7 @@ def most_paths(trace: Trace, theory: Theory, steps: int) -> int:
 
 
 def trace_facts(problem: Problem, start: int, stop: int) -> str:
-    """The facts for steps `start` to `stop - 1`, and for the actions that lead to these steps."""
+    """Return the facts for steps `start` to `stop - 1`, and for the actions that lead to them."""
     trace, theory = problem.trace, problem.theory
     facts = []
     for t in range(start, stop):
@@ -131,7 +131,7 @@ def trace_facts(problem: Problem, start: int, stop: int) -> str:
 
 
 def _gateway_facts(trace: Trace, start: int, stop: int, *, changes: bool) -> Iterator[str]:
-    """Yield facts for gateways.lp: what steps see, and how that fits what earlier steps see."""
+    """Yield facts for gateways.lp: the stars of steps, and how they fit those of earlier steps."""
     found = frames.Frames(trace, stop, changes=changes)
     known = len(frames.Frames(trace, start, changes=changes).frames)
     yield from (f"star({t},{found.stars[t]})." for t in range(start, stop))
@@ -197,7 +197,7 @@ def _evidence_facts(problem: Problem, start: int, stop: int) -> Iterator[str]:
 
 
 def program(problem: Problem) -> str:
-    """The text of a file that `encodings/run.py` solves: the facts of a trace and its theory."""
+    """Return a file that `encodings/run.py` solves: the facts of a trace and its theory."""
     trace, theory = problem.trace, problem.theory
     files = " ".join(f"{name}.lp" for name in encoding_names(theory))
     return "\n".join(
@@ -214,11 +214,12 @@ def program(problem: Problem) -> str:
 
 
 def query(t: int) -> Symbol:
-    """The external atom that says that step t is the last step."""
+    """Return the external atom that says that step t is the last step."""
     return Function("query", numbers(t))
 
 
 def _kind_fact(action: Action) -> str:
+    """Return the fact that says that an action is a lift, a travel or a turn."""
     name = constant(action.name)
     if action.changes_floor:
         return f"kind({name},lift)."

@@ -15,7 +15,7 @@ _DIRECTION = {1: "pos", -1: "neg"}
 
 
 def region_facts(ssh_map: SSHMap, trace: Trace, axioms: Collection[str]) -> str:
-    """The facts for regions.lp.
+    """Return the facts for regions.lp.
 
     Args:
         ssh_map: A map with places.
@@ -42,7 +42,7 @@ def region_facts(ssh_map: SSHMap, trace: Trace, axioms: Collection[str]) -> str:
 
 
 def members_in(control: Control) -> dict[Reason, set[int]]:
-    """The places of each region, by the reason that makes them a region.
+    """Return the places of each region, by the reason that makes them a region.
 
     Args:
         control: A control that has grounded regions.lp. Grounding decides all atoms of it.
@@ -58,6 +58,7 @@ def members_in(control: Control) -> dict[Reason, set[int]]:
 
 
 def _reason(term: Symbol, number: int) -> Reason:
+    """Return the reason for a region from its term. `number` differs for each term."""
     first, *rest = term.arguments
     if term.name == "beside":
         return term.name, first.number, COURSE[rest[0].name]

@@ -14,14 +14,14 @@ from ssh_abduction.theory.theory import Theory
 
 
 def sides_framed_facts(theory: Theory) -> str:
-    """The facts that say which axioms about the sides of paths a theory has."""
+    """Return the facts that say which axioms about the sides of paths a theory has."""
     facts = ["sided."] if theory.boundary != "none" else []
     facts += ["symmetric."] if theory.symmetric_sides else []
     return "\n".join(facts)
 
 
 def sides_frameless_facts(theory: Theory, actions: Mapping[int, Action]) -> str:
-    """The facts for sides_frameless.lp: the kind of each action, and the axioms about sides.
+    """Return the facts for sides_frameless.lp: the kind of each action, and the axioms about sides.
 
     Args:
         theory: The theory.
@@ -38,7 +38,7 @@ def sides_frameless_facts(theory: Theory, actions: Mapping[int, Action]) -> str:
 def turn_facts(
     batch: int, chart: FramedChart, visits: Iterable[int], turns: Iterable[tuple[int, str, int]]
 ) -> str:
-    """The facts for sides_framed.lp about the visits and the turns of one batch.
+    """Return the facts for sides_framed.lp about the visits and the turns of one batch.
 
     Args:
         batch: The number of the batch.

@@ -22,7 +22,7 @@ def visit_facts(
     unfit: Iterable[tuple[int, int, int]] = (),
     joined: Iterable[tuple[int, int, int]] = (),
 ) -> str:
-    """The facts for one batch.
+    """Return the facts for one batch.
 
     Args:
         batch: The number of the batch.
@@ -30,7 +30,7 @@ def visit_facts(
         leaves: For each visit that ends, the visit, the slot that it leaves through, and the
             action.
         fits: Pairs of visits (I, J, R) that may be at one place.
-        unfit: Pairs (I, J, R) of earlier batches that turned out not to be at one place.
+        unfit: Pairs (I, J, R) of earlier batches that are now known not to be at one place.
         joined: Pairs (I, J, R) that the user says are at one place.
     """
     new = {"node": nodes, "leaves": leaves, "fits": fits, "unfit": unfit, "joined": joined}
@@ -42,7 +42,7 @@ def visit_facts(
 
 
 def same(pair: tuple[int, int, int]) -> Symbol:
-    """The atom that says that a pair of visits (I, J, R) is at one place."""
+    """Return the atom that says that a pair of visits (I, J, R) is at one place."""
     return Function("same", numbers(*pair))
 
 
@@ -53,12 +53,12 @@ def read_same(atom: Symbol) -> tuple[int, int, int]:
 
 
 def listed(batch: int) -> Symbol:
-    """The external atom that is true while answers for the batches up to this one are listed."""
+    """Return the external atom that is true while answers up to this batch are listed."""
     return Function("listed", numbers(batch))
 
 
 def first(place: int) -> Symbol:
-    """The atom that says that a node is the first at its dstate.
+    """Return the atom that says that a node is the first at its dstate.
 
     Args:
         place: The number of the node, which is its position in the order of nodes.
@@ -67,7 +67,7 @@ def first(place: int) -> Symbol:
 
 
 def over(core: int, count: int) -> Symbol:
-    """The atom that says that at least `count` members of an unsat core are true."""
+    """Return the atom that says that at least `count` members of an unsat core are true."""
     return Function("over", numbers(core, count))
 
 
@@ -79,12 +79,12 @@ def read_over(member: Symbol) -> tuple[int, int] | None:
 
 
 def core_facts(core: int, members: Iterable[Symbol]) -> str:
-    """The facts that name the members of an unsat core: atoms that cannot all be false."""
+    """Return the facts that name the members of an unsat core: atoms that cannot all be false."""
     return "\n".join(f"member({core},{member})." for member in members)
 
 
 def three_facts(batch: int, threes: Iterable[tuple[int, ...]]) -> str:
-    """The facts for triples of visits for which "is at one place" has to be transitive.
+    """Return the facts for triples of visits for which "is at one place" has to be transitive.
 
     Args:
         batch: The number of the program part. Each call has a new one.
@@ -99,7 +99,7 @@ def forbidden_pairs(
     different: Iterable[tuple[int, int, int]] = (),
     listed: int | None = None,
 ) -> str:
-    """The rule that forbids answers with all of some pairs of visits and none of some others.
+    """Return the rule that forbids answers with all pairs of one set and none of another set.
 
     Args:
         pairs: Pairs (I, J, R) that are all at one place in the forbidden answers.
@@ -114,7 +114,7 @@ def forbidden_pairs(
 
 
 def forbidden_places(equalities: Sequence[Sequence[tuple[int, int, int]]]) -> str:
-    """The rules that some equalities do not all hold.
+    """Return the rules that some equalities do not all hold.
 
     Args:
         equalities: For each equality, pairs of visits (I, J, R). The equality holds if one of its
