@@ -76,7 +76,7 @@ def _clashes_of(m: Reading) -> list[Clash]:
 
 
 def _sights_of(m: Reading) -> tuple[list[Sight], Turns]:
-    """The sights of a map; with a price of changes, each drive has its own."""
+    """Return the sights of a map; with a price of changes, each drive has its own."""
     return sights_of(m.trace, m.map, m.onward, bool(m.theory.changed))
 
 

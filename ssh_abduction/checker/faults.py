@@ -49,7 +49,7 @@ def _changes(m: Reading) -> Iterator[tuple[int, int, int, str, str]]:
 
 
 def _told(fault: Fault) -> tuple[object, ...]:
-    """What a map says of a change."""
+    """Return the values of a change that a map lists."""
     where = fault.gateway if fault.bearing is None else fault.bearing
     return fault.place, where, fault.step, fault.expected, fault.seen
 

@@ -98,13 +98,13 @@ def _begins(at: Sequence[int], visit: Sequence[int]) -> list[int]:
 
 
 def course_of(ssh_map: SSHMap) -> Course:
-    """The dstate and the place of each step, numbered by first visit."""
+    """Return the dstate and the place of each step, numbered by first visit."""
     places = [ssh_map.dstates[label].place for label in ssh_map.dstate_at]
     return tuple(numbered(ssh_map.dstate_at)), tuple(numbered(places))
 
 
 def rival_of(ssh_map: SSHMap, nats: float) -> Rival:
-    """The rival that a map of this cost is."""
+    """Make a rival of a map and its cost in nats."""
     dstates, places = course_of(ssh_map)
     faults = tuple((fault.kind, fault.step) for fault in ssh_map.faults)
     return Rival(nats, dstates, places if ssh_map.places else (), faults=faults)

@@ -105,7 +105,7 @@ class Solution(MapSequence):
         return f"<Solution {self.headline}>"
 
     def _repr_html_(self) -> str:
-        """The HTML that notebooks show: how the search ended, the summary, and the first map."""
+        """Return the HTML for notebooks: how the search ended, the summary, and the first map."""
         parts = []
         if self.status is not Status.UNSATISFIABLE:
             parts.append(cards.paragraph(self.summary))
@@ -205,7 +205,7 @@ class Solution(MapSequence):
         return sentence_of(self.by_minimality, self.count, minimal=minimal)
 
     def probability(self, first: int, second: int, of: str = "dstate") -> float:
-        """The probability that two steps are at one dstate, or at one place.
+        """Return the probability that two steps are at one dstate, or at one place.
 
         Args:
             first: The number of a step.
@@ -338,7 +338,7 @@ class Solution(MapSequence):
             return getattr(self.effort, name)
 
     def to_dict(self) -> dict[str, Any]:
-        """The answer as plain data, as `solve --json` prints it (docs/reference/formats.md).
+        """Return the answer as plain data, as `solve --json` prints it (docs/reference/formats.md).
 
         Two fields of `solve --json` are missing, as each needs another search: why there is no map,
         and the runner-up.

@@ -62,7 +62,7 @@ class Cost:
         return tuple(getattr(self, name) for name in checked_theory(theory).priorities)
 
     def to_dict(self) -> dict[str, float]:
-        """The counts by name. Excuses and faults are left out if there are none."""
+        """Return the counts by name. Excuses and faults are left out if there are none."""
         counts: dict[str, float] = {
             "dstates": self.dstates,
             "places": self.places,
@@ -117,7 +117,7 @@ class Bound:
         return shortly(self)
 
     def to_dict(self) -> dict[str, float]:
-        """The bounds that are proven, by name. "cost" is `tenths` in dstates."""
+        """Return the bounds that are proven, by name. "cost" is `tenths` in dstates."""
         counts: dict[str, float | None] = {
             "dstates": self.dstates,
             "places": self.places,
@@ -179,7 +179,7 @@ class Level:
     complete: bool = field(default=False, compare=False)
 
     def to_dict(self) -> dict[str, Any]:
-        """The cost and the count as plain data."""
+        """Return the cost and the count as plain data."""
         return {"cost": self.cost.to_dict(), "count": self.count}
 
 

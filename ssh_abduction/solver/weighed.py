@@ -44,7 +44,7 @@ class Rival:
     faults: tuple[tuple[str, int], ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
-        """The rival as plain data."""
+        """Return the rival as plain data."""
         written: dict[str, Any] = {"nats": round(self.nats, 6), "dstates": list(self.dstates)}
         written |= {"places": list(self.places)} if self.places else {}
         written |= {"faults": [list(fault) for fault in self.faults]} if self.faults else {}
@@ -128,10 +128,11 @@ class Weighed:
         )
 
     def nats_if_other(self, first: int, second: int) -> float | None:
-        """How many nats more a map costs that has two steps at one place if the best map has not.
+        """Return the extra cost, in nats, of deciding otherwise about two steps.
 
-        Or that has them at two places if the best map has them at one. Maps without places are
-        compared by dstates. None if no such map is known.
+        If the best map has them at one place, the cheapest map that has them at two places costs
+        this much more, and the other way round. Maps without places are compared by dstates. None
+        if no such map is known.
         """
         at = [rival.places or rival.dstates for rival in self.rivals]
         is_one = at[0][first] == at[0][second]
@@ -182,7 +183,7 @@ class Weighed:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """The costs as plain data."""
+        """Return the costs as plain data."""
         return {
             "nats": round(self.nats, 6),
             "bound": round(self.bound, 6),
@@ -230,7 +231,7 @@ class Weighed:
 
 
 def probability_in_words(probability: float) -> str:
-    """A probability with two digits, but never 0 or 1, as nothing is certain."""
+    """Return a probability with two digits, but never 0 or 1, as nothing is certain."""
     if probability < 0.005:
         return "below 0.01"
     return "above 0.99" if probability >= 0.995 else f"{probability:.2f}"

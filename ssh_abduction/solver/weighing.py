@@ -119,7 +119,7 @@ class Weighing:
         return self.candidates[0] if self.candidates else None
 
     def minimal(self) -> list[Candidate]:
-        """The maps of least cost."""
+        """Return the maps of least cost."""
         least = self.candidates[0].nats + EQUAL if self.candidates else 0.0
         return [candidate for candidate in self.candidates if candidate.nats <= least]
 
@@ -293,7 +293,7 @@ class Weighing:
         return min(*found, self._price(least)) + self._base
 
     def _price(self, counts: Mapping[str, int]) -> float:
-        """The price of this many dstates, places and paths, in nats."""
+        """Return the price of this many dstates, places and paths, in nats."""
         return sum(price * counts.get(name, 0) for name, price in self._prices.items())
 
     def weighed(self) -> Weighed | None:

@@ -195,7 +195,7 @@ class FaultyEngine:
             self._control.give_around([failed, *doubted] if failed >= 0 else doubted)
 
     def _cost_of(self, found: Found) -> int:
-        """The cost of a map as clingo counts it, in tenths of dstates."""
+        """Return the cost of a map as clingo counts it, in tenths of dstates."""
         return found.cost[0] if self._most_faults is None else 10 * len(found.map.dstates)
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:

@@ -233,7 +233,7 @@ class Beam:
         return sorted(settled, key=lambda found: found.nats)
 
     def _price_of(self, found: Hypothesis) -> float:
-        """The price of the dstates, places and faults of a hypothesis, in nats."""
+        """Return the price of the dstates, places and faults of a hypothesis, in nats."""
         price = self._prices[0] * len(found.places) + self._prices[1] * len(found.position)
         price += sum(self._fault[kind][t] for t, kind in found.faults)
         if "misread" in self._fault:

@@ -84,7 +84,7 @@ class _Place:
     turns: dict[tuple[_Seen, _Seen], set[Action]] = field(default_factory=dict)
 
     def with_sight(self, seen: _Seen, step: int, move: tuple[_Seen, Action] | None) -> _Place:
-        """This place after a step there.
+        """Return this place after a step there.
 
         Args:
             seen: What the step sees.
@@ -143,7 +143,7 @@ class GatewaySketch(Sketch):
         self._last = there, self._star_seen
 
     def _may_show(self, there: int) -> bool:
-        """Whether what the present step sees fits a dstate, and what was seen at its place."""
+        """Whether the present step fits a dstate, and the earlier steps at its place."""
         place = self._states[there].place
         grown = self._grown(place, there, len(self.labels))
         known = self._shown[place]
@@ -154,14 +154,14 @@ class GatewaySketch(Sketch):
         return fit(*self._sights(grown), self._axioms, as_shown=False) is not None
 
     def _grown(self, place: int, there: int, t: int) -> _Place:
-        """What was seen at a place, and at step t, the present one, at a dstate there."""
+        """Return the place with step t added, the present step, at a dstate there."""
         move = None
         if self._turn_made and self._last and self._states[self._last[0]].place == place:
             move = self._last, self._turn_made
         return self._shown[place].with_sight((there, self._star_seen), t, move)
 
     def _sights(self, place: _Place) -> tuple[list[Sight], dict[tuple[Sight, Sight], set[Action]]]:
-        """The sights of a place and the turns between them, as `fit` takes them."""
+        """Return the sights of a place and the turns between them, as `fit` takes them."""
         made: dict[_Seen, Sight] = {}
         shown: set[int] = set()
         for (s, star), t in place.sights.items():
@@ -173,7 +173,7 @@ class GatewaySketch(Sketch):
         return list(made.values()), {(made[a], made[b]): x for (a, b), x in place.turns.items()}
 
     def _onward(self, s: int) -> tuple[int, ...]:
-        """The directions in which the path of a dstate goes on: 0 (ahead), 180 (behind) degrees."""
+        """Return the directions in which the path of a dstate goes on: 0 (ahead), 180 (behind)."""
         known = self._states[s]
         if known.path is None:
             return ()
@@ -199,7 +199,7 @@ class GatewaySketch(Sketch):
         return fits
 
     def _first_of(self, known: Iterable[int], step: Step) -> int | None:
-        """The first of some dstates at which a step may be; None if there is none."""
+        """Return the first of some dstates at which a step may be; None if there is none."""
         seen = observation(step, self._theory)
         return next((x for x in known if self._states[x].seen == seen and self._may_show(x)), None)
 
@@ -233,7 +233,7 @@ class GatewaySketch(Sketch):
         return there
 
     def _ends(self, place: int, path: int, direction: int) -> bool:
-        """Whether a path ends at a place: what is seen there shows no gateway that leads on."""
+        """Whether a path ends at a place: a star seen there has no gateway that leads on."""
         for s, star in self._shown[place].sights:
             known = self._states[s]
             if known.path == path and not _leads_on(

@@ -89,7 +89,7 @@ def _agree(first: Star | tuple[bool, ...] | None, second: Star | tuple[bool, ...
 
 @lru_cache(maxsize=2**14)
 def _fewest_changes(first: tuple[bool, ...], second: tuple[bool, ...]) -> int:
-    """The fewest gateways that differ between two stars of four openings, however turned."""
+    """Return the fewest openings that differ between two stars of four, over all rotations."""
     return min(
         sum(a != b for a, b in zip(first, second[k:] + second[:k], strict=True)) for k in range(4)
     )
@@ -97,9 +97,9 @@ def _fewest_changes(first: tuple[bool, ...], second: tuple[bool, ...]) -> int:
 
 @lru_cache(maxsize=2**14)
 def _fewest_closed(first: Star, second: Star) -> float:
-    """The fewest gateways that changed between two stars with bearings; inf if more than CHANGES.
+    """Return the fewest gateways that changed between two stars with bearings.
 
-    These are the gateways without which the stars agree.
+    Without these gateways the stars agree. The result is inf if they are more than CHANGES.
     """
     return next(
         (
@@ -115,7 +115,7 @@ def _fewest_closed(first: Star, second: Star) -> float:
 
 @lru_cache(maxsize=2**14)
 def _smaller(star: Star, less: int) -> tuple[Frame, ...]:
-    """The frames of a star without some of its gateways.
+    """Return the frames of a star without some of its gateways.
 
     Args:
         star: The star.

@@ -223,7 +223,7 @@ class Sketch:
         return there
 
     def _turned_to(self, here: int, heading: int, action: Action, step: Step) -> int | None:
-        """The known dstate to which the axioms say that a turn leads; None if there is none."""
+        """Return the known dstate that a turn leads to by the axioms; None if there is none."""
         s = self._states[here]
         if self._framed:
             return self._facing.get((s.place, heading))
@@ -311,7 +311,7 @@ class Sketch:
         return s.path, s.direction
 
     def _course_through(self, here: int) -> tuple[int, int] | None:
-        """The known path, and direction, that leaves the place of a dstate in its heading.
+        """Return the known path, and direction, that leaves the place of a dstate in its heading.
 
         Without frames there are no slots, so every such path is new.
         """

@@ -122,7 +122,7 @@ class Continuations:
         return row
 
     def apart(self) -> Matrix:
-        """The pairs of steps that are apart, as a matrix of flags, steps x steps."""
+        """Return the pairs of steps that are apart, as a matrix of flags, steps x steps."""
         steps = len(self._place)
         apart = np.empty((steps, steps), dtype=bool)
         for step in range(steps):
@@ -183,7 +183,7 @@ class _Clique:
     group: int
 
     def joined(self, other: _Clique, *, apart: bool) -> _Clique:
-        """A largest clique of the union of two groups.
+        """Return a largest clique of the union of two groups.
 
         Args:
             other: A largest clique of the other group.
@@ -201,12 +201,12 @@ class _Clique:
 
 
 def _ranked(keys: NDArray[np.int_]) -> NDArray[np.int_]:
-    """The rank of each key, from 0. Equal keys have the same rank."""
+    """Return the rank of each key, from 0. Equal keys have the same rank."""
     return np.unique(keys, return_inverse=True)[1]
 
 
 def clique(apart: Matrix, seen: Sequence[int]) -> list[int]:
-    """A large clique of nodes, found greedily: a sorted list of nodes that are pairwise apart.
+    """Find a large clique of nodes greedily: a sorted list of nodes that are pairwise apart.
 
     Nodes with different views are always apart. So grow a clique for each view and join them.
 

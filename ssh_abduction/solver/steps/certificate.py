@@ -59,7 +59,7 @@ class Certificate:
         return len(self.clique) + len(self.refuted)
 
     def words(self, trace: Trace) -> dict[tuple[int, int], tuple[str, ...]]:
-        """The words that distinguish the steps of the clique.
+        """Return the words that distinguish the steps of the clique.
 
         The word of two steps is the sequence of actions that leads from both to different views. It
         is empty if their own views differ.

@@ -69,7 +69,7 @@ class Chart:
         )
 
     def apart(self) -> NDArray[np.bool_]:
-        """The pairs of nodes that are apart, as a matrix of flags, nodes x nodes."""
+        """Return the pairs of nodes that are apart, as a matrix of flags, nodes x nodes."""
         return self.continuations.apart()
 
     @cached_property
@@ -251,7 +251,7 @@ class FramedChart(Chart):
     def apart(
         self, most: int | None = None, others: Sequence[int] | None = None
     ) -> NDArray[np.bool_]:
-        """The pairs of nodes that are apart, as a matrix of flags, nodes x others.
+        """Return the pairs of nodes that are apart, as a matrix of flags, nodes x others.
 
         Two nodes are apart if their visits cannot be at one place with both nodes facing one slot.
 
@@ -284,12 +284,12 @@ class FramedChart(Chart):
         }
 
     def turns(self, trace: Trace) -> list[tuple[int, str, int]]:
-        """The distinct turns of the trace in order, as (node, direction, node)."""
+        """Return the distinct turns of the trace in order, as (node, direction, node)."""
         steps = zip(pairwise(self.node_of), trace.actions, strict=False)
         return list(dict.fromkeys((s, action.turn, x) for (s, x), action in steps if action.turn))
 
     def visits_with(self, pairs: int) -> int:
-        """Find the most first visits of which at most `pairs` pairs may be at one place."""
+        """Return the greatest n such that `fits` lists at most `pairs` for the first n visits."""
         import numpy as np
 
         return int(np.searchsorted(self.fitting, pairs, side="right")) - 1

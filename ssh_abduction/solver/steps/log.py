@@ -51,12 +51,12 @@ class Replay:
 
 
 def observation(step: Step, theory: Theory) -> tuple[object, object]:
-    """What the axioms read at a step: its view, and its star (the openings seen there) or None.
+    """Return the values of a step that the axioms read: its view, and its star or None.
 
-    Two steps at one dstate have equal observations, by functional_view and the axioms of stars. If
-    only the pattern of a star matters (star=pattern), its four rotations are one observation. The
-    star is None if stars are not used, or if they need to agree only within their spread
-    (star=alike or gateways).
+    A star is the openings seen at a step. Two steps at one dstate have equal observations, by
+    functional_view and the axioms of stars. If only the pattern of a star matters (star=pattern),
+    its four rotations are one observation. The star is None if stars are not used, or if they need
+    to agree only within their spread (star=alike or gateways).
     """
     star = step.openings if theory.star in ("pattern", "frame") else None
     if star is None or theory.star == "frame":
