@@ -340,7 +340,8 @@ def test_json_goes_to_its_file_while_progress_shows_on_a_terminal(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="terminals")
-def test_json_is_not_wrapped_on_a_narrow_terminal(room: str) -> None:
+@pytest.mark.parametrize("traces", [1, 2])
+def test_json_is_not_wrapped_on_a_narrow_terminal(traces: int, room: str) -> None:
     """Nor does it go elsewhere: rich takes over stdout while it shows how far a search is."""
     import pty
     import termios
@@ -350,7 +351,7 @@ def test_json_is_not_wrapped_on_a_narrow_terminal(room: str) -> None:
     attributes[1] &= ~termios.OPOST  # what is printed comes as it is
     termios.tcsetattr(theirs, termios.TCSANOW, attributes)
     wrong, their_wrong = pty.openpty()
-    command = [sys.executable, "-m", "ssh_abduction", "solve", room, "--json"]
+    command = [sys.executable, "-m", "ssh_abduction", "solve", *[room] * traces, "--json"]
     environment = {**os.environ, "TERM": "xterm", "COLUMNS": "30"}
     printed = {ours: b"", wrong: b""}
 
@@ -371,8 +372,11 @@ def test_json_is_not_wrapped_on_a_narrow_terminal(room: str) -> None:
         for reader in readers:
             reader.join(10)
     lines = printed[ours].decode().splitlines()
-    assert len(json.loads("".join(lines))["maps"]) == 1
-    assert len(lines) == 3
+    if traces > 1:
+        assert [json.loads(line)["count"] for line in lines] == [1, 1]
+    else:
+        assert len(json.loads("".join(lines))["maps"]) == 1
+        assert len(lines) == 3
 
 
 CTRL_C_AT = """
