@@ -115,7 +115,7 @@ def test_whoever_uses_an_item_is_not_under_the_limit_of_whoever_makes_it() -> No
 
 
 @pytest.mark.parametrize(
-    ("steps", "wrong", "stars"), [(60, 0, False), (60, 6, False), (150, 20, False), (60, 6, True)]
+    ("steps", "wrong", "stars"), [(60, 0, False), (60, 6, False), (100, 13, False), (60, 6, True)]
 )
 def test_there_is_a_map_when_the_time_is_over(steps: int, wrong: int, stars: bool) -> None:
     """The checker refuses sketches with wrong returns, as displacements contradict them."""

@@ -53,7 +53,7 @@ def test_a_map_with_frames_changes_no_answer(data: st.DataObject) -> None:
 
 def test_a_maze_has_a_small_map_before_the_proof() -> None:
     """The robot was in fewer than 40 dstates; a sketch without frames has hundreds."""
-    walk = maze(3, 3, steps=300, seed=0, stars=True)
+    walk = maze(3, 3, steps=200, seed=0, stars=True)
     with patch.object(Prefixes, "find_minimum", side_effect=[StageTimeError, KeyboardInterrupt]):
         solution = solve(walk.trace, PATTERN)
     assert (solution.status, solution.stopped) == (Status.FEASIBLE, "interrupted")

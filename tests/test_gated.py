@@ -63,7 +63,7 @@ def test_a_greedy_map_satisfies_all_axioms(world: str) -> None:
 
 @pytest.mark.parametrize("world", ["junction of 5", "any angles"])
 def test_a_greedy_map_is_returned_when_time_is_up(world: str) -> None:
-    trace = drive(world, 0, 40)
+    trace = drive(world, 0, 30)
     with patch.multiple(fallback, OVERTIME=100.0):
         solution = solve(trace, time_limit=1e-6)
     assert solution.status is Status.FEASIBLE

@@ -438,13 +438,10 @@ def test_streets_at_any_angles_are_mapped_right(noise: float, unseen: bool) -> N
     assert solution.cost.places == tour.places
 
 
-@pytest.mark.parametrize(("spokes", "noise", "unseen"), [(5, 0, False), (5, 9, True)])
-def test_no_axiom_forbids_the_true_map(spokes: int, noise: float, unseen: bool) -> None:
+def test_no_axiom_forbids_the_true_map() -> None:
     """Hubs with a ring road: bearings may be off by less than their spread, and gateways behind the
     robot need not be observed."""
-    tour = drive(
-        planar.wheel(spokes), "hub", 0, 24, random.Random(spokes), noise=noise, unseen=unseen
-    )
+    tour = drive(planar.wheel(5), "hub", 0, 24, random.Random(5), noise=9, unseen=True)
     pairs = [(i, j) for j in range(24) for i in range(j)]
     same = [(i, j) for i, j in pairs if tour.truth[i] == tour.truth[j]]
     elsewhere = [(i, j) for i, j in pairs if tour.truth[i][0] != tour.truth[j][0]]

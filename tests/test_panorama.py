@@ -261,7 +261,7 @@ def test_panoramas_in_the_shell(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     drive = (
-        "simulate notched-rectangle --tours 2 --set images=panoramas --set textures=repeated --set "
+        "simulate notched-rectangle --tours 1 --set images=panoramas --set textures=repeated --set "
         "paint_seed=5 --set hours=8,18 --set stars=false"
     )
     assert main([*drive.split(), "-o", "run.jsonl"]) == 0
@@ -272,7 +272,7 @@ def test_panoramas_in_the_shell(
         3,
     )
     camera = Camera(paint=Paint(5, repeated=True), hours=(8.0, 18.0))
-    inline = simulate(ROOM, 2, stars=False, camera=camera)
+    inline = simulate(ROOM, 1, stars=False, camera=camera)
     assert np.array_equal(images_of(trace), images_of(inline))
     assert main(["cluster", "run.jsonl", "--set", "k_max=5", "-o", "views.jsonl"]) == 0
     assert main(["solve", "views.jsonl", "--json"]) == 0
