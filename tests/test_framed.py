@@ -114,8 +114,6 @@ def test_lists_the_maps_of_the_plain_encoding(
     first = data.draw(st.sampled_from([2, engine.FIRST_PREFIXES]), label="first prefixes")
     at_a_time = data.draw(st.sampled_from([1, transitive.AT_A_TIME]), label="at a time")
     cores = {
-        "MANY": data.draw(st.sampled_from([1, 2, same.MANY]), label="many"),
-        "FAR": data.draw(st.sampled_from([0, same.FAR]), label="far"),
         "FIRST_PAIRS": data.draw(
             st.sampled_from([0, 2, 10, same.FIRST_PAIRS]), label="first pairs"
         ),
@@ -169,7 +167,6 @@ def test_a_trace_that_grows_has_the_maps_of_the_plain_encoding(
         patch.multiple(
             same,
             GROWN=grown,
-            MANY=data.draw(st.sampled_from([1, same.MANY]), label="many"),
             FIRST_PAIRS=data.draw(st.sampled_from([0, 5, same.FIRST_PAIRS]), label="first pairs"),
         ),
         patch.object(FramedEngine, "_charted", charted),
@@ -194,7 +191,7 @@ def test_a_maze_is_mapped_while_it_is_explored() -> None:
     first, *rest = trace.steps
     paths = set()
     with (
-        patch.multiple(same, GROWN=100, MANY=1),
+        patch.object(same, "GROWN", 100),
         patch.object(transitive, "AT_A_TIME", 5),
         patch.object(choosing, "FEW_STEPS", 10),
     ):
@@ -226,7 +223,7 @@ def test_each_speedup_off_alone() -> None:
     trace = maze(2, 2, steps=36, seed=0, stars=True).trace
     expected = solve(trace, Theory.topological(), max_maps=None, speedups=Speedups.without("names"))
     for off in ("", "clique", "core_guided", "sides"):
-        with patch.object(same, "MANY", 1), patch.object(transitive, "AT_A_TIME", 5):
+        with patch.object(transitive, "AT_A_TIME", 5):
             found = solve(
                 trace, Theory.topological(), max_maps=None, speedups=Speedups.without(off)
             )

@@ -2,8 +2,7 @@
 
 If visits I and J are at one place, and J and K, then so are I and K. These rules are not grounded
 beforehand, as there are millions of triples of visits. `intransitive` finds the triples that an
-answer violates. `Transitive` is a propagator that adds clauses for them while many answers are
-listed.
+answer violates.
 """
 
 from __future__ import annotations
@@ -69,63 +68,6 @@ def intransitive(pairs: Sequence[Pair], fits: Set[Pair], chart: FramedChart) -> 
         if len(found) >= AT_A_TIME:
             break
     return list(found)
-
-
-class Transitive(clingo.Propagator):
-    """A propagator of clingo that makes each answer of a list transitive.
-
-    Attributes:
-        asked: Whether the propagator is switched on. It takes effect with the next question.
-        failed: The number of violations since the caller last set this to 0.
-        literals: For each pair of visits, the program literal that they are at one place.
-    """
-
-    def __init__(self) -> None:
-        self.asked = False
-        self.failed = 0
-        self.literals: dict[Pair, int] = {}
-        self._watched: dict[int, list[Pair]] = {}
-        self._literals: dict[Pair, int] = {}  # the solver literals
-        self._turned: Turned = {}
-
-    def init(self, init: clingo.PropagateInit) -> None:
-        """Watch the literals of pairs, and record the pairs whose literals are true already."""
-        for literal in self._watched:
-            init.remove_watch(literal)
-        self._watched, self._turned = {}, {}
-        if not self.asked:
-            return
-        for pair, program_literal in self.literals.items():
-            literal = self._literals[pair] = init.solver_literal(program_literal)
-            self._watched.setdefault(literal, []).append(pair)
-            if init.assignment.is_true(literal):
-                take(self._turned, pair)
-        for literal in self._watched:
-            init.add_watch(literal)
-
-    def propagate(self, control: clingo.PropagateControl, changes: Sequence[int]) -> None:
-        """Add a clause for each triple of visits that violates transitivity."""
-        pairs = [pair for literal in changes for pair in self._watched.get(literal, ())]
-        for pair in pairs:
-            take(self._turned, pair)
-        for pair in pairs:
-            for first, (middle, half), (last, turn) in apart_yet_joined(pair, self._turned):
-                self.failed += 1
-                clause = [
-                    -self._literals[pair],
-                    -self._literals[ordered_pair(middle, last, (turn - half) % 4)],
-                ]
-                if (third := self._literals.get(ordered_pair(first, last, turn))) is not None:
-                    clause.append(third)
-                if not control.add_clause(clause, lock=True) or not control.propagate():
-                    return
-
-    def undo(self, thread: int, assignment: clingo.Assignment, changes: Sequence[int]) -> None:
-        """Forget pairs whose literals are no longer true."""
-        for literal in changes:
-            for i, j, _ in self._watched.get(literal, ()):
-                self._turned.get(i, {}).pop(j, None)
-                self._turned.get(j, {}).pop(i, None)
 
 
 class PairOf(dict[clingo.Symbol, Pair]):

@@ -35,8 +35,6 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Generator, Iterable, Sequence
 from itertools import combinations
 
-import clingo
-
 from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.facts import visits_lp
 from ssh_abduction.solver.engines.base import Task
@@ -50,7 +48,6 @@ from ssh_abduction.solver.engines.visit_program import (
 )
 from ssh_abduction.solver.steps.apart import clique
 from ssh_abduction.solver.steps.chart import FramedChart
-from ssh_abduction.solver.steps.localising import Located
 
 # At first, give clingo as many first visits that at most this many pairs of them may be at one
 # place. It gets other visits if answers need them.
@@ -58,11 +55,6 @@ FIRST_PAIRS = 10_000
 # If the number of nodes has grown by this factor, make a new control, as the order of choice only
 # suits the nodes that it was made for.
 GROWN = 1.1
-# After this many answers found one by one, look for the next ones near the last. That is faster if
-# there are many answers.
-MANY = 5
-# After this many violations of transitivity near an answer, ask for single answers again.
-FAR = 200
 
 
 class VisitLabels:
@@ -239,8 +231,7 @@ class VisitLabels:
         """Yield all labels with this many dstates, each once.
 
         Clingo gets a rule against each labelling that was found, and the same question as for the
-        fewest dstates. So it soon proves that there are no others. If there are many, it lists
-        further ones near the last one, while a propagator keeps them transitive (`_nearby`).
+        fewest dstates. So it soon proves that there are no others.
 
         Args:
             dstates: The number of dstates, the fewest possible.
@@ -249,7 +240,6 @@ class VisitLabels:
         if self.fewest() is None or program.cores.least > dstates:
             return
         yield from map(list, self._found)
-        asked = 0
         while True:
             known = [
                 program.spanning(found, program.nodes) for found in self._found[self._excluded :]
@@ -264,49 +254,6 @@ class VisitLabels:
                 return
             self._found.append(labels)
             yield list(labels)
-            asked += 1
-            if asked == MANY:
-                asked = 0
-                if (yield from self._nearby(dstates)):
-                    return
-
-    def _nearby(self, dstates: int) -> Generator[list[int], None, bool]:
-        """Let clingo list labels near the last ones, and yield those that are new.
-
-        Returns:
-            Whether clingo has listed all labels that were left.
-        """
-        program = self.program
-        transitive = program.transitive
-
-        def read(model: clingo.Model) -> Located:
-            transitive.failed = 0
-            return program.located(program.read(model))
-
-        excluded = set(self._found[self._excluded :])
-        program.read_literals()
-        transitive.asked, transitive.failed = True, 0
-        mode, assumed = self._asking_for(dstates)
-        answers = self._asker.answers(
-            read, mode, 0, assumptions=assumed, until=lambda: transitive.failed > FAR
-        )
-        try:
-            while True:
-                try:
-                    everywhere = next(answers)
-                except StopIteration as end:
-                    return bool(end.value)
-                if everywhere.missed:
-                    break
-                labels = program.labels(everywhere)
-                if labels not in excluded:
-                    self._found.append(labels)
-                    yield list(labels)
-        finally:
-            answers.close()
-            transitive.asked = False
-        self._give_more(everywhere.missed)
-        return False
 
     def _other(self, dstates: int) -> tuple[int, ...] | None:
         """Find labels with this many dstates that are not excluded; None if there are none."""

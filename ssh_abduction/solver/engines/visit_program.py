@@ -6,7 +6,7 @@ them. Fewer visits are a relaxation, so a bound proven for them holds for the tr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence, Set
+from collections.abc import Callable, Collection, Iterable, Sequence, Set
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -17,7 +17,7 @@ from ssh_abduction.solver.asp.facts import sides_lp, visits_lp
 from ssh_abduction.solver.asp.facts.atoms import numbers
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.engines.base import Task
-from ssh_abduction.solver.engines.transitive import Pair, PairOf, Three, Transitive, intransitive
+from ssh_abduction.solver.engines.transitive import Pair, PairOf, Three, intransitive
 from ssh_abduction.solver.steps.chart import FramedChart, numbered
 from ssh_abduction.solver.steps.localising import Located, State, faced, located
 from ssh_abduction.theory.pairs import pairs_in
@@ -164,7 +164,6 @@ class VisitProgram:
         chart: The chart of the first steps, with their visits and nodes.
         batch: The number of the last batch of visits; -1 before the first.
         cores: The lower bound, and the assumptions that raise it.
-        transitive: The propagator, which also holds the literals of pairs.
     """
 
     def __init__(self, task: Task, asker: Asker, chart: FramedChart, sides: Sides) -> None:
@@ -184,11 +183,8 @@ class VisitProgram:
         self._one = pairs_in(task.log.pairs.one)
         asker.control = new_control("visits", "", ["--heuristic=Domain"])
         self.cores = Cores(asker, self.tell)
-        self.transitive = Transitive()
-        asker.control.register_propagator(self.transitive)
         self._known = _Known()
         self._pair_of = PairOf()
-        self._unread: list[Pair] = []  # pairs whose literals are not yet looked up
         self._parts = 0
         sides.begin()
 
@@ -258,7 +254,6 @@ class VisitProgram:
         control.ground([(part, []), ("more", numbers(self.batch))])
         control.assign_external(visits_lp.listed(self.batch), True)
         self._avoid_first(place for place, *_ in nodes)
-        self._unread += new
         self._sides.extend(self.batch)
 
     def _joined(self) -> set[Pair]:
@@ -291,19 +286,6 @@ class VisitProgram:
     def read(self, model: clingo.Model) -> list[Pair]:
         """Read the pairs of visits that are at one place in an answer."""
         return [self._pair_of[symbol] for symbol in model.symbols(shown=True)]
-
-    def read_literals(self) -> Mapping[Pair, int]:
-        """Return, for each pair, the literal that says that its visits are at one place.
-
-        Pairs are in the order in which they were given to clingo. Looking up many literals takes
-        seconds, so call this only if they are needed.
-        """
-        atoms = self._asker.control.symbolic_atoms
-        for pair in self._unread:
-            if atom := atoms[visits_lp.same(pair)]:
-                self.transitive.literals[pair] = atom.literal
-        self._unread = []
-        return self.transitive.literals
 
     def tell(self, told: str, part: str | None = None, number: int = 0) -> None:
         """Give clingo more rules.

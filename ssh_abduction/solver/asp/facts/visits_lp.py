@@ -41,11 +41,6 @@ def visit_facts(
     )
 
 
-def same(pair: tuple[int, int, int]) -> Symbol:
-    """Return the atom that says that a pair of visits (I, J, R) is at one place."""
-    return Function("same", numbers(*pair))
-
-
 def read_same(atom: Symbol) -> tuple[int, int, int]:
     """Read the pair of visits (I, J, R) from an atom of `same`."""
     first, second, turned = (argument.number for argument in atom.arguments)
