@@ -183,7 +183,7 @@ FORK: Segments = [
 
 def test_a_robot_visits_a_fork_each_time_that_it_passes_and_turns_around_at_a_dead_end() -> None:
     log, track = log_of(FORK, [(1, 0), (18, 0), (10, 0), (10, 8)])
-    fork, end, again = find_visits(log, track)
+    _, fork, end, again, _ = find_visits(log, track)
     assert math.dist(fork.middle, (10, 0)) < 0.5
     assert math.dist(end.middle, (18, 0)) < 0.5
     assert math.dist(again.middle, (10, 0)) < 0.5
@@ -207,19 +207,20 @@ def test_a_robot_turns_around_in_a_bow() -> None:
     bow = [(17.5, -0.6), (18, -0.2), (18, 0.2), (17.5, 0.6)]
     log, track = log_of(FORK, [(1, -0.6), *bow, (10, 0.6), (10, 8)])
     middles = [visit.middle for visit in find_visits(log, track)]
-    assert len(middles) == 3
-    assert math.dist(middles[1], (18, 0)) < 0.5
+    assert len(middles) == 5
+    assert math.dist(middles[2], (18, 0)) < 0.5
 
 
 def test_a_robot_that_turns_around_in_a_disc_has_one_visit() -> None:
     log, track = log_of(FORK, [(1, 0), (10.8, 0), (10, 0), (10, 8)])
-    assert [round(float(visit.middle[0])) for visit in find_visits(log, track)] == [10]
+    _, *visits, _ = find_visits(log, track)
+    assert [round(float(visit.middle[0])) for visit in visits] == [10]
 
 
 def test_a_robot_that_turns_around_just_outside_of_a_disc_has_a_visit_there() -> None:
     """The robot passes the fork, comes back from the east, and leaves to the north."""
     log, track = log_of(FORK, [(1, 0), (11.4, 0), (10, 0), (10, 8)])
-    fork, end, again = find_visits(log, track)
+    _, fork, end, again, _ = find_visits(log, track)
     assert fork.scan < end.scan < again.scan
     assert math.dist(end.middle, (11.4, 0)) < 0.3
     ways = [fork.arrived, fork.left], [end.arrived, end.left], [again.arrived, again.left]
@@ -243,5 +244,21 @@ def test_successive_visits_to_one_place_are_one() -> None:
 
 def test_a_wide_robot_has_fewer_ways() -> None:
     log, track = log_of(FORK, [(1, 0), (18, 0)])
-    assert len(find_visits(log, track, 0.5)) == 1
-    assert len(find_visits(log, track, 2.4)) == 0
+    assert len(find_visits(log, track, 0.5)) == 3
+    assert len(find_visits(log, track, 2.4)) == 2
+
+
+@pytest.mark.parametrize(
+    ("begin", "end", "middles"),
+    [
+        pytest.param(1, 18, [1, 10, 18], id="in dead ends"),
+        pytest.param(9, 12.5, [10, 12.5], id="in the disc of the fork"),
+        pytest.param(1, 2, [], id="near each other"),
+    ],
+)
+def test_a_drive_begins_and_ends_at_places(begin: float, end: float, middles: list[float]) -> None:
+    log, track = log_of(FORK, [(begin, 0), (end, 0)])
+    visits = find_visits(log, track)
+    assert [float(visit.middle[0]) for visit in visits] == pytest.approx(middles, abs=0.5)
+    for visit, way in zip(visits[:: max(1, len(visits) - 1)], ("arrived", "left"), strict=False):
+        assert getattr(visit, way) is None

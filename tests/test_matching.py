@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from test_distinctive import log_of
 
-from perception.places import closures
+from perception.places import closures, matching
 from perception.places.closures import Closing, find_closures, relative, uncertainty
 from perception.places.distinctive import WINDOW, find_visits
 from perception.places.following import _matched
@@ -59,6 +59,13 @@ def test_a_match_finds_how_a_room_is_turned_and_shifted(turn: float, x: float, y
     assert found.spread < 0.5
     assert math.dist(found.shift, (x, y)) < 0.12
     assert abs(math.remainder(found.turn - turn, math.tau)) < math.radians(1.5)
+
+
+def test_a_match_that_slides_while_it_is_refined_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    shifted, room = scene(patch_of(0.3, 0.6, -0.4)), Turned.of(scene(patch_of()), [0.3])
+    assert match(shifted, room) is not None
+    monkeypatch.setattr(matching, "SLID", 0.1)  # the coarse shift is 0.2 m off
+    assert match(shifted, room) is None
 
 
 def test_another_room_matches_badly() -> None:

@@ -1,4 +1,4 @@
-"""Finds the distinctive places that a robot passes: junctions, and points where it turned around.
+"""Finds the distinctive places that a robot passes: junctions, turning points, and the two ends.
 
 Milestones are scans a metre apart on the trajectory. The local map of each milestone has a
 skeleton with junctions. Junctions near each other at successive milestones are one chain. If the

@@ -43,6 +43,8 @@ OVERLAP = 0.3
 HOPELESS, SPREAD = 0.7, 0.85
 # Scores differ by 1 / SHARPNESS where a shift is e times as probable.
 SHARPNESS = 25.0
+# A match that the refinement moves by more than SLID metres slides along a corridor.
+SLID = 2 * COARSE
 # Steps of the refinement, in radians and metres; each is repeated at most TRIES times.
 STEPS = tuple(
     (math.radians(degrees), metres)
@@ -236,8 +238,10 @@ def match(first: Scene, second: Turned) -> Match | None:
     best = np.unravel_index(int(scores.argmax()), scores.shape)
     if scores[best] < HOPELESS or (spread := _spread(scores - scores[best])) >= SPREAD:
         return None
-    shift = np.array([_X[best[1:]], _Y[best[1:]]])
-    score, turn, shift = _refined(first, scene, float(second.turns[int(best[0])]), shift)
+    coarse = np.array([_X[best[1:]], _Y[best[1:]]])
+    score, turn, shift = _refined(first, scene, float(second.turns[int(best[0])]), coarse)
+    if math.dist(shift, coarse) > SLID:
+        return None
     return Match(score, turn, shift, first.mutual(scene, turn, shift), spread)
 
 

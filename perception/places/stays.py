@@ -1,5 +1,7 @@
 """Completes the visits that were found: one for each stay, with turning points and gateways.
 
+A drive begins and ends in dead ends of its trajectory. So both are turning points, too.
+
 Visits pass through in order while the robot drives. No visit waits for more than a bounded number
 of metres.
 """
@@ -22,6 +24,9 @@ SAME, SHARE = 0.6, 0.5
 # differ by more than REVERSED radians. It turns on the spot or in a bow, so there are several
 # strides. Other visits are farther away along the trajectory than a stride and than their radius.
 STRIDES, REVERSED = (1.0, 2.0, 4.0), math.radians(135)
+# The beginning and the end of a drive are turning points, too, if the robot visits no place within
+# END metres of trajectory.
+END = 2.0
 # A turn waits for visits up to NEARBY metres of trajectory away. No stride is longer, and discs are
 # taken to be no larger. Turns near each other wait for each other up to TURNING metres.
 NEARBY, TURNING = 4.0, 8.0
@@ -37,7 +42,7 @@ RIM, SMALL = 0.5, 0.5
 
 @dataclass(frozen=True)
 class _Turn:
-    """A scan at which the robot turned around.
+    """A scan at which the robot turned around, or at which the drive begins or ends.
 
     Attributes:
         way: Metres driven up to it.
@@ -66,7 +71,7 @@ class Stays:
         self._recent, self._maps, self._half = recent, maps, half
         self._passing: Visit | None = None  # the last visit, which the next one may replace
         self._found: list[tuple[float, Visit]] = []  # the metres driven up to each visit
-        self._turns: list[_Turn] = []
+        self._turns = [_Turn(0.0, END, math.pi, 0)]
         self._asked = dict.fromkeys(STRIDES, 0)  # the next scan that may be a turn
         self._done = 0  # all visits before this scan are complete
         self._staying: Visit | None = None
@@ -89,6 +94,8 @@ class Stays:
         if self._passing and (horizon is None or not self._may_overlap(self._passing, horizon)):
             self._settle()
         self._find_turns()
+        if horizon is None and (last := self._recent.end - 1) >= 0:
+            self._turns.append(_Turn(self._recent.way(last), END, math.pi, last))
         for visit in self._complete(self._limit(horizon)):
             if self._staying and self._comes_back(visit):
                 self._staying = joined(self._staying, visit)
@@ -185,9 +192,7 @@ class Stays:
         # Begin with the shortest stride and the sharpest turn. Other turns near it belong to the
         # same turning point.
         for turn in sorted(self._turns, key=lambda turn: (turn.stride, -turn.angle, -turn.scan)):
-            if turn.scan < limit and all(
-                abs(at - turn.way) > max(turn.stride, visit.radius) for at, visit in self._found
-            ):
+            if turn.scan < limit and self._is_apart(turn):
                 self._add_turn(turn.scan)
         done = sorted(
             (visit for _, visit in self._found if self._done <= visit.scan < limit),
@@ -200,6 +205,16 @@ class Stays:
         self._turns = [turn for turn in self._turns if turn.scan >= limit]
         self._done = limit
         return completed
+
+    def _is_apart(self, turn: _Turn) -> bool:
+        """Whether a turn is neither in the disc of a place nor close to a visit along the way."""
+        here = self._recent.poses(turn.scan, turn.scan + 1)[0, :2]
+        for at, visit in self._found:
+            far = abs(at - turn.way)
+            inside = math.dist(here, visit.middle) <= visit.radius + RIM
+            if far <= turn.stride or (inside and far <= visit.radius):
+                return False
+        return self._recent.way(self._recent.end - 1) > turn.stride
 
     def _add_turn(self, scan: int) -> None:
         """Add a visit where the robot turned around. It splits a stay that it is part of."""

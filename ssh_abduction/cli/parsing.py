@@ -23,8 +23,8 @@ WITHDRAWN = dict.fromkeys(
     ("places", "gateway", "radius"),
     (
         "--width",
-        "places are the junctions of the free space and the points where the robot turned around; "
-        "the only length to set is the width of the robot, --width METRES",
+        "places are the junctions of the free space and the points where the robot turned around, "
+        "began or ended; the only length to set is the width of the robot, --width METRES",
     ),
 )
 OTHER_VERBS = {"localize": "localise"}

@@ -201,7 +201,11 @@ def _settings(run: Mapping[str, Any]) -> str:
         if value not in (None, False, [], 0)
     )
     rows = [
-        ("places", "junctions, turning points", "where the free space forks, or the robot turned"),
+        (
+            "places",
+            "junctions, turning points, ends",
+            "where the free space forks, or the robot turned, began or ended",
+        ),
         ("width", f"{run['width']:g} m", "of the robot; it cannot pass narrower parts"),
         ("theory", theory, "the axioms, and the choices in them"),
     ]
