@@ -14,7 +14,7 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import combinations, pairwise
+from itertools import pairwise
 
 from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.rotations import leads, middle, rotations, turns_so, ways
@@ -227,10 +227,20 @@ def facing(
                 for towards in (0, 180)
                 if not changes and not any(leads(frame, towards) for frame in sight.star.frames)
             )
-        for (a, seen_a), (b, seen_b) in combinations(zip(seen, fitted, strict=True), 2):
-            if are_opposite(seen_a, seen_b):
-                found.opposite.append((a.dstate.id, b.dstate.id))
+        found.opposite.extend(
+            (seen[i].dstate.id, seen[j].dstate.id) for i, j in _opposite_sights(tuple(fitted))
+        )
     return found
+
+
+@lru_cache(maxsize=2**12)
+def _opposite_sights(fitted: tuple[Turned, ...]) -> tuple[tuple[int, int], ...]:
+    """The pairs of sights of a place, by number, in which the robot surely faces opposite ways."""
+    if not fitted:
+        return ()
+    *earlier, last = fitted
+    pairs = ((i, len(earlier)) for i, seen in enumerate(earlier) if are_opposite(seen, last))
+    return (*_opposite_sights(tuple(earlier)), *pairs)
 
 
 def are_opposite(seen_a: Turned, seen_b: Turned) -> bool:
@@ -267,9 +277,13 @@ def fit(
         For each sight, its frame (which gateways exist) and its shift (how many slots to add, so
         that gateways have the same slots as in the first sight); None if nothing fits.
     """
-    made = tuple(
-        (a, b, frozenset(actions)) for a in sights for b in sights if (actions := turns.get((a, b)))
-    )
+    place, order = sights[0].dstate.place if sights else None, {s: k for k, s in enumerate(sights)}
+    found_turns = [
+        (order[a], order[b], a, b, frozenset(actions))
+        for (a, b), actions in turns.items()
+        if a.dstate.place == place and a in order and b in order
+    ]
+    made = tuple((a, b, actions) for *_, a, b, actions in sorted(found_turns, key=lambda t: t[:2]))
     headings = tuple(sight.dstate.heading for sight in sights) if as_shown else None
     drives = len({sight.drive for sight in sights})
     for most in range(MOST_CLOSED * max(drives - 1, 0) + 1):
@@ -332,6 +346,15 @@ def _fitted(
                         return read
         return None
 
+    if len(sights) > 1:
+        # The search goes on from what fits all but the last sight, if that is the first answer.
+        earlier = tuple(turn for turn in made if sights[-1] not in turn[:2])
+        fewer = None if headings is None else headings[:-1]
+        known = _fitted(sights[:-1], fewer, earlier, axioms, most)
+        if known is None:
+            return None
+        closed = {s.drive: _closed(read) for s, read in zip(sights, known, strict=False)}
+        return extended([*known], closed if most else {}) or extended([], {})
     return extended([], {})
 
 
