@@ -70,7 +70,7 @@ def _file_kind(action: argparse.Action) -> str | None:
     if action.nargs == 0 or action.choices is not None:
         return None
     if not action.option_strings:
-        return "file" if action.type is None else None
+        return None if action.type in (int, float) else "file"
     named = str(action.metavar or "")
     if "FOLDER" in named:
         return "folder"
