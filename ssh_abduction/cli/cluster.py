@@ -30,7 +30,10 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_argument("trace", help="trace file with images, or - for standard input")
     add_output(parser)
     parser.add_argument(
-        "--k", type=int, help="number of views (default: the one with the largest M)"
+        "--k",
+        type=int,
+        metavar="K",
+        help="number of views (default: the number that the measure M of the paper rates best)",
     )
     parser.add_setting(
         "k_max", "largest number of views to try (default: 20)", type=int, metavar="K"
@@ -48,8 +51,8 @@ def add_parser(verbs: Verbs) -> None:
         type=picture_file,
         metavar="PNG",
         help=(
-            "draw M against k; and, if the truth is known, U, which says how well the views agree "
-            "with the true dstates"
+            "draw the measure M against the number of views. If the truth is known, also draw U, "
+            "which says how well the views agree with the true dstates"
         ),
     )
     parser.set_defaults(run=run)

@@ -88,7 +88,7 @@ def add_parser(verbs: Verbs) -> None:
         "--plot",
         type=picture_file,
         metavar="PNG",
-        help="draw the entropy of the belief at each step",
+        help="draw how unsure the belief is at each step (its entropy)",
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(run=run)

@@ -47,13 +47,13 @@ def add_parser(verbs: Verbs) -> None:
         "--time-limit",
         type=float,
         metavar="S",
-        help="stop after S seconds with the best plan so far",
+        help="stop after S seconds and print the best plan so far",
     )
     parser.add_argument(
         "--memory-limit",
         type=int,
         metavar="MIB",
-        help="stop when the process has used this many MiB, with the best plan so far",
+        help="stop when the process has used this many MiB, and print the best plan so far",
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
     add_theory(parser, default="the theory in the file of maps")
