@@ -77,7 +77,7 @@ def _how_to_obey(maps: Path) -> str:
     if trace_beside(str(maps)) is None:
         return f"solve again with -o {shlex.quote(str(maps))}"
     folder = shlex.quote(str(maps.parent))
-    return f"to obey: ssh-abduction solve {folder} --theory {folder} -o {shlex.quote(str(maps))}"
+    return f"to obey: ssh-abduction solve --theory {folder} {folder} -o {shlex.quote(str(maps))}"
 
 
 def _pair(standing: Standing, kind: str, pair: str) -> tuple[str, str]:
