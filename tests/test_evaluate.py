@@ -505,11 +505,6 @@ def test_errors_of_the_shell_are_one_line(
             "solve this trace",
         ),
         ([str(none), ACES], f"{none}: maps: expected one to evaluate, got none"),
-        (
-            [ACES, solved],
-            f"{ACES}: expected a file of maps, got a trace; "
-            "name the maps first, and then the trace",
-        ),
         ([solved, solved], f"{solved}:1: header: expected a trace, got maps, as solve prints them"),
         ([str(tmp_path / "nosuch"), ACES], "nosuch: expected a readable file of maps"),
     ]:

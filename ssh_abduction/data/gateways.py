@@ -126,10 +126,7 @@ def sights_of(
 def _onward_of(
     trace: Trace, ssh_map: SSHMap, axioms: Collection[str]
 ) -> Callable[[DState], tuple[int, ...]]:
-    """Make a function that returns the directions in which the path of a dstate goes on.
-
-    These are 0 (ahead) and 180 (behind) degrees, as in `Sight.onward`.
-    """
+    """Make a function that returns `Sight.onward` for a dstate."""
     kinds = {action.name: action.kind for action in trace.actions}
     states = {s.id: s for s in ssh_map.dstates}
     total = {"path_order_total", "on_path"} <= set(axioms)
@@ -235,7 +232,7 @@ def facing(
 
 @lru_cache(maxsize=2**12)
 def _opposite_sights(fitted: tuple[Turned, ...]) -> tuple[tuple[int, int], ...]:
-    """The pairs of sights of a place, by number, in which the robot surely faces opposite ways."""
+    """List pairs of indices of fitted sights in which the robot surely faces opposite ways."""
     if not fitted:
         return ()
     *earlier, last = fitted
@@ -378,9 +375,7 @@ def _closed(read: Turned) -> frozenset[int]:
 
 
 def _changes(closed: Mapping[int, frozenset[int]]) -> float:
-    """How many gateways differ between a drive and the one before at a place.
-
-    It is inf if too many differ between two drives.
+    """Count the gateways that change from each drive at a place to the next; inf if too many.
 
     Args:
         closed: For each drive at the place, the gateways that are closed.
