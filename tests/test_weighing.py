@@ -21,7 +21,7 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.misfit import false_costs, misfit
 from ssh_abduction.data import MapError, Odometry, SolverError, TheoryError
 from ssh_abduction.data.fields import FieldReader
-from ssh_abduction.solver import Search, Status, weighing
+from ssh_abduction.solver import Search, Status, beams, weighing
 from ssh_abduction.solver.fit import Poses, fit
 from ssh_abduction.solver.misfit import Misfit
 from ssh_abduction.solver.weighed import Rival, Weighed
@@ -258,7 +258,7 @@ def test_false_costs_are_found(weighed_route: Solution, name: str, said: str) ->
 
 
 def test_a_stopped_search_does_not_claim_to_be_sure(route: truth.Known) -> None:
-    with patch.object(weighing, "WIDTHS", {1: 0.8, weighing.BROAD: 0.0}):  # no broad beam
+    with patch.object(beams, "WIDTHS", {1: 0.8, beams.BROAD: 0.0}):  # no broad beam
         solution = solve(route.trace, time_limit=0.5)
     assert solution.status is Status.FEASIBLE
     assert solution.weighed is not None

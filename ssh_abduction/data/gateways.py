@@ -480,7 +480,7 @@ def _allowed(
     if "gateway_heading" in axioms:
         if s.id == x.id and not alike:
             return False
-        if as_shown and a.first and b.shows and not _is_shown(x.heading, found):
+        if as_shown and a.first and b.shows and x.heading not in (found or range(360)):
             return False
     if "gateway_dstate" in axioms and s.id != x.id and alike and (sure or 0 not in found):
         return False
@@ -492,8 +492,3 @@ def _allowed(
             if (on_course and not way) or (off_course and (sure or towards not in found)):
                 return False
     return True
-
-
-def _is_shown(heading: int | None, found: Collection[int]) -> bool:
-    """Whether a dstate has a heading, and it is one of the rotations found (if there are any)."""
-    return heading is not None and 0 <= heading < 360 and (heading in found or not found)

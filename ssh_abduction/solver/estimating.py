@@ -11,7 +11,8 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import TypeAlias
 
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.solver.asp.limits import Watch
+from ssh_abduction.runtime.clock import heeding, look_at_clock
+from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.solver.weighed import Rival
 from ssh_abduction.theory.settle import Problem
@@ -44,21 +45,22 @@ def estimated(
     for step, begin in enumerate(_begins(at, visit)):
         if begin == step:
             visits.setdefault(at[step], []).append(step)
-    watch, slowest = Watch().part(seconds), 0.0
+    watch = Watch().part(seconds)
     tried: set[Course] = {(best.dstates, best.places)}
     for name, begins in visits.items():
         singly = [{begin} for begin in begins[1:]]
         from_then_on = [set(begins[i:]) for i in range(1, len(begins) - 1)]
         for moved in (*singly, *from_then_on) if len(begins) > 1 else ():
-            if not watch.allows(slowest):
-                return
             dstates, places = course = _moved(best, visit, name, moved)
             if course in tried:
                 continue
             tried.add(course)
-            began = watch.elapsed()
-            nats = cost_of(dstates, places)
-            slowest = max(slowest, watch.elapsed() - began)
+            try:
+                with heeding(watch.check):
+                    look_at_clock()
+                    nats = cost_of(dstates, places)
+            except LimitError:
+                return
             if nats < best.nats + CERTAIN:
                 yield Rival(nats, dstates, places, True, best.faults)
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.runtime.clock import heeding
+from ssh_abduction.runtime.clock import each_looking, heeding
 from ssh_abduction.runtime.logs import log_of
 from ssh_abduction.solver.answer import Answer
 from ssh_abduction.solver.asp.limits import LimitError, Watch
@@ -47,7 +47,7 @@ def fall_back(parts: Parts, answer: Answer, *, may_search: bool) -> None:
     parts.watch.start()  # what is done after the limit counts, too
     with suppress(KeyboardInterrupt):
         # A search by cost tried beams before.
-        parts.candidates.sketch(_overtime(parts), beams=parts.task.theory.weigh == "count")
+        parts.candidates.sketch(overtime(parts), beams=parts.task.theory.weigh == "count")
     if may_salvage:
         salvage(parts)
     answer.count_apart()
@@ -68,7 +68,7 @@ def two_steps_clash(
     if theory.has_faults:
         return False
     bare = theory.replace(weigh="count", displacement="none")
-    for t, action in enumerate(trace.actions):
+    for t, action in enumerate(each_looking(trace.actions)):
         steps = trace.steps[t], replace(trace.steps[t + 1], action=None)
         if not action.starts:
             two = Trace(steps, odometry=trace.odometry)
@@ -105,7 +105,7 @@ def best_map(parts: Parts) -> Iterator[Priced]:
     known, watch = parts.known, parts.watch
     watch.start()
     if known.status in (Status.FEASIBLE, Status.OPTIMAL) and not known.count and known.best:
-        with suppress(LimitError), heeding(Watch().part(_overtime(parts)).check):
+        with suppress(LimitError), heeding(Watch().part(overtime(parts)).check):
             parts.judging.pass_map(known.best, parts.engine.size, watch.elapsed())
         watch.stop()
         known.count = 1
@@ -114,7 +114,7 @@ def best_map(parts: Parts) -> Iterator[Priced]:
     watch.stop()
 
 
-def _overtime(parts: Parts) -> float:
+def overtime(parts: Parts) -> float:
     """Return the seconds that are left to make a map without a search, or to check one.
 
     Parts of the search that could not be stopped may have used up some of this time.

@@ -27,9 +27,9 @@ from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.runtime.logs import log_of
 from ssh_abduction.runtime.threads import one_thread
 from ssh_abduction.solver.answer import Answer
-from ssh_abduction.solver.asp.limits import LimitError, StageTimeError, Stop
+from ssh_abduction.solver.asp.limits import LimitError, StageTimeError, Stop, Watch
 from ssh_abduction.solver.asp.rules import check_rules
-from ssh_abduction.solver.fallback import OVERTIME, best_map, fall_back, two_steps_clash
+from ssh_abduction.solver.fallback import OVERTIME, best_map, fall_back, overtime, two_steps_clash
 from ssh_abduction.solver.map_list import Priced, by_count, listed
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.ranking import Ranking
@@ -47,6 +47,8 @@ SHORTEST = 0.05
 # Without a time limit, the proof of what all minimal maps share may take this many seconds, or as
 # long as the search took if that is more.
 REASONING = 5.0
+# After a limit, the cost of the best map may take at least this many seconds.
+LEAST_WEIGHING = 0.2
 if TYPE_CHECKING:
     from ssh_abduction.solver.weighing import Weighing
 
@@ -285,7 +287,11 @@ class Search:
             parts.end_clingo()
         fall_back(parts, self._answer, may_search=not self._stages.mends)
         if self._weighing is not None:
-            self._weighing.keep_best()
+            # If this takes too long after a limit, the map has no cost in nats.
+            ended = known.stopped in ("time limit", "interrupted")
+            seconds = max(overtime(parts), LEAST_WEIGHING) if ended else math.inf
+            with suppress(LimitError), heeding(Watch().part(seconds).check):
+                self._weighing.keep_best()
         yield from best_map(parts)
         if self._reasons:
             self._reason()
