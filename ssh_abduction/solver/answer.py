@@ -75,8 +75,9 @@ class Answer:
         levels = tuple(replace(level, complete=parts.rivals.listed) for level in self._levels)
         asker = parts.engine.asker
         seconds = Seconds(parts.watch.elapsed(), asker.ground_seconds, asker.solve_seconds)
-        # If a limit came first, the evidence said nothing yet.
-        kinds = task.problem.evidence if task.log.has_pairs else ()
+        # If a limit came before the pairs of steps were compared, the evidence said nothing yet.
+        is_said = task.log.has_pairs or known.stopped is None
+        kinds = task.problem.evidence if is_said else ()
         return Solution(
             status=known.status,
             maps=maps,

@@ -264,7 +264,8 @@ class Solution(MapSequence):
         not `proven`, and `find_backbone` can prove it.
         """
         if self.shared is not None:
-            return replace(self.shared, drives=self.drives)
+            is_named = self.shared.drives == self.drives
+            return self.shared if is_named else replace(self.shared, drives=self.drives)
         sharing = Sharing()
         for ssh_map in self.minimal_maps:
             sharing.absorb(ssh_map)
