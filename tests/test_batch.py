@@ -403,7 +403,7 @@ def test_where_a_worker_is_killed_all_logs_are_mapped_and_none_twice(
         "1",
     ]
     capsys.readouterr()
-    for said in ("3 places", "done already"):
+    for said in ("4 places", "done already"):
         assert main(command) == 0
         assert [line.partition(",")[0] for line in capsys.readouterr().out.splitlines()] == [
             f"{quick}: {said}",

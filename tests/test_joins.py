@@ -197,7 +197,7 @@ def test_the_page_lists_doubtful_joins() -> None:
     weighed = Weighed(0.0, 5.0, tuple(Rival(*rival) for rival in zip(costs, rivals, strict=True)))
     one = solve(read("ababa", "oooo"), CAUSAL).maps[0]
     content = content_of(Listing((one,), weighed=weighed))
-    assert content["joins"] == [(2, 4, 0.73)]
+    assert content["joins"] == [(2, 4, "0.73")]
     assert content["sureness"] == weighed.sentence
 
 

@@ -177,7 +177,7 @@ def test_a_causal_maze_is_guessed_by_its_turns() -> None:
 def test_a_limit_leaves_the_small_map_found_near_a_guess() -> None:
     """It has no more dstates than the states that the robot was in; what is merged at once has more
     than twice as many."""
-    walk = maze(4, 4, steps=500, seed=1)
+    walk = maze(4, 4, steps=600, seed=1)
     best: list[int] = []
 
     def stop(self: NearbySearch, *_: object) -> Generator[list[int], None, str]:

@@ -285,7 +285,7 @@ def test_what_is_refused_holds_in_no_planar_map_and_the_checker_refuses_the_same
     """
     rng = random.Random(3)
     refused = accepted = 0
-    for _ in range(10):
+    for _ in range(20):
         letters = [rng.choice("TTTTRLA") for _ in range(6)]
         trace = Trace.from_steps(
             "a" * 7,
@@ -315,7 +315,7 @@ def test_what_is_refused_holds_in_no_planar_map_and_the_checker_refuses_the_same
 
 def test_a_map_cut_to_first_steps_stays_planar() -> None:
     rng = random.Random(4)
-    for _ in range(8):
+    for _ in range(15):
         letters = [rng.choice("TTRRLA") for _ in range(9)]
         stars = [(1, 1, 1, 1)] * 10 if rng.random() < 0.5 else None
         trace = Trace.from_steps("a" * 10, [ACTIONS[letter] for letter in letters], stars=stars)

@@ -250,10 +250,7 @@ class Solution(MapSequence):
 
     @property
     def minimal_listed(self) -> bool:
-        """Whether the search gave all minimal maps.
-
-        Unlike `complete`, this says nothing about the other maps that `within` asks for.
-        """
+        """Whether the search gave all minimal maps. Maps that `within` adds do not count."""
         return self.complete or (bool(self.levels) and self.levels[0].complete)
 
     @property
@@ -263,15 +260,15 @@ class Solution(MapSequence):
         If not all minimal maps were listed, the backbone need not hold for all of them. Then it is
         not `proven`, and `find_backbone` can prove it.
         """
-        if self.shared is not None:
-            is_named = self.shared.drives == self.drives
-            return self.shared if is_named else replace(self.shared, drives=self.drives)
-        sharing = Sharing()
-        for ssh_map in self.minimal_maps:
-            sharing.absorb(ssh_map)
-        if not sharing.maps:
-            return None
-        return replace(sharing.backbone(proven=self.minimal_listed), drives=self.drives)
+        shared = self.shared
+        if shared is None:
+            sharing = Sharing()
+            for ssh_map in self.minimal_maps:
+                sharing.absorb(ssh_map)
+            if not sharing.maps:
+                return None
+            shared = sharing.backbone(proven=self.minimal_listed)
+        return shared if shared.drives == self.drives else replace(shared, drives=self.drives)
 
     @property
     def summary(self) -> str:

@@ -8,7 +8,6 @@ whole trace (`fallback.py`). `prefixes.py` proves that it is enough to solve the
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import replace
@@ -27,7 +26,7 @@ from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.runtime.logs import log_of
 from ssh_abduction.runtime.threads import one_thread
 from ssh_abduction.solver.answer import Answer
-from ssh_abduction.solver.asp.limits import LimitError, StageTimeError, Stop, Watch
+from ssh_abduction.solver.asp.limits import LimitError, StageTimeError, Stop, Watch, now
 from ssh_abduction.solver.asp.rules import check_rules
 from ssh_abduction.solver.fallback import OVERTIME, best_map, fall_back, overtime, two_steps_clash
 from ssh_abduction.solver.map_list import Priced, by_count, listed
@@ -92,7 +91,7 @@ class Search:
         on_progress: Callable[[Progress], None] | None = None,
         _start: Start = ANEW,
     ) -> None:
-        began = time.perf_counter()
+        began = now()
         checked_trace(trace)
         self.limits = Limits(time_limit, memory_limit, max_maps, within)
         if on_progress is not None and not callable(on_progress):

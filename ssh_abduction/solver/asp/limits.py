@@ -26,6 +26,11 @@ TICK = 0.5
 Stop: TypeAlias = Literal["time limit", "memory limit", "interrupted", "maps limit", "no proof"]
 
 
+def now() -> float:
+    """Return the time of the clock that limits are about, in seconds."""
+    return time.perf_counter()
+
+
 def check_limit(name: str, unit: str, limit: object) -> None:
     """Raise SolverError if a limit is neither None nor a number above 0.
 
@@ -90,10 +95,10 @@ class Watch:
         """Let the clock run. If it runs already, do nothing.
 
         Args:
-            since: Count from this value of `time.perf_counter`; None for now.
+            since: Count from this value of `now`; None for the present time.
         """
         if self._started is None:
-            self._started = time.perf_counter() if since is None else since
+            self._started = now() if since is None else since
 
     @property
     def has_reserve(self) -> bool:
@@ -146,7 +151,7 @@ class Watch:
 
     def elapsed(self) -> float:
         """Return the seconds on the clock."""
-        return self._spent + (0 if self._started is None else time.perf_counter() - self._started)
+        return self._spent + (0 if self._started is None else now() - self._started)
 
     def check(self, ahead: float = 0.0, mebibytes: float = 0.0) -> None:
         """Raise if a limit is reached, or would be reached during the next work.
