@@ -92,13 +92,8 @@ class Trace:
             if getattr(self, name) is not None:
                 a_text(name, getattr(self, name), TraceError, mend="give a text, or leave it out")
         if self.odometry is not None:
-            an_instance(
-                "odometry",
-                self.odometry,
-                Odometry,
-                TraceError,
-                mend="make one with Odometry.of, or leave it out",
-            )
+            mend = "make one with Odometry.of, or leave it out"
+            an_instance("odometry", self.odometry, Odometry, TraceError, mend=mend)
         an_object("extra", self.extra, TraceError)
         object.__setattr__(
             self, "closures", checked_closures(self.closures, len(self.steps), self.source)
@@ -222,6 +217,11 @@ class Trace:
         return any(step.star is not None for step in self.steps)
 
     @cached_property
+    def _starts(self) -> list[tuple[int, str]]:
+        """The first step and the name of each drive but the first."""
+        return [(t, action.name) for t, action in enumerate(self.actions, 1) if action.starts]
+
+    @cached_property
     def in_quarters(self) -> bool:
         """Whether right angles describe all stars (openings seen) and turns.
 
@@ -255,10 +255,9 @@ class Trace:
         a_whole_number("step", step, TraceError)
         if self.source:
             return f"{named(self.source)}:{step + 2}"
-        starts = [(t, action.name) for t, action in enumerate(self.actions, 1) if action.starts]
-        if not starts:
+        if not self._starts:
             return f"step {step}"
-        drives = [(0, self.drive or self.name or "drive 1"), *starts]
+        drives = [(0, self.drive or self.name or "drive 1"), *self._starts]
         first, drive = next(found for found in reversed(drives) if found[0] <= step)
         return f"step {drive}:{step - first}"
 
