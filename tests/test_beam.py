@@ -185,7 +185,10 @@ def test_two_steps_that_clash_end_the_search_at_once() -> None:
     assert (explanation.first, explanation.last) == (1, 2)
 
 
-@pytest.mark.parametrize(("longer", "widths"), [(0.0, [1, 16, 64]), (math.inf, [1, 16])])
+@pytest.mark.parametrize(
+    ("longer", "widths"),
+    [(0.0, [1, 16, 64]), pytest.param(math.inf, [1, 16], marks=pytest.mark.slow)],
+)
 def test_a_wider_beam_takes_part_if_the_others_were_quick(
     monkeypatch: pytest.MonkeyPatch, longer: float, widths: list[int]
 ) -> None:

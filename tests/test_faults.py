@@ -264,7 +264,7 @@ def test_bounds_by_blocks_are_no_more_than_the_minimum(data: st.DataObject) -> N
     )
 
 
-@pytest.mark.parametrize("kind", ["misread", "slipped"])
+@pytest.mark.parametrize("kind", ["misread", pytest.param("slipped", marks=pytest.mark.slow)])
 def test_many_faults_of_a_long_trace_are_proven(kind: str) -> None:
     """A rectangle of eight dstates and five views, 1,200 steps, and twelve faults: disjoint blocks
     add up to what the map costs."""

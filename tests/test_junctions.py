@@ -279,7 +279,12 @@ def test_images_at_even_distances() -> None:
 
 @pytest.mark.parametrize(
     ("name", "tours", "seed"),
-    [("triangle", 2, 1), ("three-ways", 1, 3), ("five-ways", 1, 4), ("six-ways", 1, 5)],
+    [
+        ("triangle", 2, 1),
+        ("three-ways", 1, 3),
+        pytest.param("five-ways", 1, 4, marks=pytest.mark.slow),
+        ("six-ways", 1, 5),
+    ],
 )
 def test_the_true_map_is_found_from_what_was_simulated(
     name: str, tours: int, seed: int, tmp_path: Path

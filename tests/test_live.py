@@ -47,7 +47,7 @@ def given(monkeypatch: pytest.MonkeyPatch, data: bytes) -> None:
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(data)))
 
 
-@pytest.mark.parametrize("pack", [bytes, gzip.compress])
+@pytest.mark.parametrize("pack", [bytes, pytest.param(gzip.compress, marks=pytest.mark.slow)])
 def test_import_of_a_pipe_shows_each_place_and_writes_the_trace_of_the_file(
     pack: Callable[[bytes], bytes],
     drive: Path,

@@ -94,7 +94,7 @@ def test_scans_mend_the_odometry(hall: Path) -> None:
 
 @pytest.mark.parametrize(
     "words",
-    ["check", "show", "compare", "next --time-limit 20", "explain FOLDER 0 1", "view -o PAGE"],
+    ["check", "compare", "explain FOLDER 0 1", "view -o PAGE"],
 )
 def test_a_folder_of_map_stands_for_its_maps_and_its_trace(
     runs: Path, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -292,7 +292,12 @@ def pinned_in_a_maze() -> tuple[Trace, Pinned]:
 
 
 @pytest.mark.parametrize(
-    ("first", "guessed", "goes_on"), [(460, 0, True), (20, 0, False), (20, 501, True)]
+    ("first", "guessed", "goes_on"),
+    [
+        (460, 0, True),
+        (20, 0, False),
+        pytest.param(20, 501, True, marks=pytest.mark.slow),
+    ],
 )
 def test_a_guess_at_the_beginning_of_a_long_trace_goes_on_if_it_can(
     first: int, guessed: int, goes_on: bool
