@@ -174,7 +174,10 @@ def walk(world: Streets, place: str, steps: int, seed: int) -> Trace:
     return drive(world, start, "E", actions)
 
 
-@pytest.mark.parametrize(("frame_after", "engine"), [(60.0, StepEngine), (0.0, FramelessEngine)])
+@pytest.mark.parametrize(
+    ("frame_after", "engine"),
+    [pytest.param(60.0, StepEngine, marks=pytest.mark.slow), (0.0, FramelessEngine)],
+)
 def test_every_engine_leaves_what_it_takes_to_reason(frame_after: float, engine: type) -> None:
     """32 maps that differ in dstates, too: found by a prefix of the readable encodings, or by
     labels that are settled before places and paths."""

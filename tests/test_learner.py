@@ -753,6 +753,7 @@ def test_errors_of_the_wings_are_one_line(
         assert captured.out == ""
 
 
+@pytest.mark.slow
 def test_reproduce_writes_the_page_and_all_that_made_it(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
@@ -850,6 +851,7 @@ def five_circuits() -> tuple[Trace, BootstrapLearner]:
     return trace, BootstrapLearner().fit(trace)
 
 
+@pytest.mark.slow
 def test_bad_images_are_disbelieved_where_views_may_be_misread(
     five_circuits: tuple[Trace, BootstrapLearner],
 ) -> None:

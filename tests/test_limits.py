@@ -135,6 +135,7 @@ def test_limits_hold_on_traces_with_flaws(case: Case, tmp_path: Path) -> None:
     assert found.mebibytes <= 1
 
 
+@pytest.mark.slow
 @POSIX
 def test_rules_of_ones_own_that_are_too_large_end_with_the_limit(
     noisy: Path, tmp_path: Path

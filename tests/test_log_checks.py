@@ -120,6 +120,7 @@ def test_a_shuffled_log_is_refused_before_it_is_matched(
         tracked(RobotLog(tuple(shuffled), source="drive"))
 
 
+@pytest.mark.slow
 def test_a_log_whose_scans_do_not_match_is_refused(
     scans: tuple[Scan, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:

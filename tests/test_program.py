@@ -160,6 +160,7 @@ def test_ladder_prints_the_rungs_so_far(
     assert [rung["status"] == "optimal" for rung in rungs] == [True, False]
 
 
+@pytest.mark.slow
 @POSIX
 def test_map_that_is_interrupted_says_so_and_is_done_again(
     tmp_path: Path,

@@ -70,6 +70,7 @@ def test_a_place_lists_its_sides_and_regions() -> None:
     assert told[-1].endswith("behind place 0, in region 0: all links to it lead through place 0")
 
 
+@pytest.mark.slow
 def test_how_many_minimal_maps_have_a_side() -> None:
     trace = Trace.load(ACES3)
     maps = solve(trace).maps

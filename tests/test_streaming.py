@@ -45,7 +45,7 @@ def fields(visits: list[Visit]) -> list[tuple[object, ...]]:
     ]
 
 
-@pytest.mark.parametrize("name", DRIVES)
+@pytest.mark.parametrize("name", ["fork", pytest.param("rounds in a room", marks=pytest.mark.slow)])
 def test_a_stream_has_the_visits_of_the_whole_log(name: str) -> None:
     log = drive(name)
     streamed = list(stream_visits(iter(log.scans)))
