@@ -111,6 +111,17 @@ def _changes(trace: Trace, at: list[int], headings: tuple[int, ...]) -> Iterator
     yield count
 
 
+def solved_as(trace: Trace, theory: Theory, costs: dict[Key, tuple[float, ...]]) -> None:
+    """Assert that the answer is the cheapest of some maps, with the cost of the brute force."""
+    least = min(costs.values(), default=(0.0,))
+    solution = solve(trace, theory, max_maps=None, time_limit=100)
+    assert solution.complete
+    assert {key(m) for m in solution.maps} == {k for k, cost in costs.items() if cost == least}
+    for ssh_map in solution.maps:
+        assert check(trace, ssh_map, theory) == ()
+        assert 10 * len(ssh_map.dstates) + sum(10 * f.cost for f in ssh_map.faults) == least[0]
+
+
 @settings(max_examples=15)
 @given(st.data())
 def test_the_solver_lists_the_maps_with_changes_of_the_brute_force(data: st.DataObject) -> None:
@@ -125,13 +136,7 @@ def test_the_solver_lists_the_maps_with_changes_of_the_brute_force(data: st.Data
         if changes is not None:
             tenths = 10 * counts.dstates + round(10 * price) * changes
             costs[found] = (tenths, counts.paths, counts.places)
-    least = min(costs.values(), default=(0.0,))
-    solution = solve(trace, theory, max_maps=None, time_limit=100)
-    assert solution.complete
-    assert {key(m) for m in solution.maps} == {k for k, cost in costs.items() if cost == least}
-    for ssh_map in solution.maps:
-        assert check(trace, ssh_map, theory) == ()
-        assert 10 * len(ssh_map.dstates) + sum(10 * f.cost for f in ssh_map.faults) == least[0]
+    solved_as(trace, theory, costs)
 
 
 @st.composite
@@ -164,13 +169,7 @@ def test_maps_with_changes_at_bearings_are_those_of_the_brute_force(
         if changes is not None:
             tenths = 10 * counts.dstates + round(10 * price) * changes
             costs[found] = (tenths, counts.paths, counts.places)
-    least = min(costs.values(), default=(0.0,))
-    solution = solve(trace, theory, max_maps=None, time_limit=100)
-    assert solution.complete
-    assert {key(m) for m in solution.maps} == {k for k, cost in costs.items() if cost == least}
-    for ssh_map in solution.maps:
-        assert check(trace, ssh_map, theory) == ()
-        assert 10 * len(ssh_map.dstates) + sum(10 * f.cost for f in ssh_map.faults) == least[0]
+    solved_as(trace, theory, costs)
 
 
 def test_a_change_has_a_name_and_a_place(

@@ -29,7 +29,7 @@ COMPARED = 400
 # The checks at the end need the ranges of the scans before and after a poor match. They are kept
 # for at most this many poor matches.
 MOST_POOR = 200
-# Notes on this many cuts of the track are told at once. Those on later cuts come at the end.
+# The first notes on cuts of the track are told at once, this many. The others come at the end.
 SAID = 3
 
 

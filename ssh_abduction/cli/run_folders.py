@@ -17,12 +17,13 @@ from pathlib import Path
 from typing import Any
 
 from ssh_abduction.cli.import_log import named_after
+from ssh_abduction.cli.options import MAPS, RUN, TRACE
 from ssh_abduction.cli.outcome import warn
 from ssh_abduction.data.errors import AbductionError, named
 from ssh_abduction.data.files import write_file
 
-RUN = "run.json"  # written last: it marks a run as finished
-FILES = ("trace.jsonl", "maps.json", "page.html", "report.html", RUN)
+# RUN is written last: it marks a run as finished.
+FILES = (TRACE, MAPS, "page.html", "report.html", RUN)
 LONGEST = 255  # the most bytes of the name of a folder
 DIGITS = 8  # of a log's digest, appended to its name if another log has the same name
 

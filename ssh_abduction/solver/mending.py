@@ -43,7 +43,7 @@ from ssh_abduction.theory.theory import Theory
 # Mend the trace by at most this many cheapest causal maps. If there are more, the list of minimal
 # maps may be incomplete.
 MOST_CAUSAL = 200
-ROUNDS = 5  # the most rounds of robust merging, each of which begins with a better map
+ROUNDS = 5  # the most rounds of robust merging; each begins with a better map
 # Solving a trace that was mended by merging takes at most MERGED seconds. Solving any mended trace
 # takes at most SHARE of the time that is left.
 MERGED, SHARE = 30.0, 0.5

@@ -120,12 +120,8 @@ class Weighed:
             second: Another step.
             of: "dstate" or "place".
         """
-        names = [r.dstates if of == "dstate" or not r.places else r.places for r in self.rivals]
-        return math.fsum(
-            weight
-            for weight, name in zip(self.weights, names, strict=True)
-            if name[first] == name[second]
-        )
+        are_one = self._are_one(first, second, of)
+        return math.fsum(w for w, is_one in zip(self.weights, are_one, strict=True) if is_one)
 
     def nats_if_other(self, first: int, second: int) -> float | None:
         """Return the extra cost, in nats, of deciding otherwise about two steps.
@@ -134,14 +130,21 @@ class Weighed:
         this much more, and the other way round. Maps without places are compared by dstates. None
         if no such map is known.
         """
-        at = [rival.places or rival.dstates for rival in self.rivals]
-        is_one = at[0][first] == at[0][second]
+        are_one = self._are_one(first, second, "place")
         others = [
             rival.nats
-            for rival, names in zip(self.rivals, at, strict=True)
-            if (names[first] == names[second]) != is_one
+            for rival, is_one in zip(self.rivals, are_one, strict=True)
+            if is_one != are_one[0]
         ]
         return min(others) - self.nats if others else None
+
+    def _are_one(self, first: int, second: int, of: str) -> list[bool]:
+        """Return for each rival whether two steps are at one dstate, or at one place.
+
+        Without places, `of` "place" compares dstates.
+        """
+        named = (r.dstates if of == "dstate" or not r.places else r.places for r in self.rivals)
+        return [names[first] == names[second] for names in named]
 
     @cached_property
     def joins(self) -> tuple[tuple[int, int, float], ...]:

@@ -297,7 +297,7 @@ TABLE = (
     Speedup(
         "named dstates",
         "names",
-        "Causal theory: give the dstates names, of which clingo chooses one for each node.",
+        "Causal theory: make some names. Clingo chooses one of them for each node.",
         _is_causal,
         CAUSAL,
         _kept_by("names", and_also=(*PAIRS_OF_STEPS, *OF_TRACES)),
@@ -370,7 +370,7 @@ TABLE = (
     Speedup(
         "clique",
         "clique",
-        "Find steps, or segments of paths, of which no two can be one, and give each its own name.",
+        "Find steps that are pairwise distinct, or such segments of paths. Give each its own name.",
         _knows_views,
         CAUSAL,
         EVERY,

@@ -1,7 +1,7 @@
 """Searches for names with the fewest dstates, for the engines without frames.
 
-Clasp raises the lower bound core by core. A core is a set of spare names of which at least one is
-needed. Cores are small at first, as views share no names.
+Clasp raises the lower bound by one for each core. A core is a set of spare names, and at least one
+of them is needed. Cores are small at first, as views share no names.
 
 If that takes long, the search also looks for small maps in other ways (`engines/small_maps.py`,
 `engines/nearby.py`): first it merges steps, and later it guesses a map. The search ends as soon as

@@ -44,9 +44,9 @@ class Cores:
 
     A node is *first* if no node before it, in the order of choice, is at its dstate. So there is
     one first node for each dstate. Clingo is initially asked for an answer without first nodes. If
-    there is none, it returns an unsat core: nodes of which at least one is first. This raises the
-    bound by one. From then on one node of the core may be first. A later core may allow a second
-    one, and so on.
+    there is none, it returns an unsat core: a set of nodes. At least one of them is first. This
+    raises the bound by one. From then on one node of the core may be first. A later core may allow
+    a second one, and so on.
 
     Attributes:
         least: A lower bound on the number of first nodes.
