@@ -44,10 +44,7 @@ def reported(
     dx, dy, turned = displacement
     drift = bend * math.hypot(dx, dy)
     # On average, the direction of motion is off by half of the drift.
-    cos, sin = (
-        (1 + scale) * math.cos(drift / 2),
-        (1 + scale) * math.sin(drift / 2),
-    )
+    cos, sin = ((1 + scale) * math.cos(drift / 2), (1 + scale) * math.sin(drift / 2))
     noise = np.linalg.cholesky(np.array(odometry.covariance(displacement))) @ rng.normal(size=3)
     x, y, heading = np.array([cos * dx - sin * dy, sin * dx + cos * dy, turned + drift]) + noise
     return round(float(x), DIGITS), round(float(y), DIGITS), round(float(heading), DIGITS)

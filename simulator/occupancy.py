@@ -319,12 +319,7 @@ def _cells(fields: MapFile, path: Path) -> Cells:
             f"{where}: expected {kinds}: {error.strerror or error}; check the path and the file"
         ) from None
     # Damaged images and impossible paths raise these.
-    except (
-        ValueError,
-        SyntaxError,
-        IndexError,
-        OverflowError,
-    ) as error:
+    except (ValueError, SyntaxError, IndexError, OverflowError) as error:
         raise SimulatorError(
             f"{where}: expected {kinds}: {error}; the file is damaged, or is none"
         ) from None

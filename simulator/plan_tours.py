@@ -15,11 +15,7 @@ import numpy as np
 from simulator.errors import SimulatorError
 from simulator.motion import Pose, between, reported
 from simulator.plans import APART, Plan
-from ssh_abduction.data.checks import (
-    a_number,
-    a_whole_number,
-    an_instance,
-)
+from ssh_abduction.data.checks import a_number, a_whole_number, an_instance
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.star import Gateway as Sighted
 from ssh_abduction.data.trace import Action, Step, Trace

@@ -21,11 +21,7 @@ import networkx as nx
 
 from simulator.errors import SimulatorError
 from simulator.plan_files import Door, Room, read_plan
-from ssh_abduction.data.checks import (
-    a_number,
-    a_text,
-    all_instances,
-)
+from ssh_abduction.data.checks import a_number, a_text, all_instances
 
 __all__ = ["APART", "STRAIGHT", "Door", "Gateway", "Plan", "Room"]
 

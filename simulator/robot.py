@@ -92,11 +92,7 @@ class Robot:
         self.body = body
         self.pose = pose
         self.driven = 0.0
-        self.odometry: Pose = (
-            0.0,
-            0.0,
-            0.0,
-        )
+        self.odometry: Pose = (0.0, 0.0, 0.0)
         self._rng = rng
         self._reported = self.odometry  # The odometry at the last report.
         # Covariance of odometry since the last report, in the start frame.

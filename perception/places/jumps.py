@@ -288,11 +288,7 @@ def unknown_steps(log: RobotLog) -> Unknown:
     carried, still = _moved_while_still(log, paused)
     moved = frozenset(k for first, last in still for k in range(first, last + 1))
     return Unknown(
-        _targets(jumped) | moved | carried,
-        carried,
-        _targets(doubtful & ~jumped),
-        seams,
-        still,
+        _targets(jumped) | moved | carried, carried, _targets(doubtful & ~jumped), seams, still
     )
 
 

@@ -31,10 +31,4 @@ def deterministic(m: Reading) -> Found:
             )
 
 
-AXIOMS: dict[str, Check] = {
-    check.__name__: check
-    for check in (
-        functional_view,
-        deterministic,
-    )
-}
+AXIOMS: dict[str, Check] = {check.__name__: check for check in (functional_view, deterministic)}

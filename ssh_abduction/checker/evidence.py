@@ -199,13 +199,5 @@ def _may_show_the_same(one: Star, other: Star) -> bool:
 
 AXIOMS: dict[str, Check] = {
     check.__name__: check
-    for check in (
-        one_star,
-        asserted,
-        closure,
-        one_pose,
-        other_floor,
-        path_on_one_floor,
-        planar,
-    )
+    for check in (one_star, asserted, closure, one_pose, other_floor, path_on_one_floor, planar)
 }

@@ -34,10 +34,7 @@ class Order:
     """
 
     def __init__(
-        self,
-        listed: Sequence[int],
-        travels: Mapping[tuple[int, int], Move],
-        axioms: frozenset[str],
+        self, listed: Sequence[int], travels: Mapping[tuple[int, int], Move], axioms: frozenset[str]
     ) -> None:
         self.listed, self.travels = listed, travels
         self.position = {p: i for i, p in reversed(list(enumerate(listed)))}

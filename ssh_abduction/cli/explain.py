@@ -80,10 +80,7 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.add_argument("--json", action="store_true", help="print the explanation as JSON")
     parser.add_argument(
-        "--time-limit",
-        type=float,
-        metavar="S",
-        help="stop after S seconds and print what is known",
+        "--time-limit", type=float, metavar="S", help="stop after S seconds and print what is known"
     )
     parser.add_argument(
         "--memory-limit",

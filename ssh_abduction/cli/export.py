@@ -62,9 +62,7 @@ def add_parser(verbs: Verbs) -> None:
         "ssh-abduction",
     )
     parser.add_setting(
-        "frame",
-        "the name of the coordinate frame in nav2 and tmap2 files (default: map)",
-        "map",
+        "frame", "the name of the coordinate frame in nav2 and tmap2 files (default: map)", "map"
     )
     parser.set_defaults(run=run)
     parser.epilog = (
@@ -99,11 +97,7 @@ def run(options: argparse.Namespace) -> int:
     else:
         write_map(options.output, text.removesuffix("\n"), "map", "--output")
     for doubt in doubts(
-        chosen,
-        options.to,
-        level=options.level,
-        turns=turns,
-        hide_undecided=options.hide_undecided,
+        chosen, options.to, level=options.level, turns=turns, hide_undecided=options.hide_undecided
     ):
         print(f"ssh-abduction: warning: {doubt}", file=sys.stderr)
     return 0

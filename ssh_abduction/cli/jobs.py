@@ -131,8 +131,7 @@ def final_code(codes: Sequence[int], asked: int, stop: StopFlag, files: str) -> 
         return interrupted_code()
     if errors := codes.count(EXIT_ERROR):
         print(
-            f"ssh-abduction: errors in {errors} of {asked} {files}, on their lines",
-            file=sys.stderr,
+            f"ssh-abduction: errors in {errors} of {asked} {files}, on their lines", file=sys.stderr
         )
         return EXIT_ERROR
     return max(codes, default=0)

@@ -71,10 +71,7 @@ def add_parser(verbs: Verbs) -> None:
     }
     for name in CHANCES:
         parser.add_setting(
-            name,
-            f"at each step, the probability that {said[name]}",
-            type=float,
-            metavar="P",
+            name, f"at each step, the probability that {said[name]}", type=float, metavar="P"
         )
     parser.add_setting(
         "zero_one",

@@ -17,14 +17,7 @@ from ssh_abduction.explain.axioms import Interrupted
 from ssh_abduction.explain.no_map import Explanation, explain
 from ssh_abduction.learning.runner_up import second_map
 from ssh_abduction.runtime import program
-from ssh_abduction.solver import (
-    Backbone,
-    Cost,
-    Search,
-    Solution,
-    Status,
-    written_map,
-)
+from ssh_abduction.solver import Backbone, Cost, Search, Solution, Status, written_map
 from ssh_abduction.solver import ending as written_ending
 from ssh_abduction.solver import opening as written_opening
 

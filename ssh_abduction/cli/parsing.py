@@ -12,11 +12,7 @@ from typing import Any, NoReturn
 from ssh_abduction.data.errors import printable
 
 # Options of version 0.1.0 that have another name now. They still work, with a warning.
-REPLACED = {
-    "as": "format",
-    "theory-of": "theory",
-    "localize": "run",
-}
+REPLACED = {"as": "format", "theory-of": "theory", "localize": "run"}
 # Options that have no successor, by the option that a verb has now instead. They have no effect.
 # The sentence says why.
 WITHDRAWN = dict.fromkeys(

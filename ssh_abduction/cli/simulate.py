@@ -63,11 +63,7 @@ def add_parser(verbs: Verbs) -> None:
         ),
     )
     parser.add_argument(
-        "--tours",
-        type=int,
-        default=1,
-        metavar="N",
-        help="drive the route N times (default: 1)",
+        "--tours", type=int, default=1, metavar="N", help="drive the route N times (default: 1)"
     )
     parser.add_argument(
         "--seed", type=seed, default=0, help="random seed of all noise (default: 0)"

@@ -157,9 +157,7 @@ def add_parser(verbs: Verbs) -> None:
         metavar="K",
     )
     parser.add_setting(
-        "joint_trace",
-        "with --together: also write the joint trace to this file",
-        metavar="FILE",
+        "joint_trace", "with --together: also write the joint trace to this file", metavar="FILE"
     )
     parser.add_setting(
         "without_speedups",

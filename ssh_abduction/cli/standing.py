@@ -11,12 +11,7 @@ from pathlib import Path
 
 from ssh_abduction.cli.options import maps_in, read_maps
 from ssh_abduction.data.corrections import Corrections
-from ssh_abduction.data.corrections_file import (
-    FILE,
-    direction,
-    load_corrections,
-    save_corrections,
-)
+from ssh_abduction.data.corrections_file import FILE, direction, load_corrections, save_corrections
 from ssh_abduction.data.drives import Drive, step_name, step_of
 from ssh_abduction.data.errors import MapError, TraceError, brief, named
 from ssh_abduction.data.maps import SSHMap

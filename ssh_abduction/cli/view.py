@@ -65,11 +65,7 @@ def add_parser(verbs: Verbs) -> None:
         help="with --serve, seconds for each answer (default: 30)",
     )
     parser.add_setting(
-        "port",
-        "with --serve, the port (default: any free port)",
-        0,
-        type=int,
-        metavar="N",
+        "port", "with --serve, the port (default: any free port)", 0, type=int, metavar="N"
     )
     parser.add_setting(
         "open",

@@ -42,23 +42,11 @@ _HOMES = {  # module: the names that this package exports from it
         "TheoryError",
         "TraceError",
     ),
-    "maps": (
-        "DState",
-        "Fault",
-        "Fit",
-        "MapPath",
-        "Name",
-        "Pose",
-        "SSHMap",
-    ),
+    "maps": ("DState", "Fault", "Fit", "MapPath", "Name", "Pose", "SSHMap"),
     "odometry": ("Odometry",),
     "regions": ("Region",),
     "star": ("Star",),
-    "trace": (
-        "Action",
-        "Step",
-        "Trace",
-    ),
+    "trace": ("Action", "Step", "Trace"),
 }
 __all__ = [
     "AbductionError",

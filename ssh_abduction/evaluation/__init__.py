@@ -23,20 +23,9 @@ if TYPE_CHECKING:
     from ssh_abduction.evaluation.trajectory import Trajectory, TrajectoryWarning
 
 _HOMES = {
-    "named_truth": (
-        "Evaluation",
-        "MapEvaluation",
-        "evaluate",
-        "tells_names",
-    ),
-    "relations": (
-        "Relation",
-        "Relations",
-    ),
-    "trajectory": (
-        "Trajectory",
-        "TrajectoryWarning",
-    ),
+    "named_truth": ("Evaluation", "MapEvaluation", "evaluate", "tells_names"),
+    "relations": ("Relation", "Relations"),
+    "trajectory": ("Trajectory", "TrajectoryWarning"),
     "pose_truth": (
         "MapPairs",
         "MapVisits",

@@ -12,11 +12,7 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "mend": ("explain_trace",),
-    "no_map": (
-        "Explanation",
-        "explain",
-        "why_apart",
-    ),
+    "no_map": ("Explanation", "explain", "why_apart"),
     "pairs": ("explain_pair",),
     "sides": ("PlaceExplanation", "explain_place"),
 }

@@ -122,11 +122,7 @@ class Question(ABC, Generic[_Answer]):
         return search
 
     def _told_changes(
-        self,
-        ssh_map: SSHMap,
-        places: Collection[int | None],
-        cost: Cost | None,
-        nats: float | None,
+        self, ssh_map: SSHMap, places: Collection[int | None], cost: Cost | None, nats: float | None
     ) -> tuple[str, ...]:
         """Say which gateways at some places changed between drives, and what that costs.
 

@@ -61,12 +61,7 @@ def explain_place(
         TraceError, TheoryError: As `solve` does.
     """
     return PlaceQuestion(
-        trace,
-        place,
-        path,
-        checked_theory(theory),
-        time_limit=time_limit,
-        memory_limit=memory_limit,
+        trace, place, path, checked_theory(theory), time_limit=time_limit, memory_limit=memory_limit
     ).answer()
 
 

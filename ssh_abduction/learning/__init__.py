@@ -7,11 +7,7 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from ssh_abduction.learning.learner import BootstrapLearner
 
-_HOMES = {
-    "learner": ("BootstrapLearner",),
-}
-__all__ = [
-    "BootstrapLearner",
-]
+_HOMES = {"learner": ("BootstrapLearner",)}
+__all__ = ["BootstrapLearner"]
 
 __getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)

@@ -15,17 +15,10 @@ if TYPE_CHECKING:
 _HOMES = {
     "belief": ("Belief",),
     "chances": ("Chances",),
-    "explorer": (
-        "Exploration",
-        "Explorer",
-    ),
+    "explorer": ("Exploration", "Explorer"),
     "localiser": ("Localiser",),
     "mapper": ("OnlineMapper",),
-    "routes": (
-        "Move",
-        "Route",
-        "route",
-    ),
+    "routes": ("Move", "Route", "route"),
 }
 __all__ = [
     "Belief",

@@ -32,10 +32,7 @@ class MapKeeper:
     standing = None  # only `Recovery`, for theories with faults, has a standing
 
     def __init__(
-        self,
-        problem: Problem,
-        options: StepOptions,
-        before: MapKeeper | None = None,
+        self, problem: Problem, options: StepOptions, before: MapKeeper | None = None
     ) -> None:
         trace, theory = problem.trace, problem.theory
         self._problem, self._options = problem, options

@@ -62,10 +62,7 @@ class Recovery:
     """
 
     def __init__(
-        self,
-        problem: Problem,
-        options: StepOptions,
-        before: Recovery | None = None,
+        self, problem: Problem, options: StepOptions, before: Recovery | None = None
     ) -> None:
         self._trace, self._theory, self._options = problem.trace, problem.theory, options
         self._judging = Judging(problem)

@@ -14,14 +14,8 @@ if TYPE_CHECKING:
     from ssh_abduction.rivals.sides import SharedSides, shared_sides
 
 _HOMES = {
-    "comparison": (
-        "Comparison",
-        "compare",
-    ),
-    "differences": (
-        "Difference",
-        "difference",
-    ),
+    "comparison": ("Comparison", "compare"),
+    "differences": ("Difference", "difference"),
     "drive_joins": ("DrivePair", "joins_of_drives"),
     "experiment": ("Experiment",),
     "explore": ("next_experiment",),

@@ -199,9 +199,7 @@ def _surest(
     """Find the pair of steps, one of each list, that is most probably at one place."""
     joins = (
         DriveJoin(
-            i,
-            j,
-            math.fsum(w for w, at in zip(weights, placings, strict=True) if at[i] == at[j]),
+            i, j, math.fsum(w for w, at in zip(weights, placings, strict=True) if at[i] == at[j])
         )
         for i in here
         for j in there

@@ -70,13 +70,7 @@ def next_tour(
     """
     if margin and ssh_map.places:
         ssh_map = with_doubted_returns(ssh_map, trace, margin)
-    stances = Stances(
-        ssh_map,
-        trace,
-        settle(trace, theory).theory,
-        [*map(Action.of, actions)],
-        can,
-    )
+    stances = Stances(ssh_map, trace, settle(trace, theory).theory, [*map(Action.of, actions)], can)
     start, moves = ssh_map.dstate_at[-1], stances.moves()
     near = reached_from(moves, start)
     moves = [move for move in moves if move.source in near]

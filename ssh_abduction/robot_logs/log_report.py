@@ -22,12 +22,7 @@ from ssh_abduction.output.drawing import escaped
 from ssh_abduction.output.undecided import place_of_steps
 from ssh_abduction.rivals.drive_joins import joins_of_drives
 from ssh_abduction.rivals.listing import Listing
-from ssh_abduction.robot_logs.log_picture import (
-    SURE,
-    doubtful_joins,
-    figure,
-    paths_mean_something,
-)
+from ssh_abduction.robot_logs.log_picture import SURE, doubtful_joins, figure, paths_mean_something
 from ssh_abduction.solver import Solution, Status
 
 STYLE = """

@@ -14,13 +14,7 @@ from pathlib import Path
 from ssh_abduction.data.files import shipped
 
 # Each of these files needs the ones before it. Files that users add follow, sorted by name.
-FIRST = (
-    "causal",
-    "topological",
-    "boundary",
-    "star",
-    "gateways",
-)
+FIRST = ("causal", "topological", "boundary", "star", "gateways")
 _AXIOM = re.compile(
     r"^% @axiom\((?P<name>\w+)\) (?:(?P<sentence>.+?) \[(?P<source>[^\]]+)\](?: if "
     r"(?P<when>.+))?|(?P<alone>.+))$"

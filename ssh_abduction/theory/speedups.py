@@ -196,10 +196,7 @@ def _kept_by(*names: str, and_also: Iterable[str] = ()) -> Callable[[], frozense
 
 CAUSAL = frozenset({"functional_view", "deterministic"})
 # A dstate has one observation, one place, and one course.
-ONE_OF_EACH = CAUSAL | {
-    "one_place",
-    "one_course",
-}
+ONE_OF_EACH = CAUSAL | {"one_place", "one_course"}
 TRAVELS_AND_TURNS = CAUSAL | {
     "one_place",
     "turn_stays",

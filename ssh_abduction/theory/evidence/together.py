@@ -234,10 +234,7 @@ class Together:
         alone, rows, loops = self._of_each(number), self.rows, self._loops(number)
         squares = alone.square[later] + alone.square[earlier]
         # The stretch that both loops share.
-        begin, stop = (
-            np.maximum(rows[earlier, 0], rows[later, 0]),
-            rows[earlier, 1],
-        )
+        begin, stop = (np.maximum(rows[earlier, 0], rows[later, 0]), rows[earlier, 1])
         gathered = loops.of_ends(end)
         ends = np.outer(_common_ends(rows[earlier], rows[later]), loops.at_end)
         share = self._largest_share(alone, later, gathered[stop] - gathered[begin] + ends)
