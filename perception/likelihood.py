@@ -201,7 +201,6 @@ class ImageLikelihood:
         """Log density of an isotropic Gaussian in `dimensions` dimensions.
 
         Args:
-            squares: Squared distances from the centre.
             mean: Mean squared distance from the centre.
         """
         return np.asarray(

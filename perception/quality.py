@@ -367,9 +367,6 @@ class _Search:
 
         Args:
             lower: (rows, columns) lower bounds of the squared distances of the pairs.
-            slack: Largest error of these bounds.
-            row: Index of the image of the first row of the block.
-            column: Index of the image of the first column of the block.
         """
         components, least = self.components[row : row + len(lower)], lower.min(axis=1)
         hot = np.flatnonzero(least < self.best[components])

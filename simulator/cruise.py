@@ -72,7 +72,6 @@ def _come_to(way: Array, at: int, driver: Driver) -> int:
     Args:
         way: (n, 2) route in metres.
         at: Index of the last point that was reached.
-        driver: The robot.
     """
     off = np.hypot(*(way[at : at + round(1.5 * AIM / CELL)] - np.array(driver.robot.pose[:2])).T)
     nearest = len(off) - 1 - int((off[::-1]).argmin())
@@ -83,9 +82,7 @@ def _stride(driver: Driver, way: Array, aim: float) -> None:
     """Turn towards the aim, a point on the route, and drive if the aim is roughly ahead.
 
     Args:
-        driver: The robot.
         way: (n, 2) rest of the route in metres.
-        aim: Metres along the route to the aim.
     """
     x, y, heading = driver.robot.pose
     goal = way[: 2 + round(aim / CELL)][-1]
@@ -105,7 +102,6 @@ def _around_obstacles(
     """Plan the route again if the laser shows a new obstacle on it.
 
     Args:
-        driver: The robot.
         space: Free space, in which new obstacles are marked.
         image: (180,) ranges in metres.
         way: (n, 2) current route in metres.

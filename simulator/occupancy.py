@@ -176,12 +176,7 @@ def _fields(data: bytes) -> dict[str, str | list[str]]:
 
 
 class _Reader:
-    """Checks the fields of a map file. Errors name the field that is wrong.
-
-    Args:
-        fields: Fields by name.
-        path: The file, for errors.
-    """
+    """Checks the fields of a map file. Errors name the field that is wrong."""
 
     def __init__(self, fields: Mapping[str, str | list[str]], path: Path) -> None:
         self.fields, self.path = fields, path

@@ -92,11 +92,7 @@ def read_plan(path: str | os.PathLike[str]) -> tuple[str, tuple[Room, ...], tupl
 
 
 class _Reader:
-    """Reads the XML of a plan. All methods but `wrong` raise SimulatorError for wrong parts.
-
-    Args:
-        where: Name of the file, for errors.
-    """
+    """Reads the XML of a plan. All methods but `wrong` raise SimulatorError for wrong parts."""
 
     def __init__(self, where: str) -> None:
         self.where = where
@@ -165,10 +161,7 @@ class _Reader:
         """Read the indices of the two rooms of a door, in ascending order.
 
         Args:
-            portal: The door.
-            numbers: Index of each room, by name.
             here: Index of the room in which the door is listed.
-            where: Name of the door, for errors.
         """
         names = [target.text or "" for target in portal.findall("target/id")]
         rooms = sorted({numbers[name] for name in names if name in numbers})

@@ -263,8 +263,6 @@ def _star(
     """The star of a room: its gateways, sorted by bearing, each with its opposite gateway.
 
     Args:
-        plan: The plan.
-        stand: State of the robot.
         bearings: Bearing of each gateway in degrees, in the order of the plan.
         spread: Error of the bearings that the star states, in degrees.
     """

@@ -243,7 +243,6 @@ def _apart(log: RobotLog, turns: Array, stretch: float = 1.0) -> Array | None:
     """How far the points of two scans lie apart, if the odometry moves one scan to the other.
 
     Args:
-        log: The scans. Pairs of near scans are compared.
         turns: (n,) angles in radians by which the laser is rotated on the robot.
         stretch: Factor by which the angle between beams is multiplied.
 

@@ -44,7 +44,6 @@ def _bends_of(edge: Edge, first: float, last: float, distance: Array, out: float
     """Find the bends of one line, the sharpest first. See `bends`.
 
     Args:
-        edge: The line.
         first: Length of the line in the disc of its first node, in cells.
         last: Length of the line in the disc of its last node, in cells.
         distance: (rows, columns) distance of each cell to the nearest obstacle, in cells.

@@ -98,7 +98,6 @@ def _closings(
     Args:
         scene: Makes the scene of a visit from its index.
         asked: Index and gate of each earlier visit to try.
-        last: Index of the visit.
     """
     if not asked:
         return
@@ -150,7 +149,6 @@ class _Gates:
     """Makes the gate of any two visits.
 
     Args:
-        track: Trajectory of the robot.
         visits: The visits, in order.
         apart: Metres that the robot drove at least between two visits to be matched.
     """

@@ -287,7 +287,6 @@ def _distance(middle: Array, radius: float, junction: Junction) -> float | None:
     Args:
         middle: The middle of the chain: (2,) metres.
         radius: The radius of the chain in metres.
-        junction: The junction.
     """
     far = math.dist(middle, junction.middle)
     return far if far < max(SAME, SHARE * min(radius, junction.radius)) else None

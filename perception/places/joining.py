@@ -84,7 +84,6 @@ def _closings(parts: Sequence[Imported], counts: Sequence[int]) -> Iterator[Clos
     """Yield the closures between drives, with visits numbered over all drives.
 
     Args:
-        parts: The import of each drive.
         counts: The number of visits before each drive.
     """
     scenes = [scenes_of(part) for part in parts]
@@ -113,7 +112,6 @@ def _joint_track(tracks: Sequence[Track], begins: Sequence[int]) -> tuple[Track,
     """Join tracks.
 
     Args:
-        tracks: The tracks of the drives.
         begins: The number of the first scan of each drive, over all drives.
 
     Returns:

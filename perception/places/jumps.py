@@ -113,7 +113,6 @@ def _of_source(scans: tuple[Scan, ...], members: NDArray[np.intp]) -> tuple[Scan
     """Replace the odometry of all scans by that of one source, inter- and extrapolated.
 
     Args:
-        scans: The scans.
         members: Indices of the scans of that source.
     """
     from scipy.interpolate import interp1d
@@ -310,7 +309,6 @@ def _impossible(
     time that it took.
 
     Args:
-        log: The n scans.
         seconds: (n - 1,) duration of each step; None if unknown.
         paused: (n - 1,) mask of the steps that took unusually long.
 

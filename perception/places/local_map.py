@@ -201,10 +201,8 @@ class LocalMaps:
         """Mask of the cells on the trajectory of the window.
 
         Args:
-            begin: First scan of the window.
             end: Scan after the last of the window.
             first: Cell at the corner of the patch, counted from the origin.
-            shape: Rows and columns of the patch.
         """
         path = self._recent.poses(begin, end)[:, :2]
         legs = [

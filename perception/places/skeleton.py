@@ -106,7 +106,6 @@ def _with_mouths(found: list[Fork], mouths: list[Fork], far: float) -> list[Fork
 
     Args:
         found: The junctions of the skeleton without shores.
-        mouths: The junctions of the skeleton with shores.
         far: Distance of a shore from obstacles, in cells.
     """
     # The disc of a junction amid an open space is as large as those of the mouths around it.
@@ -198,8 +197,6 @@ def _out(edge: Edge, nodes: Mapping[int, Node], degrees: Mapping[int, int]) -> f
     """Compute by how many metres a branch to prune leads out of the disc of its junction.
 
     Args:
-        edge: The edge from the junction to the dead end.
-        nodes: The nodes.
         degrees: The number of edges of each node.
 
     Returns:
@@ -247,10 +244,8 @@ def _are_one(
     """Check whether the junctions of an edge are in one open space.
 
     Args:
-        edge: The edge.
         heads: For each end of the edge, the junction with the largest disc among those that were
             merged with that end.
-        nodes: The nodes.
         distance: (rows, columns) distance of each cell to the nearest obstacle, in cells.
     """
     first, second = (nodes[node] for node in heads)
@@ -267,8 +262,6 @@ def _branches(graph: Graph, group: set[int], radius: float) -> list[Array]:
     """List the lines that lead away from a group of merged junctions.
 
     Args:
-        graph: The skeleton.
-        group: The numbers of the junctions.
         radius: Radius of the merged junction in cells. Lines within the group that are shorter than
             its diameter are left out.
     """

@@ -247,7 +247,6 @@ class Stays:
         """The direction in radians in which the robot crosses the disc of a place.
 
         Args:
-            visit: Visit to the place.
             side: -1 for entering the disc, 1 for leaving it.
 
         Returns:

@@ -199,7 +199,6 @@ def _add_line(
     """Add a line to a graph, with a node at each of its ends that is at no junction.
 
     Args:
-        graph: The graph.
         line: (n, 2) rows and columns along the line.
         touched: The junctions that touch its first and its last cell.
         distance: (rows, columns) distances to the outside, in cells.

@@ -129,14 +129,9 @@ def _step(
     """Make one step, without its action.
 
     Args:
-        log: The scans.
-        track: Their poses.
         visit: Visit that the step belongs to.
-        pose: Pose of the step, at the middle of the place.
-        patch: Local map around the middle.
         last: Visit and pose of the last step; None for the first step. The displacement leads from
             this pose, unless the track is cut between.
-        number: Index of the visit.
     """
     onward = covariance = None
     cuts = [] if last is None else track.cuts_between(last[0].scan, visit.scan)
@@ -206,15 +201,7 @@ def _image(patch: PackedPatch, middle: Array, heading: float) -> Array:
 
 
 def _covariance(track: Track, begin: int, end: int, first: Pose, last: Pose) -> Covariance:
-    """The covariance of the displacement between two steps, in the frame of the first.
-
-    Args:
-        track: Trajectory of the robot.
-        begin: Scan of the first step.
-        end: Scan of the last step.
-        first: Pose of the first step.
-        last: Pose of the last step.
-    """
+    """The covariance of the displacement between two steps, in the frame of the first."""
     total = uncertainty(track, begin, end, np.array(last[:2]))
     turned = np.eye(3)
     cos, sin = math.cos(first[2]), math.sin(first[2])
@@ -230,7 +217,6 @@ def _with_turns(steps: list[Step], visits: Sequence[Visit]) -> list[Step]:
 
     Args:
         steps: The steps. Those that end with a travel have their action.
-        visits: The visits.
     """
     done = list(steps)
     for i, step in enumerate(steps[:-1]):

@@ -131,9 +131,7 @@ def _checked(scans: Sequence[Scan], begin: int, unseen: bool, source: str) -> li
 
     Args:
         scans: The scans. Their ranges are not looked at.
-        begin: Number of the first scan of the stretch.
         unseen: Whether the robot moves while its odometer stands still.
-        source: Name of the log, for errors.
 
     Raises:
         LogError: The scans are in random order.

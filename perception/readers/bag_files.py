@@ -96,11 +96,6 @@ def opened(path: Path, format: str) -> Iterator[Files]:
 def _of_folder(path: Path, folder: Path, stack: ExitStack) -> Files:
     """Open a folder by its metadata.yaml. Without a usable one, open all files in it.
 
-    Args:
-        path: The folder.
-        folder: Temporary folder.
-        stack: Closes the files.
-
     Raises:
         LogError: No file can be opened, or the files are of several drives.
     """
@@ -176,10 +171,8 @@ def _open_part(path: Path, files: Files, folder: Path, stack: ExitStack) -> None
     """Open one file, and add its reader to those of the drive.
 
     Args:
-        path: The file.
         files: Open files of the drive; receives the reader and notes.
         folder: Temporary folder, for an unpacked copy or a link.
-        stack: Closes the reader.
 
     Raises:
         LogError: No message can be read.

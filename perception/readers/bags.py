@@ -133,10 +133,7 @@ def _chosen(bag: Bag, kinds: Sequence[str], name: str | None, option: str) -> st
     """Choose a topic: the named one, or the only one with messages of some kinds.
 
     Args:
-        bag: The open bag.
-        kinds: Message kinds.
         name: Name of the topic; None for the only one.
-        option: Name of the option for the topic, for errors.
 
     Returns:
         The topic; None if no topic has such messages.
@@ -197,8 +194,6 @@ def _odometer(
     """Read the poses of the odometer.
 
     Args:
-        bag: The open bag.
-        topic: Topic of the odometry.
         damaged: Receives the messages that cannot be read.
         notes: Receives a note if several programs publish the topic.
 
@@ -250,9 +245,7 @@ def _odometer_of_transforms(bag: Bag, frames: Frames, frame: str) -> tuple[Track
     """Take the poses of the odometer from the transforms from `odom` to the robot.
 
     Args:
-        bag: The open bag.
         frames: Transforms between frames.
-        frame: Frame of the scans.
 
     Returns:
         The poses, the name of their frame, and that of the frame of the robot.
@@ -279,8 +272,6 @@ def _of_one_source(track: Track, called: str, notes: list[str]) -> Track:
     """Keep the poses of the largest source if the poses of several sources alternate.
 
     Args:
-        track: The poses.
-        called: What publishes the poses, for a note.
         notes: Receives a note if there are several sources.
     """
     sources = sources_of(track)
@@ -347,9 +338,6 @@ def _scans(
     """Yield the scans of a bag.
 
     Args:
-        bag: The open bag.
-        topics: The topics of the scans.
-        where: The poses of the robot and its lasers.
         damaged: Damage that was found during the survey. It is yielded first.
 
     Yields:

@@ -181,10 +181,6 @@ def _scans(
     """Yield the scans, and damage for lines that cannot be read.
 
     Args:
-        file: The log.
-        source: Name of the log, for errors.
-        odometer: Gives the pose of each scan.
-        kind: Kind of the lines with scans.
         mount: Pose of the laser in the frame of the robot.
         reach: Reach of the laser in metres, if the lines of the scans do not give it.
     """
@@ -350,7 +346,6 @@ def _measured(
     """The ranges of a scan in metres, and its laser.
 
     Args:
-        line: The line of the scan.
         mount: Pose of the laser in the frame of the robot.
         reach: Reach of the laser in metres, if the line does not give it.
         fov: Field of view in radians, if the line does not give the geometry of the laser.

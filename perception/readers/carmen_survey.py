@@ -305,7 +305,6 @@ def _count_restart(
 
     Args:
         survey: Receives the counts.
-        line: Line of the scan.
         before: Pose and time of the ODOM line before the scan.
         pose: Pose of the ODOM line after the scan.
         time: Time of the ODOM line after the scan, in seconds.

@@ -268,10 +268,6 @@ def _kinds(scan: Scan) -> dict[str, Bools]:
 def _survey(scans: Sequence[Scan], told: Told) -> tuple[Meaning, list[str]]:
     """Find out what the ranges of one laser mean.
 
-    Args:
-        scans: Scans of one laser.
-        told: What the user says about the laser.
-
     Returns:
         The meaning, and notes on it.
     """
@@ -349,7 +345,6 @@ def _without_measurement(scans: Sequence[Scan], reach: float) -> tuple[frozenset
     """Find out which kinds of beams without a measurement mean that nothing came back.
 
     Args:
-        scans: Scans of one laser.
         reach: Reach of the laser in metres.
 
     Returns:

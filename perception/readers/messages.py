@@ -130,7 +130,6 @@ def _ranges(tokens: list[bytes], at: int) -> tuple[NDArray[np.float64], int]:
     """Parse ranges that come after their number.
 
     Args:
-        tokens: Words of the line.
         at: Index of the word with the number of ranges.
 
     Returns:

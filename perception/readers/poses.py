@@ -148,7 +148,6 @@ def _wrong_recording(name: str, times: Array, stamps_are_wrong: bool) -> str | N
     They are wrong if they stand still while the stamps in the headers go on.
 
     Args:
-        name: Name of the topic.
         times: (n, 2) stamps and times of recording in seconds.
         stamps_are_wrong: Whether the stamps are wrong. Then recording that stands still is an
             error whatever the stamps say.

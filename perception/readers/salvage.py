@@ -257,10 +257,6 @@ def _fields(data: bytes) -> dict[bytes, bytes]:
 def _unpacked(packed: str, data: bytes) -> bytes:
     """Unpack the content of a chunk, as far as it exists.
 
-    Args:
-        packed: Name of the compression.
-        data: The packed bytes.
-
     Raises:
         KeyError: The compression is unknown.
     """

@@ -271,8 +271,6 @@ class _Maker:
     """Makes messages with one time.
 
     Args:
-        types: Message classes by name.
-        stamp: Message with the time.
         numbering: Keyword argument with the sequence number of the header, for ROS 1; empty for
             ROS 2.
     """

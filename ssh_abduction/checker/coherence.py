@@ -52,7 +52,6 @@ def _numbered(what: str, ids: Sequence[int], visits: Iterable[tuple[int, int | N
     """Check that ids are 0, 1, 2, … by first visit, and that each is visited.
 
     Args:
-        what: What the ids are of, in words, such as "places".
         ids: The ids that the map lists.
         visits: Pairs of a step and the id visited there, sorted by step; None for no id.
     """

@@ -118,7 +118,6 @@ def _p_value(match: Closure, odometry: Odometry, freedom: int) -> float:
     """Compute how probable a closure at least this far from zero is if both poses are one.
 
     Args:
-        match: The closure.
         odometry: The noise model, with the errors of poses at visits.
         freedom: 2 to compare positions, 3 to compare poses.
     """

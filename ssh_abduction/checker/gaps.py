@@ -86,12 +86,7 @@ def _frame(
     """Find the frame of a stretch, by a dstate or two places whose poses are known already.
 
     Args:
-        steps: The steps of the stretch.
         pose: The pose of each step; those of `steps` are in the frame of the stretch.
-        dstates: The dstate of each step.
-        places: The place of each step.
-        known: For each dstate with a known pose, a step there.
-        position: For each place with a known position, this position.
 
     Returns:
         The position and the heading of the origin of the stretch; None if they are undetermined.

@@ -170,10 +170,6 @@ def _returns(
     """Find the returns of a map whose closing error is known.
 
     Args:
-        trace: The trace.
-        ssh_map: A map of the trace.
-        theory: The theory, resolved for the trace.
-        drifts: The poses by dead reckoning.
         of_arrivals: Whether to leave out returns to dstates in which a step is not the first one of
             its visit. Returns to places always have first steps of visits.
 
@@ -335,7 +331,6 @@ def _unsafe(
     Args:
         filtered: The poses without drift.
         rows: The returns, sorted by last step, (m, 3).
-        alone: The values of each return alone.
         end: The last step of the later return.
         most: The least chi-square at which a pair may be rejected.
 
@@ -374,7 +369,6 @@ def _common_ends(rows: Steps, here: Steps, others: Steps) -> Steps:
     Both returns share the error by which the robot is off its dstate at such an end.
 
     Args:
-        rows: The returns.
         here: Indices into `rows` of one return of each pair.
         others: Indices into `rows` of the other return of each pair.
     """
@@ -386,7 +380,6 @@ def _is_safe(share: Array, squares: Array, most: float) -> NDArray[np.bool_]:
     """For each pair of returns, tell whether the bound shows that it is not rejected.
 
     Args:
-        share: The number s of the bound in the module's docstring.
         squares: The sum of the chi-squares of both returns.
         most: The least chi-square at which a pair may be rejected.
     """
@@ -399,8 +392,6 @@ def _square_together(filtered: ErrorFilter, rows: Steps, here: Steps, others: St
     """Compute the chi-square of each pair of returns; 0 if a closing error of the pair is unknown.
 
     Args:
-        filtered: The poses.
-        rows: The returns.
         here: The index into `rows` of one return of each pair.
         others: The index into `rows` of the other return of each pair.
     """

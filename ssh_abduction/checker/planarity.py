@@ -281,12 +281,7 @@ def _parts(
     around: Mapping[int, Sequence[tuple[int, int]]],
     beyond: Mapping[tuple[int, int], tuple[int, int]],
 ) -> int:
-    """Count the connected parts of a drawing.
-
-    Args:
-        around: The gateways of each place.
-        beyond: For each gateway, the gateway at the other end of its edge.
-    """
+    """Count the connected parts of a drawing."""
     left, parts = set(around), 0
     while left:
         parts += 1
@@ -329,7 +324,6 @@ def _orders(gateways: Sequence[Arm], told: Sequence[Sequence[Arm]]) -> list[tupl
     Orders that differ by a rotation are listed once: each starts with the first gateway.
 
     Args:
-        gateways: The gateways of one place.
         told: Sequences of gateways that are known to follow each other clockwise.
     """
     orders: list[tuple[Arm, ...]] = [()]

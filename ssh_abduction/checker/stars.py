@@ -115,7 +115,6 @@ def _one_star(seen: Iterable[tuple[DState, Openings, int]], how: str) -> Found:
 
     Args:
         seen: A dstate, a star in a form that all steps at its place share, and its first step.
-        how: How the stars were turned, for the message.
     """
     known: dict[int, tuple[Openings, int]] = {}
     for s, star, i in seen:

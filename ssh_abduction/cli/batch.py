@@ -170,9 +170,6 @@ class Question:
 
         Args:
             number: The index of the trace.
-            path: The file of the trace.
-            search: The search.
-            maps: The list of maps found so far.
             given_up: Returns whether the answer is not needed any more.
         """
 

@@ -144,10 +144,6 @@ def _bound(
     """Check the lower bound and the other claims in a file of maps, and print the result.
 
     Args:
-        trace: The trace.
-        data: The content of the file.
-        theory: The theory to check by.
-        maps: The maps in the file.
         doubt: Why clingo's proofs may not hold for this trace and theory; None if they do.
         solved: The theory in the file, in which no field is "auto".
         broken: Whether some maps break axioms.

@@ -97,8 +97,6 @@ def _answers(
     alone. If its worker is killed again, the file is to blame and gets a lost answer.
 
     Args:
-        question: The question.
-        paths: The files.
         attempt: Takes a list of files to work on, and a list to which it appends the files whose
             worker was killed. Yields the answers for all other files.
     """
@@ -173,11 +171,7 @@ def _on_workers(
     joblib's backend for Dask hangs when a worker is killed.
 
     Args:
-        question: The question.
-        client: The connection to the scheduler.
         most: The largest number of files on the cluster at a time.
-        absence: Says when to stop waiting for a worker.
-        tasks: The files.
         killed: Receives the files whose worker was killed.
     """
     from distributed import KilledWorker, as_completed

@@ -130,11 +130,7 @@ class Guard:
         return self._deaf_at is not None and time.monotonic() > self._deaf_at
 
     def _end(self, why: Stop) -> None:
-        """Print the last words, and end the process and its helper processes without clean-up.
-
-        Args:
-            why: The reason for the end.
-        """
+        """Print the last words, and end the process and its helper processes without clean-up."""
         self._interrupt()
         code = 1
         try:
@@ -199,11 +195,7 @@ class _Printer:
         self._writes_since: float | None = None  # when the current piece of text was begun
 
     def say(self, text: Callable[[], str]) -> None:
-        """Make a text while holding the lock, and print it in pieces.
-
-        Args:
-            text: Returns the text.
-        """
+        """Make a text while holding the lock, and print it in pieces."""
         with self.speaking:
             made = text()
             for start in range(0, len(made), PIECE):

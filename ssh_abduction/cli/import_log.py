@@ -144,7 +144,6 @@ def _told(field: str, text: str) -> Any:
     """Convert text to the value of a field of `Told`, which describes the laser, and check it.
 
     Args:
-        field: The name of the field.
         text: A number, or numbers separated by commas.
     """
     from perception.readers.echoes import Told

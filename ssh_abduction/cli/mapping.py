@@ -194,13 +194,11 @@ class MapQuestion:
 
         Args:
             number: The index of the log.
-            paths: The logs as the user named them.
             files: The files to read, which may be copies.
             content: The digest of the logs before they are read; None if there is none. If a log
                 changes later, the next call sees another digest and maps them again.
             given_up: Returns whether the answer is not needed any more.
             answer_last: Takes the answer if the process has to end because clingo does not stop.
-            tell: Takes each warning about the log as soon as it is known.
         """
         begun: list[LogMapping] = []  # one entry, once the logs are read
         names = [named_after(path) for path in paths]
@@ -424,13 +422,7 @@ def _check_alone(path: str, folder: Path) -> None:
 
 
 def _here(question: MapQuestion, logs: Sequence[str], folder: Path) -> int:
-    """Map a log, or several together, in this process, and return the exit code.
-
-    Args:
-        question: The settings.
-        logs: The logs, one a drive.
-        folder: The folder to write.
-    """
+    """Map a log, or several together, in this process, and return the exit code."""
     told: set[str] = set()  # warnings that were printed while the logs were mapped
 
     def tell(warning: str) -> None:
@@ -464,8 +456,6 @@ def _kept(
 
     Args:
         answers: The answers in any order.
-        paths: The logs.
-        folders: The folder of each log.
     """
     for answer in answers:
         path, code = paths[answer.number], answer.code

@@ -209,10 +209,6 @@ class Parser(argparse.ArgumentParser):
     def _with_replacements(self, words: list[str], notes: list[str]) -> list[str]:
         """Replace options of version 0.1.0 by their new form.
 
-        Args:
-            words: The words of the command line.
-            notes: Gets a sentence for each replacement.
-
         Returns:
             The new words.
         """
@@ -240,8 +236,6 @@ class Parser(argparse.ArgumentParser):
         """Find the new form of an option of version 0.1.0.
 
         Args:
-            word: The option, perhaps with "=VALUE".
-            rest: The words behind it. If the value is the first of these, it is removed.
             notes: Gets a sentence if the option is replaced.
 
         Returns:
@@ -311,9 +305,7 @@ def _exported(words: list[str], at: int, notes: list[str]) -> list[str]:
     """Replace `show --dot`, `--graphml` or `--svg` of version 0.1.0 by an `export` command.
 
     Args:
-        words: The words of the command line.
         at: The index of the verb.
-        notes: Gets a sentence about the replacement.
 
     Returns:
         The new words.
@@ -344,7 +336,6 @@ def _meant(word: object, names: Iterable[str]) -> str:
     """Make a hint such as "; did you mean star?" if a name is similar to a word; else "".
 
     Args:
-        word: The word.
         names: The names that it may mean.
     """
     near = difflib.get_close_matches(str(word), list(names), n=1)

@@ -300,10 +300,6 @@ def _camera(options: argparse.Namespace) -> Camera | None:
 def _with_table(trace: Trace, target: str) -> Trace:
     """Write the panoramas of a trace to an .npz file beside it.
 
-    Args:
-        trace: The trace.
-        target: The file of the trace.
-
     Returns:
         The trace, whose images are now indices into that file.
     """

@@ -158,7 +158,6 @@ class Standing:
         Without headings, only the steps at the dstate itself are listed.
 
         Args:
-            label: The dstate.
             way: The direction of the gateway from this dstate, in degrees clockwise from ahead.
         """
         here = self.map.dstates[label]

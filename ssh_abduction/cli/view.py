@@ -163,9 +163,7 @@ def _run(options: argparse.Namespace, trace: Trace | None, data: Any) -> Run | N
     """Make the localised run that the options ask for; None if they ask for none.
 
     Args:
-        options: The options.
         trace: The trace that was mapped; None if it is unknown.
-        data: The content of the file of maps.
 
     Raises:
         AbductionError: A file is wrong, or the run is missing.
@@ -192,9 +190,7 @@ def _with_beliefs(followed: Trace, file: str, data: Any) -> Run:
     """Make a run with beliefs from a file.
 
     Args:
-        followed: The trace of the run.
         file: The file, as `localise --json` writes it.
-        data: The content of the file of maps.
 
     Raises:
         MapError: The file is malformed, or is of another run or other maps.

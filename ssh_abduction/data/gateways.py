@@ -301,7 +301,6 @@ def _fitted(
     """Do what `fit` does, with a cache: maps of growing prefixes have many places in common.
 
     Args:
-        sights: The sights at one place.
         headings: The headings of their dstates, which have to fit; None if they need not. Dstates
             that differ only in their heading are equal, so it is an argument of its own.
         made: Pairs of these sights, and the turns that lead from the first to the second.
@@ -457,7 +456,6 @@ def _allowed(
         seen_a: Its frame and shift.
         b: The later sight.
         seen_b: Its frame and shift.
-        turns: The turns between sights.
         axioms: Names of the axioms that hold.
         as_shown: Whether the headings that the dstates have must fit, too.
     """

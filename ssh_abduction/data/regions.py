@@ -109,7 +109,6 @@ def _smallest_around(places: frozenset[int], before: Iterable[frozenset[int]]) -
     """Find the smallest earlier sets that contain these places and more.
 
     Args:
-        places: The places.
         before: The earlier sets.
 
     Returns:

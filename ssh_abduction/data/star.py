@@ -358,7 +358,6 @@ def _entry(value: Any, count: int, four: bool, where: str) -> Entry:
         value: What the trace or the caller gives.
         count: The number of entries of the star.
         four: Whether the star is written as four of 0, 1 or None.
-        where: The name of the entry in messages.
     """
     if isinstance(value, Gateway):
         value = {name: getattr(value, name) for name in _FIELDS}
@@ -378,9 +377,7 @@ def _gateway(value: Mapping[str, Any], count: int, where: str) -> Gateway:
     """Check and return a gateway that is given as an object.
 
     Args:
-        value: The object.
         count: The number of entries of the star.
-        where: The name of the gateway in messages.
     """
     if unknown := [name for name in value if name not in _FIELDS]:
         raise TraceError(

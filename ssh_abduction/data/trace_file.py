@@ -104,7 +104,6 @@ def _record(raw: bytes, where: str) -> dict[str, Any]:
 
     Args:
         raw: The line. If it is the first one, it may begin with a byte order mark.
-        where: File and line, for messages.
     """
     is_first = where.endswith(":1")
     if is_first:
@@ -199,8 +198,6 @@ def _step(record: Mapping[str, Any], where: str, actions: dict[str, Action]) -> 
     """Make a step of the object on a line.
 
     Args:
-        record: The object.
-        where: File and line, for messages.
         actions: The actions of earlier steps, by name. Equal actions become one object. A new
             action is added.
     """

@@ -249,7 +249,6 @@ def _told(value: Any, where: str) -> dict[str, Hashable]:
 
     Args:
         value: The `truth` of the step.
-        where: The name of the step, for messages.
 
     Returns:
         A dict from sorts (dstate, place, path, course) to names. Unknown names are None or missing.

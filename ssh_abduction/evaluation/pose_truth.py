@@ -366,7 +366,6 @@ def _verdicts(
     """Judge each pair of visits, and each pair of steps of different visits.
 
     Args:
-        truth: The source of distances.
         visit: The visit of each step, (n,), counted from 0.
         near: The greatest distance of two poses at one place in metres.
         turned: The greatest difference of two headings at one dstate in degrees.
@@ -415,7 +414,6 @@ def _evaluated(ssh_map: SSHMap, visit: Steps, places: Verdicts, dstates: Verdict
     """Measure the accuracy of a map.
 
     Args:
-        ssh_map: The map.
         visit: The visit of each step, (n,).
         places: The verdicts on pairs of visits, (v, v).
         dstates: The verdicts on pairs of steps, (n, n).

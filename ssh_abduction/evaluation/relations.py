@@ -174,9 +174,7 @@ class Relations:
         """Compose the pose at a node along the shortest way.
 
         Args:
-            node: The node.
             before: For each node, the node before it on its shortest way.
-            poses: The poses of nodes found so far. Poses of nodes on the way are added.
         """
         way = []
         while node not in poses:

@@ -318,7 +318,6 @@ def _warn_of_space(source: str, rise: float, leaning: int, count: int) -> None:
     """Warn if a trajectory is not on a floor, for example because it is that of a camera.
 
     Args:
-        source: The name of the trajectory, for messages.
         rise: The difference between the greatest and the least height in metres.
         leaning: The number of poses that lean by more than 30 degrees.
         count: The number of poses.

@@ -197,10 +197,8 @@ class Argument:
         """Find the first link of `left` that gives a new conclusion or a contradiction.
 
         Args:
-            placed: The links in the argument so far.
             left: The links not yet in the argument.
             assumed: The supposition, if there is one.
-            known: The conclusions so far.
 
         Returns:
             The link, alone in a tuple; None if no single link gives anything new.
@@ -219,7 +217,6 @@ class Argument:
         """Add a line if some known conclusions are new.
 
         Args:
-            group: The links of the line.
             known: All conclusions that hold with these links.
             supposed: Whether they hold only under the supposition.
         """
@@ -350,7 +347,6 @@ class Argument:
         Args:
             conclusions: The conclusions of the line; None for the contradiction.
             premises: The indices of the lines that it follows from.
-            needed: Its links.
         """
         line = self._line_of(conclusions[0])
         known = [symbol for symbol, born in self._born.items() if born <= self._lines.index(line)]
@@ -381,8 +377,6 @@ class Argument:
 
         Args:
             goal: The last conclusion; None for a contradiction.
-            premises: The premises of each conclusion.
-            links: The links of each conclusion.
         """
         conclusion = goal
         while len(premises[conclusion]) == 1:

@@ -330,7 +330,6 @@ class Axioms:
         """Find equalities of a model that some evidence rejects.
 
         Args:
-            answer: The model.
             active: The pairs (axiom, step) that have to hold, if the axioms are relaxed. Then a
                 rejection counts only if its axiom is active at the step of `_judged_at`.
 
@@ -373,8 +372,6 @@ class Axioms:
         A return is two steps at one dstate or at one place.
 
         Args:
-            displacement: The evidence of displacements.
-            answer: The model.
             step: The last step of the later return.
 
         Returns:
@@ -388,7 +385,6 @@ class Axioms:
         """Add a constraint that these equalities do not all hold.
 
         Args:
-            refusal: The equalities.
             where: An atom. If given, the constraint applies only while this atom is true.
         """
         name = f"told_{self._refusals}"

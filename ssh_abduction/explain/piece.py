@@ -85,10 +85,6 @@ def _said_across(problem: Problem, number: Mapping[int, int]) -> str:
 
     The facts are computed from the whole trace, as the piece lacks the displacements of the steps
     that are left out.
-
-    Args:
-        problem: The whole trace and the theory.
-        number: The number in the piece of each step of the piece.
     """
     displacement = displacement_of(problem)
     if displacement is None:

@@ -100,10 +100,7 @@ class Question(ABC, Generic[_Answer]):
         """Make a search for maps.
 
         Args:
-            trace: The trace.
-            theory: The theory.
             maps: List at most this many maps; None for all.
-            seconds: The time limit of the search; infinity for none.
         """
 
         def end_with_this(_: Progress) -> None:
@@ -127,9 +124,6 @@ class Question(ABC, Generic[_Answer]):
         """Say which gateways at some places changed between drives, and what that costs.
 
         Args:
-            ssh_map: The best map.
-            places: Places of the map.
-            cost: The cost of the map.
             nats: Its cost in nats; None if maps are not weighed.
         """
         changes = changes_at(ssh_map, places)

@@ -228,13 +228,7 @@ def _check(name: str, number: int, known: Iterable[int]) -> None:
 
 
 def _path_side(readings: list[Reading], place: int, path: int) -> PathSide:
-    """Find the side of a path on which a place lies in the first map, and how many maps agree.
-
-    Args:
-        readings: The trace, read with each map.
-        place: The place in the first map.
-        path: The path in the first map.
-    """
+    """Find the side of a path on which a place lies in the first map, and how many maps agree."""
     first, *others = readings
     side, branch = _side_of(first, place, (path, 1))
     at = next(t for t, s in first.visited if s.place == place)

@@ -187,8 +187,6 @@ def _followed(
     than half of the steps with a known dstate.
 
     Args:
-        ssh_map: The map.
-        trace: A trace of m steps.
         views: The number of the view of each step; -1 if there is none.
         looks: The dstate that the image of each step looks like, (m,).
     """

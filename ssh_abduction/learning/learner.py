@@ -211,7 +211,6 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
         """Follow traces on the map. Return the dstate of each step, (m,), or -1 if it is unknown.
 
         Args:
-            traces: Traces with m steps in all.
             looks: The dstate that the image of each step looks like, (m,).
         """
         views = self.clusterer_.predict(self.features_.transform(traces.images))

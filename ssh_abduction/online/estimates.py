@@ -86,11 +86,7 @@ class Moves:
         return self._links.get(move)
 
     def _turn(self, degrees: int) -> Links:
-        """Find where a turn leads: to the dstates at the same place that face that way.
-
-        Args:
-            degrees: The angle of the turn, clockwise.
-        """
+        """Find where a turn leads: to the dstates at the same place that face that way."""
         sources, targets, angles = self._pairs
         off = (angles - degrees + 180) % 360 - 180
         near = np.abs(off) <= FACING * SPREAD

@@ -391,9 +391,6 @@ class Explorer:
         A return is a pair of visits that the map has at one place. The actions distinguish the map
         from the best map without this return.
 
-        Args:
-            best: The minimal map.
-
         Returns:
             The actions; empty if no doubt is left that the robot can test.
         """

@@ -206,7 +206,6 @@ class Rival:
         """Extend this rival by a step at the dstate `there`.
 
         Args:
-            there: The dstate of the step.
             link: The name of the action if this step adds a link; else None.
             new: The view and star of the dstate if it is new; else None.
             faults: The faults that this step adds.

@@ -286,7 +286,6 @@ class Localiser:
 
         Args:
             before: The observation o before the action; None if there was none.
-            move: The action, as a move.
             seen: The observation o' after it; None if there was none.
         """
         links = self._moves.links(move)
@@ -321,7 +320,6 @@ class Localiser:
         Args:
             expected: The belief before the observation.
             seen: The observation; None if there was none.
-            alike: p(o|akin) / q(o).
         """
         weights = self._products(expected, seen)
         unknown = expected.akin * alike + 1 - expected.akin  # p(o|nowhere) / q(o)

@@ -217,8 +217,6 @@ class MoveGraph:
         Add no move to another floor, as paths do not lead there.
 
         Args:
-            source: The start.
-            target: The end.
             action: The name of its action; None if it is unknown.
         """
         is_known = self._graph.has_edge(source, target)
@@ -232,13 +230,7 @@ class MoveGraph:
         return path is not None and path == other and way != other_way
 
     def _cost(self, source: Node, target: Node, move: float) -> float:
-        """Compute the cost of a move.
-
-        Args:
-            source: The start.
-            target: The end.
-            move: The cost in a route by places. A travel to another place costs more in addition.
-        """
+        """Compute the cost of a move."""
         if self.by == "actions":
             return 1.0
         if self.by == "metres":

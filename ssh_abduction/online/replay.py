@@ -114,10 +114,7 @@ class MinimalMaps:
         """Extend a map by the last step if both the map and the evidence allow it.
 
         Args:
-            replayed: The map.
-            trace: The steps so far.
             action: The name of the action before the last step.
-            pairs: What evidence says about pairs of these steps.
         """
         outcome = replayed.follow(action, self._seen[-1], pairs)
         if outcome is Outcome.PREDICTED and not self._judging.allows_grown(

@@ -266,9 +266,7 @@ class RivalMaps:
 
         Args:
             t: The number of the step.
-            lead: The best map.
             there: The dstate at which this map expected the step.
-            seen: The view and star of the step.
         """
         kinds = [kind for kind in ("misread", "slipped") if getattr(self._theory, kind)]
         expected = lead.shows[there]

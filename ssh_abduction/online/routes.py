@@ -343,9 +343,6 @@ def _leads_to(
 
     Args:
         leads: The dstate that each link leads to, by its dstate and the name of its action.
-        ssh_map: The map.
-        dstate: The dstate where the moves begin.
-        moves: The moves, with the views to expect.
     """
     for move in moves:
         target = leads.get((dstate, move.action or ""))

@@ -164,11 +164,6 @@ class Confidence:
 
         This needs a later step, and localisation has to agree with the best map: it gives more than
         half of the probability to the dstate where this map has the robot.
-
-        Args:
-            where: The belief about where the robot is.
-            lead: The best map.
-            trace: The steps so far.
         """
         return (
             self._broke[-1][0] < len(trace) - 1
@@ -179,12 +174,7 @@ class Confidence:
     def _hypotheses(
         self, rivals: Sequence[Rival], shares: Sequence[float]
     ) -> tuple[Hypothesis, ...]:
-        """Make hypotheses of the most probable rivals, and one for all others together.
-
-        Args:
-            rivals: The rivals.
-            shares: The probability of each.
-        """
+        """Make hypotheses of the most probable rivals, and one for all others together."""
         order = sorted(range(len(shares)), key=lambda i: -shares[i])
         first = order if len(order) <= TOLD else order[: TOLD - 1]
         told = [Hypothesis(shares[i], rivals[i].explained(), self._said(rivals[i])) for i in first]
@@ -232,9 +222,7 @@ def _is_decided(maps: RivalMaps, rivals: Sequence[Rival], shares: Sequence[float
     must have at least the probability CERTAIN, together with the minimal maps.
 
     Args:
-        maps: The rivals of the steps so far.
         rivals: The rivals that later steps have to decide between.
-        shares: The probability of each of them.
     """
     if not maps.is_complete:
         return False

@@ -34,9 +34,6 @@ def _clusters(ssh_map: SSHMap, places: set[int], after: int, indent: str = "  ")
     first.
 
     Args:
-        ssh_map: The map.
-        places: The places to write.
-        after: The id of the first region to write.
         indent: The spaces before each line.
     """
     lines, left = [], set(places)

@@ -136,9 +136,7 @@ def _synchronised(graph: nx.MultiDiGraph[Any], first: Course, robust: bool) -> d
     averaging again and again, with weights that are lower for turns with larger errors.
 
     Args:
-        graph: The courses, and an edge with angle and weight for each turn between two of them.
         first: The course with the heading 0.
-        robust: See above.
 
     Returns:
         The heading of each course in radians counterclockwise.

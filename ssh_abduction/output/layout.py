@@ -117,13 +117,7 @@ def located(ssh_map: SSHMap) -> tuple[Pose, ...] | None:
 
 
 def _moves_of_floors(ssh_map: SSHMap, at: Sequence[Point], least: float = 0.0) -> list[Point]:
-    """Find how far to move each dstate, so that each floor is below the one before.
-
-    Args:
-        ssh_map: The map.
-        at: The position of each dstate, with y up.
-        least: The least distance between two floors.
-    """
+    """Find how far to move each dstate, so that each floor is below the one before."""
     moves = [(0.0, 0.0)] * len(at)
     boxes = [_box([at[s] for s in floor]) for floor in ssh_map.floors]
     extent = max((max(x1 - x0, y1 - y0) for x0, y0, x1, y1 in boxes), default=0.0)
@@ -176,7 +170,6 @@ class _Drawing:
     A spot is the id of a place, or a negative number for a dstate without a place.
 
     Args:
-        ssh_map: The map.
         degrees: For each action's name, the degrees clockwise that it turns, and their weight.
     """
 
@@ -244,7 +237,6 @@ class _Drawing:
         """Find the course of a dstate: the path, or part of a path, that is drawn straight.
 
         Args:
-            s: The dstate.
             whole: Whether whole paths are straight. Otherwise only their segments are.
 
         Returns:
@@ -298,9 +290,6 @@ class _Drawing:
 
     def _packed(self, at: Mapping[int, Point]) -> dict[int, Point]:
         """Move parts of the map that no street connects side by side.
-
-        Args:
-            at: The position of each spot.
 
         Returns:
             The new position of each spot. The first one is at (0, 0).

@@ -134,9 +134,7 @@ class _Picture:
         """Find a point of the page relative to a dstate.
 
         Args:
-            s: The dstate.
             ahead: How far ahead of the dstate the point is, in units of the page times `unit`.
-            left: How far to the left, in the same units.
         """
         pose, u = self.poses[s.id], self.unit
         x, y = self.on_page(pose)
@@ -167,7 +165,6 @@ class _Picture:
         """Draw an ellipse of two standard deviations around a point of the page.
 
         Args:
-            spot: The point.
             spread: The covariance (xx, xy, yy) in square metres.
 
         Returns:
@@ -224,9 +221,6 @@ class _Picture:
 
         In the world, a dotted part of a path need not be straight. The order of places may be one
         of several that fit, as the robot may have passed places without noticing them.
-
-        Args:
-            spots: The point of each place on the page.
         """
         orders, travels = [], []
         u, floor = self.unit, {s.place: s.floor for s in self.map.dstates}
@@ -278,11 +272,8 @@ class _Picture:
         """Draw a label at the first point where it overlaps nothing; empty if there is none.
 
         Args:
-            label: The text.
             spots: The points to try, in order.
-            colour: The colour of the text.
             size: The font size, before it is reduced for lack of room.
-            weight: The font weight.
         """
         w, h = self.half(label, size)
         for x, y in spots:

@@ -93,10 +93,7 @@ def _draw_dstate(
     """Draw a dstate as a triangle ahead of its place, or as its number in a circle.
 
     Args:
-        axes: The matplotlib axes.
-        s: The dstate.
         pose: Its position, and its heading in radians (None if it is unknown).
-        unit: The distance of the nearest spots.
 
     Returns:
         The position of the mark.
@@ -125,12 +122,7 @@ def _nearest(spots: list[tuple[float, float]]) -> float:
 
 
 def _new_axes(spots: list[tuple[float, float]], unit: float) -> Any:
-    """Make matplotlib axes that are large enough for spots.
-
-    Args:
-        spots: The positions.
-        unit: The distance of the nearest ones.
-    """
+    """Make matplotlib axes that are large enough for spots."""
     try:
         from matplotlib import pyplot
     except ImportError:

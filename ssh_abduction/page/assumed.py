@@ -98,7 +98,6 @@ def _agreed(labels: list[tuple[int, ...]], steps: int) -> Iterator[tuple[Pair, b
     """Yield the pairs of steps on which all maps agree, and whether both are one dstate.
 
     Args:
-        labels: For each map, the dstate of each step.
         steps: The number of first steps to consider.
     """
     for later in range(steps):

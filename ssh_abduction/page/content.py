@@ -249,7 +249,6 @@ def _layouts(
     """Draw the first map and, if time and size allow, the maps with other dstates or places.
 
     Args:
-        maps: The maps.
         told: The entry of each map in the content. If the map has a drawing, it gets the key
             `layout`: the index in the returned list.
         trace: The trace, if it is known.
@@ -344,8 +343,6 @@ def _ellipses(found: Layout, ssh_map: SSHMap, unit: float) -> list[list[float]]:
     A dstate without a place has its own ellipse.
 
     Args:
-        found: The drawing.
-        ssh_map: The map, with poses.
         unit: The unit for lengths, in metres.
 
     Returns:

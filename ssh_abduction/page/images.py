@@ -125,7 +125,6 @@ def _panoramas(
 
     Args:
         held: The image of each step; None for a step without one.
-        shape: The numbers of rows, columns and colours from the header of the trace.
         each: The largest number of characters for an image.
 
     Returns:

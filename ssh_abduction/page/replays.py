@@ -72,8 +72,6 @@ def _replay(trace: Trace, name: str, views: Sequence[str]) -> dict[str, Any]:
     """Make the replay of a trace.
 
     Args:
-        trace: The trace.
-        name: The name of the replay.
         views: For each step, the text to show if the step has no view.
     """
     replay: dict[str, Any] = {
@@ -88,7 +86,6 @@ def _step(step: Step, view: str) -> dict[str, Any]:
     """Make a dict of what was observed at a step, and of the next action.
 
     Args:
-        step: The step.
         view: The text to show if the step has no view.
     """
     told: dict[str, Any] = {
@@ -132,9 +129,7 @@ def _beliefs(maps: Sequence[SSHMap], labelings: Sequence[int], run: Run) -> dict
     Maps with the same labeling have the same links, and therefore the same beliefs.
 
     Args:
-        maps: The maps.
         labelings: For each map, the number of its labeling.
-        run: The run.
 
     Returns:
         For the number of each labeling, as text, a belief for each step.

@@ -247,13 +247,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._send(HTTPStatus.FORBIDDEN, b"", "text/plain")
 
     def _send(self, status: HTTPStatus, body: bytes, kind: str) -> None:
-        """Send an answer, with headers that keep browsers from storing or framing it.
-
-        Args:
-            status: The status.
-            body: The content.
-            kind: The content type.
-        """
+        """Send an answer, with headers that keep browsers from storing or framing it."""
         self.send_response(status)
         for name, value in {
             "Content-Type": kind,

@@ -332,11 +332,6 @@ def _depending(
 ) -> tuple[list[dict[Matter, tuple[int, ...]]], dict[Matter, tuple[int, ...]]]:
     """Find the steps that depend on one choice alone, and those that depend on several.
 
-    Args:
-        asked: All questions, with the answers of the maps.
-        options: For each choice, the option of each map.
-        table: The maps as arrays.
-
     Returns:
         For each choice, the steps of each sort that depend on it alone, and the steps of each sort
         that depend on several choices.
@@ -368,8 +363,6 @@ def _choice(
     """Make a choice.
 
     Args:
-        asked: The questions of the choice, with the answers of the maps.
-        option: The option of each map.
         differing: The value for `Choice.differing`.
     """
     members = members_of(option.tolist())
@@ -443,7 +436,6 @@ def _contradiction(told: Shared, seen: Shared, in_one: Sequence[int]) -> tuple[i
     Args:
         told: The backbone for one sort: the steps that are one in all maps, or in some.
         seen: The same, for the listed maps only.
-        in_one: A number for each step. Pairs of steps with the same number are skipped.
 
     Returns:
         Two steps that are one in all maps by the backbone, but differ in a listed map; or that are

@@ -276,7 +276,6 @@ def _groups(classes: Sequence[int], ones: Sequence[int]) -> list[list[int]]:
     """Group classes that are one in a map.
 
     Args:
-        classes: The classes to group.
         ones: The row of a map in `Table.ones`.
 
     Returns:

@@ -153,7 +153,6 @@ def _pair(
     Args:
         one: The earlier drive.
         other: The later drive.
-        placings: For each map, the place of each step.
         weights: The weight of each map. The weights sum to 1.
         of: "place"; or "dstate", if maps have no places.
         proven: Whether these are all maps.

@@ -121,7 +121,6 @@ def _split(column: Bools, groups: NDArray[np.intp]) -> int:
     """Count the pairs of maps that are in one group but answer a question differently.
 
     Args:
-        column: The answer of each map to the question.
         groups: The number of the group of each map, from 0.
     """
     sizes = np.bincount(groups)

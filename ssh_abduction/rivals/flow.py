@@ -162,7 +162,6 @@ def _parts_cut_off(used: Sequence[Move], start: int) -> list[set[int]]:
     """Find the connected parts of a flow without the start, as sets of stances.
 
     Args:
-        used: The moves of the flow.
         start: The number of the stance where the robot is.
     """
     near = reached_from(used, start)

@@ -187,8 +187,6 @@ def _side(
 
     Args:
         right: For each course of a map, the places that lie right of it.
-        place: The place.
-        course: The course: a path and a direction.
     """
     if course is None:
         return None

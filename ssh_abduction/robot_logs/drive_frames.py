@@ -68,7 +68,6 @@ def _next(
     """Choose the drive to move next: the one that shares most places with the moved drives.
 
     Args:
-        drives: All drives.
         ssh_map: The map that says which places drives share; None if there is no map.
         laid: The indices of the drives that were moved already.
 
@@ -127,9 +126,7 @@ def _turned(ssh_map: SSHMap | None, first: int, second: int) -> float:
     """Compute the heading at one step minus that at another step of the same place, in radians.
 
     Args:
-        ssh_map: The map.
         first: The step that is subtracted.
-        second: The other step.
 
     Returns:
         Radians counterclockwise; 0 if the map has no poses.

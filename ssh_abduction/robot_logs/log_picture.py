@@ -234,8 +234,6 @@ def _bands(
     """Draw a band for each region behind one place, along the courses between its places.
 
     Args:
-        sheet: The poses.
-        ssh_map: The map.
         middles: (2,) the middle of each place.
         edges: The two places and the course, (n, 2) metres, of each edge.
     """
@@ -262,10 +260,6 @@ def _edges(
     An edge that several drives took comes once for each drive.
 
     Args:
-        sheet: The poses.
-        imported: The trace, and how it was made.
-        places: The place of each step.
-        visit_of: The visit of each step.
         middles: (2,) the point of each place to which edges lead. At other places, edges follow
             the course of the robot through the place.
     """
@@ -357,10 +351,6 @@ def _walls(log: RobotLog, poses: Sequence[Pose]) -> Array:
 
     The squares have sides of GRAIN metres. In a log of more than 100 scans, at least two beams must
     have ended in a square, so that few stray beams are drawn.
-
-    Args:
-        log: The robot's log.
-        poses: The pose of each scan.
     """
     found = []
     for scan, pose in zip(log.scans, poses, strict=True):

@@ -289,7 +289,6 @@ def _pairs(field: str, value: Any) -> tuple[Pair, ...]:
     """Check pairs of steps, and return each once, with the earlier step first.
 
     Args:
-        field: The name of the field.
         value: Pairs of numbers, or texts such as "3,12".
 
     Raises:

@@ -99,9 +99,6 @@ def _on_rings(place_of: Sequence[Place]) -> set[int]:
     """Return the edges that are not in dead ends.
 
     Edges in dead ends can be added to any drawing of the others.
-
-    Args:
-        place_of: The place of each end of an edge.
     """
     ends_at: dict[Place, set[int]] = {}
     for end, place in enumerate(place_of):
@@ -137,9 +134,7 @@ def _one_place_more(
     The place is a neighbour of a drawn place, and has the fewest possible ways of all neighbours.
 
     Args:
-        drawn: The ends around each drawn place, clockwise.
         orders: The allowed clockwise orders of ends around each place.
-        place_of: The place of each end.
 
     Returns:
         For each way, the ends around each place that is drawn then.
@@ -174,9 +169,7 @@ def _leaves_room(
     meets them.
 
     Args:
-        drawn: The ends around each drawn place, clockwise.
         orders: The allowed clockwise orders of ends around each place.
-        place_of: The place of each end.
     """
     part = _parts_of_rest(drawn, orders, place_of)
     following = {

@@ -188,7 +188,6 @@ def _kept_by(*names: str, and_also: Iterable[str] = ()) -> Callable[[], frozense
     """Make a function that returns the axioms that some fast encodings keep.
 
     Args:
-        names: The names of the encodings.
         and_also: Axioms that the Python code around the encodings keeps.
     """
     return lambda: encodings.keeps(*names) | frozenset(and_also)

@@ -282,7 +282,6 @@ def _contrast(e: Experiment, seed: int, trace: Trace, alone: NDArray[Any], k: in
     """Measure the results without a part of the method.
 
     Args:
-        e: The experiment.
         seed: The seed of all noise.
         trace: The trace, with images at dstates.
         alone: The cluster of each image of the trace, with as many clusters as dstates.

@@ -214,7 +214,6 @@ def _is_turn(here: int | None, there: int | None, length: float) -> bool:
     Args:
         here: The place where it begins; None if it is unknown.
         there: The place where it ends; None if it is unknown.
-        length: The length of the road.
     """
     return length < LEAST if here is None or there is None else here == there
 

@@ -86,10 +86,7 @@ def _node(
     """Make a node with its goal tolerances, the octagon around it, and the edges from it.
 
     Args:
-        stop: The stop.
         leaving: The roads that begin there.
-        names: The name of each stop, by id.
-        pointset: The name of the map.
         frame: The name of the coordinate frame of the positions.
         facing: The tolerance of the heading, in radians.
     """

@@ -63,7 +63,6 @@ class Closure:
         """Yield the pairs of steps of the closures that are rejected.
 
         Args:
-            trace: The trace.
             places: Whether the steps are compared as places, by their positions alone. Otherwise
                 they are compared as dstates.
         """
@@ -82,7 +81,6 @@ def _square(match: Match, odometry: Odometry, places: bool) -> float:
     """Compute the chi-square of a closure if its two steps have one position, or one pose.
 
     Args:
-        match: The closure.
         odometry: The noise model, for the errors at both steps.
         places: Whether only positions are compared, and not headings.
     """

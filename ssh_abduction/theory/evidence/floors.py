@@ -66,7 +66,6 @@ def _pairs(stretches: tuple[int, ...], lifted: tuple[int, ...]) -> Pairs:
     """Pair each step on the stretch before a lift with each step on the stretch behind it.
 
     Args:
-        stretches: For each step, the first step of its stretch.
         lifted: The steps that a lift leads to.
     """
     steps: dict[int, list[int]] = {}
@@ -95,8 +94,6 @@ def _way(one: int, other: int, beside: dict[int, dict[int, Equality]]) -> list[E
     """Find the fewest meetings that connect two stretches; empty if none connect them.
 
     Args:
-        one: A stretch, named by its first step.
-        other: Another stretch.
         beside: For each stretch, the stretches that it meets at a dstate or place, and where.
     """
     came: dict[int, int] = {one: one}

@@ -394,8 +394,6 @@ def _parts(trace: Trace, start: int = 0, missing: int = 0) -> Steps:
     """Return, for each step from `start` on, the number of missing displacements up to it.
 
     Args:
-        trace: The trace.
-        start: The first step.
         missing: The number for the step before.
     """
     unknown = [t > 0 and trace.steps[t].displacement is None for t in range(start, len(trace))]
@@ -407,8 +405,6 @@ def _sums(trace: Trace, start: int, stop: int, bends: Array, last: Array) -> Arr
     """Compute the poses, moments and ways of some steps for each drift, as in Loops.
 
     Args:
-        trace: The trace.
-        start: The first step.
         stop: The step after the last one.
         bends: The drifts, in radians a metre.
         last: The row of the step before, drifts x COLUMNS; zeros if there is none.

@@ -122,10 +122,7 @@ class Planar:
         """Whether some travels and turns cannot be drawn without a crossing.
 
         Args:
-            trace: The trace.
             moves: The steps at which these travels and turns begin.
-            labels: The dstate of each step.
-            at: The place of each step.
             distinct: Whether different dstates at a place face different slots.
         """
         shown = _Shown(trace, moves, labels, at, stars=self.stars)
@@ -193,7 +190,6 @@ def _can_draw_framed(shown: _Shown, turns: bool, distinct: bool) -> bool:
     have any heading that the stars (openings seen) allow.
 
     Args:
-        shown: What the travels and turns show.
         turns: Whether the axioms allow using the turns.
         distinct: Whether different dstates at a place face different slots.
     """
@@ -231,11 +227,8 @@ def _slots_of(
     Ways that differ only by a rotation of the whole place count once.
 
     Args:
-        shown: What the travels and turns show.
         group: For each dstate, the first dstate of its group that turns link.
         slot: For each dstate, its slot relative to that first dstate.
-        place: The place.
-        ends: The ends of edges at the place.
         distinct: Whether different dstates at a place face different slots.
 
     Returns:
@@ -329,7 +322,6 @@ def _can_draw_sided(shown: _Shown, crossing: bool) -> bool:
     After turning around, a robot faces the gateway that was behind it.
 
     Args:
-        shown: What the travels and turns show.
         crossing: Whether two edges cross if a turn leads from one to the other.
     """
     same = _Classes()
@@ -367,7 +359,6 @@ def _paired(shown: _Shown, same: _Classes) -> list[frozenset[Gateway]] | None:
     Gateways of one place that lead to the same gateway become one.
 
     Args:
-        shown: What the travels and turns show.
         same: Which arms are known to be one gateway. Those that become one are added.
 
     Returns:
@@ -409,7 +400,6 @@ def _can_complete(order: list[Arm], others: list[Arm], clockwise: Sequence[Seque
 
     Args:
         order: The clockwise order of some arms.
-        others: The other arms.
         clockwise: The clockwise orders that turns show.
     """
     if not all(_is_clockwise(order, told) for told in clockwise):

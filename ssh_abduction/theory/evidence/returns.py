@@ -159,7 +159,6 @@ class Returns:
 
         Args:
             tested: All possible returns, or those that end at new steps.
-            since: The first new step.
         """
         far = self._refused_among(*tested[True], True)
         known = self._pairs or NO_PAIRS
@@ -205,8 +204,6 @@ class Returns:
         """List the returns that are rejected alone: they close badly for every drift of heading.
 
         Args:
-            first: The first steps of the returns.
-            last: The last steps.
             places: Whether these are returns to places. Then only positions are compared.
         """
         import numpy as np
@@ -255,8 +252,6 @@ class Returns:
         """List the returns of a map: pairs of visits whose first steps are at one place or dstate.
 
         Args:
-            labels: The dstate of each step.
-            places: The place of each dstate.
             since: The earliest step where a return may end.
 
         Returns:

@@ -268,7 +268,6 @@ class Together:
         S is the covariance of a return, and F the part of it that noise and repeated errors cause.
 
         Args:
-            alone: What is known about each return.
             returns: The indices of the returns.
             noise: The covariance that the noise causes, m x 9.
         """
@@ -348,7 +347,6 @@ def _common_ends(these: Steps, others: Steps) -> Steps:
 
     Args:
         these: Rows of returns, as in `Together.rows`.
-        others: The same for the other returns.
     """
     return np.asarray((these[..., :2] == others[..., :2]).sum(-1))
 
