@@ -49,8 +49,10 @@ Branch: TypeAlias = tuple[
 ]  # (p, h, d, h', d'): at p, (h', d') leaves to the right of (h, d)
 Axioms: TypeAlias = frozenset[str]
 Named: TypeAlias = tuple[
-    int, int, int
-]  # a gateway: its number in the star, its bearing and its spread, in whole degrees
+    int, float, float
+]  # a gateway: its number in the star, its bearing and its spread, in degrees
+LITTLE = 1e-6  # the error of sums of bearings, in degrees
+WHOLE = 1 - LITTLE  # angles that differ by less than this are possible in whole degrees
 
 SLOTS = (0, 1, 2, 3)
 QUARTERS = {"right": 1, "around": 2, "left": 3}
@@ -506,7 +508,7 @@ def _named(
         for reading in _readings(trace.steps[step]):
             bent = _way_on(reading, Star.of(trace.steps[step].star or ()).gateways)
             if not bent and not all(
-                any(_off(b, way) <= 2 * d for _, b, d in reading) for way in onward[step]
+                any(_off(b, way) <= 2 * d + LITTLE for _, b, d in reading) for way in onward[step]
             ):
                 continue
             for k in range(max(len(reading), 1)) if chosen else (0,):
@@ -587,7 +589,7 @@ def _readings(step: Step) -> list[tuple[Named, ...]]:
     found = []
     for seen in product(*[(True,) if g.open else (True, False) for g in gateways]):
         kept = [
-            (k, round(g.bearing) % 360, math.ceil(g.spread + abs(g.bearing - round(g.bearing))))
+            (k, g.bearing % 360, g.spread)
             for k, (g, there) in enumerate(zip(gateways, seen, strict=True))
             if there
         ]
@@ -622,7 +624,8 @@ def _agree(
             r
             for r in range(360)
             if all(
-                _off(b, c + r) <= d + e for (_, b, d), (_, c, e) in zip(seen_i, seen_t, strict=True)
+                _off(b, c + r) < d + e + WHOLE
+                for (_, b, d), (_, c, e) in zip(seen_i, seen_t, strict=True)
             )
         }
         both = [(a[0], b[0]) for a, b in zip(seen_i, seen_t, strict=True)]
@@ -638,7 +641,7 @@ def _agree(
                 rotations = set()
     if "gateway_frame" in on and not rotations:
         return False
-    alike = seen_i == seen_t
+    alike, both_i, both_t = seen_i == seen_t, seen_i, seen_t
     seen_i, seen_t = (tuple(g for g in seen if g[0] >= 0) for seen in (seen_i, seen_t))
     if (
         "gateway_turn" in on
@@ -656,10 +659,11 @@ def _agree(
             declared = (ways[0][0], now) in pairs and (
                 way == "same" or (ways[0][0], ways[1][0]) not in pairs
             )
-        facing[way] = (
-            degrees in rotations or declared,
-            (degrees in rotations and not rotations & {90, 270}) or declared,
+        fits = bool(rotations) and all(
+            _off(b, c + degrees) <= d + e + LITTLE
+            for (_, b, d), (_, c, e) in zip(both_i, both_t, strict=True)
         )
+        facing[way] = fits or declared, (fits and not rotations & {90, 270}) or declared
     one = labels[i] == labels[t]
     if "gateway_heading" in on and one:
         if not facing["same"][0]:
@@ -681,24 +685,24 @@ def _turn(action: Action, seen: tuple[Named, ...], star: tuple[Gateway, ...]) ->
     if action.bearing is not None:
         return {r for r in range(360) if _off(r, round(action.bearing)) <= 10}
     if action.gateway is not None:
-        beside = sorted((b, d) for _, b, d in seen if _off(b, 0) > d)
+        beside = sorted((b, d) for _, b, d in seen if _off(b, 0) > d + LITTLE)
         if action.turn == "left":
             beside.reverse()
         if action.gateway > len(beside):
             return set()
         bearing, spread = beside[action.gateway - 1]
-        return {r for r in range(360) if _off(r, bearing) <= spread}
+        return {r for r in range(360) if _off(r, bearing) < spread + WHOLE}
     by_number = {k: (b, d) for k, b, d in seen}
     behind: set[int] = set()
     if action.turn == "around":
-        faced = [k for k, b, d in seen if _off(b, 0) <= d][:1]
+        faced = [k for k, b, d in seen if _off(b, 0) <= d + LITTLE][:1]
         behind = {
             r
             for k in faced
             if star[k].opposite in by_number
             for b, d in [by_number[star[k].opposite]]
             for r in range(360)
-            if _off(r, b) <= d
+            if _off(r, b) < d + WHOLE
         }
     return {"around": {180} | behind, "right": set(range(21, 160)), "left": set(range(201, 340))}[
         str(action.turn)
@@ -714,7 +718,8 @@ def _way_on(seen: tuple[Named, ...], star: tuple[Gateway, ...]) -> tuple[int, in
     ):
         other = star[k].opposite
         if other in by_number and (
-            _off(bearing, 0) <= spread or _off(by_number[other][0], 180) <= by_number[other][1]
+            _off(bearing, 0) <= spread + LITTLE
+            or _off(by_number[other][0], 180) <= by_number[other][1] + LITTLE
         ):
             return k, other
     return None

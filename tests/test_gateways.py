@@ -4,6 +4,7 @@ worlds with streets at any angles."""
 from __future__ import annotations
 
 import json
+import math
 import random
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import networkx as nx
 import planar
 import pytest
 from brute_force import key, minimal_maps
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from planar import drive
 
@@ -192,8 +193,8 @@ gateways = st.builds(
         if opposite and len(bearings) > 1
         else (None,) * len(bearings),
     ),
-    st.lists(st.integers(0, 35).map(lambda k: 10 * k), max_size=4, unique=True),
-    st.lists(st.sampled_from([0, 10, 25, 90]), min_size=4, max_size=4),
+    st.lists(st.integers(0, 71).map(lambda k: 5.2 * k % 360), max_size=4, unique=True),
+    st.lists(st.sampled_from([0, 0.8, 10, 25, 90]), min_size=4, max_size=4),
     st.booleans(),
 )
 
@@ -207,7 +208,39 @@ def test_rotations_are_those_of_a_plain_search(first: Frame, then: Frame, shift:
     shift %= max(first.slots, 1)
     found = frames.members(frames.rotations(first, then, shift))
     assert set(found) == judge.rotations(first, then, shift)
+    may = frames.may_face(first, then, shift)
+    assert ("alike" in may, "opposite" in may) == judge.ways(first, then, shift, frozenset(found))
     assert not found or frames.heading(first, then, shift) in found or len(found) == 360
+
+
+@given(
+    st.lists(st.floats(0, 359), min_size=1, max_size=8, unique_by=round),
+    st.data(),
+    st.floats(0, 2),
+    st.floats(0, 359),
+)
+def test_headings_more_than_four_spreads_apart_are_never_one(
+    bearings: list[float], data: st.DataObject, spread: float, turn: float
+) -> None:
+    bearings = sorted(bearings)
+    gaps = [(b - a) % 360 for a, b in zip(bearings, bearings[1:] + bearings[:1], strict=True)]
+    assume(len(gaps) == 1 or min(gaps) > 2 * spread)
+    spreads, opposite = (spread,) * len(bearings), (None,) * len(bearings)
+    off = st.lists(st.floats(-spread, spread), min_size=len(gaps), max_size=len(gaps))
+    first, then = (
+        Frame(
+            tuple((b + e - r) % 360 for b, e in zip(bearings, data.draw(off), strict=True)),
+            spreads,
+            opposite,
+        )
+        for r in (0.0, turn)
+    )
+    found = judge.rotations(first, then, 0)
+    assert {math.floor(turn), math.ceil(turn)} & found
+    away = min(turn, 360 - turn)
+    for alike in (judge.ways(first, then, 0, found)[0], "alike" in frames.may_face(first, then, 0)):
+        assert alike or away > 0
+        assert not alike or away <= 4 * spread + 1e-3
 
 
 # --- the axioms on tiny traces: clingo, the checker and a brute force
@@ -252,7 +285,7 @@ def traces(draw: st.DrawFn) -> Trace:
     Mostly the stars after a turn are those seen before it, turned as the action says.
     """
     shapes = draw(st.lists(st.sampled_from(SHAPES), min_size=1, max_size=2))
-    noise = draw(st.sampled_from([0, 0, 7]))
+    noise = draw(st.sampled_from([0, 0, 7, 10.4]))
     steps = draw(st.integers(2, 5))
     actions = draw(
         st.lists(st.sampled_from(("travel", *TURNS)), min_size=steps - 1, max_size=steps - 1)

@@ -431,7 +431,7 @@ def changes_of(sights: Sequence[Sight], turns: Turns, axioms: Collection[str]) -
             turn = middle(rotations(fitted[0][0], frame, shift))
             for k in range(frame.slots):
                 if not frame.is_closed(k):
-                    at = (frame.bearings[k] + turn) % 360
+                    at = round(frame.bearings[k] + turn) % 360
                     bearing.setdefault((k + shift) % frame.slots, at)
         for a, b in pairwise(sorted(first_of) if fitted else ()):
             was, now = (_closed(fitted[first_of[drive]]) for drive in (a, b))

@@ -13,10 +13,11 @@ frozenset()
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 from functools import lru_cache
 
-from ssh_abduction.data.star import SPREAD, Frame
+from ssh_abduction.data.star import ROUNDING, SPREAD, Frame
 from ssh_abduction.data.trace import Action
 
 
@@ -43,11 +44,22 @@ def rotations(first: Frame, then: Frame, shift: int) -> frozenset[int]:
     found: Collection[int] = range(360)
     for j, k in pairs:
         centre, most = first.bearings[j] - then.bearings[k], first.spreads[j] + then.spreads[k]
-        arc = {(centre + off) % 360 for off in range(-most, most + 1)}
-        found = arc.intersection(found)
+        found = arc(centre, most).intersection(found)
         if not found:
             break
     return frozenset(found)
+
+
+@lru_cache(maxsize=2**14)
+def arc(centre: float, most: float) -> frozenset[int]:
+    """List the angles in an arc in whole degrees, 0 to 359. The ends are rounded outwards.
+
+    Args:
+        centre: The middle of the arc in degrees.
+        most: By how many degrees an angle may differ from it.
+    """
+    least, last = centre - most + ROUNDING, centre + most - ROUNDING
+    return frozenset(angle % 360 for angle in range(math.floor(least), math.ceil(last) + 1))
 
 
 def between(a: float, b: float) -> float:
@@ -70,25 +82,20 @@ def turns_so(action: Action, before: Frame, found: frozenset[int]) -> bool:
         beside = [
             (bearing, spread)
             for bearing, spread in zip(before.bearings, before.spreads, strict=True)
-            if between(bearing, 0) > spread
+            if between(bearing, 0) > spread + ROUNDING
         ]
         if action.turn == "left":
             beside.reverse()
-        return action.gateway <= len(beside) and any(
-            between(r, beside[action.gateway - 1][0]) <= beside[action.gateway - 1][1]
-            for r in found
-        )
+        return action.gateway <= len(beside) and bool(found & arc(*beside[action.gateway - 1]))
     if action.turn == "around":
         behind = [
             (before.bearings[other], before.spreads[other])
             for bearing, spread, other in zip(
                 before.bearings, before.spreads, before.opposite, strict=True
             )
-            if other is not None and between(bearing, 0) <= spread
+            if other is not None and between(bearing, 0) <= spread + ROUNDING
         ][:1]
-        return any(
-            between(r, bearing) <= spread for r in found for bearing, spread in [(180, 0), *behind]
-        )
+        return any(found & arc(*gateway) for gateway in [(180, 0), *behind])
     sides = (r if action.turn == "right" else 360 - r for r in found)
     return any(2 * SPREAD < side < 180 - 2 * SPREAD for side in sides)
 
@@ -97,8 +104,8 @@ def turns_so(action: Action, before: Frame, found: frozenset[int]) -> bool:
 def ways(first: Frame, then: Frame, shift: int, found: frozenset[int]) -> tuple[bool, bool]:
     """Return two flags: may the robot face the same way in both sights, and opposite ways?
 
-    The flags are true if 0, or 180, is in `found`. They are also true if gateways that are declared
-    opposite match in this way: they are on one path, which may bend.
+    The flags are true if no bearing speaks against a turn of 0, or 180, degrees. They are also true
+    if gateways that are declared opposite match in this way: they are on one path, which may bend.
 
     Args:
         first: The gateways in the earlier sight.
@@ -106,7 +113,15 @@ def ways(first: Frame, then: Frame, shift: int, found: frozenset[int]) -> tuple[
         shift: Gateway k of `then` is taken to be gateway k + shift of `first`.
         found: By how many degrees the robot may have turned.
     """
-    alike, opposite = 0 in found, 180 in found
+    alike, opposite = (
+        bool(found)
+        and all(
+            between(first.bearings[(k + shift) % first.slots] - towards, bearing)
+            <= first.spreads[(k + shift) % first.slots] + spread + ROUNDING
+            for k, (bearing, spread) in enumerate(zip(then.bearings, then.spreads, strict=True))
+        )
+        for towards in (0, 180)
+    )
     here, there = passes(first), passes(then)
     if found and here and there:
         ahead, behind = ((k + shift) % first.slots for k in there)
@@ -120,7 +135,7 @@ def ways(first: Frame, then: Frame, shift: int, found: frozenset[int]) -> tuple[
 def leads(frame: Frame, towards: int) -> bool:
     """Whether the robot's path may go on by some gateway ahead (`towards` 0) or behind (180)."""
     return passes(frame) is not None or any(
-        between(bearing, towards) <= 2 * spread
+        between(bearing, towards) <= 2 * spread + ROUNDING
         for bearing, spread in zip(frame.bearings, frame.spreads, strict=True)
     )
 
@@ -136,8 +151,8 @@ def passes(frame: Frame) -> tuple[int, int] | None:
         zip(frame.bearings, frame.spreads, frame.opposite, strict=True)
     ):
         if other is not None and (
-            between(bearing, 0) <= spread
-            or between(frame.bearings[other], 180) <= frame.spreads[other]
+            between(bearing, 0) <= spread + ROUNDING
+            or between(frame.bearings[other], 180) <= frame.spreads[other] + ROUNDING
         ):
             return k, other
     return None

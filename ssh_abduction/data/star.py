@@ -17,10 +17,9 @@ ahead, right, back or left, a star is also four openings, which the fast engines
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import combinations, combinations_with_replacement
-from math import ceil
 from typing import Any, TypeAlias
 
 from ssh_abduction.data.errors import TraceError, brief, is_finite, is_whole
@@ -36,6 +35,8 @@ SPREAD = 10.0
 QUARTER = 20.0
 # The largest spread in degrees: a gateway that was not observed may be anywhere in a half circle.
 WIDEST = 90.0
+# Sums and differences of bearings are off by less than this many degrees.
+ROUNDING = 1e-6
 # The spread of a gateway that is closed on a drive: it may be in any direction.
 CLOSED = 180
 # At most this many gateways of a place change between two drives.
@@ -79,14 +80,22 @@ class Frame:
     ahead, from the first one to the right of it.
 
     Attributes:
-        bearings: The bearing of each slot, in whole degrees clockwise from straight ahead.
+        bearings: The bearing of each slot, in degrees clockwise from straight ahead.
         spreads: How many degrees each bearing may be off.
         opposite: For each slot, the slot where the same path goes on; None if the star gives none.
+        hashed: The hash of the bearings. Frames are often hashed, and few share these.
     """
 
-    bearings: tuple[int, ...]
-    spreads: tuple[int, ...]
+    bearings: tuple[float, ...]
+    spreads: tuple[float, ...]
     opposite: tuple[int | None, ...]
+    hashed: int = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "hashed", hash(self.bearings))
+
+    def __hash__(self) -> int:
+        return self.hashed
 
     @property
     def slots(self) -> int:
@@ -106,14 +115,12 @@ class Frame:
 
     def faces(self, slot: int) -> bool:
         """Whether the gateway with this slot is straight ahead of the robot."""
-        return (
-            not self.is_closed(slot)
-            and abs((self.bearings[slot] + 180) % 360 - 180) <= self.spreads[slot]
-        )
+        is_ahead = abs((self.bearings[slot] + 180) % 360 - 180) <= self.spreads[slot] + ROUNDING
+        return is_ahead and not self.is_closed(slot)
 
     def has_behind(self, slot: int) -> bool:
         """Whether the gateway with this slot is straight behind the robot."""
-        is_behind = abs(self.bearings[slot] % 360 - 180) <= self.spreads[slot]
+        is_behind = abs(self.bearings[slot] % 360 - 180) <= self.spreads[slot] + ROUNDING
         return is_behind and not self.is_closed(slot)
 
     def is_closed(self, slot: int) -> bool:
@@ -132,9 +139,17 @@ class Star:
 
     Attributes:
         gateways: The gateways.
+        hashed: The hash of their bearings. Stars are often hashed, and few share these.
     """
 
     gateways: tuple[Gateway, ...]
+    hashed: int = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "hashed", hash(tuple(g.bearing for g in self.gateways)))
+
+    def __hash__(self) -> int:
+        return self.hashed
 
     @classmethod
     def of(cls, entries: Sequence[Entry]) -> Star:
@@ -202,9 +217,8 @@ class Star:
         slot = {k: i for i, k in enumerate(clockwise)}
         gateways = [self.gateways[k] for k in clockwise]
         return Frame(
-            tuple(round(g.bearing) % 360 for g in gateways),
-            # Add the error of rounding the bearing.
-            tuple(ceil(g.spread + abs(g.bearing - round(g.bearing))) for g in gateways),
+            tuple(g.bearing % 360 for g in gateways),
+            tuple(g.spread for g in gateways),
             tuple(None if g.opposite is None else slot.get(g.opposite) for g in gateways),
         )
 

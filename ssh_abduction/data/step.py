@@ -58,6 +58,7 @@ class Step:
     truth: Any = field(default=None, hash=False)
     extra: Mapping[str, Any] = field(default_factory=dict, hash=False)
     confidence: float | None = None
+    gateways: Star | None = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         # Replace each field by its checked value. Python forbids `self.view = …`: Step is frozen.
@@ -75,6 +76,7 @@ class Step:
             object.__setattr__(self, "confidence", sure)
         if self.star is not None:
             object.__setattr__(self, "star", parse_star(self.star, "star"))
+        object.__setattr__(self, "gateways", None if self.star is None else Star.of(self.star))
         if self.displacement is not None:
             moved = checked_displacement(self.displacement, "displacement")
             object.__setattr__(self, "displacement", moved)
@@ -124,11 +126,6 @@ class Step:
             return Step(seen, action, openings, displacement, covariance)  # type: ignore[arg-type]
         except TraceError as error:
             raise TraceError(f"{where}: {error}") from None
-
-    @property
-    def gateways(self) -> Star | None:
-        """The star (the openings seen) as gateways with bearings; None if the step has no star."""
-        return None if self.star is None else Star.of(self.star)
 
     @property
     def openings(self) -> Openings | None:

@@ -5,8 +5,8 @@ is a gateway. A *frame* is a star after this is decided. The gateways of a frame
 clockwise; these numbers are its *slots*. All frames at a place have the same number N of slots.
 Slot K of a frame is slot (K+C) mod N of an earlier frame, for some *shift* C. A gateway is seen at
 some bearing, give or take a spread in degrees. So the shift limits by which rotations the robot can
-have turned between the two frames. A set of rotations has whole degrees clockwise. If it is empty,
-the two frames are not seen at one place with this shift.
+have turned between the two frames. A set of rotations has whole degrees clockwise. Its ends are
+rounded outwards. If it is empty, the two frames are not seen at one place with this shift.
 
 >>> from ssh_abduction.data.star import Star
 >>> from ssh_abduction.solver.steps.frames import members, rotations
@@ -21,8 +21,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from functools import lru_cache
+from math import ceil, floor
 
-from ssh_abduction.data.star import SPREAD, Frame, Star
+from ssh_abduction.data.star import ROUNDING, SPREAD, Frame, Star
 from ssh_abduction.data.trace import Action, Trace
 
 # A set of rotations is an integer: bit R is 1 if R degrees clockwise are in the set.
@@ -113,7 +114,7 @@ def may_face(first: Frame, then: Frame, shift: int) -> list[str]:
     return [
         way
         for way, towards in WAYS.items()
-        if found >> towards & 1 or way == _declared(first, then, shift)
+        if (found and _looks(first, then, shift, towards)) or way == _declared(first, then, shift)
     ]
 
 
@@ -123,7 +124,8 @@ def must_face(first: Frame, then: Frame, shift: int) -> list[str]:
     return [
         way
         for way, towards in WAYS.items()
-        if _surely(found, towards) or way == _declared(first, then, shift)
+        if (_is_sure(found) and _looks(first, then, shift, towards))
+        or way == _declared(first, then, shift)
     ]
 
 
@@ -140,13 +142,13 @@ def ends(frame: Frame) -> list[str]:
     """
     if _way(frame) is not None:
         return []
-    near = [
-        (bearing, 2 * spread) for bearing, spread in zip(frame.bearings, frame.spreads, strict=True)
-    ]
     return [
         way
         for way, towards in (("ahead", 0), ("behind", 180))
-        if not any(_about(*gateway) >> towards & 1 for gateway in near)
+        if not any(
+            _near(bearing - towards, 2 * spread)
+            for bearing, spread in zip(frame.bearings, frame.spreads, strict=True)
+        )
     ]
 
 
@@ -217,18 +219,36 @@ def _way(frame: Frame) -> tuple[int, int] | None:
     return None
 
 
-def _surely(found: int, towards: int) -> bool:
-    """Whether a set of rotations contains a direction, but neither 90 nor 270 degrees.
+def _looks(first: Frame, then: Frame, shift: int, towards: int) -> bool:
+    """Whether bearings allow a rotation by exactly 0, or 180, degrees. See `rotations`."""
+    n = first.slots
+    return all(
+        _near(
+            first.bearings[(k + shift) % n] - then.bearings[k] - towards,
+            first.spreads[(k + shift) % n] + then.spreads[k],
+        )
+        for k in range(n)
+    )
+
+
+def _near(degrees: float, spread: float) -> bool:
+    """Whether an angle may be 0, give or take a spread."""
+    return abs((degrees + 180) % 360 - 180) <= spread + ROUNDING
+
+
+def _is_sure(found: int) -> bool:
+    """Whether a set of rotations is not empty, and contains neither 90 nor 270 degrees.
 
     Stars without known gateways allow nearly all rotations, so that no direction is sure.
     """
-    return bool(found >> towards & 1) and not found >> 90 & 1 and not found >> 270 & 1
+    return bool(found) and not found >> 90 & 1 and not found >> 270 & 1
 
 
 @lru_cache(maxsize=2**14)
-def _about(degrees: int, spread: int) -> int:
-    """Return the set of rotations that differ from `degrees` by at most `spread`."""
-    return _of((degrees + d) % 360 for d in range(-spread, spread + 1))
+def _about(degrees: float, spread: float) -> int:
+    """Return the set of rotations that differ from `degrees` by at most `spread`, rounded up."""
+    least, most = floor(degrees - spread + ROUNDING), ceil(degrees + spread - ROUNDING)
+    return _of(r % 360 for r in range(least, most + 1))
 
 
 def _between(least: int, most: int) -> int:
