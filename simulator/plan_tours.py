@@ -22,6 +22,8 @@ from ssh_abduction.data.trace import Action, Step, Trace
 
 # Views round the directions of doors to this many degrees.
 COARSE = 45
+# Bearings are rounded to this many digits, twice. Rounding may move a bearing by ROUNDED degrees.
+DIGITS, ROUNDED = 3, 0.001
 # Largest number of actions of a tour, so that its trace fits into memory.
 MOST_STEPS = 10_000_000
 
@@ -234,18 +236,19 @@ def _bearings(plan: Plan, stand: Stand) -> tuple[float, ...]:
     """
     heading = _heading(plan, stand)
     return tuple(
-        round((gateway.bearing - heading) % 360, 3) % 360 for gateway in plan.gateways[stand.room]
+        round((gateway.bearing - heading) % 360, DIGITS) % 360
+        for gateway in plan.gateways[stand.room]
     )
 
 
 def _sighted(
     plan: Plan, stand: Stand, spread: float, chance: np.random.Generator
 ) -> tuple[Sighted, ...]:
-    """The star with random errors: each bearing is off by at most `spread` degrees."""
-    found = plan.gateways[stand.room]
-    off = chance.uniform(-spread, spread, len(found)).tolist()
+    """The star with random errors: each bearing is off by at most `spread` degrees, rounded."""
+    found, most = plan.gateways[stand.room], max(spread - ROUNDED, 0)
+    off = chance.uniform(-most, most, len(found)).tolist()
     bearings = [
-        round(bearing + wrong, 3) % 360
+        round(bearing + wrong, DIGITS) % 360
         for bearing, wrong in zip(_bearings(plan, stand), off, strict=True)
     ]
     return _star(plan, stand, bearings, spread)
