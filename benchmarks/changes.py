@@ -33,7 +33,7 @@ import networkx as nx
 import numpy as np
 from instances import HEADINGS, doors_of, maze
 from together import joined
-from truth import NOISE, Known, is_true, told
+from truth import NOISE, Known, is_true, with_truth
 
 from simulator.motion import between, reported
 from simulator.plan_tours import Floor, Stand
@@ -112,7 +112,7 @@ def case_of_plan(plan: Plan, steps: int, seed: int, changes: int, views: int) ->
         states = [step.truth["dstate"] for step in trace.steps]
         for state in sorted({*states} - looks.keys()):
             looks[state] = f"v{chance.randrange(views)}"
-        drives.append(told("", trace.with_views([looks[state] for state in states])))
+        drives.append(with_truth("", trace.with_views([looks[state] for state in states])))
         if not number:
             closed = _closable(plan, {*drives[0].places}, changes, chance)
     both = {*drives[0].places} & {*drives[1].places}

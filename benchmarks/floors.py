@@ -20,7 +20,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from truth import NOISE, Known, is_true, told, worlds
+from truth import NOISE, Known, is_true, with_truth, worlds
 
 from simulator.errors import SimulatorWarning
 from simulator.motion import between
@@ -46,7 +46,7 @@ def towers(floors: int, steps: int, seeds: Sequence[int]) -> Iterator[Known]:
             warnings.simplefilter("ignore", SimulatorWarning)  # The route does not return.
             trace = simulate(driven, seed=seed, body=Body(odometry=NOISE["along"]))
         views = [str(step.star) for step in trace.steps]
-        yield told(f"{tower.name}, {seed}", trace.with_views(views))
+        yield with_truth(f"{tower.name}, {seed}", trace.with_views(views))
 
 
 def random_route(

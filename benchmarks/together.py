@@ -31,7 +31,7 @@ from truth import (
     is_true,
     random_walk,
     report,
-    told,
+    with_truth,
     worlds,
 )
 
@@ -128,7 +128,7 @@ def of_plans(folder: Path, steps: int, seeds: Sequence[int], noise: Noise) -> It
         for seed in seeds:
             name = f"{plan.name}, {seed}"
             tours = [tour(plan, steps, DRIVES * seed + i, noise.odometry) for i in range(DRIVES)]
-            yield joined(name, [told("", trace) for trace in tours])
+            yield joined(name, [with_truth("", trace) for trace in tours])
 
 
 def main() -> None:

@@ -184,7 +184,7 @@ def plans(folder: Path, steps: int, seeds: Sequence[int], noise: Noise) -> Itera
         plan = Plan.load(path)
         for seed in seeds:
             trace = tour(plan, steps, seed, noise.odometry, scale=noise.scale, bend=noise.bend)
-            yield told(f"{plan.name}, {seed}", trace)
+            yield with_truth(f"{plan.name}, {seed}", trace)
 
 
 def aces3(seeds: Sequence[int], noise: Noise) -> Iterator[Known]:
@@ -206,7 +206,7 @@ def taylor_hall(tours: int, seeds: Sequence[int], noise: Noise) -> Iterator[Know
             trace = process.submit(
                 drive, tours, seed, Body(scale=noise.scale, bend=noise.bend)
             ).result()
-        yield told(f"Taylor Hall, {seed}", trace)
+        yield with_truth(f"Taylor Hall, {seed}", trace)
 
 
 def drive(tours: int, seed: int, body: Body) -> Trace:
@@ -232,7 +232,7 @@ def worlds(folder: Path) -> Iterator[Known]:
         yield Known(path.stem, trace, dstates, dstates)
 
 
-def told(name: str, trace: Trace) -> Known:
+def with_truth(name: str, trace: Trace) -> Known:
     """Collect the truth of a trace whose steps state their true dstate and place."""
     return Known(
         name,

@@ -56,7 +56,7 @@ def test_a_causal_map_needs_no_places() -> None:
 def test_gateways_at_any_angles(tmp_path: Path) -> None:
     """A room with one gateway ends a path, so the axioms force some returns."""
     plan = plan_of(tmp_path, xml())
-    known = truth.told("ring", tour(plan, 60, 5, DRIFTING.odometry))
+    known = truth.with_truth("ring", tour(plan, 60, 5, DRIFTING.odometry))
     assert truth.is_true(maps_of(known.trace, Theory.topological(), 4)[0], known)
 
 

@@ -15,7 +15,7 @@ from coarse import every_second_beam, hall
 from perception.errors import LogError
 from perception.places.agreement import disagreement
 from perception.places.importing import tracked
-from perception.readers.echoes import MEANINGS, Array, Told, interpret_log, interpret_scan
+from perception.readers.echoes import MEANINGS, Array, LaserOptions, interpret_log, interpret_scan
 from perception.readers.logs import read_log
 from perception.readers.scans import RobotLog, Scan
 from perception.readers.writers import write_bag, write_carmen
@@ -93,7 +93,7 @@ def with_rays_beyond(ranges: Array, beyond: Array) -> Array:
 def test_a_range_that_repeats_is_no_return(
     drive: tuple[Scan, ...], say: Callable[[Array, Array], Array], reach: float
 ) -> None:
-    scans, notes = interpret_log(written(drive, say, reach), Told())
+    scans, notes = interpret_log(written(drive, say, reach), LaserOptions())
     assert len(notes) == 1
     assert re.search(
         (
@@ -117,7 +117,7 @@ def test_a_range_that_repeats_is_no_return(
 def test_walls_are_walls(
     drive: tuple[Scan, ...], say: Callable[[Array, Array], Array], reach: float
 ) -> None:
-    scans, notes = interpret_log(written(drive, say, reach), Told())
+    scans, notes = interpret_log(written(drive, say, reach), LaserOptions())
     assert notes == ()
     for scan, true in zip(scans, drive, strict=True):
         seen = np.isfinite(scan.ranges)
@@ -129,12 +129,13 @@ def test_a_robot_that_stands_before_a_wall_sees_no_range_that_repeats(
     drive: tuple[Scan, ...],
 ) -> None:
     flat = replace(drive[0], ranges=np.full(180, 2.0))
-    assert not any("repeat" in note for note in interpret_log([flat] * 200, Told())[1])
+    assert not any("repeat" in note for note in interpret_log([flat] * 200, LaserOptions())[1])
 
 
 def test_a_reach_of_nothing_is_that_of_the_largest_range(drive: tuple[Scan, ...]) -> None:
     scans, notes = interpret_log(
-        written(drive, lambda ranges, beyond: np.where(beyond, np.inf, ranges), math.inf), Told()
+        written(drive, lambda ranges, beyond: np.where(beyond, np.inf, ranges), math.inf),
+        LaserOptions(),
     )
     most = max(scan.ranges[scan.ranges <= SEES].max() for scan in drive)
     assert re.search(rf"does not say how far the laser reaches.* it is {most:.4g} m", notes[0])
@@ -146,7 +147,7 @@ def test_a_reach_of_nothing_is_that_of_the_largest_range(drive: tuple[Scan, ...]
 
 @pytest.mark.parametrize("value", [0.0, math.nan, -1.0, 0.05])
 def test_zeros_beside_long_beams_are_free(drive: tuple[Scan, ...], value: float) -> None:
-    scans, notes = interpret_log(written(drive, constant(value), nearest=0.1), Told())
+    scans, notes = interpret_log(written(drive, constant(value), nearest=0.1), LaserOptions())
     assert re.search(r"\d+ % of the beams are .*nothing came back.*--set zero_is=unknown", notes[0])
     for scan, true in zip(scans, drive, strict=True):
         assert np.array_equal(np.isinf(scan.ranges), true.ranges > SEES)
@@ -157,7 +158,7 @@ def test_zeros_at_random_are_unknown(drive: tuple[Scan, ...], value: float) -> N
     rng = np.random.default_rng(0)
     scans, notes = interpret_log(
         written(drive, lambda ranges, _: np.where(rng.random(len(ranges)) < 0.1, value, ranges)),
-        Told(),
+        LaserOptions(),
     )
     (note,) = (note for note in notes if "of the beams are" in note)
     assert re.search(r"\d+ % of the beams are .*nothing is known there.*--set zero_is=free", note)
@@ -168,7 +169,7 @@ def test_zeros_at_random_are_unknown(drive: tuple[Scan, ...], value: float) -> N
 def test_what_the_user_says_of_zeros_is_obeyed_in_silence(
     drive: tuple[Scan, ...], meaning: str
 ) -> None:
-    told = Told(zero_is=meaning, no_return=11.0)
+    told = LaserOptions(zero_is=meaning, no_return=11.0)
     scans, notes = interpret_log(written(drive, constant(0.0)), told)
     assert notes == ()
     is_meant = np.isinf if meaning == "free" else np.isnan
@@ -180,7 +181,7 @@ def test_what_the_user_says_of_zeros_is_obeyed_in_silence(
 
 
 def test_ranges_from_no_return_on_are_none(drive: tuple[Scan, ...]) -> None:
-    scans, _ = interpret_log(drive, Told(no_return=3.0))
+    scans, _ = interpret_log(drive, LaserOptions(no_return=3.0))
     assert all(
         np.array_equal(np.isinf(scan.ranges), true.ranges >= 3.0)
         for scan, true in zip(scans, drive, strict=True)
@@ -207,13 +208,13 @@ def test_ranges_from_no_return_on_are_none(drive: tuple[Scan, ...]) -> None:
 )
 def test_nonsense_about_the_laser_is_refused(told: dict[str, object]) -> None:
     with pytest.raises(LogError, match=f"{next(iter(told))}: expected .*, got .*; name"):
-        Told(**told)  # type: ignore[arg-type]
+        LaserOptions(**told)  # type: ignore[arg-type]
 
 
 def test_a_mount_for_several_lasers_is_refused(drive: tuple[Scan, ...]) -> None:
     second = [replace(scan, laser=replace(scan.laser, mount=(0.0, 0.0, math.pi))) for scan in drive]
     with pytest.raises(LogError, match="mount: expected the scans of one laser, got those of 2"):
-        interpret_log([*drive, *second], Told(mount=(0, 0, 0)))
+        interpret_log([*drive, *second], LaserOptions(mount=(0, 0, 0)))
 
 
 def doubt(scans: tuple[Scan, ...]) -> str:
@@ -232,7 +233,7 @@ def test_a_wrong_field_of_view_is_said_with_the_likely_one(
     coarse: tuple[Scan, ...], fov: float
 ) -> None:
     """The true one is 180 degrees."""
-    said = doubt(tuple(Told(fov=fov).placed(scan) for scan in coarse))
+    said = doubt(tuple(LaserOptions(fov=fov).placed(scan) for scan in coarse))
     (about,) = map(
         float, re.findall(rf"cover about (\d+) degrees, not {fov:.0f} \(--set fov\)", said)
     )
@@ -241,12 +242,12 @@ def test_a_wrong_field_of_view_is_said_with_the_likely_one(
 
 
 def test_a_laser_that_hangs_upside_down_is_said(coarse: tuple[Scan, ...]) -> None:
-    assert "--set fov=180" in doubt(tuple(Told(fov=-180).placed(scan) for scan in coarse))
+    assert "--set fov=180" in doubt(tuple(LaserOptions(fov=-180).placed(scan) for scan in coarse))
 
 
 def test_a_wrong_mount_is_said_with_the_likely_one(coarse: tuple[Scan, ...]) -> None:
     """The laser truly looks ahead."""
-    said = doubt(tuple(Told(mount=(0, 0, 60.0)).placed(scan) for scan in coarse))
+    said = doubt(tuple(LaserOptions(mount=(0, 0, 60.0)).placed(scan) for scan in coarse))
     (looks,) = map(float, re.findall(r"--set mount=0,0,(-?\d+)\)", said))
     assert abs(looks) <= 10
 
@@ -264,7 +265,9 @@ def test_both_verbs_show_all_notes_and_take_the_same_options(
     coarse: tuple[Scan, ...], verb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "dri\x1b[31mve.bag"  # A name that would colour a terminal.
-    write_bag(path, written(tuple(Told(fov=135).placed(scan) for scan in coarse), constant(5.0)))
+    write_bag(
+        path, written(tuple(LaserOptions(fov=135).placed(scan) for scan in coarse), constant(5.0))
+    )
     out = [
         "-o",
         str(tmp_path / "out"),

@@ -219,4 +219,4 @@ def test_maps_of_logs_say_it_too() -> None:
         files=lambda: dict(files),
     )
     question = MapQuestion(None, {}, {}, 0.5, None, 0, ladder=False)
-    assert told in question._told(0, ["a.log"], done, None).line
+    assert told in question._answer(0, ["a.log"], done, None).line

@@ -128,7 +128,7 @@ def toured(tour: str) -> Trace:
     return Trace.from_steps([*views, f"{tour[-1]}{facing:.1f}"], actions, displacements=moved)
 
 
-def told(regions: tuple[Region, ...]) -> str:
+def in_words(regions: tuple[Region, ...]) -> str:
     """The regions in short: places, bounds and door, in the order of their places."""
     parts = [
         " ".join(
@@ -169,8 +169,8 @@ def test_leaving_out_one_axiom_changes_the_regions(axiom: str) -> None:
     trace = trace_of(text)
     ssh_map = first_map(trace, theory)
     axioms = axioms_for_regions(settle(trace, theory).theory)
-    assert told(derived(ssh_map, trace, axioms)) == with_it
-    assert told(derived(ssh_map, trace, axioms - {axiom})) == without_it
+    assert in_words(derived(ssh_map, trace, axioms)) == with_it
+    assert in_words(derived(ssh_map, trace, axioms - {axiom})) == without_it
 
 
 def walk(seed: int, steps: int, side: int = 3) -> Trace:
@@ -231,7 +231,7 @@ def test_a_floor_lies_behind_its_lift() -> None:
     theory = settle(trace, PLAIN).theory
     ssh_map = first_map(trace, theory)
     assert not check(trace, ssh_map, theory)
-    assert "4,5 behind3" in told(ssh_map.regions or ()).split("/")
+    assert "4,5 behind3" in in_words(ssh_map.regions or ()).split("/")
     assert as_set(ssh_map) == brute_regions.regions(ssh_map, trace, axioms_for_regions(theory))
 
 

@@ -116,15 +116,17 @@ def agreement(log: RobotLog, track: Track) -> Agreement:
         return Agreement(
             float(np.hypot(*np.diff(odometry[:, :2], axis=0).T).sum()), float(track.way[-1])
         )
-    told = np.array([between(odometry[i], odometry[j]) for i, j in stretches])
+    measured = np.array([between(odometry[i], odometry[j]) for i, j in stretches])
     seen = np.array([between(track.poses[i], track.poses[j]) for i, j in stretches])
-    motion_told, motion_seen = (way[:, 0] + 1j * way[:, 1] for way in (told, seen))
+    motion_told, motion_seen = (way[:, 0] + 1j * way[:, 1] for way in (measured, seen))
     length = np.abs(motion_told)
     # Turning on the spot has no direction of motion.
     driven = length >= STRETCH / 2
     parted = np.abs(motion_seen - motion_told)[driven] > PARTED * length[driven] + ASIDE
-    turned = np.abs(told[:, 2]) >= TURN
-    ratios = [wrapped(float(b)) / a for a, b in zip(told[turned, 2], seen[turned, 2], strict=True)]
+    turned = np.abs(measured[:, 2]) >= TURN
+    ratios = [
+        wrapped(float(b)) / a for a, b in zip(measured[turned, 2], seen[turned, 2], strict=True)
+    ]
     return Agreement(
         odometry=float(length.sum()),
         scans=float(np.abs(motion_seen).sum()),

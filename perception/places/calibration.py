@@ -19,10 +19,10 @@ from perception.places.closures import (
     GATE,
     INFLATED,
     Closing,
-    drifted,
     errors_of,
     seen_from,
     uncertainty,
+    without_drift,
 )
 from perception.places.tracing import DRIFT
 from perception.places.track import Track
@@ -68,7 +68,7 @@ def factor_of(track: Track, visits: Sequence[Visit], closings: Sequence[Closing]
     wrong = math.log(WRONG) - VOLUME - np.linalg.slogdet(spreads + np.diag(ERROR) ** 2)[1] / 2
     best = np.full(len(FACTORS), -np.inf)
     for drift in DRIFTS:
-        poses = drifted(middles, track.way[scans], drift)
+        poses = without_drift(middles, track.way[scans], drift)
         off = errors_of(seen_from(poses[first], poses[last]), matches)
         squares = np.einsum("ni,fnij,nj->fn", off, inverse, off)
         right = math.log(1 - WRONG) - (squares + size) / 2

@@ -159,7 +159,7 @@ class _Gates:
         self._scans = [visit.scan for visit in visits]
         self._way = track.way[self._scans]
         self._middles = np.array([visit.middle for visit in visits]).reshape(-1, 2)
-        self._poses = np.array([drifted(self._middles, self._way, drift) for drift in DRIFTS])
+        self._poses = np.array([without_drift(self._middles, self._way, drift) for drift in DRIFTS])
 
     def earlier(self, last: int) -> range:
         """The earlier visits far enough before a visit, without a cut of the track between.
@@ -239,8 +239,8 @@ def errors_of(poses: Array, matches: Array) -> Array:
     return off
 
 
-def drifted(middles: Array, way: Array, drift: float) -> Array:
-    """Compute the middles of visits after a steady drift of the heading is removed.
+def without_drift(middles: Array, way: Array, drift: float) -> Array:
+    """Compute the middles of visits without a steady drift of the heading.
 
     Args:
         middles: (n, 2) middles in metres, by the track.

@@ -299,8 +299,8 @@ def turned_wrongly(log: RobotLog, track: Track) -> list[tuple[int, float]]:
     """
     found: list[tuple[int, float]] = []
     for i in range(1, len(log)):
-        told = between(log.scans[i - 1].odometry, log.scans[i].odometry)[2]
-        off = wrapped(float(track.poses[i, 2] - track.poses[i - 1, 2]) - told)
+        measured = between(log.scans[i - 1].odometry, log.scans[i].odometry)[2]
+        off = wrapped(float(track.poses[i, 2] - track.poses[i - 1, 2]) - measured)
         if abs(off) > TURNED and track.shares[i] >= POOR and i not in track.cuts:
             found.append((i, off))
     return found

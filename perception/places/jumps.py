@@ -416,9 +416,9 @@ def _change(first: Scan, last: Scan) -> float:
         np.minimum(np.nan_to_num(scan.ranges, nan=0.0, posinf=NO_RANGE), NO_RANGE)
         for scan in (first, last)
     )
-    told = ((before < NO_RANGE) | (after < NO_RANGE)) & (before > 0) & (after > 0)
+    valid = ((before < NO_RANGE) | (after < NO_RANGE)) & (before > 0) & (after > 0)
     changed = np.abs(before - after) > CHANGED + CHANGED_SHARE * np.minimum(before, after)
-    return float(changed[told].mean()) if told.any() else 0.0
+    return float(changed[valid].mean()) if valid.any() else 0.0
 
 
 def _far(log: RobotLog, steps: int) -> NDArray[np.float64]:

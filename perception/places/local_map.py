@@ -125,9 +125,9 @@ class Beams:
         x = pose[0] + cos * scan.laser.mount[0] - sin * scan.laser.mount[1]
         y = pose[1] + sin * scan.laser.mount[0] + cos * scan.laser.mount[1]
         angles = pose[2] + scan.laser.mount[2] + scan.laser.bearings
-        told = ~np.isnan(scan.ranges)
-        ranges = np.minimum(np.where(told, scan.ranges, 0.0), SIGHT)
-        met = told & (scan.ranges < min(SIGHT, scan.laser.reach))
+        valid = ~np.isnan(scan.ranges)
+        ranges = np.minimum(np.where(valid, scan.ranges, 0.0), SIGHT)
+        met = valid & (scan.ranges < min(SIGHT, scan.laser.reach))
         # Sample each beam along its free part.
         along = np.arange(0.0, SIGHT, 0.8 * CELL)
         through = along < (ranges - CELL)[:, None]
@@ -176,7 +176,7 @@ class LocalMaps:
         """Make the square patch around a position near a scan.
 
         Args:
-            scan: Index of the scan whose window is used.
+            scan: Index of the scan in the middle of the window.
             middle: (x, y) of the centre of the patch in metres, in the frame of the track.
             half: Half the side of the patch in metres.
         """

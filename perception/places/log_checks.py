@@ -246,10 +246,10 @@ def _overriding(log: RobotLog, track: Track) -> float:
     """The share of the steps in which matching contradicts the odometry."""
     trust, count = Trust(), 0
     for i in range(1, len(log)):
-        told = between(log.scans[i - 1].odometry, log.scans[i].odometry)
+        measured = between(log.scans[i - 1].odometry, log.scans[i].odometry)
         seen = between(_pose(track, i - 1), _pose(track, i))
-        off = np.array([*np.subtract(seen[:2], told[:2]), wrapped(seen[2] - told[2])])
-        spread = np.diag(trust.covariance(told))
+        off = np.array([*np.subtract(seen[:2], measured[:2]), wrapped(seen[2] - measured[2])])
+        spread = np.diag(trust.covariance(measured))
         count += i not in track.cuts and float((off**2 / spread).sum()) > CONTRADICTS
     return count / max(len(log) - 1, 1)
 

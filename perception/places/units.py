@@ -88,8 +88,8 @@ def _length(log: RobotLog) -> tuple[float, list[str]]:
     # Relative difference between odometry in this unit and scan matching.
     def off(unit: str) -> float:
         tried = Units(UNITS[unit]).convert(stretch)
-        told, seen = np.array([scan.odometry[:2] for scan in tried.scans]), follow(tried)
-        ways = [np.hypot(*np.diff(way, axis=0).T) for way in (told, seen.poses[:, :2])]
+        measured, seen = np.array([scan.odometry[:2] for scan in tried.scans]), follow(tried)
+        ways = [np.hypot(*np.diff(way, axis=0).T) for way in (measured, seen.poses[:, :2])]
         return (
             float(np.abs(ways[0] - ways[1]).sum() / max(ways[1].sum(), 1e-9))
             if not seen.breaks

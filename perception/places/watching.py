@@ -46,7 +46,7 @@ class Teller:
         tell: Takes the notes.
 
     Attributes:
-        notes: What was told.
+        notes: The notes so far.
     """
 
     def __init__(self, tell: Callable[[str], None]) -> None:

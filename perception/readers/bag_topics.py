@@ -21,7 +21,7 @@ class Bag:
     """An open bag.
 
     Attributes:
-        readers: A reader for each part: one of rosbags, or a `Salvage`.
+        readers: A reader for each part, from the package rosbags or a `Salvage`.
         format: `ros1`, `ros2` or `mcap`.
         notes: Sentences about the files that a user should know.
         source: Name of the bag, for errors.

@@ -226,16 +226,16 @@ def _odometer(
     best = max(tracks, key=lambda source: (len(tracks[source].numbers), "odom" in source[0]))
     if len(tracks) > 1:
 
-        def told(source: tuple[str, str, str]) -> str:
+        def described(source: tuple[str, str, str]) -> str:
             """Name a source (frame, frame of the robot, sender) in a note."""
             odom, base, sender = source
             return f"from {odom} to {base}{f' by {sender}' if sender else ''}"
 
         listed = ", ".join(
-            f"{len(track.table())} {told(source)}" for source, track in tracks.items()
+            f"{len(track.table())} {described(source)}" for source, track in tracks.items()
         )
         notes.append(
-            f"Several sources publish {topic}: {listed}. Those {told(best)} are read; record "
+            f"Several sources publish {topic}: {listed}. Those {described(best)} are read; record "
             "each source to a topic of its own."
         )
     return tracks[best], best[0], best[1]

@@ -8,7 +8,7 @@ constant below it, 0, or NaN. A log rarely says which. So the whole log is surve
 - If the neighbours of beams with 0 or NaN are long, such a beam means that nothing came back. If
   the neighbours have usual lengths, the laser failed there, and nothing is known.
 
-Notes say what was found. `Told` holds what the user says instead.
+Notes say what was found. `LaserOptions` holds what the user says instead.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ LONG = 0.8
 
 
 @dataclass(frozen=True)
-class Told:
+class LaserOptions:
     """What the user says about the laser. None means that the log and the survey decide.
 
     Attributes:
@@ -120,7 +120,7 @@ class Told:
         return scan if laser is scan.laser else replace(scan, laser=laser)
 
     def reach(self, reach: float) -> float:
-        """Return the reach of a laser in metres that the user gives, or else that of the log.
+        """Return the reach of a laser in metres: from the user, or else from the log.
 
         Args:
             reach: Reach according to the log, in metres.
@@ -147,12 +147,14 @@ class Meaning:
     free: frozenset[str]
 
 
-def interpret_log(scans: Sequence[Scan], told: Told) -> tuple[tuple[Scan, ...], tuple[str, ...]]:
+def interpret_log(
+    scans: Sequence[Scan], options: LaserOptions
+) -> tuple[tuple[Scan, ...], tuple[str, ...]]:
     """Find out what the ranges of a whole log mean.
 
     Args:
         scans: The scans, with ranges as the driver wrote them.
-        told: What the user says about the laser. The survey finds the rest.
+        options: What the user says about the laser. The survey finds the rest.
 
     Returns:
         The scans, in which ranges are infinite if nothing came back and NaN if nothing is known;
@@ -161,18 +163,18 @@ def interpret_log(scans: Sequence[Scan], told: Told) -> tuple[tuple[Scan, ...], 
     Raises:
         LogError: The user gives one mount, but the scans come from several lasers.
     """
-    interpret, notes = interpreter_of(scans, told)
+    interpret, notes = interpreter_of(scans, options)
     return tuple(map(interpret, scans)), notes
 
 
 def interpreter_of(
-    scans: Sequence[Scan], told: Told
+    scans: Sequence[Scan], options: LaserOptions
 ) -> tuple[Callable[[Scan], Scan], tuple[str, ...]]:
     """Find out from some scans what the ranges of a log mean.
 
     Args:
         scans: The scans, with ranges as the driver wrote them.
-        told: What the user says about the laser. The survey finds the rest.
+        options: What the user says about the laser. The survey finds the rest.
 
     Returns:
         A function that interprets a scan of the same lasers, also a later one; and notes on what
@@ -182,26 +184,26 @@ def interpreter_of(
         LogError: The user gives one mount, but the scans come from several lasers.
     """
     lasers = len({scan.laser.mount for scan in scans})
-    if told.mount is not None and lasers > 1:
+    if options.mount is not None and lasers > 1:
         raise LogError(
             f"mount: expected the scans of one laser, got those of {lasers}; leave it out "
             "(--set mount), or read the topic of one laser (--set scan_topic)"
         )
     # A log may have several lasers. The number of beams of a laser may change from scan to scan.
     groups: dict[_Key, list[Scan]] = defaultdict(list)
-    for scan in map(told.placed, scans):
+    for scan in map(options.placed, scans):
         groups[_key(scan)].append(scan)
     meanings: dict[_Key, Meaning] = {}
     notes: list[str] = []
     for key, members in groups.items():
         kept = moving(members)
         some = np.unique(np.linspace(0, len(kept) - 1, min(len(kept), MOST_SURVEYED)).astype(int))
-        meanings[key], said = _survey([kept[i] for i in some], told)
+        meanings[key], said = _survey([kept[i] for i in some], options)
         notes += said
 
     def interpret(scan: Scan) -> Scan:
-        placed = told.placed(scan)
-        usual = Meaning(told.reach(placed.laser.reach), told.free)
+        placed = options.placed(scan)
+        usual = Meaning(options.reach(placed.laser.reach), options.free)
         return _measured(placed, meanings.get(_key(placed), usual))
 
     return interpret, tuple(dict.fromkeys(notes))
@@ -212,18 +214,18 @@ def _key(scan: Scan) -> _Key:
     return scan.laser.reach, scan.laser.nearest, scan.laser.mount
 
 
-def interpret_scan(scan: Scan, told: Told) -> Scan:
+def interpret_scan(scan: Scan, options: LaserOptions) -> Scan:
     """Interpret the ranges of a single scan without its log.
 
     Args:
         scan: The scan, with ranges as the driver wrote them.
-        told: What the user says about the laser.
+        options: What the user says about the laser.
 
     Returns:
         The scan, in which ranges are infinite if nothing came back and NaN if nothing is known.
     """
-    placed = told.placed(scan)
-    return _measured(placed, Meaning(told.reach(placed.laser.reach), told.free))
+    placed = options.placed(scan)
+    return _measured(placed, Meaning(options.reach(placed.laser.reach), options.free))
 
 
 def moving(scans: Iterable[Scan]) -> list[Scan]:
@@ -265,15 +267,15 @@ def _kinds(scan: Scan) -> dict[str, Bools]:
     return dict(zip(KINDS, found, strict=True))
 
 
-def _survey(scans: Sequence[Scan], told: Told) -> tuple[Meaning, list[str]]:
+def _survey(scans: Sequence[Scan], options: LaserOptions) -> tuple[Meaning, list[str]]:
     """Find out what the ranges of one laser mean.
 
     Returns:
         The meaning, and notes on it.
     """
     laser, notes = scans[0].laser, list[str]()
-    reach = told.reach(laser.reach)
-    if told.no_return is None and (repeated := _repeated(scans)) is not None:
+    reach = options.reach(laser.reach)
+    if options.no_return is None and (repeated := _repeated(scans)) is not None:
         reach, share = repeated
         but = (
             f", though the laser is said to reach {laser.reach:g} m"
@@ -299,8 +301,8 @@ def _survey(scans: Sequence[Scan], told: Told) -> tuple[Meaning, list[str]]:
                 f"{most:.4g} m. "
                 "If it reaches farther, or less far, say so: --set no_return=METRES."
             )
-    if told.zero_is is not None:
-        return Meaning(reach, told.free), notes
+    if options.zero_is is not None:
+        return Meaning(reach, options.free), notes
     free, said = _without_measurement(scans, reach)
     return Meaning(reach, free), notes + said
 

@@ -12,7 +12,7 @@ from typing import IO, cast
 
 from perception.errors import LogError
 from perception.readers import bag_files, bag_topics, bags, carmen
-from perception.readers.echoes import Told, interpret_log, interpret_scan, interpreter_of
+from perception.readers.echoes import LaserOptions, interpret_log, interpret_scan, interpreter_of
 from perception.readers.lines import LONGEST_LINE, Piped, lines, opened, piped
 from perception.readers.scans import Damage, Reading, RobotLog, Scan
 from ssh_abduction.data.checks import a_list, a_path, a_text
@@ -60,7 +60,7 @@ def read_log(
             several.
         odom_topic: Topic of the odometry in a bag; needed if there are several.
         fov: Degrees from the first beam to the last, counterclockwise, if the log does not say it
-            or is wrong. `perception.readers.echoes.Told` explains this and the following arguments.
+            or is wrong. `perception.readers.echoes.LaserOptions` explains these four arguments.
         mount: Position of the laser on the robot: metres ahead, metres to the left, degrees to the
             left.
         no_return: Metres from which a range means that nothing came back.
@@ -73,7 +73,7 @@ def read_log(
     Raises:
         LogError: The file cannot be read, has no known format, or holds no scan or no odometry.
     """
-    told = Told(fov, mount, no_return, zero_is)
+    options = LaserOptions(fov, mount, no_return, zero_is)
     with _reading(path, format, scan_topic, odom_topic) as reading:
         scans: list[Scan] = []
         damaged: list[Damage] = []
@@ -87,13 +87,13 @@ def read_log(
             f"{named(path)}: expected scans, got none that can be read; {len(damaged)} are "
             f"damaged, first: {damaged[0].what if damaged else 'none'}"
         )
-    meant, found_out = interpret_log(scans, told)
+    meant, found_out = interpret_log(scans, options)
     log = RobotLog(
         meant,
         tuple(damaged),
         reading.format,
         os.fspath(path),
-        (*reading.notes, *_assumed(reading, told), *found_out),
+        (*reading.notes, *_assumed(reading, options), *found_out),
     )
     for warning in log.warnings:
         _log.warning("%s: %s", named(path), warning)
@@ -120,10 +120,10 @@ def stream_log(
     Yields:
         Scans, and `Damage` for the parts that were skipped.
     """
-    told = Told(fov, mount, no_return, zero_is)
+    options = LaserOptions(fov, mount, no_return, zero_is)
     with _reading(path, format, scan_topic, odom_topic) as reading:
         for item in reading.items:
-            yield interpret_scan(item, told) if isinstance(item, Scan) else item
+            yield interpret_scan(item, options) if isinstance(item, Scan) else item
 
 
 def live_log(
@@ -156,7 +156,7 @@ def live_log(
     Raises:
         LogError: The pipe has no lines of CARMEN, or vertices, whose edges may come later.
     """
-    told = Told(fov, mount, no_return, zero_is)
+    options = LaserOptions(fov, mount, no_return, zero_is)
     if not hasattr(stream, "readline") or isinstance(stream, io.TextIOBase):
         raise LogError(f"stream: expected a stream of bytes, got {brief(stream)}; open a file")
     text = piped(stream, named(source))
@@ -169,16 +169,16 @@ def live_log(
     file = cast(IO[bytes], Piped(head, text))
     reading = carmen.read(file, named(source), "carmen", surveyed=io.BytesIO(head))
     first = list(islice(reading.items, SURVEYED))
-    interpret, found_out = interpreter_of([one for one in first if isinstance(one, Scan)], told)
-    for note in (*reading.notes, *_assumed(reading, told), *found_out):
+    interpret, found_out = interpreter_of([one for one in first if isinstance(one, Scan)], options)
+    for note in (*reading.notes, *_assumed(reading, options), *found_out):
         tell(note)
     for item in chain(first, reading.items):
         yield interpret(item) if isinstance(item, Scan) else item
 
 
-def _assumed(reading: Reading, told: Told) -> list[str]:
+def _assumed(reading: Reading, options: LaserOptions) -> list[str]:
     """Notes on what the reader assumed. If the user gave a setting, nothing was assumed for it."""
-    return [note for option, note in reading.assumed.items() if getattr(told, option) is None]
+    return [note for option, note in reading.assumed.items() if getattr(options, option) is None]
 
 
 @contextmanager

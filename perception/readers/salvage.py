@@ -171,12 +171,12 @@ def _ros1(path: Path) -> Iterator[Message]:
             number = struct.unpack("<I", header[b"conn"])[0]
             # Connections name topic, kind and sender; messages refer to them.
             if kind == CONNECTION:
-                told = _fields(data)
-                package, _, name = told[b"type"].decode().partition("/")
+                fields = _fields(data)
+                package, _, name = fields[b"type"].decode().partition("/")
                 connections[number] = (
                     header[b"topic"].decode(),
                     f"{package}/msg/{name}",
-                    told.get(b"callerid", b"").decode(),
+                    fields.get(b"callerid", b"").decode(),
                 )
             elif number in connections:
                 seconds, nano = struct.unpack("<II", header[b"time"])

@@ -146,7 +146,7 @@ class Reading:
         items: Iterator over scans, with ranges as the driver wrote them, and skipped parts, in the
             order of the file.
         assumed: Notes on what the reader assumed. The key of a note is the field of
-            `perception.readers.echoes.Told` by which a user can say otherwise.
+            `perception.readers.echoes.LaserOptions` by which a user can say otherwise.
     """
 
     format: str

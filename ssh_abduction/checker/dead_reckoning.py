@@ -167,7 +167,7 @@ class ErrorFilter:
         return moved
 
     def is_known(self, first: Any, last: Any) -> NDArray[np.bool_]:
-        """For each loop, tell whether its closing error is known.
+        """For each loop from step `first` to `last`, tell whether its closing error is known.
 
         The error is known if no displacement of the loop is missing and the standard deviation of
         the heading at its end is at most LOST.

@@ -10,7 +10,7 @@ from ssh_abduction.checker.moves import Move, heading_of
 from ssh_abduction.checker.planarity import Edges
 from ssh_abduction.checker.reading import Check, Found, Reading
 from ssh_abduction.checker.stars import stars_of
-from ssh_abduction.data.closure import Closure, told
+from ssh_abduction.data.closure import Closure, match_in_words
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.star import Star
 
@@ -33,7 +33,7 @@ def one_star(m: Reading) -> Found:
 def asserted(m: Reading) -> Found:
     """Check that the map satisfies each assertion of the theory about a pair of steps."""
     labels, theory = m.map.dstate_at, m.theory
-    told = [
+    claims = [
         ("one dstate", theory.same),
         ("different dstates", theory.different),
         ("at different places", theory.elsewhere),
@@ -41,7 +41,7 @@ def asserted(m: Reading) -> Found:
     ]
     for said, (i, j) in (
         (said, [m.steps[t] for t in pair])
-        for said, pairs in told
+        for said, pairs in claims
         for pair in pairs
         if max(pair) < len(labels)
     ):
@@ -109,7 +109,7 @@ def closure(m: Reading) -> Found:
                 yield (
                     [i, j],
                     f"Steps {named[0]} and {named[1]} are at one {kind}, but "
-                    f"{told(match, *named)} and a turn of "
+                    f"{match_in_words(match, *named)} and a turn of "
                     f"{math.degrees(match.displacement[2]):.0f} degrees.",
                 )
 

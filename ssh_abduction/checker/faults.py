@@ -34,9 +34,9 @@ def faults_are_allowed(m: Reading) -> Found:
                 )
         named.add((kind, i, fault.gateway, fault.bearing))
     if m.theory.changed:
-        told = {_told(f) for f in m.map.faults}
+        listed = {_key(f) for f in m.map.faults}
         for change in _changes(m):
-            if change not in told:
+            if change not in listed:
                 p, slot, i, was, now = change
                 way = f"{slot} degrees" if m.theory.star == "gateways" else f"slot {slot}"
                 said = f"The gateway at {way} of place {p} was {was} and {now}: the map hides it."
@@ -48,7 +48,7 @@ def _changes(m: Reading) -> Iterator[tuple[int, int, int, str, str]]:
     return clashes.changes(m) if m.theory.star == "gateways" else changes(m)
 
 
-def _told(fault: Fault) -> tuple[object, ...]:
+def _key(fault: Fault) -> tuple[object, ...]:
     """Return the values of a change that a map lists."""
     where = fault.gateway if fault.bearing is None else fault.bearing
     return fault.place, where, fault.step, fault.expected, fault.seen
@@ -95,7 +95,7 @@ def _what_is_wrong(m: Reading, fault: Fault) -> str | None:
     if kind == "changed":
         return (
             None
-            if _told(fault) in list(_changes(m))
+            if _key(fault) in list(_changes(m))
             else f"The map says that {fault}, but no drives show it."
         )
     if kind == "slipped" and step.action and fault.seen != step.action.name:

@@ -106,8 +106,8 @@ def sentence_of(joins: Sequence[Join], maps: int = 1, *, minimal: bool = False) 
         "these dstates": [join for join in joins if not join.at_place],
     }
     named = [f"{kind}: {_named(some)}" for kind, some in kinds.items() if some]
-    told = ("minimal; " if minimal else "") + ("in map 1 " if maps > 1 else "")
-    return f"{told}nothing observed separates {'; nor '.join(named)}" if named else ""
+    opening = ("minimal; " if minimal else "") + ("in map 1 " if maps > 1 else "")
+    return f"{opening}nothing observed separates {'; nor '.join(named)}" if named else ""
 
 
 def _named(joins: Sequence[Join]) -> str:

@@ -148,12 +148,12 @@ class Edges:
         ):
             at_edge |= more
         # for each place, sequences of gateways that are known to follow each other clockwise
-        told: dict[int, list[list[Arm]]] = defaultdict(list)
+        sequences: dict[int, list[list[Arm]]] = defaultdict(list)
         for s, turn, t in self.turns:
             if turn != "around" and {s, t} <= at_edge:
                 side = 1 if turn == "right" else -1
                 arms = [(s, 1), (t, side), (s, -1), (t, -side)]
-                told[self.place_of[s]].append(
+                sequences[self.place_of[s]].append(
                     [one[arm] for arm in arms if crossing or arm != (t, -1)]
                 )
         edges = {
@@ -162,7 +162,9 @@ class Edges:
         }
         ends = [choose(edge, key=repr) for edge in edges for choose in (min, max)]
         orders = {
-            p: _orders(sorted({arm for arms in told[p] for arm in arms}, key=repr), told[p])
+            p: _orders(
+                sorted({arm for arms in sequences[p] for arm in arms}, key=repr), sequences[p]
+            )
             for p in self._at
         }
 
@@ -304,27 +306,27 @@ def _is_turned(faced: Mapping[int, int], turn: tuple[int, int, int]) -> bool:
     return s not in faced or t not in faced or (faced[s] + quarters - faced[t]) % 4 == 0
 
 
-def _goes_round(order: Sequence[Arm], told: Sequence[Arm]) -> bool:
+def _goes_round(order: Sequence[Arm], sequence: Sequence[Arm]) -> bool:
     """Tell whether gateways are distinct, and clockwise in a circular order.
 
     Args:
         order: The circular order.
-        told: The gateways. Those that the order does not have yet are skipped.
+        sequence: The gateways. Those that the order does not have yet are skipped.
     """
-    there = [order.index(gateway) for gateway in told if gateway in order]
+    there = [order.index(gateway) for gateway in sequence if gateway in order]
     return (
-        len(set(told)) == len(told)
+        len(set(sequence)) == len(sequence)
         and sum(j < i for i, j in zip(there, [*there[1:], *there[:1]], strict=True)) <= 1
     )
 
 
-def _orders(gateways: Sequence[Arm], told: Sequence[Sequence[Arm]]) -> list[tuple[Arm, ...]]:
+def _orders(gateways: Sequence[Arm], sequences: Sequence[Sequence[Arm]]) -> list[tuple[Arm, ...]]:
     """List all clockwise orders of gateways that agree with some sequences.
 
     Orders that differ by a rotation are listed once: each starts with the first gateway.
 
     Args:
-        told: Sequences of gateways that are known to follow each other clockwise.
+        sequences: Sequences of gateways that are known to follow each other clockwise.
     """
     orders: list[tuple[Arm, ...]] = [()]
     for gateway in gateways:
@@ -336,6 +338,6 @@ def _orders(gateways: Sequence[Arm], told: Sequence[Sequence[Arm]]) -> list[tupl
         orders = [
             order
             for order in each_looking(longer)
-            if all(_goes_round(order, some) for some in told)
+            if all(_goes_round(order, some) for some in sequences)
         ]
     return orders

@@ -91,13 +91,13 @@ def check_bound(trace: Trace, certificate: Any) -> ProvenBound:
             )
         word_of[frozenset(entry[:2])] = entry[2]
     pairs = list(combinations(steps, 2))
-    told = (
+    reasons = (
         word_of.get(frozenset(pair), []) if has_words else _common_actions(trace, *pair)
         for pair in pairs
     )
     faults = [
         fault
-        for (i, j), word in zip(pairs, told, strict=True)
+        for (i, j), word in zip(pairs, reasons, strict=True)
         if (fault := _not_apart(trace, i, j, word))
     ]
     return ProvenBound(len(steps), tuple(refuted), tuple(faults))

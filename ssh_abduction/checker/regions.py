@@ -126,7 +126,7 @@ def _missing(m: Reading, expected: Mapping[_Places, str]) -> Found:
     there = {frozenset(region.places) for region in m.map.regions or ()}
     for places, why in expected.items():
         if places not in there:
-            yield _steps(m, places), f"The map lists no region of {_told(places)}. {why}"
+            yield _steps(m, places), f"The map lists no region of {_listed(places)}. {why}"
 
 
 def _wrong(m: Reading, region: Region) -> Iterator[str]:
@@ -175,7 +175,7 @@ def _steps(m: Reading, places: Iterable[int]) -> list[int]:
     return [step for place in places for step in m.steps_at(place)]
 
 
-def _told(places: _Places) -> str:
+def _listed(places: _Places) -> str:
     """Name places in words."""
     return f"place{'' if len(places) == 1 else 's'} {listed(sorted(places))}"
 

@@ -30,9 +30,9 @@ from ssh_abduction.cli.outcome import (
     exit_code,
     explained,
     given_by,
+    map_record,
     on_ctrl_c,
     opening,
-    told,
     warn,
     warnings_of,
 )
@@ -152,7 +152,7 @@ class Question:
                 maps += [given_by(search, ssh_map)] if self.json else []
             explanation = explained(search)
             solution = search.solution(tuple(ssh_map for ssh_map, _ in maps))
-            return self._told(
+            return self._answer(
                 number, path, search, solution, all_given(solution), explanation, search.backbone
             )
 
@@ -177,7 +177,7 @@ class Question:
             solution = search.snapshot(why)
             found = [*maps] or ([(ssh_map, None) for ssh_map in solution.maps] if self.json else [])
             # Nobody reads the exit code of this process.
-            return self._told(number, path, search, solution, found, None, None), EXIT_ERROR
+            return self._answer(number, path, search, solution, found, None, None), EXIT_ERROR
 
         if not workers.serves():
             return contextlib.nullcontext()
@@ -190,7 +190,7 @@ class Question:
             print_last=workers.reply,
         )
 
-    def _told(
+    def _answer(
         self,
         number: int,
         path: str,
@@ -203,12 +203,12 @@ class Question:
         """Make the answer for a solution: its line, exit code and warnings."""
         if self.json:
             count = len(maps)
-            maps_told = list(map(told, maps))
+            records = list(map(map_record, maps))
             line = dump(
                 {
                     "trace": path,
                     **opening(search),
-                    "maps": maps_told,
+                    "maps": records,
                     **ending(search, solution, explanation, count, backbone),
                 }
             )

@@ -59,15 +59,15 @@ def run(options: argparse.Namespace) -> int:
 
     maps = maps_in(options.maps)
     others = None if options.other is None else maps_in(options.other)
-    told: dict[str, Any] = {}  # the output of --json
+    record: dict[str, Any] = {}  # the output of --json
     if maps != options.maps and others != options.other:
-        told["runs"] = differences(options.maps, options.other)
+        record["runs"] = differences(options.maps, options.other)
         if not options.json:
-            print("\n".join(_runs(told["runs"], options.maps, options.other)))
+            print("\n".join(_runs(record["runs"], options.maps, options.other)))
         # Maps of different traces have nothing else to compare.
         if not of_one_trace(options.maps, options.other):
             if options.json:
-                print(json_line(told))
+                print(json_line(record))
             return 0
     listing = Listing.load(maps)
     other = Listing.load(others) if others is not None else None
@@ -77,21 +77,21 @@ def run(options: argparse.Namespace) -> int:
         i, j = listing.number(options.diff[0]), there.number(options.diff[1])
         names = f"map {i + 1}", f"map {j + 1}" + (f" of {printable(other.source)}" if other else "")
         between = difference(listing.maps[i], there.maps[j], names, drives=listing.drives)
-        print(json_line({**told, **between.to_dict()}) if options.json else between)
+        print(json_line({**record, **between.to_dict()}) if options.json else between)
         return 0
     found = compare(listing, other)
     if listing.weighed is not None:
-        told["confidence"] = listing.weighed.confidence
+        record["confidence"] = listing.weighed.confidence
     elif listing.by_minimality:
-        told["by_minimality"] = [join.to_dict() for join in listing.by_minimality]
+        record["by_minimality"] = [join.to_dict() for join in listing.by_minimality]
     drives = joins_of_drives(listing)
     if drives:
-        told["drives"] = [pair.to_dict() for pair in drives]
+        record["drives"] = [pair.to_dict() for pair in drives]
     sides = shared_sides(listing)
     if sides is not None:
-        told["sides"] = sides.to_dict()
+        record["sides"] = sides.to_dict()
     if options.json:
-        print(json_line({**told, **found.to_dict()}))
+        print(json_line({**record, **found.to_dict()}))
         return 0
     differing = [f"  {sides}"] if sides is not None and sides.possible else []
     print("\n".join([*_lines(found), *differing, *map(str, drives)]))

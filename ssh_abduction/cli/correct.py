@@ -7,7 +7,7 @@ import shlex
 from pathlib import Path
 
 from ssh_abduction.cli.options import Verbs, add_map, add_maps, trace_beside
-from ssh_abduction.cli.standing import Standing, told
+from ssh_abduction.cli.standing import Standing, sentences_of
 from ssh_abduction.data.corrections import PAIRS
 from ssh_abduction.data.errors import MapError, brief, named, printable
 from ssh_abduction.data.words import counted
@@ -64,10 +64,10 @@ def run(options: argparse.Namespace) -> int:
     for what, name in options.name or ():
         said = said.with_name(name, *standing.thing(what))
     if said == standing.corrections:
-        print("\n".join(map(printable, told(said))) or "nothing was said")
+        print("\n".join(map(printable, sentences_of(said))) or "nothing was said")
         return 0
     file = standing.save(said)
-    sentences = counted(sum(1 for _ in told(said)), "sentences")
+    sentences = counted(sum(1 for _ in sentences_of(said)), "sentences")
     print(printable(f"{named(file)}: {sentences}; {_how_to_obey(standing.file)}"))
     return 0
 

@@ -137,8 +137,8 @@ def run(options: argparse.Namespace) -> int:
                 file=sys.stderr,
             )
     if options.json:
-        told = {"count": len(maps)} if found is None else found.to_dict()
-        print(json_line({**told, **{visits.judge: visits.to_dict() for visits in judged}}))
+        record = {"count": len(maps)} if found is None else found.to_dict()
+        print(json_line({**record, **{visits.judge: visits.to_dict() for visits in judged}}))
         return 0
     if found is not None:
         may_be_more = isinstance(data, dict) and data.get("complete") is False
@@ -146,7 +146,7 @@ def run(options: argparse.Namespace) -> int:
         print(_truth(found, len(trace)))
         print(table(HEAD, [_row(i, one) for i, one in enumerate(found.maps, 1)]))
     for visits in judged:
-        print(_told_of_visits(visits))
+        print(_visits_in_words(visits))
         print(
             table(
                 PAIRS,
@@ -178,7 +178,7 @@ def _nothing_judged(found: VisitsEvaluation) -> str:
     )
 
 
-def _told_of_visits(found: VisitsEvaluation) -> str:
+def _visits_in_words(found: VisitsEvaluation) -> str:
     """Say how many pairs of visits and of steps were judged, and how many were left out."""
     places, dstates = found.places, found.dstates
     left_out = [
@@ -225,12 +225,14 @@ def _headline(found: Evaluation, may_be_more: bool) -> str:
 
 def _truth(found: Evaluation, steps: int) -> str:
     """Describe the truth of a trace with this number of steps: where it is known, and counts."""
-    told = (
+    named_counts = (
         (found.true_dstates, "dstates"),
         (found.true_places, "places"),
         (found.true_paths, "paths"),
     )
-    counts = ", ".join(counted(number, things) for number, things in told if number is not None)
+    counts = ", ".join(
+        counted(number, things) for number, things in named_counts if number is not None
+    )
     ambiguity = (
         ""
         if found.ambiguity is None

@@ -137,18 +137,18 @@ def run(options: argparse.Namespace) -> int:
 
     listing = Listing.load(maps) if maps and options.steps and not named else None
     pair = None if listing is None else _InMap.of(listing, first, second)
-    told = partial(_as_json if options.json else _as_text, pair)
+    written = partial(_as_json if options.json else _as_text, pair)
 
     def last_words(why: Stop) -> tuple[str, int]:
         known = question.known(why)
-        return told(known), _exit_code(known)
+        return written(known), _exit_code(known)
 
     with (
         on_ctrl_c(question.interrupt),
         Guard(question.interrupt, last_words, options.time_limit, options.memory_limit) as guard,
     ):
         answer = question.answer()
-        guard.say(lambda: told(answer))
+        guard.say(lambda: written(answer))
     return _exit_code(answer)
 
 
@@ -181,13 +181,13 @@ class _InMap:
         )
 
     def __str__(self) -> str:
-        told = f"map 1 has both steps at {'one place' if self.is_one_place else 'two places'}"
+        text = f"map 1 has both steps at {'one place' if self.is_one_place else 'two places'}"
         if self.probability is not None:
-            told += f"; the probability of one place is {probability_in_words(self.probability)}"
+            text += f"; the probability of one place is {probability_in_words(self.probability)}"
         if self.nats is not None:
             other = "two places" if self.is_one_place else "one place"
-            told += f"; the best known map with {other} costs {self.nats:.1f} nats more"
-        return told
+            text += f"; the best known map with {other} costs {self.nats:.1f} nats more"
+        return text
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as plain data."""
@@ -199,8 +199,8 @@ def _as_text(in_map: _InMap | None, explanation: Answer) -> str:
 
 
 def _as_json(in_map: _InMap | None, explanation: Answer) -> str:
-    told = explanation.to_dict()
-    return dump(told | ({"map": in_map.to_dict()} if in_map else {})) + "\n"
+    record = explanation.to_dict()
+    return dump(record | ({"map": in_map.to_dict()} if in_map else {})) + "\n"
 
 
 def _exit_code(explanation: Answer) -> int:

@@ -75,7 +75,7 @@ def add_reading(parser: Parser) -> None:
             "the angle from the first to the last beam of the laser; negative for a laser mounted "
             "upside down (default: from the log, else 180)"
         ),
-        type=partial(_told, "fov"),
+        type=partial(_laser_value, "fov"),
         metavar="DEGREES",
     )
     parser.add_setting(
@@ -91,7 +91,7 @@ def add_reading(parser: Parser) -> None:
             "where the laser is on the robot: metres ahead of the centre, metres to the left, and "
             "degrees to the left of straight ahead (default: from the log, else 0,0,0)"
         ),
-        type=partial(_told, "mount"),
+        type=partial(_laser_value, "mount"),
         metavar="X,Y,DEGREES",
     )
     parser.add_setting(
@@ -100,7 +100,7 @@ def add_reading(parser: Parser) -> None:
             "a range of at least this length means that the beam hit nothing (default: the "
             "laser's maximum range, or a shorter range that often repeats and is no wall)"
         ),
-        type=partial(_told, "no_return"),
+        type=partial(_laser_value, "no_return"),
         metavar="METRES",
     )
     parser.add_setting(
@@ -140,22 +140,22 @@ def reading_of(options: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def _told(field: str, text: str) -> Any:
-    """Convert text to the value of a field of `Told`, which describes the laser, and check it.
+def _laser_value(field: str, text: str) -> Any:
+    """Convert text to the value of a field of `LaserOptions`, and check it.
 
     Args:
         text: A number, or numbers separated by commas.
     """
-    from perception.readers.echoes import Told
+    from perception.readers.echoes import LaserOptions
 
     try:
         numbers = tuple(map(float, text.split(",")))
     except ValueError:
         raise argparse.ArgumentTypeError(f"expected numbers, got {text!r}") from None
     value = numbers if field == "mount" or len(numbers) != 1 else numbers[0]
-    told: dict[str, Any] = {field: value}
+    given: dict[str, Any] = {field: value}
     try:
-        Told(**told)
+        LaserOptions(**given)
     except AbductionError as error:
         raise argparse.ArgumentTypeError(str(error).partition(": ")[2]) from None
     return value

@@ -57,12 +57,12 @@ def run(options: argparse.Namespace) -> int:
     rungs: list[Rung] = []
     under_way = UnderWay()
 
-    def told() -> str:
+    def written() -> str:
         """The table of all rungs; empty with --json, as these are printed when they are ready."""
         return "" if options.json else f"{table(HEAD, list(map(_row, rungs)))}\n"
 
     def last_words(_: Stop) -> tuple[str, int]:
-        return told(), interrupted_code()
+        return written(), interrupted_code()
 
     with (
         on_ctrl_c(under_way.interrupt),
@@ -79,7 +79,7 @@ def run(options: argparse.Namespace) -> int:
             if options.json:
                 guard.say(lambda: f"{json_line(rungs[-1].to_dict())}\n")
                 sys.stdout.flush()
-        guard.say(told)
+        guard.say(written)
     return interrupted_code() if under_way.interrupted else 0
 
 

@@ -215,7 +215,7 @@ class MapQuestion:
 
         def last_words(_: Stop) -> tuple[MapAnswer, int]:
             known = [
-                self._told(number, paths, mapping.known(), content)
+                self._answer(number, paths, mapping.known(), content)
                 for mapping in begun
                 if mapping.search is not None
             ]
@@ -248,9 +248,9 @@ class MapQuestion:
                 )
                 if self.corrections:
                     say_obeyed(self.corrections, done.imported.trace)
-            return self._told(number, paths, done, content)
+            return self._answer(number, paths, done, content)
 
-    def _told(
+    def _answer(
         self, number: int, paths: Sequence[str], done: LogMap, content: str | None
     ) -> MapAnswer:
         """Make the answer for a log that was mapped, or for several that were mapped together."""
@@ -281,8 +281,8 @@ class MapQuestion:
             else f"{solution.status.value}, {counted(solution.count, 'minimal maps')}"
             f"{'' if solution.complete else ' or more'}"
         )
-        if told := sentence_of(solution.by_minimality, solution.count):
-            how += f"; {told}"
+        if joins := sentence_of(solution.by_minimality, solution.count):
+            how += f"; {joins}"
         if done.joined:
             how += f"; {done.joined}"
         total, visits = sum(done.seconds.values()), counted(len(done.imported.visits), "visits")
@@ -423,10 +423,10 @@ def _check_alone(path: str, folder: Path) -> None:
 
 def _here(question: MapQuestion, logs: Sequence[str], folder: Path) -> int:
     """Map a log, or several together, in this process, and return the exit code."""
-    told: set[str] = set()  # warnings that were printed while the logs were mapped
+    printed: set[str] = set()  # warnings that were printed while the logs were mapped
 
     def tell(warning: str) -> None:
-        told.add(warning)
+        printed.add(warning)
         warn([warning])
 
     def keep(answer: MapAnswer) -> None:
@@ -437,7 +437,7 @@ def _here(question: MapQuestion, logs: Sequence[str], folder: Path) -> int:
         except OSError as error:
             raise AbductionError(unwritten(error, folder)) from None
         _say(answer, folder)
-        warn([warning for warning in answer.warnings if warning not in told])
+        warn([warning for warning in answer.warnings if warning not in printed])
 
     check_folder(folder)
     question = question.obeying(folder)

@@ -134,7 +134,7 @@ def _lines(experiment: Experiment) -> Iterator[str]:
             [
                 "action",
                 *(
-                    f"{_told_rivals(said.rivals)} predict{'s' * (len(said.rivals) == 1)}"
+                    f"{_rivals_in_words(said.rivals)} predict{'s' * (len(said.rivals) == 1)}"
                     for said in shown
                 ),
             ],
@@ -162,7 +162,7 @@ def _tree(plan: Plan, indent: str) -> Iterator[str]:
         yield f"{indent}{printable(', '.join(plan.actions))}"
     for branch in plan.branches:
         rest = branch.plan
-        left = f"{_told_rivals(rest.rivals)}{_untried(rest)}"
+        left = f"{_rivals_in_words(rest.rivals)}{_untried(rest)}"
         yield f"{indent}  {printable(str(branch.seen))}: {left}"
         yield from _tree(rest, f"{indent}    ")
 
@@ -187,7 +187,7 @@ def _expected(untried: Untried) -> Iterator[str]:
     shown = untried.expects[:SHOWN_LINES]
     yield table(
         ["maps", "leads to", "seen there", "which is"],
-        [[_told_rivals(said.rivals), *_says(said.says)] for said in shown],
+        [[_rivals_in_words(said.rivals), *_says(said.says)] for said in shown],
     )
     if len(untried.expects) > len(shown):
         yield f"  and {len(untried.expects) - len(shown)} more (--json has all)"
@@ -198,7 +198,7 @@ def _says(says: Consequence) -> tuple[str, str, str]:
     return where, "not known" if says.seen is None else str(says.seen), HOW[says.how]
 
 
-def _told_rivals(rivals: Sequence[int]) -> str:
-    from ssh_abduction.rivals.experiment import told_rivals  # loads numpy
+def _rivals_in_words(rivals: Sequence[int]) -> str:
+    from ssh_abduction.rivals.experiment import rivals_in_words  # loads numpy
 
-    return told_rivals(rivals)
+    return rivals_in_words(rivals)

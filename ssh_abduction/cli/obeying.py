@@ -7,7 +7,7 @@ import sys
 from dataclasses import dataclass, replace
 
 from ssh_abduction.cli.outcome import warn
-from ssh_abduction.cli.standing import told
+from ssh_abduction.cli.standing import sentences_of
 from ssh_abduction.data.corrections import Corrections, Passage, Said
 from ssh_abduction.data.corrections_file import beside, load_corrections
 from ssh_abduction.data.drives import drives_of, fingerprints_of, step_of
@@ -62,7 +62,7 @@ def as_corrected(
 def say_obeyed(said: Corrections, trace: Trace) -> None:
     """Print on stderr how many sentences of the corrections are about drives of this trace."""
     here, all_of_them = (
-        sum(1 for _ in told(some)) for some in (said.known_in(drives_of(trace)), said)
+        sum(1 for _ in sentences_of(some)) for some in (said.known_in(drives_of(trace)), said)
     )
     aside = f"; {all_of_them - here} are of drives that are not solved" * (here < all_of_them)
     text = f"obeying {counted(here, 'sentences')} of {named(said.source)}{aside}"

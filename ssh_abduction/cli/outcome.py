@@ -55,7 +55,7 @@ def opening(search: Search) -> dict[str, Any]:
     return written_opening(search.theory, len(search.trace), search.limits.within)
 
 
-def told(given: Given) -> dict[str, Any]:
+def map_record(given: Given) -> dict[str, Any]:
     """Make the JSON of a map, with its cost if maps of several costs are listed.
 
     Args:
@@ -168,10 +168,10 @@ def on_ctrl_c(action: Callable[[], None] | None) -> Iterator[None]:
         number: signal.signal(number, hear if action else signal.SIG_IGN)
         for number in (signal.SIGINT, signal.SIGTERM)
     }
-    told = signal.set_wakeup_fd(-1)
+    descriptor = signal.set_wakeup_fd(-1)
     try:
         yield
     finally:
-        signal.set_wakeup_fd(told, warn_on_full_buffer=False)
+        signal.set_wakeup_fd(descriptor, warn_on_full_buffer=False)
         for number, handler in before.items():
             signal.signal(number, handler)

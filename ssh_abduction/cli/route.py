@@ -56,7 +56,7 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    from ssh_abduction.online.routes import route, told_action  # loads networkx
+    from ssh_abduction.online.routes import action_in_words, route  # loads networkx
     from ssh_abduction.rivals.listing import Listing
 
     listing = Listing.load(options.maps)
@@ -79,13 +79,13 @@ def run(options: argparse.Namespace) -> int:
     print(printable(found.sentence))
     if found.legs:
         called = listing.maps[found.map - 1].called
-        told = "; ".join(leg.told(called) for leg in found.legs)
-        print(printable(f"by regions: {told}"))
+        legs = "; ".join(leg.in_words(called) for leg in found.legs)
+        print(printable(f"by regions: {legs}"))
     if found.moves:
         chosen = listing.maps[found.map - 1]
         rows = [
             [
-                told_action(move),
+                action_in_words(move),
                 "" if move.dstate is None else move.dstate,
                 "not known" if move.view is None else move.view,
                 "" if move.place is None else chosen.numbered("place", move.place),

@@ -24,9 +24,9 @@ from ssh_abduction.cli.outcome import (
     exit_code,
     explained,
     given_by,
+    map_record,
     on_ctrl_c,
     opening,
-    told,
     warn,
     warnings_of,
 )
@@ -366,7 +366,7 @@ class _Json:
 
     def _line(self, given: Given) -> str:
         self._maps += 1
-        return ("," if self._maps > 1 else "") + "\n" + dump(told(given))
+        return ("," if self._maps > 1 else "") + "\n" + dump(map_record(given))
 
 
 def _text(lines: Iterable[str]) -> str:
@@ -385,8 +385,8 @@ def _lines(
         and sentence_of(solution.drives, solution.maps[0])
     ):
         yield joined
-    if solution.maps and (told := floors_in_words(solution.maps[0])):
-        yield told
+    if solution.maps and (floors := floors_in_words(solution.maps[0])):
+        yield floors
     if solution.weighed is None and solution.sureness:  # else the headline says it
         yield solution.sureness
     if solution.status is Status.UNSATISFIABLE:

@@ -203,6 +203,6 @@ class Standing:
         return dstate.place if kind == "place" else dstate.path
 
 
-def told(corrections: Corrections) -> Iterator[str]:
+def sentences_of(corrections: Corrections) -> Iterator[str]:
     """Yield the sentences of some corrections in words."""
     yield from map(str, (*corrections.names, *corrections.pairs, *corrections.gateways))

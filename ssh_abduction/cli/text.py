@@ -219,8 +219,8 @@ def describe_backbone(backbone: Backbone, trace: Trace) -> str:
     ):
         if pairs:
             more = f", and {len(pairs) - SHOWN_PAIRS} more" if len(pairs) > SHOWN_PAIRS else ""
-            told = ", ".join(f"{names[i]} and {names[j]}" for i, j in pairs[:SHOWN_PAIRS])
-            parts.append(f"  {sort} in some of them: the steps {told}{more}")
+            listed = ", ".join(f"{names[i]} and {names[j]}" for i, j in pairs[:SHOWN_PAIRS])
+            parts.append(f"  {sort} in some of them: the steps {listed}{more}")
     return "\n".join(parts)
 
 
@@ -264,7 +264,7 @@ def compared(found: Comparison) -> Iterator[str]:
     if not found.deciding:
         return
     causes = sum(question.sort in ("faults", "dstates") for question in found.deciding)
-    told = (
+    questions = (
         "question 1 tells"
         if len(found.deciding) == 1
         else f"questions 1 to {len(found.deciding)}, asked in this order, tell"
@@ -275,7 +275,7 @@ def compared(found: Comparison) -> Iterator[str]:
         else ""
     )
     maps = "both maps" if len(found.ids) == 2 else f"all {counted(len(found.ids), 'maps')}"
-    yield f"  {told} {maps} apart{some}"
+    yield f"  {questions} {maps} apart{some}"
 
 
 def depending(differing: Mapping[Matter, Sequence[int]]) -> str:
@@ -286,7 +286,8 @@ def depending(differing: Mapping[Matter, Sequence[int]]) -> str:
         if sort != "courses" or not set(steps) <= set(differing.get("paths", ()))
     }
     return "; ".join(
-        f"the {NOUNS[sort][len(steps) > 1]} of {told_steps(steps)}" for sort, steps in shown.items()
+        f"the {NOUNS[sort][len(steps) > 1]} of {steps_in_words(steps)}"
+        for sort, steps in shown.items()
     )
 
 
@@ -296,7 +297,7 @@ def _numbered(numbers: Sequence[int], count: int) -> str:
     )
 
 
-def told_steps(steps: Sequence[int]) -> str:
+def steps_in_words(steps: Sequence[int]) -> str:
     """Write step numbers in words, such as "step 40" or "steps 12–15 and 40"."""
     return f"{'step' if len(steps) == 1 else 'steps'} {stretches(steps)}"
 

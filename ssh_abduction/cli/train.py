@@ -265,7 +265,7 @@ def run_tell_apart(options: argparse.Namespace) -> int:
         )
     found = {p: telling_features(images, labels, *p) for p in pairs}
     if options.json:
-        told = [
+        records = [
             {
                 "dstates": p,
                 "recognised": f.recognised,
@@ -273,7 +273,7 @@ def run_tell_apart(options: argparse.Namespace) -> int:
             }
             for p, f in found.items()
         ]
-        print(json.dumps(told))
+        print(json.dumps(records))
     else:
         rows = [
             [

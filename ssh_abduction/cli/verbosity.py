@@ -20,16 +20,16 @@ LEVELS = {1: logging.INFO, 2: logging.DEBUG}
 
 def add_verbosity(parser: argparse.ArgumentParser) -> None:
     """Add -q and -v to a parser, so that they may come before or behind the verb."""
-    told = parser.add_argument_group("messages").add_mutually_exclusive_group()
+    group = parser.add_argument_group("messages").add_mutually_exclusive_group()
     none = argparse.SUPPRESS  # a default of the verb would overwrite a flag before the verb
-    told.add_argument(
+    group.add_argument(
         "-q",
         "--quiet",
         action="store_true",
         default=none,
         help="print only errors on stderr, no warnings and no progress",
     )
-    told.add_argument(
+    group.add_argument(
         "-v",
         "--verbose",
         action="count",
@@ -55,7 +55,7 @@ def telling(options: argparse.Namespace, for_programs: bool) -> Iterator[None]:
         ):
             yield
     elif verbose:
-        with _handled(logging.getLogger(PACKAGE), _Told(), LEVELS[min(verbose, 2)]):
+        with _handled(logging.getLogger(PACKAGE), _StderrHandler(), LEVELS[min(verbose, 2)]):
             yield
     elif sys.stderr.isatty() or (for_programs and _is_one_file()):
         yield
@@ -84,7 +84,7 @@ def _is_one_file() -> bool:
     return False
 
 
-class _Told(logging.Handler):
+class _StderrHandler(logging.Handler):
     """A log handler that prints each record with its module and the seconds since the start."""
 
     def __init__(self) -> None:

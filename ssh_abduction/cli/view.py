@@ -149,12 +149,14 @@ def _assuming(listing: Listing, trace: Trace, theory: Theory) -> dict[str, Any]:
     except AbductionError:  # the theory of the file does not suit this trace
         known = {}
     texts = list(
-        dict.fromkeys(text for told in known.values() for text in (told["same"], told["different"]))
+        dict.fromkeys(
+            text for costs in known.values() for text in (costs["same"], costs["different"])
+        )
     )
     number = {text: k for k, text in enumerate(texts)}
     pairs = {
-        f"{i},{j}": [number[told["same"]], number[told["different"]]]
-        for (i, j), told in known.items()
+        f"{i},{j}": [number[costs["same"]], number[costs["different"]]]
+        for (i, j), costs in known.items()
     }
     return {"texts": texts, "pairs": pairs}
 
@@ -199,23 +201,23 @@ def _with_beliefs(followed: Trace, file: str, data: Any) -> Run:
     from ssh_abduction.data.maps import maps_of
     from ssh_abduction.page.replays import Run
 
-    told = read_json(file)
-    beliefs = told.get("beliefs") if isinstance(told, dict) else None
+    record = read_json(file)
+    beliefs = record.get("beliefs") if isinstance(record, dict) else None
     if not isinstance(beliefs, list) or not all(isinstance(belief, dict) for belief in beliefs):
         raise MapError(
             f"{named(file)}: beliefs: expected a list of objects, got {brief(beliefs)}; write "
             "them with localise --json"
         )
-    maps, number = maps_of(data, "maps"), told.get("map", 1)
+    maps, number = maps_of(data, "maps"), record.get("map", 1)
     if not is_whole(number) or not 1 <= number <= len(maps):
         raise MapError(
             f"{named(file)}: map: expected 1 to {len(maps)}, got {brief(number)}; localise in "
             "these maps"
         )
-    if told.get("dstates", count := len(maps[number - 1].dstates)) != count:
+    if record.get("dstates", count := len(maps[number - 1].dstates)) != count:
         raise MapError(
             f"{named(file)}: dstates: expected {count}, as map {number} has, got "
-            f"{brief(told['dstates'])}; localise in these maps, and not in others"
+            f"{brief(record['dstates'])}; localise in these maps, and not in others"
         )
     if len(beliefs) != len(followed):
         raise MapError(

@@ -125,8 +125,8 @@ def one_of(
     known = list(choices)
     if isinstance(value, str) and value in known:
         return value
-    told = " or ".join(filter(None, (", ".join(known[:-1]), known[-1])))
-    raise error(f"{name}: expected {told}, got {brief(value)}; {mend}")
+    listed = " or ".join(filter(None, (", ".join(known[:-1]), known[-1])))
+    raise error(f"{name}: expected {listed}, got {brief(value)}; {mend}")
 
 
 def an_instance(name: str, value: object, kind: type[T], error: Kind, *, mend: str) -> T:
@@ -187,12 +187,12 @@ def a_path(name: str, value: object, error: Kind) -> str:
 def _between(low: float, high: float, above: float = -math.inf) -> str:
     """Say in words which numbers are allowed."""
 
-    def told(number: float) -> str:
+    def text(number: float) -> str:
         return f"{number:,.0f}" if number == round(number) else f"{number:g}"
 
     has_low, has_high = math.isfinite(low), math.isfinite(high)
     if math.isfinite(above):
-        return f" above {told(above)}" + (f" and at most {told(high)}" if has_high else "")
+        return f" above {text(above)}" + (f" and at most {text(high)}" if has_high else "")
     if has_low:
-        return f" from {told(low)} to {told(high)}" if has_high else f", {told(low)} or more"
-    return f", {told(high)} or less" if has_high else ""
+        return f" from {text(low)} to {text(high)}" if has_high else f", {text(low)} or more"
+    return f", {text(high)} or less" if has_high else ""

@@ -63,7 +63,7 @@ class Closure:
             object.__setattr__(self, name, value)
 
     def __str__(self) -> str:
-        return told(self, self.first, self.last)
+        return match_in_words(self, self.first, self.last)
 
     @classmethod
     def of(cls, value: Any) -> Closure:
@@ -95,7 +95,7 @@ class Closure:
         }
 
 
-def told(closure: Closure, first: int, last: int) -> str:
+def match_in_words(closure: Closure, first: int, last: int) -> str:
     """Say how well the local maps of two steps match.
 
     Args:

@@ -95,8 +95,8 @@ class Passage:
     note: str | None = None
 
     def __str__(self) -> str:
-        told = ", ".join(f"{told_direction(way)} at {step}" for step, way in self.seen)
-        return f"{'open' if self.is_open else 'closed'}: {told}"
+        sights = ", ".join(f"{direction_in_words(way)} at {step}" for step, way in self.seen)
+        return f"{'open' if self.is_open else 'closed'}: {sights}"
 
 
 @dataclass(frozen=True)
@@ -202,10 +202,10 @@ class Corrections:
         other = [d for d, mark in known.items() if self.drives.get(d, mark) not in (mark, None)]
         other = [d for d in other if known[d] is not None]
         if other or (self.drives and not set(self.drives) & set(known)):
-            told = f"other steps of {other[0]}" if other else f"{', '.join(known)}"
+            found = f"other steps of {other[0]}" if other else f"{', '.join(known)}"
             raise MapError(
                 f"{where}: drives: expected the drives {', '.join(self.drives)} that it was "
-                f"written for, got {told}; it belongs to another map: name another file, or "
+                f"written for, got {found}; it belongs to another map: name another file, or "
                 "remove it"
             )
 
@@ -363,7 +363,7 @@ class Corrections:
             raise self._contradicted(said, f"the robot came to {name} through it; say it is open")
 
 
-def told_direction(way: float) -> str:
+def direction_in_words(way: float) -> str:
     """Say a direction: ahead, right, back, left, or degrees clockwise from ahead."""
     names = {degrees: name for name, degrees in DIRECTIONS.items()}
     return names.get(way, f"{way:g}")

@@ -21,7 +21,7 @@ from ssh_abduction.data.corrections import (
     Passage,
     Said,
     checked_corrections,
-    told_direction,
+    direction_in_words,
 )
 from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.errors import MapError, brief, named
@@ -138,7 +138,7 @@ def to_yaml(corrections: Corrections) -> str:
     data["gateways"] = [
         {
             ("open" if said.is_open else "closed"): {
-                step: told_direction(way) for step, way in said.seen
+                step: direction_in_words(way) for step, way in said.seen
             },
             **_note(said),
         }
@@ -172,8 +172,8 @@ def from_yaml(text: str, source: str = "corrections") -> Corrections:
         _check_keys(yaml.compose(text, Loader=yaml.BaseLoader))
         data = yaml.load(text, Loader=yaml.BaseLoader)
     except (yaml.YAMLError, RecursionError, ValueError) as error:
-        told = " ".join(str(error).split())
-        raise MapError(f"{source}: expected YAML, got {told}; mend it there") from None
+        reason = " ".join(str(error).split())
+        raise MapError(f"{source}: expected YAML, got {reason}; mend it there") from None
     return _Reader(source).corrections(data)
 
 
@@ -205,8 +205,8 @@ class _Reader:
         if record.get("format") != FORMAT:
             raise self._wrong("format", f'"{FORMAT}"', record.get("format"))
         if record.get("version") != str(VERSION):
-            told = f"{VERSION} (another one is of another ssh-abduction)"
-            raise self._wrong("version", told, record.get("version"))
+            expected = f"{VERSION} (another one is of another ssh-abduction)"
+            raise self._wrong("version", expected, record.get("version"))
         drives = self._object(record.get("drives") or {}, "drives")
         return Corrections(
             {name: self._text(mark, f"drives.{name}") for name, mark in drives.items()},
@@ -280,8 +280,8 @@ class _Reader:
         self, value: object, where: str, fields: Sequence[str] | None = None
     ) -> Mapping[str, Any]:
         if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
-            told = "fields such as name: kitchen" if fields is None else ", ".join(fields)
-            raise self._wrong(where, told, value)
+            expected = "fields such as name: kitchen" if fields is None else ", ".join(fields)
+            raise self._wrong(where, expected, value)
         if fields is not None and (unknown := set(value) - set(fields)):
             raise self._wrong(where, f"only {', '.join(fields)}", min(unknown))
         return value

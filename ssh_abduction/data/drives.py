@@ -224,8 +224,8 @@ def sentence_of(drives: Sequence[Drive], ssh_map: SSHMap) -> str:
         return ""
     if len(groups) == 1:
         return f"the map joins all {len(drives)} drives: {', '.join(groups[0])}"
-    told = "; ".join(", ".join(names) + (" alone" if len(names) == 1 else "") for names in groups)
-    return f"the map is in {len(groups)} pieces that share no place: {told}"
+    pieces = "; ".join(", ".join(names) + (" alone" if len(names) == 1 else "") for names in groups)
+    return f"the map is in {len(groups)} pieces that share no place: {pieces}"
 
 
 def together(traces: Iterable[Trace], names: Iterable[str] | None = None) -> Trace:
@@ -251,7 +251,7 @@ def together(traces: Iterable[Trace], names: Iterable[str] | None = None) -> Tra
         raise TraceError("traces: expected at least one trace, got none; give the traces to join")
     called = _names(parts, names)
     _check_alike(parts, called)
-    if len({told for trace in parts if (told := _odometry(trace))}) > 1:
+    if len({model for trace in parts if (model := _odometry(trace))}) > 1:
         parts = tuple(map(_with_covariances, parts))
     drives = [trace.steps[d.first : d.stop] for trace in parts for d in drives_of(trace)]
     if len(drives) == 1:
@@ -355,10 +355,10 @@ def _warn_of_other_names(traces: Sequence[Trace]) -> None:
         for alike, names in named.items():
             first, others = known.setdefault(alike, (i, names))
             if not names & others:
-                told = " and ".join(brief(min(some)) for some in (others, names))
+                pair = " and ".join(brief(min(some)) for some in (others, names))
                 warnings.warn(
                     f"action: traces {first + 1} and {i + 1}{_names_of(traces, first, i)} have "
-                    f"different names for one kind of action: {told}; give both one name if they "
+                    f"different names for one kind of action: {pair}; give both one name if they "
                     "are one action",
                     stacklevel=3,
                 )
@@ -391,12 +391,12 @@ def _travels(trace: Trace) -> list[float]:
 def _check_alike(traces: Sequence[Trace], names: Sequence[str]) -> None:
     """Raise TraceError if two traces differ in what they record."""
     for what, read, mend in _RECORDED:
-        told = [read(trace) for trace in traces]
-        known = next((i for i, here in enumerate(told) if here is not None), 0)
-        for i, here in enumerate(told):
-            if here is not None and here != told[known]:
+        values = [read(trace) for trace in traces]
+        known = next((i for i, here in enumerate(values) if here is not None), 0)
+        for i, here in enumerate(values):
+            if here is not None and here != values[known]:
                 raise TraceError(
-                    f"{what}: expected the same in all traces, got {told[known]} in trace "
+                    f"{what}: expected the same in all traces, got {values[known]} in trace "
                     f"{known + 1} and {here} in trace {i + 1}{_names_of(traces, known, i)}; {mend}"
                 )
     actions: dict[str, tuple[int, Action]] = {}
@@ -427,10 +427,10 @@ def _displacements(trace: Trace) -> str | None:
 
 def _systematic(trace: Trace) -> dict[str, float] | None:
     """The odometry's errors of scale, drift and dstates, by name; None without displacements."""
-    told = _odometry(trace)
-    if told is None:
+    model = _odometry(trace)
+    if model is None:
         return None
-    return {name: getattr(told, name) for name in ("scale", "bend", "offset", "facing")}
+    return {name: getattr(model, name) for name in ("scale", "bend", "offset", "facing")}
 
 
 def _odometry(trace: Trace) -> Odometry | None:

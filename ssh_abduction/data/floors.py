@@ -36,8 +36,8 @@ def floors_in_words(ssh_map: SSHMap) -> str:
     at = [{ssh_map.dstates[s].place for s in floor} - {None} for floor in floors]
     what = "places" if ssh_map.places else "dstates"
     sizes = map(len, at if ssh_map.places else floors)
-    told = ", ".join(f"floor {i} with {counted(size, what)}" for i, size in enumerate(sizes))
-    return f"the map has {counted(len(floors), 'floors')}: {told}" if floors else ""
+    listed = ", ".join(f"floor {i} with {counted(size, what)}" for i, size in enumerate(sizes))
+    return f"the map has {counted(len(floors), 'floors')}: {listed}" if floors else ""
 
 
 def with_floors(ssh_map: SSHMap, trace: Trace) -> SSHMap:

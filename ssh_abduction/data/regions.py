@@ -64,15 +64,15 @@ def described(region: Region, called: Callable[[str, int], str]) -> str:
         called: Returns words for a kind ("place", "region") and a number, as `SSHMap.called`.
     """
     places = f"place{'' if len(region.places) == 1 else 's'} {listed(region.places)}"
-    told = [f"{called('region', region.id)}: {places}"]
+    parts = [f"{called('region', region.id)}: {places}"]
     if region.bounds:
-        told.append(f"right of {listed(map(course_named, region.bounds))}")
+        parts.append(f"right of {listed(map(course_named, region.bounds))}")
     if region.door is not None:
-        told.append(f"behind {called('place', region.door)}")
+        parts.append(f"behind {called('place', region.door)}")
     if region.inside:
         plural = "" if len(region.inside) == 1 else "s"
-        told.append(f"in region{plural} {listed(region.inside)}")
-    return ", ".join(told)
+        parts.append(f"in region{plural} {listed(region.inside)}")
+    return ", ".join(parts)
 
 
 def of_members(members: Mapping[Reason, Collection[int]]) -> tuple[Region, ...]:

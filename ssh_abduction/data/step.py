@@ -90,12 +90,12 @@ class Step:
             object.__setattr__(self, "covariance", noise)
 
     def __repr__(self) -> str:
-        told = that_differ(self)
+        texts = that_differ(self)
         if self.action is not None:
-            told["action"] = repr(self.action.name)
+            texts["action"] = repr(self.action.name)
         if isinstance(self.image, tuple):
-            told["image"] = f"<{counted(len(self.image), 'numbers')}>"
-        return f"Step({', '.join(f'{name}={text}' for name, text in told.items())})"
+            texts["image"] = f"<{counted(len(self.image), 'numbers')}>"
+        return f"Step({', '.join(f'{name}={text}' for name, text in texts.items())})"
 
     @staticmethod
     def of(

@@ -22,12 +22,12 @@ def that_differ(value: Any) -> dict[str, str]:
 
     The result is a dict from names of fields to short reprs.
     """
-    told = {}
+    texts = {}
     for field in fields(value):
         usual = field.default_factory() if field.default_factory is not MISSING else field.default
         if field.repr and (here := getattr(value, field.name)) != usual:
-            told[field.name] = brief(here)
-    return told
+            texts[field.name] = brief(here)
+    return texts
 
 
 def shortly(value: Any) -> str:

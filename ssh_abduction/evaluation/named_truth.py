@@ -165,7 +165,9 @@ def evaluate(maps: Iterable[SSHMap], trace: Trace) -> Evaluation:
             _evaluated(checked_map(ssh_map, f"maps[{i}]", trace), truth)
             for i, ssh_map in enumerate(maps)
         ),
-        steps=sum(any(told) for told in zip(truth.dstates, truth.places, truth.paths, strict=True)),
+        steps=sum(
+            any(names) for names in zip(truth.dstates, truth.places, truth.paths, strict=True)
+        ),
         true_dstates=_different(truth.dstates),
         true_places=_different(truth.places),
         true_paths=_different(truth.paths),
@@ -182,7 +184,7 @@ def tells_names(trace: Trace) -> bool:
     return any(
         name
         for t, step in enumerate(trace.steps)
-        for name in _told(step.truth, trace.at(t)).values()
+        for name in _names_in(step.truth, trace.at(t)).values()
     )
 
 
@@ -202,9 +204,9 @@ class _Truth:
 
     def __init__(self, trace: Trace) -> None:
         self.trace = trace
-        told = [_told(step.truth, trace.at(t)) for t, step in enumerate(trace.steps)]
+        names = [_names_in(step.truth, trace.at(t)) for t, step in enumerate(trace.steps)]
         self.dstates, self.places, self.paths, self.courses = (
-            [step.get(sort) for step in told] for sort in _SORTS
+            [step.get(sort) for step in names] for sort in _SORTS
         )
         if not any((*self.dstates, *self.places, *self.paths)):
             raise TraceError(
@@ -214,7 +216,7 @@ class _Truth:
             )
         # For each dstate, the first step there that names its place, path or course.
         first: dict[tuple[Hashable, str], tuple[int, Hashable]] = {}
-        for t, step in enumerate(told):
+        for t, step in enumerate(names):
             dstate = step.get("dstate")
             for sort in ("place", "path", "course"):
                 name = step.get(sort)
@@ -242,7 +244,7 @@ class _Truth:
 _SORTS = ("dstate", "place", "path", "course")
 
 
-def _told(value: Any, where: str) -> dict[str, Hashable]:
+def _names_in(value: Any, where: str) -> dict[str, Hashable]:
     """Read the true names of a step.
 
     Names are converted to JSON texts, so that lists and objects can also be names.
@@ -268,15 +270,15 @@ def _told(value: Any, where: str) -> dict[str, Hashable]:
 
     if not isinstance(value, Mapping):
         return {} if value is None else {"dstate": name(value)}
-    told: dict[str, Hashable] = {
+    names: dict[str, Hashable] = {
         sort: name(value.get(sort)) for sort in ("dstate", "place", "path")
     }
     heading, direction = name(value.get("heading")), name(value.get("direction"))
-    if told["dstate"] is None and None not in (told["place"], heading):
-        told["dstate"] = told["place"], heading  # a distinctive state is a position and a heading
-    if None not in (told["path"], direction):
-        told["course"] = told["path"], direction
-    return told
+    if names["dstate"] is None and None not in (names["place"], heading):
+        names["dstate"] = names["place"], heading  # a distinctive state is a position and a heading
+    if None not in (names["path"], direction):
+        names["course"] = names["path"], direction
+    return names
 
 
 def _hops(names: Sequence[Hashable]) -> list[int]:

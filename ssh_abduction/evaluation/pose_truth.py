@@ -257,10 +257,10 @@ def told_poses(trace: Trace) -> list[Pose | None]:
     Raises:
         TraceError: A pose is malformed.
     """
-    told = [
+    values = [
         step.truth.get("pose") if isinstance(step.truth, Mapping) else None for step in trace.steps
     ]
-    return [_pose(value, f"{trace.at(t)}: truth.pose") for t, value in enumerate(told)]
+    return [_pose(value, f"{trace.at(t)}: truth.pose") for t, value in enumerate(values)]
 
 
 def _pose(value: Any, where: str) -> Pose | None:
@@ -283,15 +283,15 @@ class _Poses:
     """The truth by the poses of a trace.
 
     Attributes:
-        told: For each step, whether its pose is known, (n,).
+        known: For each step, whether its pose is known, (n,).
     """
 
     name = "poses"
 
     def __init__(self, trace: Trace) -> None:
         poses = told_poses(trace)
-        self.told = np.array([pose is not None for pose in poses])
-        if not self.told.any():
+        self.known = np.array([pose is not None for pose in poses])
+        if not self.known.any():
             raise TraceError(
                 f"{named(trace.source or 'trace')}: truth.pose: expected the true pose of some "
                 'step, got none; write "truth": {"pose": [x, y, heading]} on the steps, '
@@ -314,7 +314,7 @@ class _Related:
     """The truth by relations, at the times of the steps of a trace.
 
     Attributes:
-        told: For each step, whether its time is near related times, (n,).
+        known: For each step, whether its time is near related times, (n,).
     """
 
     name = "relations"
@@ -327,8 +327,8 @@ class _Related:
         self._seen = [
             checked_pose(step.extra.get("seen"), trace.at(t)) for t, step in enumerate(trace.steps)
         ]
-        self.told = np.array([relations.covers(time) for time in self._times])
-        if not self.told.any():
+        self.known = np.array([relations.covers(time) for time in self._times])
+        if not self.known.any():
             began, ended = relations.times[0], relations.times[-1]
             raise TraceError(
                 f"{named(trace.source or 'trace')}: time: expected steps at times that are "
@@ -377,7 +377,7 @@ def _verdicts(
     steps = np.arange(len(visit))
     # A visit has the pose of the first of its steps whose pose is known.
     at = np.array(
-        [min(steps[visit == v], key=lambda t: not truth.told[t]) for v in range(visit[-1] + 1)]
+        [min(steps[visit == v], key=lambda t: not truth.known[t]) for v in range(visit[-1] + 1)]
     )
     places = np.full((len(at), len(at)), UNKNOWN, np.uint8)
     dstates = np.full((len(visit), len(visit)), UNKNOWN, np.uint8)
@@ -390,7 +390,7 @@ def _verdicts(
         places[v, v + 1 :][left & (places[v, v + 1 :] == STAYED)] = RETURN
         later = visit > v
         for step in steps[visit == v]:
-            distance, heading, doubt = (told[later] for told in truth.seen_from(step))
+            distance, heading, doubt = (values[later] for values in truth.seen_from(step))
             far, unknown = distance > near, ~(np.abs(distance - near) >= doubt)
             returned = np.where(
                 left[visit[later] - v - 1], np.where(heading <= turned, RETURN, APART), STAYED
@@ -406,8 +406,8 @@ def _pairs(verdicts: Verdicts, visit: Steps) -> Pairs:
         verdicts: The verdict on each pair, (n, n).
         visit: The visit of each row, (n,).
     """
-    told = Counter(verdicts[visit[:, None] < visit].tolist())
-    return Pairs(told[APART] + told[RETURN], told[RETURN], told[STAYED], told[UNKNOWN])
+    counts = Counter(verdicts[visit[:, None] < visit].tolist())
+    return Pairs(counts[APART] + counts[RETURN], counts[RETURN], counts[STAYED], counts[UNKNOWN])
 
 
 def _evaluated(ssh_map: SSHMap, visit: Steps, places: Verdicts, dstates: Verdicts) -> MapVisits:

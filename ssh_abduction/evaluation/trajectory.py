@@ -168,12 +168,12 @@ class Trajectory:
             checked_time(step.extra.get("time"), trace.at(t)) for t, step in enumerate(trace.steps)
         ]
         robots = [self.at(time) for time in times]
-        told = sum(robot is not None for robot in robots)
-        if not told:
+        placed = sum(robot is not None for robot in robots)
+        if not placed:
             raise TraceError(self._no_match(trace, [time for time in times if time is not None]))
-        if told < len(times):
+        if placed < len(times):
             warnings.warn(
-                f"{named(self.source)}: {len(times) - told} of {len(times)} steps have no pose "
+                f"{named(self.source)}: {len(times) - placed} of {len(times)} steps have no pose "
                 f"within {NEAREST:g} s of their time, and no truth: "
                 "expected poses for the whole log",
                 TrajectoryWarning,
@@ -265,14 +265,14 @@ def checked_pose(value: Any, where: str) -> Pose:
 
 def _truth(step: Step, pose: Pose | None) -> Any:
     """Return the truth of a step with its pose replaced; None if nothing is left."""
-    told: dict[str, Any] = {}
+    truth: dict[str, Any] = {}
     if isinstance(step.truth, Mapping):
-        told = {name: value for name, value in step.truth.items() if name != "pose"}
+        truth = {name: value for name, value in step.truth.items() if name != "pose"}
     elif step.truth is not None:
-        told = {"dstate": step.truth}
+        truth = {"dstate": step.truth}
     if pose is not None:
-        told["pose"] = list(pose)
-    return told or None
+        truth["pose"] = list(pose)
+    return truth or None
 
 
 def _is_number(field: str) -> bool:

@@ -132,7 +132,7 @@ class Argument:
     def derivation(self) -> Derivation:
         """Find the argument and put it into words."""
         self._draw_all()
-        inferences, summary = self._told()
+        inferences, summary = self._written()
         first, second = (self._piece.steps[k] for k in self._pair)
         supposed = any(inference.supposed for inference in inferences)
         supposition = (
@@ -227,7 +227,7 @@ class Argument:
 
     # Which conclusions the argument needs
 
-    def _told(self) -> tuple[tuple[Inference, ...], str]:
+    def _written(self) -> tuple[tuple[Inference, ...], str]:
         """Put the lines that are needed into words, each after its premises.
 
         Returns:
@@ -272,7 +272,7 @@ class Argument:
             else:
                 lines.append(([conclusion], before, links[conclusion]))
             numbers[conclusion] = len(lines) - 1
-        inferences = tuple(self._inference(*told) for told in lines)
+        inferences = tuple(self._inference(*line) for line in lines)
         return inferences, self._summary(goal, premises, links)
 
     def _line_of(self, conclusion: clingo.Symbol | None) -> _Line:
@@ -386,7 +386,7 @@ class Argument:
             conclusion = goal
         # these conclusions about the pair only repeat the supposition
         obvious = (self._pair, ("one_place", "one_dstate", "two_dstates"))
-        told = [
+        clauses = [
             self._words.of(facts.read_conclusion(p), would=self._lines[self._born[p]].supposed)
             for p in sorted(
                 premises[conclusion],
@@ -402,7 +402,7 @@ class Argument:
             self._words.reason(axiom, t, said, self._pair, short=True)
             for axiom, t in links[conclusion]
         ]
-        return that_path("; ".join(dict.fromkeys([*told, *reasons])))
+        return that_path("; ".join(dict.fromkeys([*clauses, *reasons])))
 
     # Is each link needed?
 

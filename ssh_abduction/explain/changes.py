@@ -16,7 +16,9 @@ def changes_at(ssh_map: SSHMap, places: Collection[int | None]) -> tuple[Fault, 
     return tuple(f for f in ssh_map.faults if f.kind == "changed" and f.place in places)
 
 
-def told(changes: Collection[Fault], cost: Cost, nats: float | None, without: Search) -> list[str]:
+def changes_in_words(
+    changes: Collection[Fault], cost: Cost, nats: float | None, without: Search
+) -> list[str]:
     """Say what changed, and what a map costs without changes.
 
     Args:

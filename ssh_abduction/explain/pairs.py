@@ -20,7 +20,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from ssh_abduction.data.checks import a_count_of_maps
-from ssh_abduction.data.closure import told
+from ssh_abduction.data.closure import match_in_words
 from ssh_abduction.data.drives import drives_of, named_steps
 from ssh_abduction.data.errors import SolverError
 from ssh_abduction.data.maps import SSHMap
@@ -165,7 +165,7 @@ class PairQuestion(Question[PairExplanation]):
         loop = f"the loop of {closing.way:.0f} m closes {closing.size:.1f} m off"
         pair = self.first, self.second
         match = next((c for c in self.trace.closures if (c.first, c.last) == pair), None)
-        return loop if match is None else f"{loop}, and {told(match, *pair)}"
+        return loop if match is None else f"{loop}, and {match_in_words(match, *pair)}"
 
     def _verdict(self) -> Verdict:
         """Return the verdict, by what is known about both sides so far."""
@@ -228,7 +228,7 @@ class PairQuestion(Question[PairExplanation]):
         if self._best:
             ssh_map, cost, nats = self._best
             places = [ssh_map.place_of(step) for step in (self.first, self.second)]
-            self._changes = self._told_changes(ssh_map, places, cost, nats)
+            self._changes = self._changes_in_words(ssh_map, places, cost, nats)
 
     # Few steps around the pair
 

@@ -90,16 +90,16 @@ def _said_across(problem: Problem, number: Mapping[int, int]) -> str:
     if displacement is None:
         return ""
     pairs = displacement.pairs(problem.trace)
-    told = []
+    rules = []
     for name, earlier in (
         ("excluded", pairs.apart),
         ("elsewhere", pairs.elsewhere if problem.theory.level == "topological" else {}),
     ):
-        told += [
+        rules += [
             f"{name}({displacement.axiom},{number[i]},{number[t]})."
             for t, others in earlier.items()
             if t in number
             for i in others
             if i in number
         ]
-    return "\n".join(told)
+    return "\n".join(rules)

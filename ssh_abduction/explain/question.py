@@ -10,7 +10,7 @@ from typing import Generic, TypeVar
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.axioms import Interrupted
-from ssh_abduction.explain.changes import changes_at, told
+from ssh_abduction.explain.changes import changes_at, changes_in_words
 from ssh_abduction.solver import (
     Cost,
     LimitError,
@@ -118,8 +118,12 @@ class Question(ABC, Generic[_Answer]):
         )
         return search
 
-    def _told_changes(
-        self, ssh_map: SSHMap, places: Collection[int | None], cost: Cost | None, nats: float | None
+    def _changes_in_words(
+        self,
+        ssh_map: SSHMap,
+        places: Collection[int | None],
+        cost: Cost | None,
+        nats: float | None,
     ) -> tuple[str, ...]:
         """Say which gateways at some places changed between drives, and what that costs.
 
@@ -133,7 +137,7 @@ class Question(ABC, Generic[_Answer]):
         for _ in search:
             pass
         self._ended(search)
-        return (*told(changes, cost, nats, search),)
+        return (*changes_in_words(changes, cost, nats, search),)
 
     def _ended(self, search: Search) -> None:
         """Store in `stopped` why a search ended early, if a limit of this question was reached."""

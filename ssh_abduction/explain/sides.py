@@ -124,15 +124,15 @@ class PlaceExplanation:
         if not self.maps:
             why = "the trace has no map" if self.possible is False else "no map was found in time"
             return (f"{why}, so nothing is known about place {self.place}",)
-        told = []
+        sentences = []
         for side in self.sides:
             few = side.agree < self.maps
             also = f"; this holds in {side.agree} of {self.maps} minimal maps" if few else ""
-            told.append(f"{side.sentence}{also}")
-        told += self.regions
-        if not told:
-            told = [f"place {self.place} lies on no known side of a path, and in no region"]
-        return (*told, *self.changes)
+            sentences.append(f"{side.sentence}{also}")
+        sentences += self.regions
+        if not sentences:
+            sentences = [f"place {self.place} lies on no known side of a path, and in no region"]
+        return (*sentences, *self.changes)
 
     def __str__(self) -> str:
         return "\n".join(self.sentences)
@@ -181,11 +181,11 @@ class PlaceQuestion(Question[PlaceExplanation]):
         self._possible = bool(maps) or (None if search.stopped else False)
         if maps and self._path is None:
             found = maps[0], [self._place], search.cost, search.nats
-            self._changes = self._told_changes(*found)
+            self._changes = self._changes_in_words(*found)
 
     def known(self, why: Stop | None = None) -> PlaceExplanation:
         """Return what is known so far. Raises MapError if the map has no such place or path."""
-        sides, regions = self._told() if self._maps else ((), ())
+        sides, regions = self._sides_and_regions() if self._maps else ((), ())
         return PlaceExplanation(
             self._place,
             sides,
@@ -196,7 +196,7 @@ class PlaceQuestion(Question[PlaceExplanation]):
             why or self.stopped,
         )
 
-    def _told(self) -> tuple[tuple[PathSide, ...], tuple[str, ...]]:
+    def _sides_and_regions(self) -> tuple[tuple[PathSide, ...], tuple[str, ...]]:
         """Find the sides and the regions of the place. Raises MapError, as `known`."""
         first = self._maps[0]
         paths = [h.id for h in first.paths]
@@ -240,8 +240,8 @@ def _path_side(readings: list[Reading], place: int, path: int) -> PathSide:
             continue
         course = facing.path, facing.direction * (along[1] or 1)
         agree += _side_of(m, there, course)[0] == side
-    told = _sentence(place, path, side, branch)
-    return PathSide(path, side, branch.turn.steps if branch else (), told, agree)
+    sentence = _sentence(place, path, side, branch)
+    return PathSide(path, side, branch.turn.steps if branch else (), sentence, agree)
 
 
 def _side_of(m: Reading, place: int, course: Course) -> tuple[_Side, Branch | None]:
@@ -275,11 +275,11 @@ def _sentence(place: int, path: int, side: _Side, branch: Branch | None) -> str:
         for s in (source, target)
         if s.path is not None and s.direction is not None
     ]
-    told = (
+    reason = (
         f"step {turn.step} turned {turn.action.turn} from {onto[0]} onto {onto[1]} "
         f"at place {branch.place}"
     )
     ahead = course_named(branch.branch)
     leaves = "" if ahead == onto[1] else f", so {ahead} leaves {name} on the {side} there"
     where = f"place {place} lies {side} of {name}"
-    return f"{where}: {told}{leaves}, and place {place} is ahead on {ahead}"
+    return f"{where}: {reason}{leaves}, and place {place} is ahead on {ahead}"

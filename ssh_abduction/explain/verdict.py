@@ -205,25 +205,25 @@ class PairExplanation:
             key=lambda side: side.dearness(self.theory) or (),
             default=None,
         )
-        told = {}
+        costs = {}
         for name, side in sides.items():
             other = self.different if side is self.same else self.same
             if side.possible is False:
-                told[name] = "no map satisfies the axioms"
+                costs[name] = "no map satisfies the axioms"
             elif other.possible is False:
-                told[name] = "costs nothing, as it holds in every map"
+                costs[name] = "costs nothing, as it holds in every map"
             elif side.cost is None or best is None or best.cost is None:
-                told[name] = "its cost is unknown"
+                costs[name] = "its cost is unknown"
             elif side.nats is not None and best.nats is not None and side is not best:
                 known = "" if side.proven else "at most "
-                told[name] = f"costs {known}{side.nats - best.nats:.1f} nats more"
+                costs[name] = f"costs {known}{side.nats - best.nats:.1f} nats more"
             elif side is best or side.dearness(self.theory) == best.dearness(self.theory):
                 known = "costs nothing" if side.proven else "no map is known that costs less"
-                told[name] = f"{known}: {_in_words(side.cost, self.theory.priorities)}"
+                costs[name] = f"{known}: {_in_words(side.cost, self.theory.priorities)}"
             else:
                 known = "" if side.proven else "at most, "
-                told[name] = f"{known}{_difference(side.cost, best.cost, self.theory)}"
-        return told
+                costs[name] = f"{known}{_difference(side.cost, best.cost, self.theory)}"
+        return costs
 
     def __str__(self) -> str:
         lines = list(self.sentences)

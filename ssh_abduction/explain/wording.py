@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 
 import clingo
 
-from ssh_abduction.data.closure import told
+from ssh_abduction.data.closure import match_in_words
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.no_map import why_apart
 from ssh_abduction.explain.piece import Piece
@@ -152,7 +152,7 @@ class Words:
         if axiom == "closure":
             ends = steps[i], steps[j]
             found = [c for c in self._trace.closures if (c.first, c.last) == ends]
-            return "; ".join([sentence, *(told(match, *ends) for match in found)])
+            return "; ".join([sentence, *(match_in_words(match, *ends) for match in found)])
         if axiom == "one_pose" and (
             apart := why_apart(
                 self._trace,

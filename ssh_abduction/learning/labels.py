@@ -85,9 +85,9 @@ def labels_of(
         )
     elif not agreed.all() or not complete:
         one = len(maps) == 1
-        told = f"{'' if complete else 'at least '}{len(maps)} minimal map{'' if one else 's'}"
+        number = f"{'' if complete else 'at least '}{len(maps)} minimal map{'' if one else 's'}"
         warnings.warn(
-            f"{told} remain{'s' if one else ''}, and agree on {agreed.sum()} of {len(agreed)} "
+            f"{number} remain{'s' if one else ''}, and agree on {agreed.sum()} of {len(agreed)} "
             "labels: only these are learnt from; choose a map, or explore more",
             AmbiguousMapWarning,
             stacklevel=2,

@@ -1,7 +1,7 @@
 """Mend maps of a growing trace, at once or in another process.
 
 To *mend* a map that later steps contradict, keep as many of its dstates (distinctive states: a
-place and a direction) as possible, and add new dstates for what does not fit. The result satisfies
+place and a heading) as possible, and add new dstates for what does not fit. The result satisfies
 the axioms of the theory (`solver/engines/framed.py`), but need not be minimal. This needs a theory
 that numbers the directions at each place (a frame).
 """

@@ -27,7 +27,7 @@ AKIN = 0.5
 # before it was lost.
 AS_SURE = 0.1
 # Smaller probabilities are left out of JSON, as nearly all of 10,000 dstates have about 0.
-LEAST_TOLD = 0.001
+LEAST_LISTED = 0.001
 # Keeps logarithms finite.
 TINY = np.finfo(float).tiny
 
@@ -192,7 +192,7 @@ class Belief:
             "normaliser": _rounded(self.normaliser),
             "collapsed": self.collapsed,
             "lost": self.lost,
-            "probabilities": [[s, _rounded(p)] for s, p in self.above(LEAST_TOLD)],
+            "probabilities": [[s, _rounded(p)] for s, p in self.above(LEAST_LISTED)],
         }
 
 

@@ -41,9 +41,9 @@ class Leg:
     starts: Literal["right", "left"] | None = None
 
     def __str__(self) -> str:
-        return self.told(numbered)
+        return self.in_words(numbered)
 
-    def told(self, called: Callable[[str, int], str]) -> str:
+    def in_words(self, called: Callable[[str, int], str]) -> str:
         """Say what to do.
 
         Args:

@@ -1,6 +1,6 @@
 """Maps of a growing trace that satisfy the axioms, for when finding a minimal map takes too long.
 
-A dstate (distinctive state) is a place and a direction. A *sketch* (`solver/guesses/tree.py`) is
+A dstate (distinctive state) is a place and a heading. A *sketch* (`solver/guesses/tree.py`) is
 made without a search: a step gets a new dstate unless the axioms imply at which known dstate it is.
 A *draft* is a sketch that begins with a good map of the first steps. A sketch that begins at the
 first step is mostly larger than a draft. It is used if there is no draft.

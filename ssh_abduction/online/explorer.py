@@ -143,9 +143,9 @@ class Exploration:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as plain data."""
-        told = {name: getattr(self, name) for name in ("steps", "ending", "is_unique", "is_true")}
-        told["rival"] = self.rival.to_dict() if self.rival else None
-        return {**told, "summary": self.sentence, "solution": self.solution.to_dict()}
+        record = {name: getattr(self, name) for name in ("steps", "ending", "is_unique", "is_true")}
+        record["rival"] = self.rival.to_dict() if self.rival else None
+        return {**record, "summary": self.sentence, "solution": self.solution.to_dict()}
 
 
 class Explorer:
@@ -395,7 +395,7 @@ class Explorer:
             The actions; empty if no doubt is left that the robot can test.
         """
         trace, theory, dstates = self.mapper.trace, self.mapper.theory, len(best.dstates)
-        for doubt in self._doubts.open(best, trace):
+        for doubt in self._doubts.in_doubt(best, trace):
             rival = self._doubts.rival(doubt, trace, theory, dstates)
             if rival is None:
                 continue

@@ -1,7 +1,7 @@
 """Rival explanations of a growing trace with faults, and the probability of each.
 
 A *rival* is a map of all steps so far, with its *faults*: the steps that it treats as wrong. A
-dstate (distinctive state) is a place and a direction. When a new step comes, a rival that predicts
+dstate (distinctive state) is a place and a heading. When a new step comes, a rival that predicts
 it is extended in one way. Any other rival is extended in each of these ways:
 
     contradicted  The observation is misread, and the robot is where the link leads. Or the action

@@ -16,7 +16,7 @@ from ssh_abduction.output.layout import located
 if TYPE_CHECKING:
     from ssh_abduction.data.maps import Pose
 
-# The number of a dstate (distinctive state: a place and a direction). Or a course (place, path,
+# The number of a dstate (distinctive state: a place and a heading). Or a course (place, path,
 # direction) that no dstate of the map faces.
 Node: TypeAlias = "int | tuple[int, int, int]"
 # Costs of moves in a route by places. Among routes with equally many travels, the one with fewer

@@ -2,7 +2,7 @@
 
 A fault is a step that a map treats as wrong: a misread view, or an action that slipped. If a step
 contradicts all minimal maps, the mapper keeps several explanations with probabilities, until later
-steps decide which map is right. A dstate (distinctive state) is a place and a direction.
+steps decide which map is right. A dstate (distinctive state) is a place and a heading.
 
 >>> from ssh_abduction import OnlineMapper, Theory
 >>> mapper = OnlineMapper("v0", Theory.causal().replace(misread=1.5, slipped=3), time_limit=10)

@@ -14,7 +14,7 @@ from ssh_abduction.solver import solve
 from ssh_abduction.theory.theory import Theory
 
 # Two steps that the map has at one place, or by the causal theory at one dstate (distinctive
-# state: a place and a direction).
+# state: a place and a heading).
 Doubt: TypeAlias = tuple[int, int]
 
 
@@ -40,8 +40,8 @@ class ReturnDoubts:
         self._margin, self._time_limit = margin, time_limit
         self._least: dict[Doubt, int] = {}  # lower bound of the dstates of a map without the return
 
-    def open(self, ssh_map: SSHMap, trace: Trace) -> Iterator[Doubt]:
-        """Yield the returns of a map that are in doubt, the latest first: least is known of them.
+    def in_doubt(self, ssh_map: SSHMap, trace: Trace) -> Iterator[Doubt]:
+        """Yield the returns of a map that are in doubt. The latest come first.
 
         Args:
             ssh_map: A minimal map.

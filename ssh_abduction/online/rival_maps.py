@@ -164,11 +164,11 @@ class RivalMaps:
         if optimal and not any(self.is_minimal(rival) for rival in rivals):
             self.is_proven = self.is_complete = False
         # Keep the other rivals. If all minimal maps are listed, drop those that seem as cheap.
-        told = {(rival.labels, rival.faults) for rival in rivals}
+        known = {(rival.labels, rival.faults) for rival in rivals}
         others = [
             rival
             for rival in self.rivals
-            if (rival.labels, rival.faults) not in told
+            if (rival.labels, rival.faults) not in known
             and not (self.is_complete and rival.cost <= self._least)
         ]
         self.rivals = self._ranked([*rivals, *others])

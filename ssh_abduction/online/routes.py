@@ -211,8 +211,8 @@ def route(
     ssh_map = listing.maps[number]
     graph = MoveGraph(ssh_map, by)
     here, _ = graph.nodes(ssh_map.dstate_at[-1] if start is None else start, "from")
-    there, told = graph.nodes(goal, "to")
-    if told.startswith("place"):
+    there, goal_named = graph.nodes(goal, "to")
+    if goal_named.startswith("place"):
         there = graph.nodes_at_places_of(there)
     closed = _closed(graph, avoid)
     for nodes, name in ((here, "from"), (there, "to")):
@@ -232,7 +232,7 @@ def route(
             aside = graph.nodes_in(off_the_way(ssh_map, start_place, goal_place))
     way = graph.shortest(here - closed, there - closed, closed | aside)
     if way is None:
-        _raise_no_route(graph, here, there, closed, told)
+        _raise_no_route(graph, here, there, closed, goal_named)
     moves = tuple(_move(graph, a, b) for a, b in pairwise(way))
     first = way[0]
     assert isinstance(first, int)  # routes begin at dstates
@@ -241,7 +241,7 @@ def route(
         map=number + 1,
         by=by,
         start=first,
-        goal=told,
+        goal=goal_named,
         view=ssh_map.dstates[first].view,
         place=ssh_map.dstates[first].place,
         moves=moves,
@@ -257,7 +257,7 @@ def _place_of(graph: MoveGraph, nodes: AbstractSet[Node]) -> int | None:
     return places.pop() if len(places) == 1 else None
 
 
-def told_action(move: Move) -> str:
+def action_in_words(move: Move) -> str:
     """Say what to do in a move: its action or, if that is unknown, the path to turn to."""
     if move.action is not None:
         return printable(move.action)
@@ -300,19 +300,19 @@ def _raise_no_route(
     here: AbstractSet[Node],
     there: AbstractSet[Node],
     closed: AbstractSet[Node],
-    told: str,
+    named: str,
 ) -> NoReturn:
     """Raise MapError with the reason why there is no route, and what to do about it."""
     if closed and graph.shortest(here, there, set()) is not None:
         raise MapError(
-            f"avoid: expected a way round what is avoided, got none to {told}; avoid less"
+            f"avoid: expected a way round what is avoided, got none to {named}; avoid less"
         )
     mend = "drive on: next says what to try"
     if graph.by != "places" and graph.map.paths:
         mend = "take --by places, which may lead where the robot has not driven, or drive on"
     reached = counted(graph.dstates_from(here), "dstates")
     raise MapError(
-        f"to: expected one of the {reached} that known links lead to, got {told}; {mend}"
+        f"to: expected one of the {reached} that known links lead to, got {named}; {mend}"
     )
 
 

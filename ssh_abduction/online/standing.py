@@ -22,7 +22,7 @@ from ssh_abduction.theory.theory import Theory
 # A map can be certain only if it has at least this probability among its rivals.
 CERTAIN = 0.99
 # At most this many hypotheses are reported. If there are more, the last one is for all others.
-TOLD = 10
+LISTED = 10
 # Localisation begins at most this many steps before the last one.
 REPLAYED = 200
 
@@ -176,12 +176,14 @@ class Confidence:
     ) -> tuple[Hypothesis, ...]:
         """Make hypotheses of the most probable rivals, and one for all others together."""
         order = sorted(range(len(shares)), key=lambda i: -shares[i])
-        first = order if len(order) <= TOLD else order[: TOLD - 1]
-        told = [Hypothesis(shares[i], rivals[i].explained(), self._said(rivals[i])) for i in first]
+        first = order if len(order) <= LISTED else order[: LISTED - 1]
+        listed = [
+            Hypothesis(shares[i], rivals[i].explained(), self._said(rivals[i])) for i in first
+        ]
         if rest := order[len(first) :]:
             others = f"one of {len(rest)} others"
-            told.append(Hypothesis(sum(shares[i] for i in rest), None, others))
-        return tuple(told)
+            listed.append(Hypothesis(sum(shares[i] for i in rest), None, others))
+        return tuple(listed)
 
     def _said(self, rival: Rival) -> str:
         """Describe a rival: its new faults since the mapper was certain, and the robot's dstate."""

@@ -60,10 +60,10 @@ def assumptions(
         won = Side(possible=True, cost=best, proven=True)
         same, different = (won, lost) if one else (lost, won)
         verdict = Verdict.SAME_IN_MINIMAL if one else Verdict.DIFFERENT_IN_MINIMAL
-        told = PairExplanation(
+        explanation = PairExplanation(
             *pair, verdict, same, different, bool(listing.complete), None, None, None, theory
         )
-        known[pair] = told.assuming
+        known[pair] = explanation.assuming
 
     # First find the pairs for which the opposite is possible at all. All share one grounding.
     piece = Piece.of(problem, range(len(trace) if len(trace) <= UNCUT else SMALL))

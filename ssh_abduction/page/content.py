@@ -76,7 +76,7 @@ def content_of(
     # List what maps share once, and let each map refer to it by number.
     labelings, places, orders, faults = _Pool(), _Pool(), _Pool(), _Pool()
     regions = _Pool()
-    told: list[dict[str, Any]] = []
+    entries: list[dict[str, Any]] = []
     for ssh_map, name in zip(maps, found.ids, strict=True):
         one: dict[str, Any] = {
             "id": name,
@@ -97,8 +97,8 @@ def content_of(
         if ssh_map.faults:
             one["faults"] = [faults.number((fault.step, str(fault))) for fault in ssh_map.faults]
             one["cost"] = round(sum(fault.cost for fault in ssh_map.faults), 1)
-        told.append(one)
-    layouts = _layouts(maps, told, trace)
+        entries.append(one)
+    layouts = _layouts(maps, entries, trace)
     drawings = [_numbers(drawn, maps[i]) for i, drawn in layouts]
     spots = _spots(maps[0], layouts[0][1])
     return {
@@ -113,8 +113,8 @@ def content_of(
         "complete": found.complete,
         "shared": _shared(listing),
         "choices": [_choice(choice.to_dict()) for choice in found.choices],
-        "replays": replays(maps, [one["labeling"] for one in told], trace, run),
-        "maps": told,
+        "replays": replays(maps, [one["labeling"] for one in entries], trace, run),
+        "maps": entries,
         "labelings": [{"labels": labels, "views": views} for labels, views in labelings.items],
         "places": _differences(places.items),
         "orders": orders.items,
@@ -177,9 +177,9 @@ def _shared_by(pair: DrivePair) -> str:
     """Say how many places two drives share."""
     if not pair.forced and not pair.possible:
         return f"no {pair.of} in common in any map"
-    told = [f"{counted(len(pair.forced), f'{pair.of}s')} in common in all maps"]
-    told += [f"{counted(len(pair.possible), 'possible joins')}, in some maps"]
-    return "; ".join(told[not pair.forced : 1 + bool(pair.possible)])
+    parts = [f"{counted(len(pair.forced), f'{pair.of}s')} in common in all maps"]
+    parts += [f"{counted(len(pair.possible), 'possible joins')}, in some maps"]
+    return "; ".join(parts[not pair.forced : 1 + bool(pair.possible)])
 
 
 class _Pool:
@@ -219,7 +219,7 @@ def _differences(items: Sequence[Sequence[tuple[Any, Any, Any]]]) -> list[Any]:
     the first list to their numbers in this one.
     """
     first = items[0]
-    told: list[Any] = [first]
+    entries: list[Any] = [first]
     for item in items[1:]:
         called: dict[Any, Counter[Any]] = {}
         for (_, before, _), (_, now, _) in zip(first, item, strict=False):
@@ -237,19 +237,19 @@ def _differences(items: Sequence[Sequence[tuple[Any, Any, Any]]]) -> list[Any]:
         }
         if len(item) == len(first) and 2 * len(differing) < len(item):
             renamed = {str(before): now for before, now in names.items() if before != now}
-            told.append({**differing, **({"paths": renamed} if renamed else {})})
+            entries.append({**differing, **({"paths": renamed} if renamed else {})})
         else:
-            told.append(item)
-    return told
+            entries.append(item)
+    return entries
 
 
 def _layouts(
-    maps: Sequence[SSHMap], told: Sequence[dict[str, Any]], trace: Trace | None
+    maps: Sequence[SSHMap], entries: Sequence[dict[str, Any]], trace: Trace | None
 ) -> list[tuple[int, Layout]]:
     """Draw the first map and, if time and size allow, the maps with other dstates or places.
 
     Args:
-        told: The entry of each map in the content. If the map has a drawing, it gets the key
+        entries: The entry of each map in the content. If the map has a drawing, it gets the key
             `layout`: the index in the returned list.
         trace: The trace, if it is known.
 
@@ -259,7 +259,7 @@ def _layouts(
     layouts: list[tuple[int, Layout]] = []
     drawn: dict[Hashable, int] = {}
     end, room = time.process_time() + DRAWING, DRAWN
-    for i, (ssh_map, one) in enumerate(zip(maps, told, strict=True)):
+    for i, (ssh_map, one) in enumerate(zip(maps, entries, strict=True)):
         key = (one["labeling"], one["places"], one["id"] if ssh_map.fit else None)
         can = (
             time.process_time() < end

@@ -50,12 +50,12 @@ def beams_of(trace: Trace, count: int) -> tuple[float, float]:
     Raises:
         TraceError: The header is wrong.
     """
-    told = trace.extra.get("beams")
-    if told is None:
+    beams = trace.extra.get("beams")
+    if beams is None:
         usual = HALF / (count - 1) if count % 2 and count > 1 else HALF / count
         return -usual * (count - 1) / 2, usual
-    first = told.get("first") if isinstance(told, dict) else None
-    step = told.get("step") if isinstance(told, dict) else None
+    first = beams.get("first") if isinstance(beams, dict) else None
+    step = beams.get("step") if isinstance(beams, dict) else None
     if (
         not is_finite(first)
         or not is_finite(step)
@@ -65,7 +65,7 @@ def beams_of(trace: Trace, count: int) -> tuple[float, float]:
         raise TraceError(
             f'{named(trace.source or "trace")}: beams: expected {{"first": degrees, "step": '
             f"degrees}}, counterclockwise from straight ahead, with which {count} beams go round "
-            f"once at most, got {brief(told)}; mend the header, or leave it out"
+            f"once at most, got {brief(beams)}; mend the header, or leave it out"
         )
     return float(first), float(step)
 

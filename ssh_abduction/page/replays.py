@@ -88,19 +88,19 @@ def _step(step: Step, view: str) -> dict[str, Any]:
     Args:
         view: The text to show if the step has no view.
     """
-    told: dict[str, Any] = {
+    record: dict[str, Any] = {
         "view": view if step.view is None else str(step.view),
         "action": step.action.name if step.action else None,
     }
     if step.displacement is not None:
-        told["moved"] = [round(number, 3) for number in step.displacement]
+        record["moved"] = [round(number, 3) for number in step.displacement]
     if step.confidence is not None:
-        told["confidence"] = round(step.confidence, 3)
+        record["confidence"] = round(step.confidence, 3)
     if step.gateways is not None:
-        told["star"] = [
+        record["star"] = [
             [round(gateway.bearing, 1), gateway.open] for gateway in step.gateways.gateways
         ]
-    return told
+    return record
 
 
 def _steps_of_map(first: SSHMap) -> list[dict[str, Any]]:

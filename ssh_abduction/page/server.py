@@ -220,13 +220,13 @@ class _Handler(BaseHTTPRequestHandler):
             if not isinstance(data, dict):
                 raise MapError(f"expected an object, got {brief(data)}")
             with _while_there(self.connection, watch):
-                told = self.server.answer(asked, data, watch)
+                answer = self.server.answer(asked, data, watch)
         except LimitError as error:
-            told = {"error": f"no answer in time ({error.reason}); --time-limit gives more time"}
+            answer = {"error": f"no answer in time ({error.reason}); --time-limit gives more time"}
         except (AbductionError, ValueError, RecursionError) as error:
-            told = {"error": str(error)}
+            answer = {"error": str(error)}
         if not watch.interrupted:
-            self._send(HTTPStatus.OK, json.dumps(told).encode(), "application/json")
+            self._send(HTTPStatus.OK, json.dumps(answer).encode(), "application/json")
 
     def _asked(self) -> str | None:
         """The question in the path of the request; None if the request has to be rejected."""

@@ -119,12 +119,12 @@ class Others:
                 if self.count > 1
                 else "the map is the same in both"
             )
-        told = [
+        parts = [
             f"{len(self.both)} in both",
             f"{len(self.here)} only in the first",
             f"{len(self.there)} only in {printable(self.source)}",
         ]
-        return "of the maps, " + ", ".join(told[:-1]) + " and " + told[-1]
+        return "of the maps, " + ", ".join(parts[:-1]) + " and " + parts[-1]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the comparison as plain data, as `compare --json` prints it."""
@@ -188,25 +188,25 @@ class Comparison:
         """A sentence: the number of maps, what they share, and where they differ."""
         count = len(self.ids) if self.minimal is None else self.minimal
         is_partial = self.complete is False
-        told = counted(count, "maps")
+        text = counted(count, "maps")
         if self.minimal is not None:
-            told = f"{told} of least cost" if self.by_cost else counted(count, "minimal maps")
+            text = f"{text} of least cost" if self.by_cost else counted(count, "minimal maps")
         if is_partial and self.stopped == "no proof":
-            told += f", not proven to be the only one{'s' * (count != 1)}"
+            text += f", not proven to be the only one{'s' * (count != 1)}"
         elif is_partial and self.stopped:
             by = "" if self.stopped == "interrupted" else "stopped by the "
-            told = f"at least {told} (listing was {by}{self.stopped})"
+            text = f"at least {text} (listing was {by}{self.stopped})"
         elif is_partial:
-            told = f"at least {told}"
+            text = f"at least {text}"
         more = len(self.ids) - count
         if more:
-            told += f", and {more} larger ones"
+            text += f", and {more} larger ones"
         if count == 1 and not more and (not is_partial or self.minimal is None):
-            return told
-        told += f": {self._differences}"
+            return text
+        text += f": {self._differences}"
         if is_partial and not self.shared.proven:
-            told += ", as far as is known: other maps may differ in more"
-        return told
+            text += ", as far as is known: other maps may differ in more"
+        return text
 
     @property
     def _differences(self) -> str:
@@ -317,7 +317,7 @@ def compare(maps: Maps, other: Maps | None = None) -> Comparison:
         shared=shared,
         listed=listed,
         variants=_variants(table, listing.maps),
-        choices=tuple(_choice(*told) for told in zip(choices, options, of_choice, strict=True)),
+        choices=tuple(_choice(*parts) for parts in zip(choices, options, of_choice, strict=True)),
         together=together,
         deciding=tuple(asked[i].question for i in order),
         sizes=_sizes(listing.maps),
@@ -414,11 +414,11 @@ def _check_backbone(shared: Backbone, listed: Backbone, listing: Listing) -> Non
     """Raise MapError if the backbone contradicts the listed maps."""
     if shared is listed:
         return
-    for sort, told in shared.sorts.items():
+    for sort, claimed in shared.sorts.items():
         seen = listed.sorts.get(sort)
         # Steps of one dstate share a number even if they are along no path in these maps.
         in_one = listed.dstates.always if sort in ("paths", "courses") else range(listing.steps)
-        if seen is not None and (wrong := _contradiction(told, seen, in_one)):
+        if seen is not None and (wrong := _contradiction(claimed, seen, in_one)):
             first, later = wrong
             mend = "the file was changed by hand, or its maps are of another search: solve again"
             raise MapError(
@@ -427,14 +427,14 @@ def _check_backbone(shared: Backbone, listed: Backbone, listing: Listing) -> Non
             )
 
 
-def _contradiction(told: Shared, seen: Shared, in_one: Sequence[int]) -> tuple[int, int] | None:
+def _contradiction(claimed: Shared, seen: Shared, in_one: Sequence[int]) -> tuple[int, int] | None:
     """Find two steps about which the backbone is wrong.
 
     Two steps are *one* if they are at one dstate (or one place, along one path or one course,
     depending on the sort).
 
     Args:
-        told: The backbone for one sort: the steps that are one in all maps, or in some.
+        claimed: The backbone for one sort: the steps that are one in all maps, or in some.
         seen: The same, for the listed maps only.
 
     Returns:
@@ -442,17 +442,17 @@ def _contradiction(told: Shared, seen: Shared, in_one: Sequence[int]) -> tuple[i
         one in no map by the backbone, but one in a listed map. None if there are no such steps.
     """
     first_of: dict[int, int] = {}
-    for t, number in enumerate(told.always):
+    for t, number in enumerate(claimed.always):
         first = first_of.setdefault(number, t)
         if seen.always[first] != seen.always[t]:
             return first, t
-    if told.untold:
+    if claimed.untold:
         return None
-    may_be = {(told.always[i], told.always[j]) for i, j in told.sometimes}
+    may_be = {(claimed.always[i], claimed.always[j]) for i, j in claimed.sometimes}
     firsts = ((seen.always.index(number), t) for t, number in enumerate(seen.always))
     one = [*seen.sometimes, *((first, t) for first, t in firsts if in_one[first] != in_one[t])]
     for i, j in one:
-        pair = told.always[i], told.always[j]
+        pair = claimed.always[i], claimed.always[j]
         if (
             (pair[0] != pair[1] or i == j != seen.always.index(seen.always[i]))
             and pair not in may_be

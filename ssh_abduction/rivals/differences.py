@@ -38,7 +38,7 @@ SORTED_BY = {
     "courses": "directions along paths",
 }
 # At most this many changes of one sort, and at most this many links, are put into words.
-TOLD = 12
+LISTED = 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,10 +59,12 @@ class Change:
     first_none: Steps = ()
     other_none: Steps = ()
 
-    def told(self, names: tuple[str, str]) -> str:
+    def in_words(self, names: tuple[str, str]) -> str:
         """Put the change into words, with these names for the two maps."""
         sides = ((self.first, self.first_none), (self.other, self.other_none))
-        return "; ".join(f"{name} {_told(*side)}" for name, side in zip(names, sides, strict=True))
+        return "; ".join(
+            f"{name} {_groups_in_words(*side)}" for name, side in zip(names, sides, strict=True)
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the change as plain data, as `compare --diff --json` prints it."""
@@ -114,36 +116,36 @@ class Difference:
     @property
     def lines(self) -> tuple[str, ...]:
         """The difference in words, line by line; causes come before effects."""
-        told = []
+        lines = []
         counts = zip(("dstates", "places", "paths", "links"), *self.sizes, strict=True)
         if unequal := [f"{a} {name} against {b}" for name, a, b in counts if a != b]:
-            told.append(f"size: {self.names[0]} has {', '.join(unequal)} of {self.names[1]}")
+            lines.append(f"size: {self.names[0]} has {', '.join(unequal)} of {self.names[1]}")
         for name, faults in zip(self.names, self.faults, strict=True):
-            told += [f"faults: only in {name} {printable(str(fault))}" for fault in faults]
+            lines += [f"faults: only in {name} {printable(str(fault))}" for fault in faults]
         for sort, word in SORTED_BY.items():
             changes = [change for change in self.changes if change.sort == sort]
-            told += [f"{word}: {change.told(self.names)}" for change in changes[:TOLD]]
-            if len(changes) > TOLD:
-                told.append(f"{word}: {len(changes) - TOLD} more changes")
+            lines += [f"{word}: {change.in_words(self.names)}" for change in changes[:LISTED]]
+            if len(changes) > LISTED:
+                lines.append(f"{word}: {len(changes) - LISTED} more changes")
         for name, links in zip(self.names, self.links, strict=True):
             some = [
                 f"{printable(action)} from the dstate of step {s} to that of step {x}"
-                for s, action, x in links[:TOLD]
+                for s, action, x in links[:LISTED]
             ]
-            more = f", and {len(links) - TOLD} more" if len(links) > TOLD else ""
-            told += [f"links: only in {name} {', '.join(some)}{more}"] if some else []
+            more = f", and {len(links) - LISTED} more" if len(links) > LISTED else ""
+            lines += [f"links: only in {name} {', '.join(some)}{more}"] if some else []
         for name, sides in zip(self.names, self.sides, strict=True):
-            more = f", and {len(sides) - TOLD} more" if len(sides) > TOLD else ""
-            some = [*map(str, sides[:TOLD])]
-            told += [f"sides: only {name} knows that {', '.join(some)}{more}"] if some else []
+            more = f", and {len(sides) - LISTED} more" if len(sides) > LISTED else ""
+            some = [*map(str, sides[:LISTED])]
+            lines += [f"sides: only {name} knows that {', '.join(some)}{more}"] if some else []
         if any(self.has_places) and not all(self.has_places):
-            told.append(f"places and paths: only in {self.names[self.has_places.index(True)]}")
+            lines.append(f"places and paths: only in {self.names[self.has_places.index(True)]}")
         if self.chi2 and self.chi2[0] != self.chi2[1]:
-            told.append(
+            lines.append(
                 f"fit: a chi-square of {self.chi2[0]:.1f} for {self.names[0]}, {self.chi2[1]:.1f} "
                 f"for {self.names[1]}"
             )
-        return tuple(told)
+        return tuple(lines)
 
     def __str__(self) -> str:
         return "\n".join(self.lines) or "the maps are the same"
@@ -314,7 +316,7 @@ def _size(ssh_map: SSHMap) -> tuple[int, int, int, int]:
     return len(ssh_map.dstates), len(ssh_map.places), len(ssh_map.paths), len(ssh_map.links)
 
 
-def _told(groups: Sequence[Steps], none: Steps) -> str:
+def _groups_in_words(groups: Sequence[Steps], none: Steps) -> str:
     """Put into words how one map groups steps: "groups steps 0–1 | 2 and leaves out step 5"."""
     grouped = f"groups {_steps(sum(map(len, groups)))} {' | '.join(map(stretches, groups))}"
     left = f"leaves out {_steps(len(none))} {stretches(none)}"

@@ -81,8 +81,8 @@ class DrivePair:
         if self.possible:
             number = counted(len(self.possible), "possible joins")
             parts.append(f"{number}, in some {maps} ({self._named(self.possible)})")
-        told = "; ".join(parts) or f"nothing in common in any of the {maps}"
-        return f"{self.first} and {self.second}: {told}"
+        text = "; ".join(parts) or f"nothing in common in any of the {maps}"
+        return f"{self.first} and {self.second}: {text}"
 
     def _named(self, joins: Sequence[DriveJoin]) -> str:
         """Put joins into words: "monday:2 = tuesday:0". At most SHOWN of them are named."""

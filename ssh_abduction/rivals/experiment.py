@@ -115,13 +115,13 @@ class Plan:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the plan as plain data, as `next --json` prints it."""
-        told: dict[str, Any] = {"rivals": list(self.rivals)}
+        record: dict[str, Any] = {"rivals": list(self.rivals)}
         if self.branches:
-            told |= {
+            record |= {
                 "actions": list(self.actions),
                 "branches": [branch.to_dict() for branch in self.branches],
             }
-        return told | ({"untried": self.untried.to_dict()} if self.untried else {})
+        return record | ({"untried": self.untried.to_dict()} if self.untried else {})
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,20 +196,20 @@ class Experiment:
     @property
     def warning(self) -> str | None:
         """A warning if there may be more maps, or if a limit ended the search; otherwise None."""
-        told = []
+        parts = []
         if not self.complete:
             known = (
                 f"these {self.count} maps may not be all minimal ones"
                 if self.count > 1
                 else "this map may not be the only minimal one"
             )
-            told.append(f"{known}, and the experiment ignores others; list all (solve -n 0)")
+            parts.append(f"{known}, and the experiment ignores others; list all (solve -n 0)")
         if self.stopped:
-            told.append(
+            parts.append(
                 f"the search for the experiment was stopped ({self.stopped}); there may be a "
                 "better one"
             )
-        return "; ".join(told) or None
+        return "; ".join(parts) or None
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data, as `next --json` prints it (docs/reference/formats.md)."""
@@ -238,12 +238,12 @@ def _sentence(experiment: Experiment) -> str:
             if plan.worst == 1
             else f"leaves {plan.worst} of them in the worst case, as known links tell no more"
         )
-        told = f"{count} maps: after {_acts(plan.actions)} their predictions differ; this {left}"
+        text = f"{count} maps: after {_acts(plan.actions)} their predictions differ; this {left}"
         if any(branch.plan.branches for branch in plan.branches):
-            told = f"{count} maps: after {_acts(plan.actions)} their predictions differ; the whole "
-            told += f"plan takes {plan.longest} actions at most and {left}"
+            text = f"{count} maps: after {_acts(plan.actions)} their predictions differ; the whole "
+            text += f"plan takes {plan.longest} actions at most and {left}"
         is_greedy = len(experiment.alike) != 2
-        return f"{told} (another plan may be shorter or leave fewer)" if is_greedy else told
+        return f"{text} (another plan may be shorter or leave fewer)" if is_greedy else text
     if experiment.stopped:
         return f"{count} maps: no experiment was found in time"
     links = "all links" if len(experiment.alike) == 1 else "all links that all of them know"
@@ -272,6 +272,6 @@ def _acts(actions: Sequence[str]) -> str:
     return printable(", ".join(actions))
 
 
-def told_rivals(rivals: Sequence[int]) -> str:
+def rivals_in_words(rivals: Sequence[int]) -> str:
     """Put the numbers of rivals into words: "map 1", or "maps 1–3 and 7"."""
     return f"{'map' if len(rivals) == 1 else 'maps'} {stretches(rivals)}"

@@ -152,18 +152,18 @@ class Listing:
         """
         a_text("where", where, MapError)
         maps = tuple(ssh_map.renumbered() for ssh_map in maps_of(data, where))
-        told: Mapping[str, Any] = data if isinstance(data, Mapping) and "maps" in data else {}
-        for i, (record, ssh_map) in enumerate(zip(told.get("maps", [data]), maps, strict=True)):
+        answer: Mapping[str, Any] = data if isinstance(data, Mapping) and "maps" in data else {}
+        for i, (record, ssh_map) in enumerate(zip(answer.get("maps", [data]), maps, strict=True)):
             if "id" in record and record["id"] != ssh_map.id:
                 mend = "the map was changed by hand: solve again, or leave the id out"
                 raise MapError(
                     f"{where}: maps[{i}]: id: expected {ssh_map.id}, as such a map has, got "
                     f"{brief(record['id'])}; {mend}"
                 )
-        if maps and "steps" in told and told["steps"] != len(maps[0].dstate_at):
+        if maps and "steps" in answer and answer["steps"] != len(maps[0].dstate_at):
             raise MapError(
                 f"{where}: steps: expected {len(maps[0].dstate_at)}, as map 1 has, got "
-                f"{brief(told['steps'])}; solve the trace again"
+                f"{brief(answer['steps'])}; solve the trace again"
             )
         # each map is listed once
         first_with: dict[str, int] = {}
@@ -173,8 +173,8 @@ class Listing:
                     f"{where}: maps[{i}]: expected another map, got that of maps[{known}] again; "
                     "leave it out"
                 )
-        theory = theory_in(told["theory"], where) if "theory" in told else None
-        status, count = told.get("status"), told.get("count", len(maps))
+        theory = theory_in(answer["theory"], where) if "theory" in answer else None
+        status, count = answer.get("status"), answer.get("count", len(maps))
         if status is not None and status not in [known.value for known in Status]:
             raise MapError(
                 f"{where}: status: expected one of {', '.join(known.value for known in Status)}, "
@@ -186,7 +186,7 @@ class Listing:
                 "solve again"
             )
         # with levels, only maps of the first level are minimal
-        levels = told.get("levels")
+        levels = answer.get("levels")
         minimal: Any = len(maps)
         if levels is not None:
             first = levels[0] if isinstance(levels, list) and levels else None
@@ -196,32 +196,32 @@ class Listing:
                     f"{where}: levels: expected a list whose first entry counts the minimal maps, "
                     f"got {brief(levels)}; solve again"
                 )
-        complete = told.get("complete")
+        complete = answer.get("complete")
         if complete is not None and not isinstance(complete, bool):
             raise MapError(
                 f"{where}: complete: expected true or false, got {brief(complete)}; solve again"
             )
         backbone = None
-        if maps and "backbone" in told:
+        if maps and "backbone" in answer:
             backbone = Backbone.from_dict(
-                told["backbone"], len(maps[0].dstate_at), f"{where}: backbone"
+                answer["backbone"], len(maps[0].dstate_at), f"{where}: backbone"
             )
         is_optimal = status == Status.OPTIMAL.value
         listed = complete or (minimal < len(maps)) if is_optimal else complete
         read, steps = FieldReader(where), len(maps[0].dstate_at) if maps else 0
-        drives = drives_in(read, told if maps else {}, steps)
+        drives = drives_in(read, answer if maps else {}, steps)
         weighed = None
-        if maps and told.get("weighed"):
-            weighed = Weighed.from_dict(read, told["weighed"], steps, drives)
+        if maps and answer.get("weighed"):
+            weighed = Weighed.from_dict(read, answer["weighed"], steps, drives)
         listing = cls(
             tuple(with_named_faults(ssh_map, drives) for ssh_map in maps),
             minimal if is_optimal else None,
             listed,
-            told.get("stopped"),
+            answer.get("stopped"),
             backbone,
             where,
             weighed,
-            joins_in(read, told if maps else {}, steps, drives),
+            joins_in(read, answer if maps else {}, steps, drives),
             drives,
         )
         return listing.checked(one_view=theory is None or _has_one_view(theory))

@@ -279,15 +279,15 @@ class LogMapping(UnderWay):
 
     def __init__(self) -> None:
         super().__init__()
-        self.tell: Callable[[], LogMap] | None = None  # what `known` returns
+        self.latest: Callable[[], LogMap] | None = None  # what `known` returns
 
     def known(self) -> LogMap:
         """The result so far, for a program that has to end before the mapping does.
 
         Call it only after the search for maps has begun.
         """
-        assert self.tell
-        return self.tell()
+        assert self.latest
+        return self.latest()
 
 
 @renamed_parameters("limit", "maps")
@@ -354,15 +354,15 @@ def map_log(
     def outcome(solution: Solution, interrupted: bool = True) -> LogMap:
         """Make the result for the solution so far, with its names and notes."""
         ended = INTERRUPTED if interrupted else how_it_ended(solution, allowed)
-        told = (*notes, ended) if ended else notes
+        warnings = (*notes, ended) if ended else notes
         solution = solution if corrections is None else with_names(corrections, solution, trace)
         solution = solution if imported.track.is_reliable else _doubted(solution)
         return LogMap(
-            log, imported, solution, tuple(climbed), dict(seconds), allowed, told, interrupted
+            log, imported, solution, tuple(climbed), dict(seconds), allowed, warnings, interrupted
         )
 
     # 3. Maps: solve the trace.
-    mapping.tell = lambda: outcome(mapping.snapshot())
+    mapping.latest = lambda: outcome(mapping.snapshot())
     begin = time.process_time()
     solution = mapping.solve(trace, chosen, time_limit=allowed, max_maps=max_maps)
     tries = 0 if time_limit is not None else PATIENCE
@@ -370,7 +370,7 @@ def map_log(
         allowed, tries = allowed * LONGER, tries - 1
         tell(f"No map was found yet. The search goes on for up to {allowed:.0f} s.")
         solution = mapping.solve(trace, chosen, time_limit=allowed, max_maps=max_maps)
-    mapping.tell = lambda: outcome(solution)
+    mapping.latest = lambda: outcome(solution)
     seconds["maps"] = round(time.process_time() - begin, 3)
 
     # 4. Ladder: what each kind of evidence is worth.

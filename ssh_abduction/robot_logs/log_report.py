@@ -102,8 +102,8 @@ def _summary(solution: Solution, run: Mapping[str, Any]) -> str:
         proven = f"{'' if solution.complete else 'at least '}{solution.count} minimal maps"
     if solution.weighed is not None:
         proven += f"; {solution.weighed.sentence}"
-    elif told := sentence_of(solution.by_minimality, solution.count):
-        proven += f"; {told}"
+    elif joins := sentence_of(solution.by_minimality, solution.count):
+        proven += f"; {joins}"
     paths = f", {cost.paths} paths" if paths_mean_something(solution) else ""
     size = f"{cost.places} places{paths}, {cost.dstates} distinctive states"
     return f"{seen} {size}: {proven}."
@@ -117,13 +117,13 @@ def _drives(imported: Imported, solution: Solution, run: Mapping[str, Any]) -> I
     places = place_of_steps(solution.maps[0])
     at = [set(places[drive.first : drive.stop]) - {None} for drive in drives]
     rows = []
-    for k, (drive, told) in enumerate(zip(drives, run["drives"], strict=True)):
+    for k, (drive, one) in enumerate(zip(drives, run["drives"], strict=True)):
         others = set().union(*at[:k], *at[k + 1 :])
-        counts = (told["scans"], f"{told['metres']:g} m", told["visits"], told["steps"])
+        counts = (one["scans"], f"{one['metres']:g} m", one["visits"], one["steps"])
         rows.append((drive.name, *counts, len(at[k]), len(at[k] & others)))
     head = ("drive", "scans", "way", "visits", "steps", "places", "shared with other drives")
-    told_map = sentence_of_drives(drives, solution.maps[0])
-    yield "<h2>Drives</h2>" + _table(head, rows) + _paragraph(f"{told_map.capitalize()}.")
+    pieces = sentence_of_drives(drives, solution.maps[0])
+    yield "<h2>Drives</h2>" + _table(head, rows) + _paragraph(f"{pieces.capitalize()}.")
     yield "<h2>Joins between drives</h2>" + _joins_of_drives(solution)
 
 
@@ -214,12 +214,12 @@ def _time(run: Mapping[str, Any]) -> str:
         (stage, f"{seconds:.2f} s", f"{100 * seconds / max(total, 1e-9):.0f} %")
         for stage, seconds in run["seconds"].items()
     ]
-    told = f"All stages together took {total:.1f} s of processor time"
+    text = f"All stages together took {total:.1f} s of processor time"
     if run["drove"]:
         share = f"a share of 1/{run['drove'] / max(total, 1e-9):.0f}"
-        told = f"The robot drove {run['drove']:.0f} s. {told}, {share}"
+        text = f"The robot drove {run['drove']:.0f} s. {text}, {share}"
     return _table(("stage", "processor", "share"), rows) + _paragraph(
-        f"{told}. The search for the minimal maps had {run['limit']:g} s at most."
+        f"{text}. The search for the minimal maps had {run['limit']:g} s at most."
     )
 
 
@@ -273,5 +273,5 @@ def _table(head: Iterable[object], rows: Iterable[Iterable[object]]) -> str:
     return f"<table><tr>{titles}</tr>{body}</table>"
 
 
-def _paragraph(told: str) -> str:
-    return f"<p>{escaped(told)}</p>"
+def _paragraph(text: str) -> str:
+    return f"<p>{escaped(text)}</p>"

@@ -35,7 +35,7 @@ def listed(parts: Parts, found: Iterator[Priced], *, keeps_time: bool) -> Iterat
     """
     known, watch, most = parts.known, parts.watch, parts.limits.most
     if known.status is Status.OPTIMAL:
-        _log.info("minimal maps cost %s; they are listed", _told_cost(parts))
+        _log.info("minimal maps cost %s; they are listed", _cost_in_words(parts))
         ends = watch.reserve_begins if keeps_time else math.inf
         ends = ends if ends > watch.elapsed() else math.inf
         watch.end_stage_after(ends)
@@ -83,7 +83,7 @@ def by_count(parts: Parts, mended_maps: tuple[SSHMap, ...] | None) -> Generator[
         yield from parts.near.maps(known.cost, limits.within)
 
 
-def _told_cost(parts: Parts) -> str:
+def _cost_in_words(parts: Parts) -> str:
     """Return the cost of minimal maps in words."""
     cost = parts.known.best_cost
     if cost is None:

@@ -340,7 +340,7 @@ def _contradiction(
     old: Trace, trace: Trace, ssh_map: SSHMap, digest: Digest, found: Solution
 ) -> SolverError:
     """Make the error that says what contradicts the standing map, and what to do."""
-    told, drives = "no map keeps the standing map", drives_of(old)
+    reason, drives = "no map keeps the standing map", drives_of(old)
     if found.maps:
         dstates, places = _broken(found.maps[0], digest, ssh_map)
         first = {s: t for t, s in reversed([*enumerate(ssh_map.dstate_at)])}
@@ -349,12 +349,12 @@ def _contradiction(
         ]
         parts = [counted(len(dstates), "dstates")] if dstates else []
         parts += [f"the places of {', '.join(pairs[:3])}"] if pairs else []
-        told = (
+        reason = (
             f"the best map found, of {counted(len(found.maps[0].dstates), 'dstates')}, changes "
             f"{' and '.join(parts)}"
         )
     new = ", ".join(drive.name for drive in drives_of(trace))
     return SolverError(
-        f"onto: expected a drive that agrees with the standing map, got {new}: {told}; solve all "
+        f"onto: expected a drive that agrees with the standing map, got {new}: {reason}; solve all "
         "drives together (solve --together)"
     )

@@ -80,8 +80,8 @@ class Parts:
         is_outgrown = not before.goes_on or (isinstance(before, StepEngine) and may_name(self.task))
         engine = new_engine(self.task) if is_outgrown else before.over(self.task)
         # A search that was interrupted may have stopped while clingo grounded a step.
-        half_told = after.known.stopped == "interrupted" or not engine.intact
-        return engine.with_paths(engine.paths) if half_told else engine
+        is_partial = after.known.stopped == "interrupted" or not engine.intact
+        return engine.with_paths(engine.paths) if is_partial else engine
 
     def _take_over(self, after: Parts, start: Start) -> None:
         """Take over the bounds that a search for the first steps proved, and `start.minimal`."""

@@ -160,16 +160,18 @@ class Prefixes:
             self._known.refused[name] = self._known.refused.get(name, 0) + 1
             return equalities
 
-        return first_accepted(self._minimise_as_told, why_refused, self._forbid)
+        return first_accepted(self._minimise_known, why_refused, self._forbid)
 
     def _forbid(self, equalities: frozenset[Equality]) -> None:
         """Forbid all maps that have all of these equalities.
 
         If the engine cannot do it, go on with a `StepEngine`.
         """
-        if self._tell(equalities):
+        if self._forbid_in_engine(equalities):
             return
-        _log.debug("%s cannot be told so: the readable encodings go on", type(self.engine).__name__)
+        _log.debug(
+            "%s cannot forbid this: the readable encodings go on", type(self.engine).__name__
+        )
         size, theory = self.engine.size, self._task.theory
         self.engine = StepEngine(
             self._task, readable.most_paths(self._task.trace, theory, len(self._task.trace))
@@ -177,18 +179,18 @@ class Prefixes:
         self.engine.grow(size)
         self.engine.forbid(equalities)
 
-    def _tell(self, equalities: frozenset[Equality]) -> bool:
+    def _forbid_in_engine(self, equalities: frozenset[Equality]) -> bool:
         """Let the present engine forbid all maps that have all of these equalities.
 
         Returns:
             Whether it can do so.
         """
-        can_be_told = isinstance(self.engine, StepEngine) or all(
+        can_forbid = isinstance(self.engine, StepEngine) or all(
             equality.holds for equality in equalities
         )
-        return can_be_told and self.engine.forbid(equalities)
+        return can_forbid and self.engine.forbid(equalities)
 
-    def _minimise_as_told(self) -> Found | None:
+    def _minimise_known(self) -> Found | None:
         """Find a minimal map under the rules that the engine has; None if there is none.
 
         The evidence has not judged this map yet. If a map on the way replays to the end and is
@@ -276,7 +278,7 @@ class Prefixes:
         enough = min(HELD_BACK, self._most + 1) if self._most else HELD_BACK
         asked = self._most and self._most + 1
         streaming = self.engine.size == len(self._task.trace)
-        stuck, telling = 0, True
+        stuck, can_forbid = 0, True
         given = set[SSHMap]()  # maps that were yielded or held, if evidence may reject others
         while True:
             came, refusal = 0, None
@@ -296,7 +298,7 @@ class Prefixes:
                 remembers = self._judging.may_refuse and (asked or len(given) < REMEMBERED)
                 if self._judging.why_refused(whole):
                     refusal = (
-                        self._judging.why_refused(found.map) if telling and remembers else None
+                        self._judging.why_refused(found.map) if can_forbid and remembers else None
                     )
                     if refusal:
                         break
@@ -312,7 +314,7 @@ class Prefixes:
                     yield from held
                     held.clear()
             if refusal:  # list anew, without the rejected maps if the engine can forbid them
-                telling = self._tell(refusal)
+                can_forbid = self._forbid_in_engine(refusal)
                 continue
             if stuck or not asked or came < asked:
                 break

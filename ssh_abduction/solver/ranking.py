@@ -160,9 +160,9 @@ def noise_warning(fit: Fit | None, trace: Trace) -> str | None:
         # The fit adds the error of a dstate's pose to each displacement there, which is too much.
         # So a small chi-square says nothing.
         return None
-    how, told = ("smaller", "tight") if factor > 1 else ("larger", "loose")
+    how, noise = ("smaller", "tight") if factor > 1 else ("larger", "loose")
     return (
-        f"the noise model of the odometry is too {told}: the best map closes with a chi-square of "
+        f"the noise model of the odometry is too {noise}: the best map closes with a chi-square of "
         f"{fit.chi2:.0f} where {fit.dof} is expected, "
         f"so its standard deviations are {_times(factor)} {how} than the errors; multiply them by "
         f"{factor:.2g}"

@@ -134,7 +134,7 @@ def trace_in(record: Mapping[str, Any], where: str) -> Trace | None:
 
 
 def drives_in(read: FieldReader, record: Mapping[str, Any], steps: int) -> tuple[Drive, ...]:
-    """Read the drives of the trace, which follow each other. Raises MapError."""
+    """Read the drives, which divide the steps of the trace. Raises MapError."""
 
     def drive(value: Any, name: str) -> Drive:
         written = read.mapping(value, name)

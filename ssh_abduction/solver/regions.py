@@ -83,7 +83,7 @@ def derived(ssh_map: SSHMap, trace: Trace, axioms: Collection[str]) -> tuple[Reg
 
 
 class Deriving:
-    """Adds regions to the maps of one search. Maps with the same places and courses share them."""
+    """Adds regions to the maps of one search. Maps with the same dstates and links share them."""
 
     def __init__(self, trace: Trace, theory: Theory) -> None:
         self._trace = trace

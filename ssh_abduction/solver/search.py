@@ -241,9 +241,9 @@ class Search:
         for cost, level in groupby(self._found(), key=lambda priced: priced[1]):
             maps = (ssh_map for ssh_map, _ in level)
             for ssh_map in ranking.ranked(maps, self.over, left) if ranking else maps:
-                told = _told(ssh_map, self.trace, drives)
-                self._answer.take_down(told, cost)
-                yield told
+                complete = _with_names(ssh_map, self.trace, drives)
+                self._answer.take_down(complete, cost)
+                yield complete
 
     def _found(self) -> Iterator[Priced]:
         """Run the search, and yield each map with its preferred counts as it is found.
@@ -431,12 +431,12 @@ class Search:
             known.status = Status.FEASIBLE
         known.stopped = stopped
         # Clingo cannot say how large its program is while another thread uses it.
-        maps = () if best is None else (_told(best, self.trace, drives_of(self.trace)),)
+        maps = () if best is None else (_with_names(best, self.trace, drives_of(self.trace)),)
         solution = self._answer.solution(maps, Grounding(0, 0))
         return replace(solution, complete=known.status is Status.UNSATISFIABLE)
 
 
-def _told(ssh_map: SSHMap, trace: Trace, drives: Sequence[Drive]) -> SSHMap:
+def _with_names(ssh_map: SSHMap, trace: Trace, drives: Sequence[Drive]) -> SSHMap:
     """Return a map with its floors, the starts of drives, and faults that name their drives."""
-    told = with_named_faults(with_floors(ssh_map, trace), drives)
-    return replace(told, starts=tuple(drive.first for drive in drives[1:]))
+    complete = with_named_faults(with_floors(ssh_map, trace), drives)
+    return replace(complete, starts=tuple(drive.first for drive in drives[1:]))

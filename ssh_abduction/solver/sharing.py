@@ -144,10 +144,10 @@ class Backbone:
         if "paths" in differing:  # a step along another path is along another course
             differing.pop("courses", None)
         same = [sort for sort in self.sorts if sort not in differing and sort != "courses"]
-        told = [f"the same {_listed(same)}"] if same else []
+        parts = [f"the same {_listed(same)}"] if same else []
         steps = named_steps(self.drives, len(self.dstates.always))
         return "; ".join(
-            told + [_told_differing(sort, shared, steps) for sort, shared in differing.items()]
+            parts + [_differing_in_words(sort, shared, steps) for sort, shared in differing.items()]
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -159,11 +159,11 @@ class Backbone:
         labels = self.dstates.always
         firsts = {number: t for t, number in reversed(list(enumerate(labels)))}
         by_dstate = [firsts[number] for number in sorted(firsts)]
-        told: dict[str, Any] = {
+        record: dict[str, Any] = {
             sort: shared.to_dict(range(len(labels)) if sort == "dstates" else by_dstate)
             for sort, shared in self.sorts.items()
         }
-        return {"proven": self.proven, **told}
+        return {"proven": self.proven, **record}
 
     @classmethod
     def from_dict(cls, data: Any, steps: int, where: str = "backbone") -> Backbone:
@@ -367,7 +367,7 @@ def _read_shared(data: Any, of_step: Sequence[int] | None, steps: int, where: st
             f"{where}.always: expected {expected} numbers, got {brief(always)}; write it with "
             "solve --json"
         )
-    pairs, told = data.get("sometimes"), data.get("differing", [])
+    pairs, differing = data.get("sometimes"), data.get("differing", [])
     if not isinstance(pairs, list) or not all(
         isinstance(pair, list) and len(pair) == 2 and _are_steps(pair, steps) for pair in pairs
     ):
@@ -375,13 +375,13 @@ def _read_shared(data: Any, of_step: Sequence[int] | None, steps: int, where: st
             f"{where}.sometimes: expected pairs of steps, 0 to {steps - 1}, got {brief(pairs)}; "
             "write it with solve --json"
         )
-    if not isinstance(told, list) or not _are_steps(told, steps):
+    if not isinstance(differing, list) or not _are_steps(differing, steps):
         raise MapError(
-            f"{where}.differing: expected steps, 0 to {steps - 1}, got {brief(told)}; write it "
-            "with solve --json"
+            f"{where}.differing: expected steps, 0 to {steps - 1}, got {brief(differing)}; write "
+            "it with solve --json"
         )
     by_step = tuple(always if of_step is None else (always[number] for number in of_step))
-    return Shared(by_step, tuple((i, j) for i, j in pairs), tuple(told))
+    return Shared(by_step, tuple((i, j) for i, j in pairs), tuple(differing))
 
 
 def _are_steps(values: Sequence[Any], steps: int) -> bool:
@@ -408,7 +408,7 @@ def _name(dstate: DState, sort: Sort) -> Hashable:
     return None if dstate.path is None else (dstate.path, dstate.direction)
 
 
-def _told_differing(sort: Sort, shared: Shared, steps: Sequence[int]) -> str:
+def _differing_in_words(sort: Sort, shared: Shared, steps: Sequence[int]) -> str:
     """Say in which steps maps differ, for one sort. `steps` has the names of steps."""
     if len(shared.differing) == len(shared.sometimes) == 1:
         one = {
@@ -444,9 +444,9 @@ def stretches(steps: Sequence[int]) -> str:
             runs[-1].append(step)
         else:
             runs.append([step])
-    told = [f"{s[0]}–{_bare(s[-1])}" if len(s) > 1 else str(s[0]) for s in runs[:NAMED]]
+    parts = [f"{s[0]}–{_bare(s[-1])}" if len(s) > 1 else str(s[0]) for s in runs[:NAMED]]
     more = sum(map(len, runs[NAMED:]))
-    return _listed([*told, f"{more} more"] if more else told)
+    return _listed([*parts, f"{more} more"] if more else parts)
 
 
 def _bare(step: int) -> int:

@@ -168,20 +168,20 @@ class Weighed:
         """How probable the best map is, and which of its joins is least sure, in words."""
         if self.doubt is not None:
             return f"no probability is given, as {self.doubt}"
-        told = (
+        text = (
             f"the best map has probability {probability_in_words(self.confidence)}"
             if self.proven or self.searched
             else f"a map that costs {self.nats - self.bound:.1f} nats less may exist"
         )
         if self.broken > SAID:
-            told += f"; a map that breaks axioms costs {self.broken:.1f} nats less"
+            text += f"; a map that breaks axioms costs {self.broken:.1f} nats less"
         elif self.searched and not self.proven:
-            told += ", without a proof"
+            text += ", without a proof"
         if not self.joins:
-            return f"{told}; the best map joins no two visits"
+            return f"{text}; the best map joins no two visits"
         first, second, probability = self.joins[0]
         return (
-            f"{told}; the most doubtful join is of steps {first} and {second} "
+            f"{text}; the most doubtful join is of steps {first} and {second} "
             f"({probability_in_words(probability)})"
         )
 

@@ -33,22 +33,22 @@ def summary_of(solution: Solution, count: int, backbone: Backbone | None) -> str
     minimal = solution.levels[0].count if solution.levels else count
     listed = solution.minimal_listed
     kind = "minimal map" if solution.weighed is None else "map"
-    told = f"{'' if listed else 'at least '}{minimal} {kind}{'' if minimal == 1 else 's'}"
-    told += "" if solution.weighed is None else " of least cost"
+    text = f"{'' if listed else 'at least '}{minimal} {kind}{'' if minimal == 1 else 's'}"
+    text += "" if solution.weighed is None else " of least cost"
     if not listed:
-        told += (
+        text += (
             f" (listing was stopped by the {solution.stopped})"
             if solution.stopped != "interrupted"
             else " (listing was interrupted)"
         )
     # A single map differs from no other one.
     if not (listed and minimal == 1):
-        told += f": {backbone.sentence}" + (
+        text += f": {backbone.sentence}" + (
             "" if backbone.proven else ", as far as was found out: others may differ in more"
         )
     more = sum(level.count for level in solution.levels[1:])
-    told += f"; and {more} with up to {solution.within} more" if more else ""
-    return told + (f"; {solution.weighed.sentence}" if solution.weighed else "")
+    text += f"; and {more} with up to {solution.within} more" if more else ""
+    return text + (f"; {solution.weighed.sentence}" if solution.weighed else "")
 
 
 def opening(theory: Theory, steps: int, within: int) -> dict[str, Any]:
@@ -79,7 +79,7 @@ def written_map(ssh_map: SSHMap, cost: Cost | None = None) -> dict[str, Any]:
 
 
 def written_trace(trace: Trace) -> dict[str, Any]:
-    """Return a trace as the file of its solution has it: the lines of its file, without images."""
+    """Return the lines of a trace file without images, for the file of a solution."""
     steps = tuple(replace(step, image=None, truth=None) for step in trace.steps)
     bare = replace(trace, steps=steps, images=None, drive=drives_of(trace)[0].name)
     return {"trace": [json.loads(line) for line in bare.to_lines()]}

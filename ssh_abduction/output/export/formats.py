@@ -46,7 +46,7 @@ def export_map(
     """Export a map as the text of a file for another program.
 
     If the map has poses, positions are metres relative to the first dstate (distinctive state: a
-    place and a direction). Otherwise positions are computed by a layout; nav2 and tmap2 files say
+    place and a heading). Otherwise positions are computed by a layout; nav2 and tmap2 files say
     so.
 
     Args:

@@ -181,13 +181,13 @@ def answers(
     ]
     for thread in threads:
         thread.start()
-    running, told = processes, set[Worker]()
+    running, asked = processes, set[Worker]()
     try:
         while running:
             for worker in filter(None, workers):
                 worker.end_if_late()
-            for worker in {*filter(None, workers)} - told if stopped() else ():
-                told.add(worker)
+            for worker in {*filter(None, workers)} - asked if stopped() else ():
+                asked.add(worker)
                 worker.give_up()
                 worker.deadline = time.monotonic() + patience
             with suppress(queue.Empty):

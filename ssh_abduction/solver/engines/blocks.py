@@ -231,7 +231,7 @@ class Blocks:
                 for t in found
                 for near in (-1, 0, 1)
             }
-            told = faulty_lp.faulty_batch(
+            batch = faulty_lp.faulty_batch(
                 0, seen, actions, range(len(seen)), (), Pairs(), price, full
             )
             base = faulty_lp.faulty_base(
@@ -240,7 +240,7 @@ class Blocks:
             asker.control.add(
                 "base",
                 [],
-                "\n".join([base, told, faulty_lp.dstates_and_faults_up_to(most, tenths)]),
+                "\n".join([base, batch, faulty_lp.dstates_and_faults_up_to(most, tenths)]),
             )
             asker.control.ground([("base", [])])
             asker.control.ground([("more", numbers(0))])

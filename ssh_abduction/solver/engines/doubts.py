@@ -26,7 +26,7 @@ Doubt: TypeAlias = tuple[Sort, int, int, bool]
 
 
 class Doubts:
-    """Doubts about what all minimal maps share, with their rules in one control of clingo."""
+    """Asks one control of clingo whether a map contradicts what all known maps share."""
 
     def __init__(
         self,
@@ -43,7 +43,7 @@ class Doubts:
                 says that they share a thing of that sort; None if they never do.
         """
         self._asker, self._control, self._condition = asker, control, condition
-        self._told: dict[Doubt, int] = {}  # the number of each doubt that clingo has
+        self._number_of: dict[Doubt, int] = {}  # the number of each doubt that clingo has
         self._open: set[Doubt] = set()
         self._parts = 0
 
@@ -63,9 +63,11 @@ class Doubts:
         doubts = set(doubts)
         if not doubts:
             return None
-        self._tell([doubt for doubt in doubts if doubt not in self._told])
+        self._ground([doubt for doubt in doubts if doubt not in self._number_of])
         for doubt in self._open ^ doubts:
-            self._control.assign_external(questions.open_doubt(self._told[doubt]), doubt in doubts)
+            self._control.assign_external(
+                questions.open_doubt(self._number_of[doubt]), doubt in doubts
+            )
         self._open = doubts
         assumed = [(questions.some_doubt(self._parts), True)]
         with closing(
@@ -73,14 +75,14 @@ class Doubts:
         ) as answers:
             return next(answers, None)
 
-    def _tell(self, doubts: Sequence[Doubt]) -> None:
+    def _ground(self, doubts: Sequence[Doubt]) -> None:
         """Ground the rules for doubts that clingo does not have yet."""
         if not doubts:
             return
         self._parts += 1
         rules = [questions.doubts_before(self._parts)]
         for sort, i, j, one in doubts:
-            number = self._told[sort, i, j, one] = len(self._told)
+            number = self._number_of[sort, i, j, one] = len(self._number_of)
             rules.append(questions.doubt(number, self._parts, self._condition(sort, i, j), one=one))
         part = f"doubts_{self._parts}"
         with self._asker.grounding_timed():

@@ -55,7 +55,7 @@ class FaultyAnswer:
 
 
 @dataclass
-class _Told:
+class _Given:
     """A record of everything that the present control was given.
 
     Attributes:
@@ -108,7 +108,7 @@ class FaultyControl:
         self.forbidden: list[Collection[Equality]] = []
         self._asker, self._log, self._price = asker, task.log, price
         self._most_faults, self._on_bound = most_faults, on_bound
-        self._told = _Told()
+        self._given = _Given()
 
     def give_around(self, steps: Collection[int]) -> None:
         """Add these steps, and `AROUND` steps before and after each, to the given ones."""
@@ -134,24 +134,24 @@ class FaultyControl:
     def _prepare(self) -> None:
         """Bring the control up to date. Make a new one if names or full steps have changed."""
         with self._asker.grounding_timed():
-            if (self._told.names, self._told.full) != (self.names, self.full):
+            if (self._given.names, self._given.full) != (self.names, self.full):
                 self._begin()
-            control, told = self._asker.control, self._told
-            if new := sorted(self.given.difference(told.steps)):
+            control, given = self._asker.control, self._given
+            if new := sorted(self.given.difference(given.steps)):
                 self._give(new)
-            for number in range(told.forbidden, len(self.forbidden)):
+            for number in range(given.forbidden, len(self.forbidden)):
                 rule = faulty_lp.not_all_one(self.forbidden[number])
                 control.add(f"forbidden_{number}", [], rule)
                 control.ground([(f"forbidden_{number}", [])])
-            told.forbidden = len(self.forbidden)
+            given.forbidden = len(self.forbidden)
 
     def forget(self) -> None:
         """Use a new control for the next question. Clingo was stopped, and may lack rules."""
-        self._told = _Told({}, set())
+        self._given = _Given({}, set())
 
     def _begin(self) -> None:
         """Make a control with the present names, but without steps."""
-        self._told = _Told(dict(self.names), set(self.full))
+        self._given = _Given(dict(self.names), set(self.full))
         control = self._asker.control = Control(OPTIONS, self._asker.watch.check)
         control.load_encodings("faulty")
         base = faulty_lp.faulty_base(self._log.actions, self.names, self._price)
@@ -160,21 +160,21 @@ class FaultyControl:
 
     def _give(self, new: list[int]) -> None:
         """Ground the rules for new steps, as one batch."""
-        control, told, batch = self._asker.control, self._told, self._told.batches
+        control, given, batch = self._asker.control, self._given, self._given.batches
         seen, actions, pairs = self._log.seen, self._log.actions, self._log.pairs
         price = self._price
         if self._most_faults is not None:
             price = {kind: [0] * len(seen) for kind in self._price}
         rules = faulty_lp.faulty_batch(
-            batch, seen, actions, new, told.steps, pairs, price, self.full
+            batch, seen, actions, new, given.steps, pairs, price, self.full
         )
         control.add(f"batch_{batch}", [], rules)
         control.ground([(f"batch_{batch}", []), ("more", numbers(batch))])
         if self._most_faults is not None:
             control.add(f"most_{batch}", [], faulty_lp.at_most_faults(self._most_faults))
             control.ground([(f"most_{batch}", [])])
-        told.steps += new
-        told.batches += 1
+        given.steps += new
+        given.batches += 1
 
     def answers(self, mode: str) -> Iterator[FaultyAnswer]:
         """Yield answers for the given steps, each cheaper than the one before.

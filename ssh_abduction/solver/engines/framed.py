@@ -238,14 +238,14 @@ class FramedEngine:
         """Give clingo rules that exclude these labels, as no paths fit them."""
         visits, fitting = self._visits, self._fitting
         visits.take_back(labels)
-        told = (
+        passed = (
             self._task.speedups.sides
             and len(visits.program.fits) <= MANY_PAIRS
             and self._sides.say_of_path(
                 fitting.paths, self._chart, labels, visits.program.standing(labels)
             )
         )
-        if not told:
+        if not passed:
             visits.forbid(labels, fitting.clashing(self._chart, labels))
 
     def forbid(self, equalities: Collection[Equality]) -> bool:

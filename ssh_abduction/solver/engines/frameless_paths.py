@@ -39,11 +39,11 @@ BETTERING = 20_000
 
 # The labels of all steps, the options of clasp, and the parts of the program.
 _Question: TypeAlias = tuple[tuple[int, ...], tuple[str, ...], tuple[str, ...]]
-# Parts of the program. TOLD derives which places and segments are different before any are merged.
+# BEFORE_MERGING derives which places and segments are different before any are merged.
 # PARTS finds the places and paths that fit labels. EACH also lists answers that differ only in
 # paths.
-TOLD, EACH = ("base", "segments"), ("each",)
-PARTS = (*TOLD, "least", "paths")
+BEFORE_MERGING, EACH = ("base", "segments"), ("each",)
+PARTS = (*BEFORE_MERGING, "least", "paths")
 # First ask whether the pairwise distinct places are enough (`engines/homes.py`), until that failed
 # for TIGHT labellings. Each question may take TIGHTLY conflicts. The answer mostly comes at once.
 TIGHT, TIGHTLY = 5, 2000
@@ -130,7 +130,7 @@ class PlacesAndPaths:
         self._refused: list[Collection[Equality]] = []
         self._forbidden = 0  # the number of sets of links that were forbidden
         # Dstates for whose paths clingo has the axioms, as keys of `NameProgram.names`.
-        self._told: set[tuple[int, int]] = set()
+        self._grounded: set[tuple[int, int]] = set()
         # The last labels, and the control for their places and paths.
         self._asked: tuple[_Question, clingo.Control] | None = None
         # For each labelling for which the fixed places are enough: the homes (`engines/homes.py`)
@@ -140,17 +140,17 @@ class PlacesAndPaths:
 
     def forget(self) -> None:
         """Forget everything about the control. Call this before there is one for another prefix."""
-        self._told = set()
+        self._grounded = set()
         self._forget_tight()
 
     def _forget_tight(self) -> None:
         self._tight, self._failed, self._asked = {}, set(), None
 
-    def tell_again(self) -> None:
+    def give_again(self) -> None:
         """Give a new control the axioms of the paths that the previous control had."""
-        told, self._told = self._told, set()
-        if told:
-            self._tell_of([key for key in self.named.program.names() if key in told])
+        grounded, self._grounded = self._grounded, set()
+        if grounded:
+            self._give_axioms([key for key in self.named.program.names() if key in grounded])
 
     def forbid_together(self, equalities: Collection[Equality]) -> None:
         """Exclude maps in which all of these equalities hold, if one of them is of places.
@@ -161,7 +161,7 @@ class PlacesAndPaths:
             self._refused.append(equalities)
             self._forget_tight()
 
-    def _tell_of(self, dstates: Collection[tuple[int, int]]) -> None:
+    def _give_axioms(self, dstates: Collection[tuple[int, int]]) -> None:
         """Ground the axioms of order and sides for the paths of these dstates.
 
         Args:
@@ -170,7 +170,7 @@ class PlacesAndPaths:
         with self._asker.grounding_timed():
             control, names = self._asker.control, self.named.program.names()
             parts: list[tuple[str, list[clingo.Symbol]]] = []
-            if not self._told:
+            if not self._grounded:
                 control.load(encodings.path("sides_frameless"))
                 control.add(
                     "sides", [], sides_lp.sides_frameless_facts(self._task.theory, self._actions)
@@ -178,7 +178,7 @@ class PlacesAndPaths:
                 parts.append(("sides", []))
             parts += [("path", numbers(names[dstate])) for dstate in dstates]
             control.ground(parts)  # one call for all parts halves the time to ground and to search
-            self._told.update(dstates)
+            self._grounded.update(dstates)
 
     def fits(self, labels: Sequence[int]) -> bool:
         """Whether any places and paths fit these labels."""
@@ -204,14 +204,14 @@ class PlacesAndPaths:
                 self._links_of(labels),
                 labels,
                 far=self._far_away(labels),
-                parts=TOLD,
+                parts=BEFORE_MERGING,
                 labels=labels,
             )
-            told = paths_lp.Segments.read(control)
-            homes = homes_of(told)
+            known = paths_lp.Segments.read(control)
+            homes = homes_of(known)
             if homes is not None:
                 _go_on_at_home(control, homes, (*PARTS, *EACH))
-        best = None if homes is None else self._best_at_home(labels, control, fewest_paths(told))
+        best = None if homes is None else self._best_at_home(labels, control, fewest_paths(known))
         if best is None or homes is None:
             self._failed.add(key)
             return None
@@ -269,10 +269,10 @@ class PlacesAndPaths:
         new = [
             dstate
             for name in contrary
-            if (dstate := dstate_of.get(name)) is not None and dstate not in self._told
+            if (dstate := dstate_of.get(name)) is not None and dstate not in self._grounded
         ][:CONTRARY]
         if new:
-            self._tell_of(new)
+            self._give_axioms(new)
             return
         far = self._far_away(labels)
         for members in self._turned_together(links, far) or [
@@ -281,7 +281,7 @@ class PlacesAndPaths:
             placed = {at for apart in members.far for at in apart.placed}
             self.named.program.add_links_at({step for step, _ in placed})
             self._forbidden += 1
-            self.named.program.tell(
+            self.named.program.add_rules(
                 f"forbidden_{self._forbidden}", names_lp.forbidden_links(members.links, placed)
             )
 
@@ -403,7 +403,7 @@ class PlacesAndPaths:
                     labels,
                     options,
                     far=self._far_away(labels),
-                    parts=TOLD if at_home else parts,
+                    parts=BEFORE_MERGING if at_home else parts,
                     labels=labels,
                 )
                 if at_home:
@@ -490,11 +490,11 @@ def _go_on_at_home(control: Control, homes: Mapping[int, list[int]], parts: Iter
     """Ground the remaining parts of a control, and restrict each place to its homes.
 
     Args:
-        control: A control in which the parts `TOLD` are grounded.
+        control: A control in which the parts `BEFORE_MERGING` are grounded.
         homes: For each place, the fixed places that it may be.
         parts: All parts of the program.
     """
     control.add("homes", [], paths_lp.tight_facts(homes))
     control.ground(
-        [(part, []) for part in ("homes", *(part for part in parts if part not in TOLD))]
+        [(part, []) for part in ("homes", *(part for part in parts if part not in BEFORE_MERGING))]
     )

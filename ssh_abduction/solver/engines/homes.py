@@ -31,28 +31,28 @@ from ssh_abduction.solver.asp.facts.paths_lp import Segments
 from ssh_abduction.solver.engines.paths import pairwise_distinct
 
 
-def homes_of(told: Segments) -> Mapping[int, list[int]] | None:
+def homes_of(segments: Segments) -> Mapping[int, list[int]] | None:
     """Find the possible homes of each place, if a map has only as many places as fixed ones.
 
     Args:
-        told: The places and segments, and which of them are known to be different.
+        segments: The places and segments, and which of them are known to be different.
 
     Returns:
         For each place, the fixed places that it may be. None if some place can be none of them, or
         no places fit these dstates at all.
     """
-    if any(c == p for c, p in told.elsewhere):
+    if any(c == p for c, p in segments.elsewhere):
         return None  # the segments contradict each other: no places fit these dstates
-    places = told.places
+    places = segments.places
     number = {place: i for i, place in enumerate(places)}
     different = np.zeros((len(places), len(places)), dtype=bool)
-    for c, p in told.elsewhere:
+    for c, p in segments.elsewhere:
         different[number[c], number[p]] = different[number[p], number[c]] = True
-    fixed = pairwise_distinct(places, told.elsewhere)
+    fixed = pairwise_distinct(places, segments.elsewhere)
     columns = [number[place] for place in fixed]
     may_be = ~different[:, columns]
     may_be[columns] = np.eye(len(fixed), dtype=bool)
-    steps = [(segment, number[c], number[b]) for segment, c, b in told.travels]
+    steps = [(segment, number[c], number[b]) for segment, c, b in segments.travels]
     follows = {
         segment: _may_follow(pairs, columns) for segment, pairs in _by_segment(steps).items()
     }
@@ -70,13 +70,13 @@ def homes_of(told: Segments) -> Mapping[int, list[int]] | None:
     }
 
 
-def fewest_paths(told: Segments) -> int:
+def fewest_paths(segments: Segments) -> int:
     """Compute a lower bound on the number of paths, from pairwise distinct segments.
 
     Args:
-        told: The segments, and which of them are known to be different paths.
+        segments: The segments, and which of them are known to be different paths.
     """
-    return len(pairwise_distinct(told.segments, told.distinct))
+    return len(pairwise_distinct(segments.segments, segments.distinct))
 
 
 def _by_segment(steps: list[tuple[int, int, int]]) -> Mapping[int, list[tuple[int, int]]]:

@@ -47,7 +47,7 @@ class Fitting(Protocol):
         """Give clingo rules that exclude these labels, as they have no map."""
         ...
 
-    def tell_again(self) -> None:
+    def give_again(self) -> None:
         """Give a new control the rules that the previous control had."""
         ...
 
@@ -120,13 +120,13 @@ class NameProgram:
         """Whether clingo has all links of the chart."""
         return len(self._known.links) == len(self.chart.links)
 
-    def tell_all(self, links: Iterable[Link]) -> None:
+    def give_links(self, links: Iterable[Link]) -> None:
         """Give a new control some links, and all rules that forbid something."""
         self.add(links)
         for number in range(len(self.forbidden)):
-            self.tell_forbidden(number)
+            self.give_forbidden(number)
         if self._fitting:
-            self._fitting.tell_again()
+            self._fitting.give_again()
 
     def name_more(self, views: Collection[int]) -> None:
         """Add a spare name to each of these views, in a new control with the same links."""
@@ -135,7 +135,7 @@ class NameProgram:
         self._asker.watch.check()
         links = self._known.links
         self._known = self._new_control()
-        self.tell_all(links)
+        self.give_links(links)
 
     def _new_control(self) -> _Known:
         """Make a control that has the names, but no node yet."""
@@ -211,16 +211,18 @@ class NameProgram:
                     far += [(t, int(u)) for u in np.flatnonzero(excluded)]
                 known.is_open[t] = True
         known.links.update(dict.fromkeys(added))
-        self.tell(f"batch_{known.batches}", names_lp.batch_facts(known.batches, given, added, far))
+        self.add_rules(
+            f"batch_{known.batches}", names_lp.batch_facts(known.batches, given, added, far)
+        )
         self._asker.control.ground([("more", numbers(known.batches))])
         known.batches += 1
 
-    def tell(self, part: str, rules: str) -> None:
+    def add_rules(self, part: str, rules: str) -> None:
         """Ground rules for clingo, in a program part of this name."""
         self._asker.control.add(part, [], rules)
         self._asker.control.ground([(part, [])])
 
-    def tell_forbidden(self, number: int) -> None:
+    def give_forbidden(self, number: int) -> None:
         """Give clingo the rule that excludes a forbidden set of pairs, and the nodes in it.
 
         Args:
@@ -228,7 +230,7 @@ class NameProgram:
         """
         pairs = self.forbidden[number]
         self.add_links_at({step for pair in pairs for step in pair})
-        self.tell(f"not_together_{number}", names_lp.not_together(number, pairs))
+        self.add_rules(f"not_together_{number}", names_lp.not_together(number, pairs))
 
     def is_allowed(self, labels: Sequence[int]) -> bool:
         """Whether the labels of a map agree with evidence about pairs of nodes.

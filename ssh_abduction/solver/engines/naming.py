@@ -163,7 +163,7 @@ class NamedLabels:
         if speedups.lazy:  # only links that begin at the first step or at a pinned one
             first = {0, *pinned.clique}
             links = [link for link in links if link[0] in first]
-        self._program.tell_all(links)
+        self._program.give_links(links)
 
     def _first_spares(self, pinned: Pinned) -> dict[int, int]:
         """Return the number of spare names that each view has at first.
@@ -196,7 +196,7 @@ class NamedLabels:
         known = self._incumbent
         if known.labels and not self.is_allowed(known.labels):
             known.labels = None
-        self.program.tell_forbidden(len(self._forbidden) - 1)
+        self.program.give_forbidden(len(self._forbidden) - 1)
 
     def all_of(self, dstates: int, enough: int) -> Generator[list[int], None, None]:
         """Yield each labelling with a number of dstates once. A known labelling comes first.

@@ -86,7 +86,7 @@ class StepEngine:
             self._let_end_with(size - 1)
             if is_new:
                 for number in range(len(self._forbidden)):
-                    self._tell_forbidden(number)
+                    self._give_forbidden(number)
                 self._tell_number()
 
     def _ground_steps(self, stop: int) -> None:
@@ -147,7 +147,7 @@ class StepEngine:
 
     def forbid(self, equalities: Collection[Equality]) -> bool:
         self._forbidden.append(equalities)
-        self._tell_forbidden(len(self._forbidden) - 1)
+        self._give_forbidden(len(self._forbidden) - 1)
         return True
 
     def ask_for(self, number: int, count: Count) -> None:
@@ -173,7 +173,7 @@ class StepEngine:
         self.asker.control.ground([(part, [])])
         self.asker.control.assign_external(questions.of_number(*self._number), True)
 
-    def _tell_forbidden(self, number: int) -> None:
+    def _give_forbidden(self, number: int) -> None:
         """Give clingo the rule that excludes a forbidden set of equalities, by its number."""
         part = f"forbidden_{number}"
         self.asker.control.add(

@@ -245,7 +245,7 @@ class VisitLabels:
                 program.spanning(found, program.nodes) for found in self._found[self._excluded :]
             ]
             batch = program.batch
-            program.tell(
+            program.add_rules(
                 "\n".join(visits_lp.forbidden_pairs(pairs, listed=batch) for pairs in known)
             )
             self._excluded = len(self._found)
@@ -303,7 +303,7 @@ class VisitLabels:
             together = program.spanning(labels, clash)
             if program.fits.issuperset(together):  # if not, clingo cannot find such labels anyway
                 rules.append(visits_lp.forbidden_pairs(together, different))
-        program.tell("\n".join(rules))
+        program.add_rules("\n".join(rules))
 
     def forbid_together(
         self, pairs: Collection[tuple[int, int]], places: Collection[tuple[int, int]] = ()
@@ -330,7 +330,7 @@ class VisitLabels:
             choices.append([(i, j, turned) for turned in range(4) if (i, j, turned) in fits])
         # If a pair has no choice, it is known to be distinct. Then nothing has to be forbidden.
         if len(choices) == len(apart) + len(away):
-            program.tell(visits_lp.forbidden_places(choices))
+            program.add_rules(visits_lp.forbidden_places(choices))
         if away:
             return
 

@@ -56,17 +56,17 @@ class Cores:
         Andres, Kaufmann, Matheis, Schaub 2012, "Unsatisfiability-based optimization in clasp".
     """
 
-    def __init__(self, asker: Asker, tell: Callable[[str, str, int], None]) -> None:
+    def __init__(self, asker: Asker, add_rules: Callable[[str, str, int], None]) -> None:
         """Begin without any core.
 
         Args:
             asker: Asks the control that has the atoms.
-            tell: Called with rules, a program part and a number: adds the rules, and grounds the
-                part for the number.
+            add_rules: Takes rules, a program part and a number. It adds the rules, and grounds
+                the part for the number.
         """
         self.least = 0
         self.avoided: dict[int, clingo.Symbol] = {}
-        self._asker, self._tell = asker, tell
+        self._asker, self._add_rules = asker, add_rules
         self._sizes: list[int] = []  # the number of members of each core
 
     def avoid(self, symbol: clingo.Symbol) -> None:
@@ -89,7 +89,7 @@ class Cores:
         if len(members) > 1:
             number = len(self._sizes)
             self._sizes.append(len(members))
-            self._tell(visits_lp.core_facts(number, members), "core", number)
+            self._add_rules(visits_lp.core_facts(number, members), "core", number)
             self._limit(number, 2)
 
     def _limit(self, core: int, count: int) -> None:
@@ -182,7 +182,7 @@ class VisitProgram:
         self._core_guided = task.speedups.core_guided
         self._one = pairs_in(task.log.pairs.one)
         asker.control = new_control("visits", "", ["--heuristic=Domain"])
-        self.cores = Cores(asker, self.tell)
+        self.cores = Cores(asker, self.add_rules)
         self._known = _Known()
         self._pair_of = PairOf()
         self._parts = 0
@@ -287,28 +287,28 @@ class VisitProgram:
         """Read the pairs of visits that are at one place in an answer."""
         return [self._pair_of[symbol] for symbol in model.symbols(shown=True)]
 
-    def tell(self, told: str, part: str | None = None, number: int = 0) -> None:
+    def add_rules(self, rules: str, part: str | None = None, number: int = 0) -> None:
         """Give clingo more rules.
 
         This does not check any limits: if it stopped halfway, a core would be relaxed without the
         rule that limits its members.
 
         Args:
-            told: The rules.
+            rules: The rules.
             part: A program part to ground; None for none.
             number: The argument of that part.
         """
         with self._asker.grounding_timed():
             name = f"told_{self._parts}"
             self._parts += 1
-            self._asker.control.add(name, [], told)
+            self._asker.control.add(name, [], rules)
             self._asker.control.ground([(name, [])])
             if part is not None:
                 self._asker.control.ground([(part, numbers(number))])
 
     def close(self, threes: Iterable[Three]) -> None:
         """Give clingo the rules of transitivity for these triples of visits."""
-        self.tell(visits_lp.three_facts(self._parts, threes), "closed", self._parts)
+        self.add_rules(visits_lp.three_facts(self._parts, threes), "closed", self._parts)
 
     def intransitive(self, pairs: Sequence[Pair]) -> list[Three]:
         """Find the triples of visits at which an answer is not transitive."""
@@ -396,11 +396,11 @@ def fits_in_time(watch: Watch, chart: FramedChart, visits: set[int], known: int)
     Raises:
         LimitError: Grounding the other pairs would take longer than the time that is left.
     """
-    told = sorted(visits)
-    if len(told) == len(chart.stars):  # the number of pairs is known before they are listed
+    numbers = sorted(visits)
+    if len(numbers) == len(chart.stars):  # the number of pairs is known before they are listed
         watch.check(SECONDS_A_PAIR * (int(chart.fitting[-1]) - known))
     else:
         watch.check()
-    fits = frozenset(chart.fits(told))
+    fits = frozenset(chart.fits(numbers))
     watch.check(SECONDS_A_PAIR * (len(fits) - known))
     return fits

@@ -202,7 +202,7 @@ class Explainer:
         for t in range(steps - 1, 0, -1):
             labels.append(int(came[t, labels[-1]]))
         labels.reverse()
-        return self._told(machine, labels)
+        return self._explained(machine, labels)
 
     def completed(self, machine: Machine) -> Explained:
         """Add links to a machine until no step of the trace lacks one, and explain the trace by it.
@@ -292,7 +292,7 @@ class Explainer:
             best = better
         return best
 
-    def _told(self, machine: Machine, labels: Sequence[int]) -> Explained:
+    def _explained(self, machine: Machine, labels: Sequence[int]) -> Explained:
         """Make the explanation that given labels are: find their faults, and add up the cost.
 
         Args:

@@ -191,11 +191,11 @@ def with_faults(ssh_map: SSHMap, trace: Trace, mended: Trace, theory: Theory) ->
             faults.append((t, "slipped"))
         if step.displacement != other.displacement:
             faults.append((t, "jumped"))
-    told = faults_of(faults, dict(enumerate(ssh_map.dstate_at)), shows, trace, theory)
+    named = faults_of(faults, dict(enumerate(ssh_map.dstate_at)), shows, trace, theory)
     dstates = tuple(replace(s, view=shows[s.id]) for s in ssh_map.dstates)
     return replace(
         ssh_map,
         dstates=dstates,
         links=links_of(ssh_map.dstate_at, trace, faults),
-        faults=told,
+        faults=named,
     )

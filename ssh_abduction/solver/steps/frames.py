@@ -45,7 +45,7 @@ class Frames:
 
     Attributes:
         stars: The number of the star of each step.
-        looks: For each star, the numbers of the frames that it may be.
+        looks: For each star, the numbers of its possible frames.
         frames: All frames, by number.
     """
 

@@ -336,16 +336,18 @@ def _can_draw_sided(shown: _Shown, crossing: bool) -> bool:
     for x, turn, y in shown.turns:
         if turn != "around" and x in at_edge and y in at_edge:
             right, left = ((y, AHEAD), (y, BACK)) if turn == "right" else ((y, BACK), (y, AHEAD))
-            told = [(x, AHEAD), right, (x, BACK), left]
+            arms_there = [(x, AHEAD), right, (x, BACK), left]
             clockwise[shown.places[x]].append(
-                [same.of(arm) for arm in told if crossing or arm != (y, BACK)]
+                [same.of(arm) for arm in arms_there if crossing or arm != (y, BACK)]
             )
     ends = [end for edge in edges for end in tuple(edge) * (3 - len(edge))]
 
     @cache
     def allows(place: int, order: Ends) -> bool:
         arms = [ends[end][1] for end in order]
-        others = dict.fromkeys(arm for told in clockwise[place] for arm in told if arm not in arms)
+        others = dict.fromkeys(
+            arm for arms_there in clockwise[place] for arm in arms_there if arm not in arms
+        )
         return _can_complete(arms, list(others), clockwise[place])
 
     return can_be_drawn(
@@ -402,7 +404,7 @@ def _can_complete(order: list[Arm], others: list[Arm], clockwise: Sequence[Seque
         order: The clockwise order of some arms.
         clockwise: The clockwise orders that turns show.
     """
-    if not all(_is_clockwise(order, told) for told in clockwise):
+    if not all(_is_clockwise(order, sequence) for sequence in clockwise):
         return False
     if not others:
         return True
@@ -413,10 +415,10 @@ def _can_complete(order: list[Arm], others: list[Arm], clockwise: Sequence[Seque
     )
 
 
-def _is_clockwise(order: Sequence[Arm], told: Sequence[Arm]) -> bool:
-    """Whether the arms of `told` come in this clockwise order. Arms not in `order` are ignored."""
-    positions = [order.index(arm) for arm in told if arm in order]
-    if len(set(told)) < len(told):
+def _is_clockwise(order: Sequence[Arm], sequence: Sequence[Arm]) -> bool:
+    """Whether `sequence` has this clockwise order. Arms not in `order` are ignored."""
+    positions = [order.index(arm) for arm in sequence if arm in order]
+    if len(set(sequence)) < len(sequence):
         return False
     return sum(positions[i - 1] > positions[i] for i in range(len(positions))) <= 1
 
