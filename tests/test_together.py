@@ -310,6 +310,11 @@ def test_joins_of_drives_are_forced_possible_or_excluded(
         (1, 1, 0.5),
         (3, 1, 0.5),
     ]
+    assert [of_tuesday.how_sure(j) for j in (*of_tuesday.forced, *of_tuesday.possible)] == [
+        "all maps",
+        "1 of 2 maps",
+        "1 of 2 maps",
+    ]
     assert of_tuesday.excluded == 5 * 2 - 3
     assert (of_far.forced, of_far.possible, of_far.excluded) == ((), (), 10)
     assert "nothing in common in any of the maps" in str(of_far)

@@ -164,7 +164,7 @@ def _drives(listing: Listing) -> dict[str, Any]:
             {
                 "sentence": f"{pair.first} and {pair.second}: {_shared_by(pair)}",
                 "joins": [
-                    (first[pair.first] + j.first, first[pair.second] + j.second, j.percent)
+                    (first[pair.first] + j.first, first[pair.second] + j.second, pair.how_sure(j))
                     for j in (*pair.forced, *pair.possible)[:JOINS]
                 ],
             }

@@ -2,6 +2,7 @@
 
 >>> from ssh_abduction import Theory, Trace, solve
 >>> from ssh_abduction.rivals.listing import Listing
+from ssh_abduction.solver import probability_in_words
 >>> monday = Trace.from_steps("abc", ["travel", "travel"], name="monday")
 >>> tuesday = Trace.from_steps("cd", ["travel"], name="tuesday")
 >>> solution = solve([monday, tuesday], Theory.causal())
@@ -22,6 +23,7 @@ from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.words import counted
 from ssh_abduction.rivals.listing import Listing
+from ssh_abduction.solver import probability_in_words
 
 ALMOST = 1 - 1e-9  # a join that some map has not
 SHOWN = 6  # a sentence names at most this many joins of a kind
@@ -36,18 +38,13 @@ class DriveJoin:
     Attributes:
         first: The number of the step in its own drive.
         second: The number of the other step in its own drive.
-        share: The share of the maps, 0 to 1, in which both are at one place. If maps were weighed,
-            this is the probability that they are.
+        share: The share of the maps, 0 to 1, in which both are at one place. If maps were weighed
+            and their costs can be trusted, this is the probability that they are.
     """
 
     first: int
     second: int
     share: float
-
-    @property
-    def percent(self) -> str:
-        """The share in percent. Below 100 %, it is not rounded up to it."""
-        return "above 99%" if 0.995 <= self.share < 1 else f"{self.share:.0%}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +59,7 @@ class DrivePair:
         possible: The joins that some maps have.
         excluded: The number of pairs of places that no map joins.
         proven: Whether all maps are known. If not, other maps may differ.
+        of_maps: The number of maps that were compared; None if joins have a probability instead.
     """
 
     first: str
@@ -71,6 +69,15 @@ class DrivePair:
     possible: tuple[DriveJoin, ...]
     excluded: int
     proven: bool
+    of_maps: int | None
+
+    def how_sure(self, join: DriveJoin) -> str:
+        """Say in how many maps these drives have a join, or how probable it is."""
+        if join in self.forced:
+            return "all maps" if self.proven else "all maps that were found"
+        if self.of_maps is None:
+            return probability_in_words(join.share)
+        return f"{round(join.share * self.of_maps)} of {self.of_maps} maps"
 
     def __str__(self) -> str:
         maps = "maps" if self.proven else "maps that were found"
@@ -88,7 +95,7 @@ class DrivePair:
         """Put joins into words: "monday:2 = tuesday:0". At most SHOWN of them are named."""
         shown = [
             f"{self.first}:{join.first} = {self.second}:{join.second}"
-            + ("" if joins is self.forced else f", {join.percent}")
+            + ("" if joins is self.forced else f", {self.how_sure(join)}")
             for join in joins[:SHOWN]
         ]
         more = len(joins) - SHOWN
@@ -110,9 +117,11 @@ def joins_of_drives(listing: Listing) -> tuple[DrivePair, ...]:
     """
     an_instance("listing", listing, Listing, MapError, mend="make one with Listing.of")
     placings, weights, proven = _placings(listing)
+    is_probable = listing.weighed is not None and listing.weighed.doubt is None
+    count = None if is_probable else len(placings)
     of = "place" if listing.maps[0].places else "dstate"
     return tuple(
-        _pair(one, other, placings, weights, of, proven)
+        _pair(one, other, placings, weights, of, proven, count)
         for one, other in combinations(listing.drives, 2)
     )
 
@@ -125,8 +134,9 @@ def _placings(listing: Listing) -> tuple[list[_Placing], list[float], bool]:
     """
     weighed = listing.weighed
     if weighed is not None:
-        rivals = weighed.rivals
-        return [r.places or r.dstates for r in rivals], [*weighed.weights], weighed.within > 0
+        at: list[_Placing] = [rival.places or rival.dstates for rival in weighed.rivals]
+        weights = weighed.weights if weighed.doubt is None else [1 / len(at)] * len(at)
+        return at, [*weights], weighed.within > 0
     minimal = listing.maps[: listing.minimal]
     placings: list[_Placing] = []
     for ssh_map in minimal:
@@ -147,6 +157,7 @@ def _pair(
     weights: Sequence[float],
     of: str,
     proven: bool,
+    count: int | None,
 ) -> DrivePair:
     """Find the places that two drives share.
 
@@ -156,6 +167,7 @@ def _pair(
         weights: The weight of each map. The weights sum to 1.
         of: "place"; or "dstate", if maps have no places.
         proven: Whether these are all maps.
+        count: The number of maps; None if their weights are probabilities.
     """
     forced: list[DriveJoin] = []
     possible: list[DriveJoin] = []
@@ -172,7 +184,9 @@ def _pair(
                 DriveJoin(first, second, 1.0 if is_forced else min(join.share, ALMOST))
             )
     possible.sort(key=lambda join: -join.share)
-    return DrivePair(one.name, other.name, of, tuple(forced), tuple(possible), excluded, proven)
+    return DrivePair(
+        one.name, other.name, of, tuple(forced), tuple(possible), excluded, proven, count
+    )
 
 
 def _visits(drive: Drive, placings: Sequence[_Placing]) -> list[list[int]]:

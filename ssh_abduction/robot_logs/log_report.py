@@ -134,14 +134,13 @@ def _joins_of_drives(solution: Solution) -> str:
         (
             f"{pair.first}:{join.first}",
             f"{pair.second}:{join.second}",
-            join.percent,
-            "" if join not in pair.forced else "forced" if pair.proven else "in all maps found",
+            pair.how_sure(join),
         )
         for pair in pairs
         for join in (*pair.forced, *pair.possible)
     ]
     alone = [str(pair) for pair in pairs if not pair.forced and not pair.possible]
-    head = ("step", "and step", "probability", "")
+    head = ("step", "and step", "how sure")
     return (_table(head, rows) if rows else "") + "".join(_paragraph(f"{one}.") for one in alone)
 
 
