@@ -354,6 +354,10 @@ def test_maps_tell_the_theory_that_is_explained_by(
     assert main(["explain", trace, "0", "1"]) == 20
     assert main(["explain", trace, "0", "1", "--theory", str(maps)]) == 0
     assert "functional_view" in capsys.readouterr().out
+    told = tmp_path / "causal.toml"
+    told.write_text('level = "causal"')
+    assert main(["explain", trace, "0", "1", "--theory", str(told)]) == 0
+    assert "functional_view" in capsys.readouterr().out
     maps.write_text(json.dumps({"maps": []}))
     assert main(["explain", trace, "0", "1", "--theory", str(maps)]) == 1
     assert "expected the theory that the maps were made with" in capsys.readouterr().err

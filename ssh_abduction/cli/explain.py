@@ -15,10 +15,19 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.obeying import as_corrected
-from ssh_abduction.cli.options import Verbs, add_theory, maps_in, number_steps, theory_of, trace_in
+from ssh_abduction.cli.options import (
+    Verbs,
+    add_theory,
+    maps_in,
+    number_steps,
+    theory_of,
+    theory_of_maps,
+    trace_in,
+)
 from ssh_abduction.cli.outcome import dump, on_ctrl_c
 from ssh_abduction.data.drives import step_named
-from ssh_abduction.data.errors import AbductionError
+from ssh_abduction.data.errors import AbductionError, named
+from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.mend import TraceExplanation, TraceQuestion
 from ssh_abduction.explain.pairs import PairQuestion
@@ -26,6 +35,7 @@ from ssh_abduction.explain.sides import PlaceExplanation, PlaceQuestion
 from ssh_abduction.explain.verdict import PairExplanation, Verdict
 from ssh_abduction.runtime.program import interrupted_code
 from ssh_abduction.solver import Stop, probability_in_words
+from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
     from ssh_abduction.rivals.listing import Listing
@@ -105,8 +115,8 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    named = _PLACE.fullmatch(" ".join(options.steps))
-    if not named and len(options.steps) not in (0, 2):
+    of_place = _PLACE.fullmatch(" ".join(options.steps))
+    if not of_place and len(options.steps) not in (0, 2):
         raise AbductionError(
             f"steps: expected two, or none, got {len(options.steps)}; name the two steps that are "
             "to be explained, or a place and a path, as in p7 path2"
@@ -115,15 +125,15 @@ def run(options: argparse.Namespace) -> int:
         options.theory = options.theory or maps_in(options.trace)
     trace = Trace.load(trace_in(options.trace))
     number_steps(options, trace)
-    maps = options.theory if options.theory and Path(options.theory).is_file() else None
-    trace, theory = as_corrected(trace, theory_of(options), maps, options.corrections)
+    maps, found, data = _maps_of(options)
+    trace, theory = as_corrected(trace, theory_of(options, found), maps, options.corrections)
     limits: dict[str, Any] = {
         "time_limit": options.time_limit,
         "memory_limit": options.memory_limit,
     }
     question: PairQuestion | TraceQuestion | PlaceQuestion
-    if named:
-        place, path = (None if n is None else int(n) for n in named.groups())
+    if of_place:
+        place, path = (None if n is None else int(n) for n in of_place.groups())
         assert place is not None
         question = PlaceQuestion(trace, place, path, theory, **limits)
     elif options.steps:
@@ -135,8 +145,10 @@ def run(options: argparse.Namespace) -> int:
         question = TraceQuestion(trace, theory, **limits)
     from ssh_abduction.rivals.listing import Listing  # loads numpy
 
-    listing = Listing.load(maps) if maps and options.steps and not named else None
-    pair = None if listing is None else _InMap.of(listing, first, second)
+    pair = None
+    if found and maps and options.steps and not of_place:
+        listing = Listing.from_dict(data, named(maps)).named_beside(maps)
+        pair = _InMap.of(listing, first, second)
     written = partial(_as_json if options.json else _as_text, pair)
 
     def last_words(why: Stop) -> tuple[str, int]:
@@ -150,6 +162,25 @@ def run(options: argparse.Namespace) -> int:
         answer = question.answer()
         guard.say(lambda: written(answer))
     return _exit_code(answer)
+
+
+def _maps_of(options: argparse.Namespace) -> tuple[str | None, Theory | None, Any]:
+    """Read the file of maps that --theory names, if it names one.
+
+    Returns:
+        The file that --theory names, the theory of its maps, and its data; None for what there is
+        not. A file of TOML has no maps.
+
+    Raises:
+        MapError: The file cannot be read, or holds no theory.
+    """
+    file = maps_in(options.theory) if options.theory else None
+    if file is None or not Path(file).is_file():
+        return None, None, None
+    if file.endswith(".toml"):
+        return file, None, None
+    data, options.theory = read_json(file), None
+    return file, theory_of_maps(data, file), data
 
 
 @dataclass(frozen=True, slots=True)

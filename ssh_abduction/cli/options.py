@@ -297,14 +297,17 @@ def theory_of(options: argparse.Namespace, found: Theory | None = None) -> Theor
             f"--theory: expected {', '.join(PRESETS)}, a .toml file, or a file of maps, "
             f"got {brief(named_theory)}{hint}"
         )
-    data = read_json(named_theory)
+    return theory_of_maps(read_json(named_theory), named_theory).replace(**chosen)
+
+
+def theory_of_maps(data: Any, file: str) -> Theory:
+    """Return the theory with which maps were made, from the data of their file. Raises MapError."""
     if not isinstance(data, dict) or data.get("theory") is None:
         raise MapError(
-            f"{named(named_theory)}: theory: expected the theory that the maps were made with, "
-            "got none; "
+            f"{named(file)}: theory: expected the theory that the maps were made with, got none; "
             "take what solve --json printed"
         )
-    return Theory.from_dict(data["theory"]).replace(**chosen)
+    return Theory.from_dict(data["theory"])
 
 
 def number_steps(options: argparse.Namespace, trace: Trace) -> None:
