@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.asp.limits import StageTimeError
@@ -21,6 +22,23 @@ WIDTHS, BREAKING = {1: 0.7, 4: 0.6, 16: 0.7}, 0.8
 WIDER, QUICK, MOST_SECONDS, LONGER = 64, 0.3, 60.0, 5.0
 # A beam of this width or more nearly always ends with the map of least cost.
 BROAD = 4
+
+
+@dataclass(frozen=True, slots=True)
+class _Time:
+    """The time of all beams of a search.
+
+    Attributes:
+        begun: The seconds on the clock when it began.
+        seconds: How long it lasts; inf without a limit.
+    """
+
+    begun: float
+    seconds: float
+
+    def end(self, share: float) -> float:
+        """Return the seconds on the clock when a share of the time is over."""
+        return self.begun + share * self.seconds
 
 
 class Beams:
@@ -45,6 +63,8 @@ class Beams:
         # The cost of the best map of the last broad beam, and the estimate of it by the beam.
         self._best = math.inf, math.inf
         self.broken = -math.inf
+        self._ended = 0  # the width of the widest beam that ended
+        self._took: list[float] = []  # the seconds of each beam of WIDTHS
 
     def found(self, nats: float) -> bool:
         """Whether a broad beam ended with a map of this cost, and `broken` is known.
@@ -64,61 +84,66 @@ class Beams:
         Returns:
             Whether the trace may have a map.
         """
-        parts, watch = self._parts, self._parts.watch
-        begun, left = watch.elapsed(), watch.left()
-        if left > 0:
-            parts.candidates.sketch(SKETCH_SHARE * left, beams=False)
+        watch = self._parts.watch
+        time = _Time(watch.elapsed(), watch.left())
+        if time.seconds > 0:
+            self._parts.candidates.sketch(SKETCH_SHARE * time.seconds, beams=False)
             self._keep_best()
+        may_have_map = self._search_widths(time, clashes)
+        if may_have_map:
+            self._search_wider(time)
+            self._search_without_axioms(time)
+        watch.end_stage_after(math.inf)
+        return may_have_map
+
+    def _search_widths(self, time: _Time, clashes: Callable[[], bool]) -> bool:
+        """Search by beams of all WIDTHS for which there is time. Return as `search`."""
+        parts, watch = self._parts, self._parts.watch
         # With several drives or floors, a broad beam keeps as many hypotheses as a wider one.
         several = parts.task.theory.several_drives or parts.task.theory.lifts
-        widths = {w: share for w, share in WIDTHS.items() if w <= BROAD or not several}
-        # The greatest width, the width of the last beam that ended, and the seconds that the first
-        # and the last beam took.
-        widest, ended, first, last = max(widths), 0, math.inf, math.inf
-        for width, share in widths.items():
+        widths = [width for width in WIDTHS if width <= BROAD or not several]
+        for width in widths:
             began = watch.elapsed()
-            if width < widest and widest * first < widths[widest] * left - (began - begun):
-                continue  # there is time for the widest beam, so leave this one out
-            watch.end_stage_after(begun + share * left)
+            if width < widths[-1] and self._has_time_for(widths[-1], time, began):
+                continue  # leave this one out
+            watch.end_stage_after(time.end(WIDTHS[width]))
             if (beam := parts.candidates.beam(width)) is None:
                 break
-            if self._ends(beam, width):
-                ended = width
-            elif not ended:
+            if not self._ends(beam, width) and not self._ended:
                 parts.candidates.go_on(beam)
             self._keep_best()
             parts.report()
-            if first == math.inf and parts.known.best is None and clashes():
-                watch.end_stage_after(math.inf)
+            if not self._took and parts.known.best is None and clashes():
                 return False
-            last = watch.elapsed() - began
-            first = min(first, last)
-        if ended == max(WIDTHS):
-            self._search_wider(begun, min(QUICK * left, MOST_SECONDS), LONGER * last)
-        watch.end_stage_after(begun + BREAKING * left)
-        with suppress(StageTimeError):
-            is_open = self._best[1] < math.inf and math.isinf(self.broken)
-            if is_open and (beam := parts.candidates.beam(ended)):
-                self.broken = self._best[1] - beam.nats_without_axioms()
-        watch.end_stage_after(math.inf)
+            self._took.append(watch.elapsed() - began)
         return True
 
-    def _search_wider(self, begun: float, seconds: float, needed: float) -> None:
-        """Search by a beam of WIDER hypotheses, if there is time.
+    def _has_time_for(self, width: int, time: _Time, now: float) -> bool:
+        """Whether a beam of this width probably ends in its share of the time.
 
-        Args:
-            begun: The seconds on the clock when the first beam began.
-            seconds: The time that all beams together may take.
-            needed: The seconds that the beam probably takes.
+        It takes about `width` times as long as the first beam did.
         """
-        watch = self._parts.watch
-        if watch.elapsed() - begun + needed > seconds:
+        return bool(self._took) and now + width * self._took[0] < time.end(WIDTHS[width])
+
+    def _search_wider(self, time: _Time) -> None:
+        """Search by a beam of WIDER hypotheses if the widest beam ended, and there is time."""
+        parts, watch = self._parts, self._parts.watch
+        end = time.begun + min(QUICK * time.seconds, MOST_SECONDS)
+        if self._ended < max(WIDTHS) or watch.elapsed() + LONGER * self._took[-1] > end:
             return
-        watch.end_stage_after(begun + seconds)
-        if beam := self._parts.candidates.beam(WIDER):
+        watch.end_stage_after(end)
+        if beam := parts.candidates.beam(WIDER):
             self._ends(beam, WIDER)
             self._keep_best()
-            self._parts.report()
+            parts.report()
+
+    def _search_without_axioms(self, time: _Time) -> None:
+        """Set `broken` by a beam as wide as the last one that ended, if that is still open."""
+        self._parts.watch.end_stage_after(time.end(BREAKING))
+        is_open = self._best[1] < math.inf and math.isinf(self.broken)
+        with suppress(StageTimeError):
+            if is_open and (beam := self._parts.candidates.beam(min(self._ended, max(WIDTHS)))):
+                self.broken = self._best[1] - beam.nats_without_axioms()
 
     def _ends(self, beam: Beam, width: int) -> bool:
         """Keep the maps that a beam ends with. Return whether it ended in time."""
@@ -126,6 +151,7 @@ class Beams:
             nats = [self._add(ssh_map) for ssh_map in self._parts.candidates.maps_of(beam)]
         except StageTimeError:
             return False
+        self._ended = max(self._ended, width)
         if width >= BROAD:
             self._best = min(nats, default=math.inf), beam.nats
             # A beam without axioms would be the same if the checker refused nothing.
