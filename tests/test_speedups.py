@@ -37,7 +37,7 @@ from ssh_abduction.solver.engines import (
     small_maps,
 )
 from ssh_abduction.solver.engines import naming as named
-from ssh_abduction.solver.engines.nearby import NearbySearch
+from ssh_abduction.solver.engines.name_search import NameSearch
 from ssh_abduction.solver.guesses import annealing
 from ssh_abduction.solver.guesses.annealing import annealed_steps
 from ssh_abduction.solver.guesses.merging import merged, thinned
@@ -346,7 +346,7 @@ def test_a_limit_leaves_the_small_map_of_a_guess(seed: int) -> None:
     with (
         patch.multiple(name_search, PATIENCE=1, CORES=1),
         patch.object(annealing, "STEPS", ((0.75, 300),)),
-        patch.object(NearbySearch, "_take", side_effect=KeyboardInterrupt),
+        patch.object(NameSearch, "_with_fewer", side_effect=KeyboardInterrupt),
     ):
         solution = solve(walk.trace, Theory.causal(), speedups=Speedups.without("prefixes"))
     assert solution.status is Status.FEASIBLE

@@ -53,83 +53,29 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.writing import ending, opening, summary_of, written_map
 
 _HOMES = {  # module: the names that this package exports from it
-    "asp": (
-        "facts",
-        "workers",
-    ),
+    "asp": ("facts", "workers"),
     "asp.control": ("has_processors",),
-    "asp.limits": (
-        "POLL",
-        "LimitError",
-        "Stop",
-        "Watch",
-        "check_limit",
-        "resident_memory",
-    ),
-    "asp.process": (
-        "end_all",
-        "in_process",
-    ),
+    "asp.limits": ("POLL", "LimitError", "Stop", "Watch", "check_limit", "resident_memory"),
+    "asp.process": ("end_all", "in_process"),
     "asp.rules": ("check_rules",),
-    "engines.base": (
-        "AT_ONCE",
-        "Task",
-    ),
+    "engines.base": ("AT_ONCE", "Task"),
     "engines.framed": ("FramedEngine",),
-    "entry": (
-        "find_backbone",
-        "solve",
-    ),
-    "front": (
-        "Front",
-        "Point",
-        "fault_front",
-    ),
+    "entry": ("find_backbone", "solve"),
+    "front": ("Front", "Point", "fault_front"),
     "guesses.gated": ("sketch_beyond", "sketches_of"),
     "guesses.tree": ("Sketch",),
-    "judging": (
-        "InternalError",
-        "Judging",
-    ),
+    "judging": ("InternalError", "Judging"),
     "obeying": ("obeyed", "with_names"),
     "ranking": ("Ranking",),
-    "recorded": (
-        "drives_in",
-        "drives_in",
-        "joins_in",
-        "theory_in",
-    ),
-    "regions": (
-        "find_regions",
-        "with_regions",
-    ),
+    "recorded": ("drives_in", "drives_in", "joins_in", "theory_in"),
+    "regions": ("find_regions", "with_regions"),
     "result": ("Solution",),
     "search": ("Search",),
-    "start": (
-        "Limits",
-        "Start",
-    ),
-    "sharing": (
-        "SORTS",
-        "Backbone",
-        "Shared",
-        "Sharing",
-        "Sort",
-        "stretches",
-    ),
-    "steps.certificate": (
-        "RESTS_ON",
-        "Certificate",
-    ),
-    "steps.log": (
-        "Outcome",
-        "observation",
-    ),
-    "weighed": (
-        "EQUAL",
-        "Weighed",
-        "probability_in_words",
-    ),
+    "start": ("Limits", "Start"),
+    "sharing": ("SORTS", "Backbone", "Shared", "Sharing", "Sort", "stretches"),
+    "steps.certificate": ("RESTS_ON", "Certificate"),
+    "steps.log": ("Outcome", "observation"),
+    "weighed": ("EQUAL", "Weighed", "probability_in_words"),
     "values": (
         "Bound",
         "Cost",
@@ -140,12 +86,7 @@ _HOMES = {  # module: the names that this package exports from it
         "Status",
         "cost_as_counted",
     ),
-    "writing": (
-        "ending",
-        "opening",
-        "summary_of",
-        "written_map",
-    ),
+    "writing": ("ending", "opening", "summary_of", "written_map"),
 }
 __all__ = [
     "AT_ONCE",

@@ -10,14 +10,7 @@ from ssh_abduction.solver.ranking import in_order, noise_warning, units_warning
 from ssh_abduction.solver.recorded import Support
 from ssh_abduction.solver.result import Solution
 from ssh_abduction.solver.steps.certificate import Basis
-from ssh_abduction.solver.values import (
-    Cost,
-    Effort,
-    Grounding,
-    Level,
-    Seconds,
-    cost_as_counted,
-)
+from ssh_abduction.solver.values import Cost, Effort, Grounding, Level, Seconds, cost_as_counted
 from ssh_abduction.theory.evidence import said_by
 from ssh_abduction.theory.speedups import row
 

@@ -286,12 +286,7 @@ def _broken(
 
 
 def _with_assertions(
-    part: Trace,
-    pinned: Theory,
-    digest: Digest,
-    ssh_map: SSHMap,
-    found: Solution,
-    solving: Solving,
+    part: Trace, pinned: Theory, digest: Digest, ssh_map: SSHMap, found: Solution, solving: Solving
 ) -> tuple[Solution, tuple[SSHMap, ...]]:
     """Solve again with assertions that equal steps of the digest are equal, if it is short enough.
 

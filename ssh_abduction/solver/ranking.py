@@ -57,10 +57,7 @@ class Ranking:
         return with_compass(replace(ssh_map, fit=self._known[key]))
 
     def ranked(
-        self,
-        maps: Iterator[SSHMap],
-        over: Callable[[], bool],
-        left: Callable[[], float],
+        self, maps: Iterator[SSHMap], over: Callable[[], bool], left: Callable[[], float]
     ) -> Iterator[SSHMap]:
         """Yield the same maps with their fit, the one with the least chi-square first.
 

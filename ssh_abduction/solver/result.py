@@ -40,15 +40,7 @@ from ssh_abduction.solver.recorded import (
 from ssh_abduction.solver.sharing import Backbone, Sharing
 from ssh_abduction.solver.steps.certificate import Certificate
 from ssh_abduction.solver.steps.noise import LEAST, Noise
-from ssh_abduction.solver.values import (
-    Bound,
-    Cost,
-    Effort,
-    Level,
-    Seconds,
-    Status,
-    cost_as_counted,
-)
+from ssh_abduction.solver.values import Bound, Cost, Effort, Level, Seconds, Status, cost_as_counted
 from ssh_abduction.solver.weighed import Weighed
 from ssh_abduction.solver.writing import ending, opening, summary_of, written_map, written_trace
 from ssh_abduction.theory.theory import Theory

@@ -58,11 +58,7 @@ class FramedEngine:
     lists_least = True
     goes_on = True
 
-    def __init__(
-        self,
-        task: Task,
-        around: Mapping[int, Sequence[int]] | None = None,
-    ) -> None:
+    def __init__(self, task: Task, around: Mapping[int, Sequence[int]] | None = None) -> None:
         """Begin with an empty prefix.
 
         Args:

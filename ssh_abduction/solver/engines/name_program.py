@@ -21,12 +21,16 @@ from ssh_abduction.solver.asp.facts import names_lp
 from ssh_abduction.solver.asp.facts.atoms import numbers
 from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.pinned import Pinned
-from ssh_abduction.solver.engines.spare_names import AT_A_TIME, SECONDS_A_CHARACTER
 from ssh_abduction.solver.steps.chart import Chart, Link
 
 # Clingo cannot be stopped while it prepares to solve. That takes about this share of the time that
 # grounding took.
 PREPARING = 0.6
+# Give clingo this many links at once. It cannot be stopped while it grounds them.
+AT_A_TIME = 100
+# Clingo cannot be stopped while it reads and grounds the facts about names. That takes at most
+# about this many seconds for each character of the facts.
+SECONDS_A_CHARACTER = 1e-6
 # Give clingo this many more links of a long trace at a time. Of a shorter trace it gets all links
 # that are left.
 MORE_LINKS = 1000
@@ -263,6 +267,44 @@ class NameProgram:
         """
         used = set(answer.values())
         return {view for view, spare in self._known.spare.items() if spare[-1] in used}
+
+    def make_room_for(self, labels: Sequence[int]) -> None:
+        """Give each view one spare name more than these labels of a map need, if it has fewer."""
+        spares = self._labels_by_view(labels)
+        short = [view for view, some in spares.items() if len(some) >= self._spares[view]]
+        for view in short:
+            self._spares[view] = len(spares[view])  # `name_more` adds one
+        if short:
+            self.name_more(short)
+
+    def _labels_by_view(self, labels: Sequence[int]) -> dict[int, list[int]]:
+        """List the labels of a map that no pinned node has, by their views.
+
+        They are in the order in which clingo was given nodes with them.
+        """
+        pinned = {labels[node] for node in self.pinned.clique}
+        found: dict[int, dict[int, None]] = {}
+        for node in (end for t, _, u in self._known.links for end in (t, u)):
+            if labels[node] not in pinned:
+                found.setdefault(self.chart.seen[node], {})[labels[node]] = None
+        return {view: list(some) for view, some in found.items()}
+
+    def literals_of(self, labels: Sequence[int]) -> list[int]:
+        """Return the literals that give the nodes the labels of a map, up to their numbers."""
+        name_of = {labels[node]: name for name, node in enumerate(self.pinned.clique)}
+        for view, some in self._labels_by_view(labels).items():
+            name_of |= dict(zip(some, self._known.spare[view], strict=False))
+        atoms = self._asker.control.symbolic_atoms
+        return [
+            atom.literal
+            for node, label in enumerate(labels)
+            if (atom := atoms[names_lp.named(node, name_of[label])])
+        ]
+
+    def no_rests(self) -> list[int]:
+        """Return the literals that no node has a rest as its name."""
+        atom = self._asker.control.symbolic_atoms[self.resting(True)[0]]
+        return [-atom.literal] if atom else []
 
     def resting(self, value: bool) -> tuple[clingo.Symbol, bool]:
         """Return the assumption that some node has a rest as its name (True), or none (False)."""

@@ -3,14 +3,14 @@
 Clasp raises the lower bound by one for each core. A core is a set of spare names, and at least one
 of them is needed. Cores are small at first, as views share no names.
 
-If that takes long, the search also looks for small maps in other ways (`engines/small_maps.py`,
-`engines/nearby.py`): first it merges steps, and later it guesses a map. The search ends as soon as
-some map has as few dstates as the bound.
+If that takes long, the search also looks for small maps in other ways (`engines/small_maps.py`):
+first it merges steps, and later it guesses a map. Then it asks for maps with fewer dstates than the
+best one, one fewer each time. The search ends as soon as some map has as few dstates as the bound.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
+from collections.abc import Collection, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from ssh_abduction.solver.asp.control import Asker
@@ -25,11 +25,10 @@ from ssh_abduction.solver.steps.chart import Link
 # If clingo has not ended after this many conflicts, give it more links. If it lacks links that
 # matter, this mostly shows sooner.
 PATIENCE = 2000
-# After this many conflicts with all links, look for a map near a guess. Then clingo continues
-# without a limit.
+# After this many conflicts with all links, guess a map. Then clingo continues without a limit.
 CORES = 10_000
-# Search near a guess this many times, each time with more conflicts. Later tries rarely help.
-TRIES = 3
+# Ask for a map with fewer dstates than the best one with these limits of conflicts, in turn.
+FEWER = (20_000, 40_000)
 
 
 class Incumbent:
@@ -40,15 +39,10 @@ class Incumbent:
         labels: Labels of a map with few dstates; None if no map is known.
     """
 
-    def __init__(self, is_allowed: Callable[[Sequence[int]], bool]) -> None:
-        """Begin without labels and without a bound.
-
-        Args:
-            is_allowed: Says whether labels agree with the evidence about pairs of steps.
-        """
+    def __init__(self) -> None:
+        """Begin without labels and without a bound."""
         self.bound: int | None = None
         self.labels: list[int] | None = None
-        self._is_allowed = is_allowed
 
     def raise_bound(self, bound: int) -> None:
         """Take over a bound if it is higher than the known one."""
@@ -57,18 +51,6 @@ class Incumbent:
     def is_settled(self) -> bool:
         """Whether the known labels reach the bound."""
         return self.labels is not None and len(set(self.labels)) <= (self.bound or 0)
-
-    def take(self, labels: list[int] | None, bound: int) -> None:
-        """Take over labels and a bound from a search near a guess, if they are better.
-
-        Such a search ignores some evidence about pairs of steps, so the labels may not be allowed.
-        """
-        fewer = labels is not None and (
-            self.labels is None or len(set(labels)) < len(set(self.labels))
-        )
-        if labels is not None and fewer and self._is_allowed(labels):
-            self.labels = labels
-        self.raise_bound(bound)
 
 
 @dataclass
@@ -245,14 +227,54 @@ class NameSearch:
             yield from self._near_a_guess()
 
     def _near_a_guess(self) -> Iterator[list[int]]:
-        """Look for small maps near a guess for a while. Yield their labels."""
+        """Guess a map, and look for maps with fewer dstates for a while. Yield their labels."""
         check, known = self._asker.watch.check, self._incumbent.labels
-        if self._program.pinned.is_long:
-            yield from _ever_fewer(self._small.from_beginning(check), known)
-            return
-        search = self._small.search(self._asker.watch)
-        yield from _ever_fewer(self._small.near_guess(search, check, TRIES), known)
-        self._incumbent.take(None, search.bound or 0)
+        is_long = self._program.pinned.is_long
+        guessed = self._small.from_beginning(check) if is_long else self._small.guessed(check)
+        yield from _ever_fewer(guessed, known)
+        if self._incumbent.labels and not is_long:
+            yield from self._fewer(self._incumbent.labels)
+
+    def _fewer(self, labels: list[int]) -> Iterator[list[int]]:
+        """Yield maps with fewer and fewer dstates than a known one, while clingo finds them soon.
+
+        If clingo proves that there is none, the last map is minimal, and the bound says so.
+        """
+        self._program.make_room_for(labels)
+        # Clasp begins each search with the choices of its last answer. So ask for this map first.
+        self._asker.verdict(names_lp.read_names, self._program.literals_of(labels), FEWER[0])
+        for conflicts in FEWER:
+            found: dict[int, int] | None = {}
+            while found is not None:
+                found, proven = self._with_fewer(labels, conflicts)
+                if proven:
+                    self._incumbent.raise_bound(len(set(labels)))
+                    return
+                if found and (views := self._program.rests(found)):
+                    self.name_more(views)
+                elif found:
+                    labels, _ = self._program.follow(found)
+                    yield labels
+
+    def _with_fewer(
+        self, labels: Sequence[int], conflicts: int
+    ) -> tuple[dict[int, int] | None, bool]:
+        """Ask for an answer with fewer dstates, first for one without rests.
+
+        Returns:
+            The name of each node; None if clingo found none. And whether it proved that there is
+            none.
+        """
+        most = len(set(labels)) - 1 - len(self._program.pinned.clique)
+        if most < 0:
+            return None, True
+        for assumed in (self._program.no_rests(), []):
+            answer, core = self._asker.verdict(
+                names_lp.read_names, assumed, conflicts, f"enum,{most},{most}"
+            )
+            if answer is not None or core is None:
+                return answer, False
+        return None, True
 
 
 def _ever_fewer(found: Iterable[list[int]], known: list[int] | None = None) -> Iterator[list[int]]:

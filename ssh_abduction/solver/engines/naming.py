@@ -85,7 +85,7 @@ class NamedLabels:
         """
         self.size = 0
         self._task, self._asker, self._given_map, self._fitting = task, asker, given_map, fitting
-        self._incumbent = Incumbent(self.is_allowed)
+        self._incumbent = Incumbent()
         # Sets of pairs of steps. A map must not have the steps of each pair of a set at one dstate.
         self._forbidden: list[list[tuple[int, int]]] = []
         self._pinned: Pinned | None = None

@@ -1,13 +1,12 @@
-"""Small maps of the causal theory that are made without clingo, or near a guess.
+"""Small maps of the causal theory that are made without clingo.
 
 They are for long traces. If the search has to stop, there is at least a good map. And if a map has
-as few dstates as the lower bound, the search can end. `engines/nearby.py` proves that maps are
-minimal; this module does not.
+as few dstates as the lower bound, the search can end.
 
 First, steps are merged by evidence (`guesses/merging.py`). Then a map is guessed by annealing
 (`guesses/annealing.py`): the places, if turns may be rotations by right angles, otherwise the
-dstates. `NearbySearch` looks for smaller maps near the guess. Of a long trace, only the first steps
-are guessed. The guess is then followed along the other steps (`guesses/continuing.py`).
+dstates. Of a long trace, only the first steps are guessed. The guess is then followed along the
+other steps (`guesses/continuing.py`).
 """
 
 from __future__ import annotations
@@ -16,11 +15,8 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
 
-from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.engines.base import AT_ONCE, Task
-from ssh_abduction.solver.engines.nearby import NearbySearch
 from ssh_abduction.solver.engines.pinned import Pinned
-from ssh_abduction.solver.engines.spare_names import Key, seen_labels
 from ssh_abduction.solver.guesses.annealing import annealed, annealed_steps
 from ssh_abduction.solver.guesses.continuing import followed
 from ssh_abduction.solver.guesses.merging import merged, merged_near, thinned
@@ -44,22 +40,6 @@ class SmallMaps:
             pinned: The chart of the first steps, each of them a node.
         """
         self._task, self._pinned = task, pinned
-
-    def search(self, watch: Watch) -> NearbySearch:
-        """Make a search near a guess.
-
-        Clasp's configuration `tweety` finds proofs several times faster than its default.
-
-        Args:
-            watch: The limits of the search.
-        """
-        chart = self._pinned.chart
-        return NearbySearch(
-            watch,
-            self._pinned,
-            far=chart.continuations.excluded_from if chart.excluded else None,
-            configuration="tweety",
-        )
 
     def merged(self, check: Callable[[], None]) -> Iterator[list[int]]:
         """Merge nodes by evidence, and yield the labels of the map; none without that speed-up."""
@@ -90,21 +70,12 @@ class SmallMaps:
                 return
             steps = min(2 * steps, most)
 
-    def near_guess(
-        self, search: NearbySearch, check: Callable[[], None], tries: int | None = None
-    ) -> Iterator[list[int]]:
-        """Yield labels of a guessed map, and then of smaller maps near it.
-
-        Args:
-            search: Searches near the guess.
-            check: Called now and then; may raise to stop.
-            tries: Give up after this many rounds without progress; None for no limit.
-        """
-        if not self._task.speedups.annealed:
-            return
-        near = self._map_of_guess(self._pinned, check)
-        if near is not None:
-            yield from search.fewer(thinned(self._pinned.chart, near, check), tries)
+    def guessed(self, check: Callable[[], None]) -> Iterator[list[int]]:
+        """Yield the labels of a guessed map; none without that speed-up, or without a guess."""
+        if self._task.speedups.annealed:
+            near = self._map_of_guess(self._pinned, check)
+            if near is not None:
+                yield thinned(self._pinned.chart, near, check)
 
     def _map_of_guess(self, pinned: Pinned, check: Callable[[], None]) -> list[int] | None:
         """Return labels of a map of these steps near a guess; None if there is no guess."""
@@ -149,8 +120,10 @@ def mended(guess: Sequence[int], chart: Chart) -> list[int]:
     Returns:
         The new labels. A label stays as it was if the view at the node contradicts the new one.
     """
-    keys = seen_labels(guess, chart)
-    leads: dict[tuple[Key, int], Counter[Key]] = {}
+    keys = [
+        None if label < 0 else (view, label) for view, label in zip(chart.seen, guess, strict=True)
+    ]
+    leads: dict[tuple[tuple[int, int], int], Counter[tuple[int, int]]] = {}
     for t, action, u in chart.links:
         if (here := keys[t]) is not None and (there := keys[u]) is not None:
             leads.setdefault((here, action), Counter())[there] += 1

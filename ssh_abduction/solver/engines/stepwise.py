@@ -176,11 +176,7 @@ class StepEngine:
     def _give_forbidden(self, number: int) -> None:
         """Give clingo the rule that excludes a forbidden set of equalities, by its number."""
         part = f"forbidden_{number}"
-        self.asker.control.add(
-            part,
-            [],
-            questions.forbidden_equalities(self._forbidden[number]),
-        )
+        self.asker.control.add(part, [], questions.forbidden_equalities(self._forbidden[number]))
         self.asker.control.ground([(part, [])])
 
     def _read(self, model: clingo.Model) -> Found:

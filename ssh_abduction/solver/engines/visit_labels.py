@@ -142,10 +142,7 @@ class VisitLabels:
         self._asker.watch.check()
         self.clique = clique(apart, chart.seen) if self._task.speedups.clique else []
         others = set(range(len(apart))) - set(self.clique)
-        return [
-            *self.clique,
-            *sorted(others, key=lambda node: (-int(apart[node].sum()), node)),
-        ]
+        return [*self.clique, *sorted(others, key=lambda node: (-int(apart[node].sum()), node))]
 
     def _first_visits(self, chart: FramedChart) -> set[int]:
         """Return the visits that clingo gets first: all, or the clique's and some first ones."""

@@ -38,11 +38,7 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.guesses.completing import completed
 from ssh_abduction.solver.guesses.pieces import fitted
-from ssh_abduction.solver.guesses.reckoning import (
-    Hypothesis,
-    Reckoning,
-    first_pose,
-)
+from ssh_abduction.solver.guesses.reckoning import Hypothesis, Reckoning, first_pose
 from ssh_abduction.solver.guesses.sights import DEAREST, Sights
 from ssh_abduction.solver.steps.faults import with_changes, with_faults
 from ssh_abduction.solver.steps.log import Log

@@ -173,10 +173,7 @@ def _courses(
 
 
 def _orders(
-    ssh_map: SSHMap,
-    trace: Trace,
-    courses: Mapping[int, _Course],
-    ends: Sequence[tuple[int, int]],
+    ssh_map: SSHMap, trace: Trace, courses: Mapping[int, _Course], ends: Sequence[tuple[int, int]]
 ) -> tuple[MapPath, ...] | None:
     """Sort the places of each path by its travels, and put the ends of paths first or last.
 

@@ -21,7 +21,6 @@ def name_facts(
     spares: Collection[Sequence[int]],
     links: Iterable[tuple[int, int, int]],
     choices: Sequence[Sequence[int]],
-    ordered: bool = True,
 ) -> str:
     """Return the facts that hold for all batches.
 
@@ -30,8 +29,6 @@ def name_facts(
         spares: For each view its spare names; the last one is the rest.
         links: Triples of a node, an action, and the node that the action leads to.
         choices: For each node, the names that it can have.
-        ordered: Whether nodes use the spare names of a view in order, so that there are no
-            equivalent answers. If False, a single search can still assume this by `ordered()`.
     """
     view_of = dict(names)
     rests = {spare[-1] for spare in spares}
@@ -54,7 +51,6 @@ def name_facts(
         f"shows({s},{action},{view})."
         for s, action, view in {(s, action, view_of[x]) for s, action, x in leads}
     ]
-    facts += ["ordered." if ordered else "{ ordered }."]
     return "\n".join(facts)
 
 
@@ -88,19 +84,9 @@ def resting(batch: int) -> Symbol:
     return Function("resting", numbers(batch))
 
 
-def ordered() -> Symbol:
-    """Return the atom that says that steps use the spare names of a view in their order."""
-    return Function("ordered")
-
-
 def named(t: int, name: int) -> Symbol:
     """Return the atom that says that step t is at the dstate of that name."""
     return Function("is", numbers(t, name))
-
-
-def used(name: int) -> Symbol:
-    """Return the atom that says that a spare name is used."""
-    return Function("used", numbers(name))
 
 
 def read_names(model: Model) -> dict[int, int]:
