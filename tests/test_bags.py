@@ -87,6 +87,13 @@ def test_packed_lines_that_end_too_early_say_what_unpacks_the_rest(
         read_log(tmp_path / "a.log")
 
 
+def test_other_bytes_after_packed_lines_are_said_to_be_damage(tmp_path: Path) -> None:
+    write_carmen(tmp_path / "a.log", SCANS)
+    (tmp_path / "a.log").write_bytes(gzip.compress((tmp_path / "a.log").read_bytes()) + b"more")
+    with pytest.raises(LogError, match=r"but after line \d+ they are damaged \("):
+        read_log(tmp_path / "a.log")
+
+
 @pytest.mark.parametrize("format", FILES)
 @pytest.mark.parametrize("share", [0.4, 0.8, 0.97])
 def test_of_a_bag_that_was_cut_the_whole_part_is_read_and_it_is_said(

@@ -598,6 +598,8 @@ def test_errors_say_what_mends_them(
         ),
         (["show", str(none), "--map", "1"], "--map: expected a map, got none"),
         (["check", str(none), ACES], "maps: expected one to check, got none"),
+        (["check", str(tmp_path / "no.json")], "no.json: expected a readable file of maps"),
+        (["next", ACES], "expected a file of maps, got a trace; name the maps first"),
         (["train", str(solved), ACES, "--map", "5", "-o", "x"], "--map: expected 1 to 4, got 5"),
         (["reproduce", "notched-rectangle", "--jobs", "0"], "--jobs: expected how many processes"),
         (

@@ -66,6 +66,11 @@ def kidnapped(scans: Scans) -> Scans:
     ]
 
 
+def in_blocks(scans: Scans) -> Scans:
+    """Stretches of a drive are in another order."""
+    return [scan for i in (160, 80, 120, 40, 0) for scan in scans[i : i + 40]]
+
+
 def of_two_lasers(scans: Scans) -> Scans:
     other = [replace(s, laser=replace(s.laser, mount=(0.1, 0.0, 0.0))) for s in scans[150:]]
     return [*scans[:150], *other]
@@ -81,6 +86,7 @@ def of_two_clocks(scans: Scans) -> Scans:
         (lambda scans: backwards(scans[:150]), "drives backwards all the way"),
         (lambda scans: in_degrees(scans[:150]), "headings of the odometry are read as degrees"),
         (lambda scans: sideways(scans[:150]), "headings are wrong: write them in radians"),
+        (in_blocks, "So does a log that is not in the order of the drive"),
         (kidnapped, "before and after scan 100 (line or message 171) contradict each other"),
         (of_two_lasers, "The laser changes before scan 150"),
         (of_two_clocks, "The clock starts anew before scan 150"),
@@ -101,6 +107,27 @@ def test_what_is_wrong_with_a_log_is_said(
 
 def test_a_good_drive_is_not_doubted(scans: tuple[Scan, ...]) -> None:
     assert notes_of(scans) == ""
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_a_few_scans_are_not_said_to_go_back_and_forth(scans: tuple[Scan, ...], count: int) -> None:
+    assert notes_of(scans[:count]) == ""
+
+
+def test_jumps_do_not_make_headings_wrong(scans: tuple[Scan, ...]) -> None:
+    assert "headings are wrong" not in notes_of(in_blocks(scans))
+
+
+@pytest.mark.parametrize(("count", "unit"), [(100, "centimetres"), (1000, "millimetres")])
+def test_ranges_that_are_not_in_metres_are_refused(
+    scans: tuple[Scan, ...], count: int, unit: str
+) -> None:
+    longer = [
+        replace(s, ranges=count * s.ranges, laser=replace(s.laser, reach=count * s.laser.reach))
+        for s in scans
+    ]
+    with pytest.raises(LogError, match=f"if they are in {unit}, divide the ranges by {count}"):
+        tracked(RobotLog(tuple(longer), source="drive"))
 
 
 def test_headings_in_degrees_are_read_as_such(scans: tuple[Scan, ...]) -> None:

@@ -94,7 +94,7 @@ def test_scans_mend_the_odometry(hall: Path) -> None:
 
 @pytest.mark.parametrize(
     "words",
-    ["check", "compare", "explain FOLDER 0 1", "view -o PAGE"],
+    ["check", "compare", "explain FOLDER 0 1", "view -o PAGE", "localise"],
 )
 def test_a_folder_of_map_stands_for_its_maps_and_its_trace(
     runs: Path, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -105,6 +105,8 @@ def test_a_folder_of_map_stands_for_its_maps_and_its_trace(
     if verb == "explain":
         short = ["explain", str(hall), "0", "1"]
         full = ["explain", trace, "0", "1", "--theory", maps]
+    elif verb == "localise":
+        short, full = [verb, str(hall), str(hall)], [verb, maps, trace]
     else:
         traces = [] if verb in ("show", "compare") else [trace]
         short, full = [verb, str(hall), *others], [verb, maps, *traces, *others]

@@ -91,7 +91,9 @@ class Agreement:
 
     @property
     def is_good(self) -> bool:
-        """Whether the two trajectories nearly agree."""
+        """Whether the two trajectories nearly agree, or are too short to be compared."""
+        if max(self.scans, self.odometry) < STRETCH:
+            return True
         is_other_length = abs(self.scans - self.odometry) > max(LENGTH * self.odometry, STRETCH)
         is_parted = self.parted >= max(LEAST_PARTED, PARTING * self.of)
         return not (is_other_length or self.is_askew or self.has_other_turns or is_parted)

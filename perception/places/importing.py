@@ -253,7 +253,7 @@ def tracked(
     # If the odometry is wrong throughout, that explains all differences between the trajectories.
     doubt = None if whole else disagreement(log, track)
     say([doubt] if doubt else [])
-    track, doubts = log_checks.judged(log, track, explained=bool(whole or doubt))
+    track, doubts = log_checks.judged(log, track, explained=bool(whole or doubt or track.cuts))
     say(doubts)
     return log, track, tuple(notes)
 

@@ -95,9 +95,12 @@ def goes_back_and_forth(log: RobotLog) -> float:
     """Compare the trajectory by odometry over every second scan with that over all scans.
 
     Returns:
-        The ratio of their lengths: about 1 for a drive, 0 for poses of two sources.
+        The ratio of their mean lengths: about 1 for a drive, 0 for poses of two sources; 1 for a
+        log of less than three scans.
     """
-    return float(_far(log, 2).sum() / max(2 * _far(log, 1).sum(), 1e-9))
+    if len(log) < 3:
+        return 1.0
+    return float(_far(log, 2).mean() / max(2 * _far(log, 1).mean(), 1e-9))
 
 
 def usual_step(log: RobotLog) -> float:
@@ -164,7 +167,7 @@ def describe_cuts(log: RobotLog, track: Track, turned: list[tuple[int, float]]) 
             + (f", and by {far[most]:.1f} m at most" if len(jumps) > 1 else "")
             + ". Nothing is known of how the robot moved there, so the trace has no displacement "
             "across. An odometer that is started anew, or a second program that publishes the same "
-            "odometry, jumps like this."
+            "odometry, jumps like this. So does a log that is not in the order of the drive."
         )
     if still:
         notes.append(
@@ -184,7 +187,8 @@ def describe_cuts(log: RobotLog, track: Track, turned: list[tuple[int, float]]) 
         notes.append(
             f"Scans turn differently from the odometry, {_times(len(turned))}: at scan {first} "
             f"({_where(log, first)}) by {abs(math.degrees(angle)):.0f} degrees. The track "
-            "follows the scans."
+            "follows the scans. If the robot was carried there, cut the log there, and map each "
+            "part."
         )
     return notes
 

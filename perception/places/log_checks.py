@@ -43,6 +43,28 @@ NEAR, DRIFT, AWAY = 3.0, 0.02, 15.0
 # least MARGIN metres from walls. BESIDE scans on each side are compared. In good logs, scans that
 # match so badly have at most 27 % of their points there.
 INTRUDING, MARGIN, POORLY, BESIDE = 0.3, 0.4, 0.6, 3
+# Beams that meet walls are at most this many metres long, in the median of a log. Good logs have up
+# to 3 m.
+FAR_WALLS = 50.0
+
+
+def refuse_lengths(log: RobotLog) -> None:
+    """Raise a LogError if the ranges of a log are too long to be metres.
+
+    Args:
+        log: The log.
+
+    Raises:
+        LogError: The ranges are not in metres.
+    """
+    met = [scan.ranges[(scan.ranges > 0) & (scan.ranges < scan.laser.reach)] for scan in log.scans]
+    usual = float(np.median([float(np.median(some)) for some in met if len(some)] or [0.0]))
+    if usual > FAR_WALLS:
+        unit, count = ("millimetres", 1000) if usual > 10 * FAR_WALLS else ("centimetres", 100)
+        raise LogError(
+            f"{named(log.source)}: expected ranges in metres, got beams that are {usual:.0f} m "
+            f"long in the median; if they are in {unit}, divide the ranges by {count}"
+        )
 
 
 def refuse_shuffled(log: RobotLog) -> None:
@@ -83,8 +105,9 @@ def checked(log: RobotLog) -> tuple[RobotLog, list[str], list[str]]:
         converted; and notes on what is wrong with the whole log.
 
     Raises:
-        LogError: The scans are in random order.
+        LogError: The scans are in random order, or their ranges are not in metres.
     """
+    refuse_lengths(log)
     refuse_shuffled(log)
     log, alternating = jumps.keep_one_source(log)
     units, converted = units_of(log)

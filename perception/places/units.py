@@ -116,11 +116,12 @@ def ahead(log: RobotLog) -> float:
 
     Returns:
         1 for a robot that drives ahead all the way, -1 for one that drives backwards; 1 for a robot
-        that stands.
+        that stands. Jumps of the odometer do not count.
     """
     poses = np.array([scan.odometry for scan in log.scans])
     steps = np.diff(poses[:, :2], axis=0)
     length = np.hypot(*steps.T)
+    length[length > max(jumps.FAR, jumps.UNUSUAL * jumps.usual_step(log))] = 0.0
     if not length.any():
         return 1.0
     turns = (np.diff(poses[:, 2]) + math.pi) % math.tau - math.pi

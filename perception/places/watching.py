@@ -77,7 +77,8 @@ def watched(scans: Iterable[Scan], tell: Teller, source: str = "") -> Iterator[S
         The scans, with odometry in metres and radians.
 
     Raises:
-        LogError: The scans are in random order, or the odometry has several sources.
+        LogError: The scans are in random order, their ranges are not in metres, or the odometry has
+            several sources.
     """
     coming = iter(scans)
     first = _first_of(coming)
@@ -115,6 +116,7 @@ def _first_of(coming: Iterator[Scan]) -> list[Scan]:
 
 def _units_of(log: RobotLog, tell: Teller) -> Units:
     """Recognise the units of the odometry of the first scans of a drive. Raises LogError."""
+    log_checks.refuse_lengths(log)
     log_checks.refuse_shuffled(log)
     if jumps.keep_one_source(log)[1]:
         raise LogError(

@@ -251,7 +251,9 @@ def lines(file: IO[bytes], source: str) -> Iterator[tuple[int, bytes | None]]:
     except damages(OSError) as error:
         if found is None:
             raise
-        what = "they end too early" if isinstance(error, EOFError) else str(error)
+        what = (
+            "they end too early" if isinstance(error, EOFError) else f"they are damaged ({error})"
+        )
         tool = dict(PACKERS.values())[found]
         raise LogError(
             f"{source}: expected whole data of {found}, but after line {number} {what}; get "

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from ssh_abduction.cli.options import Verbs, add_map, add_maps
+from ssh_abduction.cli.options import Verbs, add_map, add_maps, trace_in
 from ssh_abduction.cli.parsing import true_or_false
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.trace import Trace
@@ -28,6 +28,7 @@ def add_parser(verbs: Verbs) -> None:
     add_map(parser)
     parser.add_argument(
         "--trace",
+        type=trace_in,
         metavar="TRACE",
         help=("the trace that was mapped; its turns give a better layout of a map without poses"),
     )

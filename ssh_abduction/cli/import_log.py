@@ -181,11 +181,12 @@ def run(options: argparse.Namespace) -> int:
 
 def _whole(options: argparse.Namespace, tell: Callable[[str], None]) -> tuple[RobotLog, Imported]:
     """Import the log in a file."""
-    from perception.places.importing import import_log
-
     log = read(options.log, options)
     for warning in log.warnings:
         tell(warning)
+    # Imported late, so that a log that cannot be read is refused at once.
+    from perception.places.importing import import_log
+
     return log, import_log(log, options.width or WIDTH, named_after(options.log), tell)
 
 

@@ -16,6 +16,7 @@ from ssh_abduction.cli.options import (
     check_picture,
     picture_file,
     read_maps,
+    trace_in,
 )
 from ssh_abduction.cli.parsing import true_or_false
 from ssh_abduction.cli.text import table
@@ -45,9 +46,10 @@ def add_parser(verbs: Verbs) -> None:
     add_maps(parser)
     parser.add_argument(
         "other",
+        type=trace_in,
         help=(
             "trace of a robot in the mapped world that uses the same names of views and actions; "
-            "- for standard input"
+            "- for standard input; or a folder that map wrote"
         ),
     )
     parser.add_argument(
@@ -55,6 +57,7 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.add_argument(
         "--trace",
+        type=trace_in,
         metavar="TRACE",
         help="the trace that was mapped, to estimate probabilities by counting its steps",
     )

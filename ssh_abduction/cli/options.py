@@ -155,11 +155,13 @@ def trace_of(options: argparse.Namespace) -> str:
     """Return the trace file of a verb with `add_maps` and `add_trace`. Warn if they are swapped.
 
     Raises:
-        AbductionError: There is no trace.
+        AbductionError: There is no trace, or the file of maps cannot be read.
     """
     if options.trace is None and (beside := trace_beside(options.maps)) is not None:
         return beside
     if options.trace is None:
+        if options.maps != "-":
+            read_maps(options.maps)  # a file that is missing or holds no maps is said first
         raise AbductionError(
             f"trace: expected the trace of {named(options.maps)}, got none; name it after the maps"
         )

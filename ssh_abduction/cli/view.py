@@ -46,7 +46,7 @@ def add_parser(verbs: Verbs) -> None:
         "robot is at each step. It may be TRACE itself. Beliefs come from its views, or from the "
         "file of --belief"
     )
-    parser.add_argument("--run", dest="followed", metavar="RUN", help=localised)
+    parser.add_argument("--run", dest="followed", type=trace_in, metavar="RUN", help=localised)
     parser.add_argument(
         "--belief",
         metavar="FILE",
