@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
@@ -37,8 +38,8 @@ FRAMING, UNMAPPED = 30.0, 2.0
 # A sketch (a map made without a search) and its check may take this share of the time left for all
 # sketches.
 SKETCH_SHARE = 0.4
-# The sketch that succeeds most often may take this many seconds even if less time is left.
-# Otherwise a slow machine would find no map.
+# The sketch that succeeds most often may take this many seconds of processor time even if less time
+# is left. Otherwise a slow or busy machine would find no map.
 SUREST = 1.0
 # The width of a broad beam of hypotheses. Make a beam only for at most LONGEST steps, as its time
 # grows with the cube of their number.
@@ -141,7 +142,7 @@ class Candidates:
                     1.0 if attempt in (surest, *smaller[-1:]) else SKETCH_SHARE,
                 )
                 part = (
-                    Watch().part(max(seconds, SUREST))
+                    Watch().part(max(seconds, SUREST), time.thread_time)
                     if attempt is surest
                     else whole.part(share * whole.left())
                 )

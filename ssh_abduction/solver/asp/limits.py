@@ -73,6 +73,7 @@ class Watch:
         limit: float | None = None,
         memory: float | None = None,
         on_tick: Callable[[], None] = lambda: None,
+        clock: Callable[[], float] | None = None,
     ) -> None:
         """Set the limits. The clock stands still until `start`.
 
@@ -80,8 +81,9 @@ class Watch:
             limit: Seconds; None for no limit.
             memory: MiB that the process may use at its peak; None for no limit.
             on_tick: Called by `check` every TICK seconds, to report progress.
+            clock: Returns the time in seconds; None for `now`.
         """
-        self._on_tick = on_tick
+        self._on_tick, self._clock = on_tick, clock or now
         self._next_tick = TICK
         self._limit = limit
         self._allowed = None if limit is None else limit * (1 - RESERVE)
@@ -95,10 +97,10 @@ class Watch:
         """Let the clock run. If it runs already, do nothing.
 
         Args:
-            since: Count from this value of `now`; None for the present time.
+            since: Count from this time of the clock; None for the present time.
         """
         if self._started is None:
-            self._started = now() if since is None else since
+            self._started = self._clock() if since is None else since
 
     @property
     def has_reserve(self) -> bool:
@@ -129,9 +131,9 @@ class Watch:
         """The seconds after which only the reserved part of the time limit is left."""
         return math.inf if self._limit is None else self._limit * (1 - RESERVE)
 
-    def part(self, seconds: float) -> Watch:
+    def part(self, seconds: float, clock: Callable[[], float] | None = None) -> Watch:
         """Start a new watch whose limit is this many seconds. Limits of this watch also end it."""
-        part = Watch(seconds, self._memory, self.check)
+        part = Watch(seconds, self._memory, self.check, clock)
         part.use_reserve()
         part.start()
         return part
@@ -151,7 +153,7 @@ class Watch:
 
     def elapsed(self) -> float:
         """Return the seconds on the clock."""
-        return self._spent + (0 if self._started is None else now() - self._started)
+        return self._spent + (0 if self._started is None else self._clock() - self._started)
 
     def check(self, ahead: float = 0.0, mebibytes: float = 0.0) -> None:
         """Raise if a limit is reached, or would be reached during the next work.
