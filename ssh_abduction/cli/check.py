@@ -24,6 +24,7 @@ from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory
 
 EXIT_VIOLATED = 20
+SHOWN = 20  # violations that are printed for each map
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -71,13 +72,15 @@ def run(options: argparse.Namespace) -> int:
     for i, ssh_map in enumerate(maps):
         violations = check(trace, ssh_map, resolved)
         broken += bool(violations)
-        for v in violations:
+        for v in violations[:SHOWN]:
             steps = (
                 f"{'step' if len(v.steps) == 1 else 'steps'} {', '.join(map(str, v.steps))}: "
                 if v.steps
                 else ""
             )
             print(f"map {i + 1}: {v.axiom}: {steps}{printable(v.message)}")
+        if more := violations[SHOWN:]:
+            print(f"map {i + 1}: and {counted(len(more), 'more violations')}")
     not_checked = unchecked(resolved)
     checked = sum(name not in not_checked for name in resolved.axioms)
     print(f"{len(maps) - broken} of {len(maps)} maps satisfy the {checked} axioms")
@@ -86,7 +89,7 @@ def run(options: argparse.Namespace) -> int:
     if unjudged:
         print("regions are not checked: the file is of another theory")
     if resolved.weigh == "cost" and isinstance(data, dict) and data.get("weighed"):
-        broken += not _costs_hold(trace, data, maps, resolved)
+        broken += not _costs_hold(trace, data, maps, resolved, str(options.maps))
     if not options.bound:
         return EXIT_VIOLATED if broken else 0
     if resolved.has_faults or (solved is not None and solved.has_faults):
@@ -116,12 +119,12 @@ def _axioms_of(theory: Theory) -> Theory:
 
 
 def _costs_hold(
-    trace: Trace, data: Mapping[str, Any], maps: Sequence[SSHMap], theory: Theory
+    trace: Trace, data: Mapping[str, Any], maps: Sequence[SSHMap], theory: Theory, where: str
 ) -> bool:
     """Compute the costs of maps in nats anew, print what is false, and return whether all hold."""
     from ssh_abduction.checker.misfit import LONGEST, false_costs  # loads numpy
 
-    Solution.from_dict(data, "the file", trace)  # the fields that claim costs have the right form
+    Solution.from_dict(data, where, trace)  # the fields that claim costs have the right form
     false = list(false_costs(trace, data, maps, theory))
     for claim in false:
         print(printable(claim))
