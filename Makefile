@@ -4,7 +4,7 @@
 # make bench-grid  localisation over dstates beside that over all poses of an occupancy grid; an hour, or ARGS="--part growing --seeds 1"
 # make parts  times of single parts: circuits, images, exploring step by step, and small traces
 # make docs   the pages of docs/ and a page for each public name as a site, with its links checked; open site/index.html
-# make test   the same, with the tools of development: lint, types, layers, tests; make test-all also runs slow tests
+# make test   lint, types, layers and tests, with the development tools in .venv; make test-all also runs slow tests
 PYTHON ?= python3
 BIN := .venv/bin
 export PIP_CONSTRAINT := $(CURDIR)/requirements.lock

@@ -244,7 +244,7 @@ def reach_of(found: Found, survey: Survey, kind: str, assumed: dict[str, str]) -
 
 
 def survey_of(file: IO[bytes], source: str, with_graph: bool) -> Found:
-    """Go through a log, and count what shows the meaning of its poses and ranges.
+    """Read a log, and count the evidence for the meaning of its poses and ranges.
 
     Args:
         file: The log.

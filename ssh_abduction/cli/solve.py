@@ -393,9 +393,10 @@ def _lines(
         if explanation:
             yield from explanation.sentences
             first, last = search.trace.at(explanation.first), search.trace.at(explanation.last)
+            where = f"at {last}" if first == last else f"from {first} to {last}"
             yield (
-                f"look at what was seen and done from {first} to {last}, or leave one of these "
-                "axioms out: --set without=NAME"
+                f"look at what was seen and done {where}, or leave one of these axioms out: "
+                "--set without=NAME"
             )
         return
     if solution.cost is None:

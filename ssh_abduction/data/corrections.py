@@ -204,9 +204,9 @@ class Corrections:
         if other or (self.drives and not set(self.drives) & set(known)):
             found = f"other steps of {other[0]}" if other else f"{', '.join(known)}"
             raise MapError(
-                f"{where}: drives: expected the drives {', '.join(self.drives)} that it was "
-                f"written for, got {found}; it belongs to another map: name another file, or "
-                "remove it"
+                f"{where}: drives: expected those that it was written for, "
+                f"{', '.join(map(brief, self.drives))}, got {found}; it belongs to another map: "
+                "name another file, or remove it"
             )
 
     def known_in(self, drives: Sequence[Drive]) -> Corrections:

@@ -72,8 +72,9 @@ class Explanation:
             f"{c.axiom} ({'step' if len(c.steps) == 1 else 'steps'} {', '.join(map(str, c.steps))})"
             for c in self.clashes
         ]
-        where = f"in steps {self.first} to {self.last} these clash"
-        return f"no map satisfies the axioms: {where}: {', '.join(parts)}"
+        many = f"steps {self.first} to {self.last}"
+        where = f"step {self.last}" if self.first == self.last else many
+        return f"no map satisfies the axioms: in {where} these clash: {', '.join(parts)}"
 
     def to_dict(self) -> dict[str, object]:
         """Return the explanation as plain data, as `solve --json` prints it."""

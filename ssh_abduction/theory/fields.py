@@ -176,7 +176,7 @@ def _check_faults(theory: Theory) -> None:
     others = [kind for kind in EXCUSED if kind != "changed" and getattr(theory, kind)]
     if theory.star == "gateways" and others:
         raise TheoryError(
-            "star: expected another value where such faults are allowed, got gateways; "
+            f"star: expected another value where {', '.join(others)} is allowed, got gateways; "
             f"take {choice('star', 'alike')}"
         )
     if theory.boundary == "defeasible":

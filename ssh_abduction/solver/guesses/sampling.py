@@ -74,7 +74,7 @@ class _Transitions:
         self._counted, self.counts, self.totals = self._tallied(labels)
 
     def rows(self, states: States, visits: States) -> States:
-        """Return the row of the table for the last step of each of some visits.
+        """Return, for each visit, the row of the table for its last step.
 
         Args:
             states: The states of the visits, in a shape that broadcasts with `visits`.
