@@ -1,5 +1,5 @@
-"""The real route of the ACES building, its maps, and what the command line says of it, which many
-tests look at and none has to compute again."""
+"""The real route of the ACES building, its maps, and the output of the shell, computed once for all
+tests."""
 
 from __future__ import annotations
 
@@ -19,13 +19,14 @@ ACES = str(PATH)
 def solution(
     theory: Theory | None = None, max_maps: int | None = None, within: int = 0
 ) -> Solution:
-    """The minimal maps of it, all or so many, and those of up to so many dstates more."""
+    """Find the minimal maps of the route, at most `maps`, and those with up to `within` dstates
+    more."""
     return solve(Trace.load(PATH), theory, max_maps=max_maps, within=within)
 
 
 @cache
 def answer() -> str:
-    """What `solve --json` prints of it."""
+    """The output of `solve --json` for the route."""
     with contextlib.redirect_stdout(io.StringIO()) as printed:
         assert main(["solve", ACES, "--json"]) == 0
     return printed.getvalue()

@@ -1,5 +1,5 @@
-"""Every map of a tiny trace (up to seven observations), by trying all of them: slow, plain,
-independent of encodings and checker.
+"""Find every map of a tiny trace (up to seven observations) by trying all. This is slow, plain, and
+independent of the encodings and the checker.
 
 >>> from ssh_abduction import Theory, Trace
 >>> trace = Trace.from_steps("aaa", ["travel", "travel"])
@@ -59,7 +59,7 @@ QUARTERS = {"right": 1, "around": 2, "left": 3}
 
 
 class Counts(NamedTuple):
-    """What a theory may minimise."""
+    """The numbers that a theory may minimise."""
 
     dstates: int
     paths: int
@@ -68,8 +68,8 @@ class Counts(NamedTuple):
 
 
 def key(ssh_map: SSHMap) -> Key:
-    """The map without its witnesses; dstates, places and paths numbered by the first step, where a
-    path is faced in direction +1."""
+    """A map without its witnesses. Dstates, places and paths are numbered by first visit. At its
+    first step a path is faced in direction +1."""
     by_id = {s.id: s for s in ssh_map.dstates}
     visited = [by_id[s] for s in dict.fromkeys(ssh_map.dstate_at)]
     labels = {s.id: i for i, s in enumerate(visited)}
@@ -148,8 +148,8 @@ def near_minimal_maps(
 
 
 def consistent_maps(trace: Trace, theory: Theory) -> Iterator[tuple[Key, Counts]]:
-    """Every map that satisfies the axioms, once, with its counts: excuses are the fewest that make
-    it consistent."""
+    """Yield every map that satisfies the axioms, once, with its counts. Of excuses it has the
+    fewest that make it consistent."""
     theory = settle(trace, theory).theory
     on = frozenset(theory.axioms)
     defeasible = theory.boundary == "defeasible"
@@ -220,8 +220,7 @@ def consistent_maps(trace: Trace, theory: Theory) -> Iterator[tuple[Key, Counts]
 
 
 def _as_asserted(labels: Labels, places: tuple[int, ...] | None, theory: Theory) -> bool:
-    """Whether dstates, and places where they are given, are as the theory says of pairs of steps
-    that the trace has."""
+    """Whether dstates and places (if given) agree with the theory's assertions on steps."""
     there = [
         [(i, j) for i, j in pairs if j < len(labels)]
         for pairs in (theory.same, theory.different, theory.elsewhere, theory.same_place)
@@ -392,8 +391,8 @@ def _headings(
     at = [places[label] for label in labels]
 
     def slots(step: int, heading: int) -> set[int]:
-        """The open slots of the place, by the star of a step: opening j from ahead belongs to slot
-        heading + j."""
+        """The open slots of the place by the star of a step. Opening j from ahead is slot heading +
+        j."""
         star = stars[step]
         assert star is not None
         return {(heading + j) % 4 for j in SLOTS if star[j]}
@@ -440,8 +439,7 @@ def _headings(
 def _goes_straight(
     labels: Labels, places: tuple[int, ...], courses: Courses, headings: tuple[int, ...], on: Axioms
 ) -> bool:
-    """A path leaves a place through opposite slots; a slot belongs to one path and direction, and
-    these to one slot."""
+    """A path leaves a place by two opposite slots. A slot belongs to one path and direction."""
     if "path_goes_straight" not in on:
         return True
     through: dict[tuple[int, int], set[Course]] = defaultdict(set)
@@ -469,8 +467,8 @@ def _gateways_agree(
     on: Axioms,
     orders: dict[int, Order] | None = None,
 ) -> bool:
-    """Whether at each place the gateways of all steps can be named, so that stars agree when turned
-    by whole degrees, and lead on where paths go on in these orders."""
+    """Whether the gateways at each place can be named so that all stars agree after a rotation by
+    whole degrees, and that paths lead on through them in these orders."""
     at = [places[label] for label in labels]
     onward: list[set[int]] = [set() for _ in labels]
     for t, label in enumerate(labels):
@@ -498,8 +496,8 @@ def _named(
     on: Axioms,
     onward: list[set[int]],
 ) -> bool:
-    """Whether each of these steps, which are at one place, has a reading of its star: the bearing
-    of each gateway of the place, in a clockwise order that is the same for all."""
+    """Whether the stars of some steps at one place have readings with one clockwise order of
+    gateways. A reading gives the bearing of each gateway of the place."""
 
     def extend(chosen: dict[int, tuple[Named, ...]]) -> bool:
         if len(chosen) == len(steps):
@@ -729,7 +727,7 @@ def _way_on(seen: tuple[Named, ...], star: tuple[Gateway, ...]) -> tuple[int, in
 
 
 def _courses(places: tuple[int, ...], links: frozenset[Link], on: Axioms) -> Iterator[Courses]:
-    """The course of each dstate:
+    """The course of each dstate.
 
     None, or a path and a direction, numbered by first visit and +1 there.
     """
@@ -789,7 +787,7 @@ def _link_allowed(start: Course | None, action: Action, end: Course | None, on: 
 
 
 def _supported(links: frozenset[Link]) -> set[int]:
-    """The dstates that a travel starts or ends at, and those that turns around join to them."""
+    """The dstates at which a travel starts or ends, and those that turns around link to them."""
     found = {
         s for source, action, target in links if action.kind == "travel" for s in (source, target)
     }
@@ -810,8 +808,8 @@ def _least_excuses(
     defeasible: bool,
     ends: Callable[[dict[int, Order]], bool] | None,
 ) -> int | None:
-    """The fewest pairs of paths to be excused from B2, under any orders of the paths that `ends`
-    allows; None where no orders and excuses will do."""
+    """The fewest pairs of paths to excuse from B2, over all orders of the paths that `ends` allows;
+    None if no order is consistent."""
     paths = sorted({course[0] for course in courses if course})
     on_path = {
         h: {p for p, c in zip(places, courses, strict=True) if c and c[0] == h}
@@ -859,7 +857,7 @@ def _least_excuses(
 
 
 def _orders(places: set[int], before: Order, on: Axioms) -> Iterator[Order]:
-    """The least order that has `before` in it or, with path_order_total, every total one.
+    """The least order that contains `before`; with path_order_total, every total order.
 
     Fewer pairs never break an axiom.
     """
@@ -892,7 +890,7 @@ def _goes_to_next(travels: list[tuple[int, int, int, int]], order: Order) -> boo
 def _branches(
     places: tuple[int, ...], courses: Courses, links: frozenset[Link], on: Axioms
 ) -> set[Branch]:
-    """B1: what leaves to the right of what."""
+    """B1: which paths leave to the right of which."""
     if "branch_side" not in on:
         return set()
     found: set[Branch] = set()
@@ -979,7 +977,7 @@ def _is_planar(
 ) -> bool:
     """Whether the edges that travels lead along can be drawn.
 
-    By headings where places have frames; if not, by sides.
+    By headings if places have frames; otherwise by sides.
     """
     travels = {(s, t) for s, action, t in links if action.kind == "travel"}
     if theory.star == "frame":
@@ -1043,8 +1041,7 @@ def _is_planar(
 
 
 def _clockwise(order: tuple[object, ...], ends: list[tuple[int, int]]) -> bool:
-    """Whether these arms, which have to be different ones, come one after another going round
-    once."""
+    """Whether these arms are different and follow each other within one round."""
     start = order.index(ends[0])
     turned = [(order.index(end) - start) % len(order) for end in ends]
     return len(set(turned)) == len(ends) and turned == sorted(turned)

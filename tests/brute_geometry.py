@@ -1,9 +1,9 @@
-"""What displacements say of a map, with matrices written out in full: slow, plain, and independent
-of the package.
+"""Judge maps by displacements, with matrices written out in full. This is slow, plain, and
+independent of the package.
 
-The error of each displacement is a variable of its own (three for each step), and so are the scale
-and the drift of the heading. How a loop moves with each of them is found by moving it a little, and
-the covariance of several closings is J C J' with these derivatives J.
+Each displacement has an error with three components. The scale and the drift of the heading are two
+more variables. Small changes of each variable give the derivatives J of the closing of a loop. The
+covariance of several closings is J C J'.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Geometry:
         self.judged: dict[tuple[tuple[int, int, int], ...], bool] = {}
 
     def end(self, i: int, j: int, bend: float, errors: np.ndarray) -> np.ndarray:
-        """The pose at step j by dead reckoning from the first step, where displacements after step
+        """The pose at step j by dead reckoning from the first step, if the displacements after step
         i, the scale and the drift have these errors."""
         x = y = heading = 0.0
         for t in range(1, j + 1):
@@ -91,8 +91,8 @@ class Geometry:
 
     @cache  # noqa: B019
     def loop(self, i: int, j: int, bend: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
-        """How far off a loop closes, its derivatives, what is added to its covariance, and whether
-        anything is known of it."""
+        """The closing error of a loop, its derivatives, what is added to its covariance, and
+        whether it is known."""
         off = self.end(i, j, bend, np.zeros(3 * len(self.trace) + 2)) - self.end(
             i, i, bend, np.zeros(3 * len(self.trace) + 2)
         )

@@ -1,5 +1,5 @@
-"""The misfit of a map to displacements and closures, by plain least squares from several starts:
-slow, and independent of the package.
+"""Compute the misfit of a map to displacements and closures, by plain least squares from several
+starts. This is slow, and independent of the package.
 
 The unknowns are the position of each place (of each dstate where there are no places), the heading
 of each dstate, how far the robot is off at each step, the scale and the drift.
@@ -105,7 +105,7 @@ class LeastSquares:
     def _reckoned(
         self, headings: Sequence[int], where: Sequence[int], places: int, dstates: int, size: int
     ) -> np.ndarray:
-        """Each unknown as dead reckoning has it at its first visit."""
+        """The initial value of each unknown: dead reckoning at its first visit."""
         unknown = np.zeros(size)
         x = y = facing = 0.0
         seen_places: set[int] = set()

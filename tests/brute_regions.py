@@ -1,5 +1,5 @@
-"""The regions of a small map by trying all sets of places: slow, plain, and independent of the
-encoding and the checker."""
+"""Find the regions of a small map by trying all sets of places. This is slow, plain, and
+independent of the encoding and the checker."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Settings of all tests: how fast the machine is, and whether somebody watches it, decides
-nothing."""
+"""Settings of all tests. Results depend neither on the speed of the machine nor on a terminal."""
 
 import contextlib
 import gc
@@ -18,8 +17,8 @@ from worlds import rectangle
 
 from ssh_abduction.cli import jobs, verbosity, view
 
-# No example takes too long, nor does it take too long to draw one. And the examples are the same in
-# each run: of traces at random, some take clingo a hundred times as long as others.
+# Hypothesis has no deadlines, because clingo takes a hundred times as long for some random traces
+# as for others. Examples are the same in each run.
 settings.register_profile(
     "the same everywhere",
     deadline=None,
@@ -28,21 +27,20 @@ settings.register_profile(
 )
 settings.load_profile("the same everywhere")
 
-# No line of progress comes where a command takes long; tests of these lines say when they come.
+# Commands print no progress by default. Tests of progress set the interval.
 verbosity.EVERY = math.inf
 
-# A page may spend three seconds on what assumptions cost. Tests of these costs ask for them.
+# A page may spend three seconds on the costs of assumptions. Only tests of these costs allow it.
 view.ASSUMING = 0.1
 
-# Programs that are begun in the background do not hear Ctrl-C, nor do those that they begin. Tests
-# do, from any thread that is the main one.
+# Background processes and their children ignore Ctrl-C. Restore the handler for tests.
 with contextlib.suppress(ValueError):
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_finish() -> None:
-    """Each core runs tests of its own, so one thread is enough for arithmetic; and what was
-    imported is not looked through for garbage again and again."""
+    """Each core runs its own tests, so arithmetic gets one thread. Imported objects are left out of
+    garbage collection, which saves time."""
     threadpool_limits(1)
     gc.freeze()
     gc.set_threshold(50_000, 20, 50)
@@ -63,9 +61,9 @@ def _answers(
 
 @pytest.fixture(scope="session")
 def in_this_process() -> Callable[[], AbstractContextManager[object]]:
-    """A context in which many files are answered here: to begin a process takes a second.
+    """Answer many files in this process, because starting a process takes a second.
 
-    Tests of processes do without it, and one of them compares the answers.
+    Tests of processes do not use it. One of them compares the answers.
     """
     return lambda: patch.object(jobs.workers, "answers", _answers)
 
@@ -74,7 +72,7 @@ def in_this_process() -> Callable[[], AbstractContextManager[object]]:
 def without_processes(
     in_this_process: Callable[[], AbstractContextManager[object]],
 ) -> Iterator[None]:
-    """The same for a whole test."""
+    """`in_this_process`, for a whole test."""
     with in_this_process():
         yield
 
@@ -83,7 +81,7 @@ def without_processes(
 def room(tmp_path: Path) -> str:
     """The path of a short trace that has one minimal map, of 8 dstates.
 
-    Tests of what surrounds a search take this one: the route of ACES3 takes ten times as long.
+    Tests that need any quick search use it. The route of ACES3 takes ten times as long.
     """
     path = tmp_path / "room.jsonl"
     rectangle(8).save(path)

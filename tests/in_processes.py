@@ -1,5 +1,4 @@
-"""What tests let other processes do. It is a module of its own, as each of these processes loads
-it."""
+"""Functions that tests run in other processes. Each of these processes loads this module."""
 
 from __future__ import annotations
 
@@ -35,7 +34,7 @@ def from_there(number: int, folder: str, _: Callable[[], bool]) -> list[str]:
 
 
 def leave_a_temporary_file(number: int, there: str, given_up: Callable[[], bool]) -> None:
-    """Tell where the temporary files of this process lie, and wait."""
+    """Print the folder of this process's temporary files, and wait."""
     folder = tempfile.mkdtemp()
     Path(there).write_text(folder)
     while not given_up():
@@ -43,7 +42,7 @@ def leave_a_temporary_file(number: int, there: str, given_up: Callable[[], bool]
 
 
 def sleep(number: int, seconds: float, given_up: Callable[[], bool]) -> int:
-    """Answers its number; after so many seconds, or when it is given up."""
+    """Return the number after some seconds, or when the task is given up."""
     ends = time.monotonic() + seconds
     while time.monotonic() < ends and not given_up():
         time.sleep(0.01)
@@ -51,12 +50,12 @@ def sleep(number: int, seconds: float, given_up: Callable[[], bool]) -> int:
 
 
 def vanish(_: int, path: str, __: Callable[[], bool]) -> None:
-    """Writes which process it is, and ends without an answer."""
+    """Write the id of this process, and end without an answer."""
     Path(path).write_text(str(os.getpid()))
     os._exit(3)
 
 
 def stay(_: int, path: str, __: Callable[[], bool]) -> None:
-    """Writes which process it is, and does not heed anything."""
+    """Write the id of this process, and ignore all signals."""
     Path(path).write_text(str(os.getpid()))
     time.sleep(1000)

@@ -1,9 +1,9 @@
-"""The tree of all maps that explain what a robot meets in a world of streets on a grid: stars only,
-no views, gateways joined in pairs.
+"""The tree of all maps that explain a drive through streets on a grid, from stars alone. A map
+joins gateways in pairs.
 
-It knows nothing of the theory's encodings. A map says which gateways are joined: `{(place, slot):
-(place, slot)}`, both ways. Each arrival leads where the map says or, through a gateway that it does
-not know yet, to a new place or to a free gateway of a place that looks like this one.
+It is independent of the encodings. A map says which gateways are joined: `{(place, slot): (place,
+slot)}`, both ways. A known gateway leads where the map says. An unknown gateway leads to a new
+place, or to a free gateway of a place that looks like this one.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ def lattice(width: int, height: int) -> Cells:
 
 
 def stars_on(route: str, cells: Cells | None) -> list[Star]:
-    """What a robot sees around it that begins at cell 0, 0, heading east, and goes these ways;
-    without cells all gateways are open everywhere."""
+    """What a robot sees that starts at cell 0, 0, heading east, and makes these moves. Without
+    cells all gateways are open everywhere."""
     x, y, heading = 0, 0, 1
     stars = []
     for way in ["", *route]:
@@ -45,7 +45,7 @@ def stars_on(route: str, cells: Cells | None) -> list[Star]:
 def levels(
     route: str, cells: Cells | None = None, allows: Sequence[Callable[[Joined], bool]] = ()
 ) -> Iterator[list[Joined]]:
-    """The maps after no move, after one, and so on, of those that each of `allows` lets be."""
+    """The maps after 0, 1, … moves that all functions in `allows` accept."""
     stars = stars_on(route, cells)
     begin: tuple[Joined, list[Star], Gateway] = ({}, [_turned(stars[0], 1)], (0, 1))
     maps, heading = [begin], 1
@@ -57,7 +57,7 @@ def levels(
 
 
 def _turned(star: Star, facing: int) -> Star:
-    """The open slots of a place, from the star seen by somebody who faces a slot."""
+    """The open slots of a place, from the star that a robot sees when it faces a slot."""
     return tuple(star[(slot - facing) % 4] for slot in range(4))
 
 

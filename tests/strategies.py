@@ -32,10 +32,10 @@ ODOMETRY = (
 STARS = ((1, 1, 1, 1), (1, 0, 1, 0), (1, 1, 0, 0), (1, 0, 0, 0), (1, 1, 1, 0))
 
 
-FOREIGN = ("without", "rules")  # what the checker cannot judge maps by
+FOREIGN = ("without", "rules")  # axioms that the checker cannot judge
 PAIRS = ("same", "different", "elsewhere", "same_place")
-# Axioms that may be left out: the map can't show what holds without these, as a dstate of a map has
-# one place and one course.
+# Axioms that may be left out. The others give each dstate one place and one course, and a map
+# cannot show more.
 LEFT_OUT = sorted(
     {axiom.name for axiom in axioms()}
     - {"one_place", "one_course", "one_heading", "turn_rotates", "star_frame", "asserted"}
@@ -44,8 +44,8 @@ LEFT_OUT = sorted(
 
 @dataclass(frozen=True)
 class Toy:
-    """An axiom that no speed-up and no checker knows: as rules, and what it says of a map as the
-    brute force has it."""
+    """An axiom that no speed-up and no checker knows: as rules, and as a test of a map of the brute
+    force."""
 
     rules: Rules
     allows: Callable[[Key], bool]
@@ -166,7 +166,7 @@ def _closures(trace: Trace) -> st.SearchStrategy[list[Closure]]:
 
 
 def _usual(action: Action) -> tuple[float, float, float]:
-    """What an action does in a world of squares, 10 metres wide."""
+    """The effect of an action in a world of squares that are 10 metres wide."""
     return (
         (10.0, 0.0, 0.0)
         if action.kind != "turn"
@@ -192,7 +192,7 @@ def _pairs(steps: int) -> st.SearchStrategy[list[tuple[int, int]]]:
 def choices_of(field: str, trace: Trace) -> st.SearchStrategy[Any]:
     """Values of a field of Theory that suit a topological theory of this trace.
 
-    A field that this does not know fails every test that draws theories.
+    A field that is missing here fails every test that draws theories.
     """
     return {
         "level": st.just("topological"),

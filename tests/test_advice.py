@@ -1,4 +1,4 @@
-"""Advice names options that the verb has, whose user is to take it."""
+"""Advice names only options of the verb that prints it."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def texts(path: Path) -> Iterator[str]:
 
 
 def said_by(path: str) -> tuple[str, ...]:
-    """The verbs that print what a module says; all of them, where nothing is known."""
+    """The verbs that print the texts of a module; all verbs if that is unknown."""
     for start, verbs in SAID_BY.items():
         if path.startswith(start):
             return verbs
@@ -91,7 +91,7 @@ def said_by(path: str) -> tuple[str, ...]:
 
 
 def wrong(path: str, text: str) -> list[str]:
-    """The options that a text names and that nobody has, whom the text speaks to."""
+    """The options that a text names, but that no verb that prints the text has."""
     found = []
     for verb, option in OPTION.findall(text):
         asked = (verb,) if verb in VERBS else said_by(path)

@@ -24,8 +24,8 @@ GATEWAYS = PLAIN.replace(star="gateways")
 NONE = None  # no map
 Answer = tuple[tuple[int, int, int] | None, int]
 
-# For each axiom: a theory, a trace, the openings or bearings at each step; and the counts and the
-# number of minimal maps with the axiom, and without it.
+# For each axiom: a theory, a trace, the openings or bearings at each step, and the counts and
+# number of minimal maps with and without the axiom.
 CASES: dict[str, tuple[Theory, str, str, Answer, Answer]] = {
     "functional_view": (PLAIN, "b L a", "", ((2, 1, 0), 1), ((1, 1, 0), 1)),
     "deterministic": (PLAIN, "a R a R b R a", "", ((3, 1, 0), 2), ((2, 1, 0), 1)),

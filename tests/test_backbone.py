@@ -1,4 +1,4 @@
-"""What all minimal maps share: as the list of all maps says, and without it."""
+"""What all minimal maps share, with and without the list of all maps."""
 
 from __future__ import annotations
 
@@ -99,15 +99,15 @@ def agrees(backbone: Backbone, keys: set[Key], steps: int) -> None:
 @settings(max_examples=6)
 @given(st.data())
 def test_the_backbone_is_what_the_brute_force_says(data: st.DataObject) -> None:
-    """From the list where it is complete, and by reasoning from one map where it was cut off: from
-    prefixes that are too short to begin with."""
+    """The backbone comes from a complete list, or from one map of a list that was cut off. The
+    first prefixes are too short."""
     trace = data.draw(traces(max_steps=6), label="trace")
     theory = data.draw(theories(trace), label="theory")
     toys = [toy for toy in TOYS if toy.rules in theory.rules]
     counts, keys = minimal_maps(trace, theory, lambda key: all(toy.allows(key) for toy in toys))
     first_prefix = data.draw(st.sampled_from([1, prefixes.FIRST_PREFIX]), label="first prefix")
-    # Engines that settle dstates first are for longer traces, and those for places without frames
-    # only where clingo takes its time.
+    # By default engines that settle dstates first are used for longer traces, and those for places
+    # without frames only if clingo is slow.
     few_steps = data.draw(st.sampled_from([0, choosing.FEW_STEPS]), label="few steps")
     frame_after = data.draw(st.sampled_from([0.0, choosing.STEPWISE]), label="frame after")
     with (
@@ -179,8 +179,8 @@ def walk(world: Streets, place: str, steps: int, seed: int) -> Trace:
     [pytest.param(60.0, StepEngine, marks=pytest.mark.slow), (0.0, FramelessEngine)],
 )
 def test_every_engine_leaves_what_it_takes_to_reason(frame_after: float, engine: type) -> None:
-    """32 maps that differ in dstates, too: found by a prefix of the readable encodings, or by
-    labels that are settled before places and paths."""
+    """32 maps that also differ in dstates. A prefix of the readable encodings finds them, or labels
+    that are settled before places and paths."""
     trace, theory = walk(TWO_BLOCKS, "a1", 50, 1), Theory(boundary="none", prefer=("dstates",))
     with patch.object(choosing, "STEPWISE", frame_after):
         every, first = solve(trace, theory, max_maps=None), solve(trace, theory, max_maps=1)
@@ -247,7 +247,7 @@ def test_a_share_of_the_time_is_kept_for_reasoning_where_the_list_does_not_end()
 
 
 def test_a_solution_is_a_value(tmp_path: Path) -> None:
-    """It survives pickle, copies and files, and finds a backbone only where it is asked to."""
+    """A solution survives pickle, copies and files, and finds a backbone only if asked."""
     solution = aces.solution(max_maps=1)
     solution.save(tmp_path / "maps.json")
     loaded = Solution.load(tmp_path / "maps.json", solution.trace)
@@ -330,7 +330,7 @@ def test_nothing_is_shared_where_no_map_is_proven_minimal() -> None:
 
 @pytest.fixture
 def solved(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
-    """What `solve` prints of the real route."""
+    """The output of `solve` for the real route."""
 
     def printed(*words: str) -> str:
         assert main(["solve", ACES3, *words]) == 0

@@ -49,20 +49,19 @@ QUESTION = Question(
 
 
 class Deadly(Question):
-    """Kills the process that is to solve a trace of this name, as the system does when memory runs
-    out."""
+    """Kill the process that solves a trace of this name, as the system does if memory runs out."""
 
     def answer(self, number: int, path: str, *rest: Any) -> Answer:
         if "deadly" in path:
-            time.sleep(0.3)  # others shall be under way
+            time.sleep(0.3)  # let other traces start
             os.kill(os.getpid(), signal.SIGKILL)
         return Question.answer(self, number, path, *rest)
 
 
 class KilledOnce(MapQuestion):
-    """Writes down that it maps a log.
+    """Record that a log is mapped.
 
-    The first time that it maps one of this name, the worker is killed whose process does so.
+    At the first log of this name, kill the worker that maps it.
     """
 
     def answer(self, number: int, path: str, *rest: Any) -> MapAnswer:
@@ -95,8 +94,8 @@ def traces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[str]:
-    """The address of a Dask scheduler with one worker of one thread, in a process of its own, which
-    may take long to come back where the machine is busy."""
+    """The address of a Dask scheduler with one worker of one thread in its own process. On a busy
+    machine the worker may take long to come back."""
     import dask
     from distributed import LocalCluster
 
@@ -115,7 +114,7 @@ def cluster() -> Iterator[str]:
 
 @pytest.fixture
 def scheduler(cluster: str, monkeypatch: pytest.MonkeyPatch) -> str:
-    """The same, for who waits as long as it takes."""
+    """The same address, for tests that wait without a limit."""
     monkeypatch.setattr(cluster_jobs, "PATIENCE", 600)
     return cluster
 
@@ -479,8 +478,8 @@ def test_ctrl_c_prints_what_waited_for_its_turn(
 def test_ctrl_c_ends_the_processes(
     jobs: str, send: Callable[[int, int], None], traces: Path
 ) -> None:
-    """What was found of the traces under way is printed, whether all processes hear of it, as from
-    a terminal, or the first one alone."""
+    """What was found for unfinished traces is printed, whether the signal reaches all processes, as
+    from a terminal, or only the first one."""
     paths = ["quick.jsonl", "slow.jsonl", "quick.jsonl", "slow.jsonl", "slow.jsonl"]
     command = [sys.executable, "-m", "ssh_abduction", "solve", *paths, *ENDLESS, "--jobs", jobs]
     with subprocess.Popen(

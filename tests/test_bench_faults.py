@@ -1,5 +1,5 @@
-"""The benchmark of faults measures what it says: truth is recognised, peers explain small traces,
-and a cell ends at its limit."""
+"""The benchmark of faults recognises the truth, peers explain small traces, and a cell ends at its
+limit."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_the_truth_is_right_and_costs_its_states_and_faults(jumps: bool) -> None
 
 
 def test_labels_are_laid_over_the_trace_anew() -> None:
-    """A wrong view has a label of its own at first, and so has a step whose label was mistaken."""
+    """At first a wrong view, and a step with a mistaken label, have labels of their own."""
     case = rectangle_of_five(0, steps=100, wrong=2)
     labels = [f"odd {t}" if t in (*case.wrong, 50) else s for t, s in enumerate(case.walk.truth)]
     assert refined(case.walk.trace, labels).is_true(case)

@@ -1,5 +1,4 @@
-"""The peers over all poses say what Bayes' rule says, the beam model is a distribution, and drives
-are driven in worlds whose truth is known."""
+"""Grid filters obey Bayes' rule, the beam model is a distribution, and drives have truth."""
 
 from __future__ import annotations
 
@@ -43,8 +42,7 @@ def test_the_beam_model_expects_what_is_there_and_people_before_it() -> None:
 
 
 def test_the_ranges_of_a_grid_are_those_of_the_world() -> None:
-    """To within two cells, a little off the walls: near to one, a beam along it meets a cell of it
-    too early."""
+    """To within two cells, away from walls. A beam along a wall meets a cell of it too early."""
     chosen = np.array([i for i, at in enumerate(grid().centres) if WORLD.clearance(*at) > 0.3])
     exact = Laser().exact(WORLD, np.column_stack([grid().centres[chosen], np.zeros(len(chosen))]))[
         :, 5::10
@@ -56,8 +54,8 @@ def test_the_ranges_of_a_grid_are_those_of_the_world() -> None:
 
 
 def test_the_histogram_is_brute_force_bayes() -> None:
-    """A tiny grid, whose belief is computed once more by a sum over all pairs of poses, with one
-    Gaussian of the displacement for each."""
+    """A tiny grid. Its belief is computed again by a sum over all pairs of poses, each with a
+    Gaussian of the displacement."""
     tiny = Grid.of(WORLD, 0.5)
     model, slipped = BeamModel(beams=30), 0.05
     belief = Histogram(tiny, model, slipped)
@@ -157,7 +155,7 @@ def test_a_robot_that_is_localised_stays_so_and_one_that_is_carried_is_found(kin
 
 
 def test_what_looks_alike_stays_undecided() -> None:
-    """In a plain rectangle half of the belief is at either end, however long the robot drives."""
+    """In a plain rectangle each end keeps half of the belief, however long the robot drives."""
     world = rectangle(0.0).world
     belief = Histogram(Grid.of(world))
     rng = np.random.default_rng(2)

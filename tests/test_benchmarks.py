@@ -1,5 +1,4 @@
-"""The benchmarks measure what they say: answers are checked, limits hold, and the pages show stored
-runs."""
+"""Benchmarks check answers and keep limits, and the pages show stored runs."""
 
 from __future__ import annotations
 
@@ -223,7 +222,7 @@ def test_a_stored_run_has_its_fields_and_no_contradiction(path: Path) -> None:
 
 
 def stored(page: str, name: str) -> Path:
-    """The stored run that the named table of a page says it is from."""
+    """The stored run that a table of a page names as its source."""
     found = re.search(
         rf"<!-- bench:begin {name} -->.*(benchmarks/results/[\w.-]+\.json)\).*<!-- bench:end "
         rf"{name} -->",

@@ -21,15 +21,15 @@ LETTERS = {
 
 
 def read(text: str) -> Trace:
-    """A trace in the notation of docs/explanation/theory.md: views and letters of actions in
-    turn."""
+    """A trace in the notation of docs/explanation/theory.md: views and letters of actions
+    alternate."""
     words = text.split()
     return Trace.from_steps(words[::2], [LETTERS[word] for word in words[1::2]])
 
 
 def rectangle(actions: int, views: int = 4) -> Trace:
-    """The notched rectangle, clockwise: a turn right and a travel in turn, seen as `views` views in
-    turn."""
+    """The notched rectangle, clockwise: turns right and travels alternate, and `views` views
+    repeat."""
     return Trace.from_steps(
         [f"v{i % views}" for i in range(actions + 1)],
         [LETTERS["RT"[i % 2]] for i in range(actions)],
@@ -129,8 +129,8 @@ def test_stars_separate_what_views_do_not() -> None:
 
 
 def test_frames_know_headings() -> None:
-    """After a turn right the opening ahead is on the left: the same pattern, and not to be seen
-    from another heading."""
+    """After a turn right the opening ahead is on the left. The pattern is the same, and fits no
+    other heading."""
     ahead, left, back, right = (1, 0, 0, 0), (0, 0, 0, 1), (0, 0, 1, 0), (0, 1, 0, 0)
     for seen, pattern, frame in (
         ((ahead, left), 1, 2),

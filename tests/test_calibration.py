@@ -1,4 +1,4 @@
-"""The covariances of a track are multiplied by a factor that closures tell."""
+"""The covariances of a track are multiplied by a factor that follows from closures."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Every public function and method is called with wrong arguments: it answers with one of the
-package's errors, or the table says why the value is right.
+"""Every public function and method is called with wrong arguments. It raises one of the package's
+errors, or a table says why the value is right.
 
-The callables are those of the reference. A new one is swept as soon as it is there. Where a
-parameter of it has no good value below, the test fails.
+The callables are those of the reference, so new ones are included. The test fails if a parameter
+has no good value below.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ from ssh_abduction.theory import Speedups
 
 SHIPPED = Path(inspect.getfile(World)).parent / "worlds" / "notched-rectangle.json"
 
-# What is tried for each argument. What has to be made anew for each call is made by a function.
+# The wrong values for each argument. Functions make those that each call needs anew.
 WRONG: dict[str, Callable[[], Any]] = {
     "None": lambda: None,
     "object": object,
@@ -87,12 +87,11 @@ WRONG: dict[str, Callable[[], Any]] = {
 }
 TEXTS = {"empty text", "nonsense", "half a character", "null character", "folder"}
 EMPTY = {"list", "generator"}
-# Whatever comes is right: `truth` is what JSON can hold, read by evaluation alone, and scikit-learn
-# passes labels `y` to estimators that do not look at them.
+# Any value is right: only evaluation reads `truth`, which may be any JSON, and estimators ignore
+# the labels `y` that scikit-learn passes.
 ANYTHING = {"truth", "y"}
 
-# Which of these are right, by what the parameter is. A parameter whose default is None takes None
-# besides.
+# Which of these are right, by the kind of parameter. A parameter with default None also takes None.
 RIGHT_BY_NAME: dict[str, set[str]] = {
     "time_limit": {"None", "3.5", "inf", "huge"},
     "memory_limit": {"None", "3.5", "inf", "huge"},
@@ -197,8 +196,8 @@ RIGHT: dict[str, set[str]] = {
     "tour.bend": {"-1"},
     "tour.scale": {"-1"},
 }
-# The package makes these values: nobody needs their constructors, which take what they are given.
-# Their methods are swept.
+# Only the package makes these values, so their constructors check nothing. Their methods are
+# tested.
 MADE_BY_THE_PACKAGE = {
     "Corrections",
     "Name",
@@ -264,7 +263,7 @@ class Ring:
 
 @cache
 def known() -> dict[str, Any]:
-    """A small trace with all that is made of it."""
+    """A small trace and everything that is made from it."""
     trace = Trace.from_steps(
         ["end", "hall", "end", "hall", "end"],
         ["travel", "travel", "around", "travel"],
@@ -313,7 +312,7 @@ def ended(search: Search) -> Search:
 
 
 def receiver(name: str) -> Any:
-    """A value of a class, whose methods are called."""
+    """An object of a class, to call its methods."""
     made = known()
     solution, trace, ssh_map = made["solution"], made["trace"], made["map"]
     return {
@@ -360,8 +359,8 @@ def receiver(name: str) -> Any:
 
 
 def good(call: str, parameter: inspect.Parameter) -> Any:
-    """A value that is right for a parameter: of this call, or of all calls that have one of this
-    name, or its default."""
+    """A right value for a parameter: for this call, for any call with a parameter of this name, or
+    the default."""
     made = known()
     solution, trace, ssh_map, world = made["solution"], made["trace"], made["map"], made["world"]
     of_call: dict[str, Any] = {
@@ -541,8 +540,8 @@ def parameters(function: Any) -> list[inspect.Parameter]:
 
 
 def do(call: str, function: Any, arguments: dict[str, Any]) -> None:
-    """Call it, and, as checks may come with the first use, use what it returns: estimators are
-    fitted, and generators begin."""
+    """Call a function and use its result, because checks may come with the first use: fit
+    estimators, and start generators."""
     if "self" in inspect.signature(function).parameters:
         result = function(receiver(call.partition(".")[0]), **arguments)
     else:
@@ -606,8 +605,7 @@ def test_wrong_arguments_are_refused_by_errors_of_the_package(call: str, functio
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("call", [call for call, _ in SWEPT])
 def test_right_arguments_are_accepted(call: str) -> None:
-    """A call that always fails would pass the sweep above. Two calls read files that no test
-    has."""
+    """A call that always fails would pass the tests above. Two calls need files that tests lack."""
     if call == "to_pandas":
         pytest.importorskip("pandas")
     function = dict(SWEPT)[call]

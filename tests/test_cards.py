@@ -1,4 +1,4 @@
-"""What notebooks show of values: well-formed, escaped, small, and of every kind of answer."""
+"""Notebook cards of values are well-formed, escaped and small, for every kind of answer."""
 
 from __future__ import annotations
 

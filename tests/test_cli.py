@@ -1,4 +1,4 @@
-"""The command line: every verb, every exit code, and that no bad input shows a traceback."""
+"""The command line: every verb and every exit code. No bad input shows a traceback."""
 
 from __future__ import annotations
 
@@ -481,7 +481,7 @@ def test_output_that_cannot_be_written(room: str) -> None:
 
 
 def printed_in(letters: str, *words: str, given: bytes = b"") -> bytes:
-    """What a command prints where standard input and output have only these letters."""
+    """The output of a command if standard input and output have only this encoding."""
     out = io.TextIOWrapper(io.BytesIO(), letters)
     with (
         patch.object(sys, "stdin", io.TextIOWrapper(io.BytesIO(given), letters)),
@@ -549,7 +549,7 @@ def test_progress_shows_on_a_terminal(tmp_path: Path) -> None:
 
 
 def test_what_programs_read_is_utf_8_on_every_terminal(tmp_path: Path) -> None:
-    """Else views could not be told apart."""
+    """Otherwise different views would look equal."""
     path = saved(Trace.from_steps(["日本", "中国", "Küche"], ["travel", "travel"]), tmp_path)
 
     def printed(*words: str, given: bytes = b"") -> str:
@@ -616,7 +616,7 @@ def test_errors_say_what_mends_them(
 def test_a_closed_standard_error_is_no_error(
     room: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What would be said there is not said; what was asked for is."""
+    """Messages are dropped if stderr is closed. The answer is printed."""
     for words, code in ((["solve", room], 0), (["solve", "nosuch"], 1)):
         monkeypatch.setattr(sys, "stderr", None)
         assert main(words) == code

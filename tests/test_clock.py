@@ -35,7 +35,7 @@ def over() -> None:
 
 
 def driven(trace: Trace, wrong: int = 0) -> Trace:
-    """The trace with displacements, some of which are wrong by metres."""
+    """The trace with displacements. Some of them are wrong by metres."""
     steps, chance = list(trace.steps), random.Random(0)
     for t, action in enumerate(trace.actions, 1):
         travels = action.kind == "travel"
@@ -99,7 +99,7 @@ def test_limits_within_limits_are_all_heeded() -> None:
     with heeding(lambda: calls.append("outer")), heeding(lambda: calls.append("inner")):
         look_at_clock()
     assert calls == ["outer", "inner"]
-    look_at_clock()  # after that nothing is heeded
+    look_at_clock()  # after that, no limit is checked
     assert len(calls) == 2
 
 
@@ -135,7 +135,7 @@ def test_a_sketch_that_the_checker_refuses_is_not_the_last_one() -> None:
 
 
 def test_no_sketch_takes_all_the_time() -> None:
-    """The first one uses all that is left for it; others still get their share."""
+    """The first sketch uses all of its time. The others still get their share."""
     trace = driven(maze(3, 3, steps=60, seed=1).trace, 4)
     tried = []
 

@@ -1,5 +1,5 @@
-"""Actions of which nothing is known, and maps with faults found by mending the trace: against the
-plain encodings and the brute force."""
+"""Unknown actions, and maps with faults found by mending the trace, against the plain encodings and
+the brute force."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PLAIN = Speedups.without(SPEEDUPS)
 
 @st.composite
 def broken_traces(draw: st.DrawFn, most_steps: int = 6) -> Trace:
-    """Traces some of whose actions slipped: what stands there is no action that is known."""
+    """Traces in which some actions slipped. Their names are unknown."""
     steps = draw(st.integers(2, most_steps))
     names = draw(
         st.lists(
@@ -61,9 +61,9 @@ def test_nothing_is_known_of_where_an_action_led_that_slipped(
 @settings(max_examples=6)
 @given(st.data())
 def test_maps_of_mended_traces_are_those_of_the_plain_encodings(data: st.DataObject) -> None:
-    """Where all is proven: the same maps.
+    """If everything is proven, the maps are the same.
 
-    With a star that may be misread, and actions that may slip.
+    Stars may be misread, and actions may slip.
     """
     trace = data.draw(small_traces())
     slipped = data.draw(st.sampled_from([0.0, 1.2]))

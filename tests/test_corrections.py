@@ -1,4 +1,4 @@
-"""Names and corrections of a person: the file, what solve does with it, and where names stand."""
+"""Names and corrections by a person: the file, its effect on solve, and where names are shown."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What version 0.1.0 called otherwise still works, and says what it is called now."""
+"""Names of version 0.1.0 still work, with a warning that gives the new name."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_the_flags_are_few() -> None:
 
 
 def test_maps_of_version_0_1_0_are_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """What 0.1.0 printed, and the order of files that it took."""
+    """The output of 0.1.0, and its order of files."""
     old = Path(__file__).parent / "files" / "maps-0.1.0.json"
     assert main(["check", str(old), ACES, "--bound"]) == 0
     assert main(["check", ACES, str(old)]) == 0

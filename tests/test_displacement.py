@@ -1,4 +1,4 @@
-"""Displacements as evidence: loops, refused returns, fits, and what is said of them."""
+"""Displacements as evidence: loops, refused returns, fits, and sentences about them."""
 
 from __future__ import annotations
 
@@ -46,8 +46,7 @@ def circuit(
     scale: float = 0.0,
     bend: float = 0.0,
 ) -> Trace:
-    """A robot that drives round a regular polygon to the right, so many sides, all corners of which
-    look alike.
+    """A robot that drives along some sides of a regular polygon, clockwise. All corners look alike.
 
     noise  standard deviations of its displacements, as a share of those that the odometry claims
     scale, bend  errors that repeat
@@ -88,8 +87,8 @@ def test_solver_and_checker_agree_with_matrices_written_out(data: st.DataObject)
 def test_sets_of_two_are_those_of_matrices_written_out(
     seed: int, corners: int, noise: float, bend: float
 ) -> None:
-    """Labels that need not be a map's: every second step is at one of few dstates, so that many
-    returns share displacements."""
+    """Labels that need not be of a map. Every second step is at one of few dstates, so many returns
+    share displacements."""
     odometry = replace(WHITE, bend=bend)
     trace = circuit(corners, 5, noise, seed, odometry)
     theory = settle(trace, Theory.causal().replace(reject=0.3)).theory
@@ -116,7 +115,7 @@ def test_sets_of_two_are_those_of_matrices_written_out(
 
 
 def test_covariances_of_closings_are_those_of_many_noisy_drives() -> None:
-    """With little noise, so that first order is good."""
+    """The noise is small, so the first order is exact enough."""
     little = Odometry(
         along=0.0005,
         across=0.0003,
@@ -130,7 +129,7 @@ def test_covariances_of_closings_are_those_of_many_noisy_drives() -> None:
     true = Loops.of(circuit(5, 4, 0.0, 0, little)).poses
 
     def closing(poses: np.ndarray, i: int, j: int) -> np.ndarray:
-        """As seen by somebody who knows the pose at step i."""
+        """Relative to the pose at step i."""
         off, turned = poses[j] - poses[i], true[i, 2] - poses[i, 2]
         cos, sin = math.cos(turned), math.sin(turned)
         return np.array([cos * off[0] - sin * off[1], sin * off[0] + cos * off[1], off[2]])
@@ -216,7 +215,7 @@ def test_dense_and_sparse_systems_have_one_solution() -> None:
 
 
 def test_fits_of_true_maps_are_as_likely_as_they_say() -> None:
-    """Of 60 true maps, about half have a p-value above one half, and hardly any one below a
+    """Of 60 true maps about half have a p-value above one half. At most very few have one below a
     thousandth."""
     chances = []
     for seed in range(60):
@@ -258,8 +257,8 @@ def test_a_noise_model_that_is_off_is_noticed(factor: float, said: str | None) -
 
 
 def test_kilometres_are_noticed() -> None:
-    """Ways that are lost in the noise of the odometry, as are those of wheels that report nothing;
-    not those of a robot that is small and says so."""
+    """A warning comes if the noise of the odometry hides all motion, also if wheels report none. It
+    does not come for a small robot with small noise."""
     trace = circuit(4, 9)
 
     def scaled(by: float, **noise: float) -> Trace:
@@ -368,8 +367,8 @@ def test_maps_with_a_fit_survive_a_round_trip(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kept", ["travels", "turns", "most", "few"])
 def test_fits_of_true_maps_are_as_likely_where_displacements_are_missing(kept: str) -> None:
-    """Of 20 true maps: where turns are not reported, headings are told by what places the stretches
-    between them share, or not at all."""
+    """20 true maps without reported turns. Headings follow from places that stretches share, or
+    stay unknown."""
     squares = freedom = above = 0.0
     for seed in range(20):
         walk = maze(3, 3, steps=30, seed=seed, stars=True, follow=True, odometry=Odometry())

@@ -352,7 +352,7 @@ def test_a_route_of_places_that_cannot_be_driven(tmp_path: Path) -> None:
         simulate(World.load(tmp_path / "world.json"))
 
 
-# What goes wrong is noticed
+# Errors are noticed
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Ranges that are no walls, and disagreement of scan matching and odometry."""
+"""Ranges that hit no wall, and scan matching that contradicts odometry."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ def told(trace: Trace, truths: Sequence[Any]) -> Trace:
 
 
 def walk(truths: Sequence[Any]) -> Trace:
-    """A trace in which nothing is seen but that the robot travels, with this truth."""
+    """A trace of travels without views, with this truth."""
     return told(
         Trace.from_steps("v" * len(truths), [{"name": "go", "kind": "travel"}] * (len(truths) - 1)),
         truths,
@@ -71,7 +71,7 @@ def naive_accuracy(labels: Sequence[int], truths: Sequence[Any]) -> float | None
     """Every one-to-one assignment is tried."""
     known = [(x, y) for x, y in zip(labels, truths, strict=True) if y is not None]
     own, true = sorted({x for x, _ in known}), sorted({y for _, y in known})
-    spare = [*true, *([None] * len(own))]  # what is assigned to nothing is right nowhere
+    spare = [*true, *([None] * len(own))]  # an unassigned dstate is never right
     best = max(
         sum(assigned[own.index(x)] == y for x, y in known)
         for assigned in permutations(spare, len(own))
@@ -82,7 +82,7 @@ def naive_accuracy(labels: Sequence[int], truths: Sequence[Any]) -> float | None
 def naive_edges(said: Sequence[int], true: Sequence[int]) -> set[tuple[float | None, float | None]]:
     """Precision and recall of edges under each one-to-one assignment that fits most steps."""
     own = sorted(set(said))
-    spare = [*sorted(set(true)), *(-1 - x for x in own)]  # a negative place is none
+    spare = [*sorted(set(true)), *(-1 - x for x in own)]  # a negative place means no place
     assignments = [
         dict(zip(own, assigned, strict=True)) for assigned in permutations(spare, len(own))
     ]

@@ -1,4 +1,4 @@
-"""The examples run, and show what they say."""
+"""The examples run, and print the stored output."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
 
 
 def run(name: str, *words: str) -> str:
-    """What an example prints, run as a program, but in this process."""
+    """The output of an example that runs as a program in this process."""
     path = str(EXAMPLES / name)
     with (
         patch.object(sys, "argv", [path, *words]),

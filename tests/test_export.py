@@ -115,7 +115,7 @@ def looked_up(node: dict[str, Any], path: str) -> Any:
 
 
 def filled(goal: Any, node: dict[str, Any]) -> Any:
-    """A goal after texts that begin with $ became fields of the node that the edge leads to."""
+    """Replace texts that begin with $ by fields of the node to which the edge leads."""
     if isinstance(goal, dict):
         return {key: filled(value, node) for key, value in goal.items()}
     return looked_up(node, goal[1:]) if isinstance(goal, str) and goal.startswith("$") else goal
@@ -372,7 +372,7 @@ def test_undecided_places_are_hidden_and_their_roads_joined(
 ) -> None:
     """The robot drove once around the square. It began and ended at place 0."""
     nodes, edges = nav2_graph(export_map(square, "nav2", hide_undecided=True))
-    assert sorted(nodes) == [0, 2, 3]  # one road less, and the loop would be none
+    assert sorted(nodes) == [0, 2, 3]  # without one of the roads there would be no loop
     costs = {(start, end): cost for start, end, cost in edges.values()}
     assert set(costs) == {(0, 2), (2, 0), (2, 3), (3, 2), (3, 0), (0, 3)}
     assert costs[0, 2] == costs[2, 0] == pytest.approx(20, abs=0.1)

@@ -1,5 +1,5 @@
-"""Faults: views that are misread, stars that are, and actions that slipped, against brute force,
-the checker, and machines whose faults are known."""
+"""Faults: misread views and stars, and actions that slipped, against brute force, the checker, and
+machines with known faults."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ def small_traces(draw: st.DrawFn, max_steps: int = 6) -> Trace:
     )
 
 
-# What the confidences of these traces make of a price, as a share of it: log(0.9 / 0.1) / log 99,
-# and the least one.
+# The shares of a price by the confidences of these traces: log(0.9 / 0.1) / log 99, and the least
+# share.
 SHARE = {None: 1.0, 0.9: 0.478, 0.4: 0.1}
 
 
@@ -65,7 +65,7 @@ def price_of(misread: int, step: Step) -> int:
 
 
 def partitions(steps: int) -> Iterator[tuple[int, ...]]:
-    """All labels of so many steps, numbered by first visit."""
+    """All labellings of this many steps, numbered by first visit."""
     found: list[tuple[int, ...]] = [()]
     for _ in range(steps):
         found = [(*labels, new) for labels in found for new in range(max(labels, default=-1) + 2)]
@@ -75,8 +75,7 @@ def partitions(steps: int) -> Iterator[tuple[int, ...]]:
 def votes(
     trace: Trace, labels: tuple[int, ...]
 ) -> tuple[dict[int, Counter[object]], dict[tuple[int, str], Counter[int]]]:
-    """How often each view is seen at each dstate, and how often each action done there leads
-    where."""
+    """Count the views at each dstate, and the ends of each action there."""
     views, ends = defaultdict(Counter), defaultdict(Counter)
     for label, view in zip(labels, trace.views, strict=True):
         views[label][view] += 1
@@ -86,8 +85,8 @@ def votes(
 
 
 def cheapest(trace: Trace, misread: int, slipped: int) -> tuple[int | None, set[Told]]:
-    """The least cost in tenths, and all causal maps of it, by trying all labels, all views of
-    dstates and all ends of actions."""
+    """The least cost in tenths, and all causal maps with it. All labels, views of dstates and ends
+    of actions are tried."""
     best: int | None = None
     maps: set[Told] = set()
     for labels in partitions(len(trace)):
@@ -135,7 +134,7 @@ def told(ssh_map: SSHMap) -> Told:
 def test_causal_maps_with_faults_are_those_of_brute_force(
     trace: Trace, misread: float, slipped: float, names: bool
 ) -> None:
-    """By names and by the readable encoding. A cost of whole dstates makes ties."""
+    """The solver uses names, or the readable encoding. Costs of whole dstates make ties."""
     theory = Theory.causal().replace(misread=misread, slipped=slipped)
     solution = solve(
         trace, theory, max_maps=None, speedups=Speedups() if names else Speedups.without("names")
@@ -177,8 +176,8 @@ def test_few_names_and_few_steps_at_first_change_no_answer(data: st.DataObject) 
 @settings(max_examples=5)
 @given(small_traces(max_steps=4), st.sampled_from([0.4, 1.0]))
 def test_topological_maps_are_those_of_corrected_traces(trace: Trace, misread: float) -> None:
-    """Every way to correct views is tried, and the corrected trace is mapped by the brute force,
-    which knows nothing of faults."""
+    """Try every correction of views. The brute force, which has no faults, maps the corrected
+    traces."""
     theory = Theory(boundary="none", star="none")
     best: tuple[int, ...] | None = None
     expected: set[object] = set()
@@ -236,8 +235,8 @@ def test_the_faults_of_machines_are_found(seed: int) -> None:
 @settings(max_examples=10)
 @given(st.data())
 def test_bounds_by_blocks_are_no_more_than_the_minimum(data: st.DataObject) -> None:
-    """Whatever map is known: here one dstate for each view, or one for each step, and all that
-    disagrees is a fault."""
+    """Any map may be known: here it has one dstate for each view, or one for each step. All
+    disagreements are faults."""
     trace = data.draw(small_traces(max_steps=7))
     theory = Theory.causal().replace(
         misread=data.draw(st.sampled_from([0.4, 1.0])),
@@ -266,8 +265,8 @@ def test_bounds_by_blocks_are_no_more_than_the_minimum(data: st.DataObject) -> N
 
 @pytest.mark.parametrize("kind", ["misread", pytest.param("slipped", marks=pytest.mark.slow)])
 def test_many_faults_of_a_long_trace_are_proven(kind: str) -> None:
-    """A rectangle of eight dstates and five views, 1,200 steps, and twelve faults: disjoint blocks
-    add up to what the map costs."""
+    """A rectangle of eight dstates and five views, 1,200 steps and twelve faults. The bounds of
+    disjoint blocks add up to the cost of the map."""
     wrong = range(60, 1200, 100)
     at = list(
         accumulate(
@@ -285,7 +284,7 @@ def test_many_faults_of_a_long_trace_are_proven(kind: str) -> None:
 
 
 def test_a_star_that_is_misread_is_excused() -> None:
-    """Out and back along a corridor, with one opening too many seen at one end."""
+    """Out and back along a corridor. At one end the robot sees one opening too many."""
     ends = [(1, 0, 0, 0), (0, 0, 1, 0)]
     stars = [*ends * 4, ends[0]]
     stars[4] = (1, 1, 0, 0)
@@ -380,8 +379,8 @@ def test_in_the_shell(
 
 
 def test_confidence_scales_what_a_fault_costs() -> None:
-    """0.99 costs the whole price, as does a step without one; the log odds of the others are its
-    share, between a tenth and five times."""
+    """A confidence of 0.99 costs the whole price, as does a step without a confidence. For others
+    the share is by the log odds, between a tenth and five times."""
     shares = {None: 15, 0.99: 15, 0.9: 7, 0.6: 2, 0.5: 2, 0.0: 2, 0.999: 23, 1.0: 75}
     assert {
         c: Theory(misread=1.5).fault_tenths("misread", Step("a", confidence=c)) for c in shares
@@ -476,7 +475,7 @@ def fewest(
     same: Iterable[tuple[int, int]] = (),
     different: Iterable[tuple[int, int]] = (),
 ) -> int | None:
-    """The fewest dstates with so many faults, by trying all labels; None where there are none."""
+    """The fewest dstates with this many faults, by trying all labels; None if there is no map."""
     counts = []
     for labels in partitions(len(trace)):
         if any(labels[i] != labels[j] for i, j in same) or any(

@@ -1,5 +1,4 @@
-"""Each log of a batch has a folder that no other log has, whatever the logs are called and in which
-order they come."""
+"""Each log of a batch has its own folder, whatever the names and the order of the logs."""
 
 from __future__ import annotations
 
@@ -28,7 +27,7 @@ def log_at(path: Path, content: str) -> str:
 
 
 def map_in(folder: Path, log: str, **more: object) -> None:
-    """Leave what a finished run of this log leaves."""
+    """Write the files of a finished run of this log."""
     run = {"settings": json.loads(json.dumps(QUESTION.settings)), "digest": digest([log]), **more}
     write_run(folder, [("maps.json", b""), (RUN, json.dumps(run).encode())])
 
@@ -169,7 +168,7 @@ def test_a_run_that_could_not_be_written_is_not_done(
 ) -> None:
     """The disk is full at the first, second, … file.
 
-    What is left of an earlier run does not stand beside what is new.
+    Files of an earlier run do not remain beside new ones.
     """
     files = [(RUN, b"new"), ("trace.jsonl", b"new"), ("maps.json", b"new"), ("report.html", b"new")]
     write_run(tmp_path, [(name, b"old") for name in FILES])
@@ -193,8 +192,8 @@ def test_a_run_that_could_not_be_written_is_not_done(
 def test_what_cannot_be_written_is_a_line_and_the_other_logs_go_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Of four logs the folder of one cannot be made, as a file is there, and the disk is full for
-    another one."""
+    """Of four logs, one has no folder because a file is in its place, and for another one the disk
+    is full."""
     logs = [log_at(tmp_path / f"{name}.log", name) for name in ("good", "taken", "full", "fine")]
     log_at(tmp_path / "runs" / "taken", "a file")
     asked: list[str] = []

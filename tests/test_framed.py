@@ -1,5 +1,5 @@
-"""Dstates first, then places and paths, where places have frames: the same maps as the plain
-encoding of the axioms lists."""
+"""With frames, dstates are found before places and paths. The maps are those of the plain encoding
+of the axioms."""
 
 from __future__ import annotations
 
@@ -51,8 +51,7 @@ PLAIN = Speedups.without(SPEEDUPS)
 
 @st.composite
 def framed_traces(draw: st.DrawFn, most_steps: int = 9) -> Trace:
-    """Walks on a torus of few cells with any stars, so that views mislead; and stars that fit no
-    frame."""
+    """Walks on a torus of few cells with any stars, so views mislead. Some stars fit no frame."""
     steps = draw(st.integers(1, most_steps))
     few = draw(
         st.sampled_from(
@@ -86,7 +85,7 @@ def framed_traces(draw: st.DrawFn, most_steps: int = 9) -> Trace:
 
 @st.composite
 def framed_theories(draw: st.DrawFn) -> Theory:
-    """All that the engine takes."""
+    """Everything that the engine accepts."""
     rest = draw(st.sampled_from([(), ("paths",), ("paths", "places"), ("places", "paths")]))
     return Theory(
         star="frame",
@@ -99,7 +98,7 @@ def framed_theories(draw: st.DrawFn) -> Theory:
 def plainly_charted(
     engine: FramedEngine, size: int, before: FramedChart | None = None
 ) -> FramedChart | None:
-    """Without what the trace alone says of order and sides, so that it has to be found."""
+    """Leave out what the trace implies about order and sides, so the search has to find it."""
     return Chart.framed(engine._task.trace, engine._task.log, size)
 
 
@@ -108,8 +107,8 @@ def plainly_charted(
 def test_lists_the_maps_of_the_plain_encoding(
     trace: Trace, theory: Theory, off: set[str], data: st.DataObject
 ) -> None:
-    """With prefixes, cores and what is told in one go so small that all of it happens on short
-    traces; and with any speed-ups off."""
+    """Prefixes, cores and batches are so small that short traces use them all. Any speed-ups may be
+    off."""
     expected = solve(trace, theory, max_maps=None, speedups=PLAIN)
     first = data.draw(st.sampled_from([2, engine.FIRST_PREFIXES]), label="first prefixes")
     at_a_time = data.draw(st.sampled_from([1, transitive.AT_A_TIME]), label="at a time")
@@ -158,7 +157,7 @@ def test_lists_the_maps_of_the_plain_encoding(
 def test_a_trace_that_grows_has_the_maps_of_the_plain_encoding(
     trace: Trace, theory: Theory, data: st.DataObject
 ) -> None:
-    """Whether clingo is told what is new, or all of it anew."""
+    """Whether clingo gets only what is new, or everything again."""
     grown = data.draw(st.sampled_from([1, 1.5, 100]), label="grown")
     charted = data.draw(st.sampled_from([FramedEngine._charted, plainly_charted]), label="charted")
     first, *rest = trace.steps
@@ -185,8 +184,8 @@ def test_a_trace_that_grows_has_the_maps_of_the_plain_encoding(
 
 
 def test_a_maze_is_mapped_while_it_is_explored() -> None:
-    """Long enough for cores, for visits told to be transitive, and for paths, all of which the
-    longer trace keeps."""
+    """The trace is long enough for cores, transitivity rules of visits, and paths. The longer trace
+    keeps them all."""
     trace = maze(3, 3, steps=36, seed=0, stars=True).trace
     first, *rest = trace.steps
     paths = set()
@@ -218,8 +217,7 @@ def test_a_maze_is_mapped_while_it_is_explored() -> None:
 
 
 def test_each_speedup_off_alone() -> None:
-    """On walks long enough for cores, for visits that have to be told to be transitive, and for
-    maps that are found nearby."""
+    """The walks are long enough for cores, transitivity rules of visits, and maps near a guess."""
     trace = maze(2, 2, steps=36, seed=0, stars=True).trace
     expected = solve(trace, Theory.topological(), max_maps=None, speedups=Speedups.without("names"))
     for off in ("", "clique", "core_guided", "sides"):
@@ -233,7 +231,8 @@ def test_each_speedup_off_alone() -> None:
 
 
 def test_apart_nodes_are_different_dstates_of_the_world() -> None:
-    """In a world that satisfies the theory, what the trace alone tells apart is apart."""
+    """In a world that satisfies the theory, steps that the trace alone distinguishes are truly
+    different."""
     for seed in range(6):
         walk = maze(3, 3, steps=120, seed=seed, stars=True)
         search = Search(walk.trace, Theory.topological())
@@ -251,7 +250,7 @@ def test_apart_nodes_are_different_dstates_of_the_world() -> None:
 
 
 def test_pairs_that_are_too_many_are_not_listed() -> None:
-    """They are counted first: ten million would take gigabytes."""
+    """Pairs are counted before they are listed, because ten million would take gigabytes."""
     trace = maze(3, 3, steps=120, seed=1, stars=True).trace
     chart = Chart.framed(trace, Log(trace, Theory(star="frame")))
     assert chart.fitting[-1] == len(chart.fits(range(len(chart.stars)))) > 50
@@ -265,7 +264,7 @@ def test_pairs_that_are_too_many_are_not_listed() -> None:
 
 
 def test_nodes_that_one_frame_fits_are_not_apart() -> None:
-    """A node for a visit and a way of facing, linked by rotations both ways and by travels."""
+    """A node for each visit and heading. Rotations (both ways) and travels link them."""
     star = [(0, 0, 1, 0), (1, 0, 0, 0), (1, 0, 1, 0), (1, 0, 1, 0)]
     trace = Trace.from_steps(
         "aabbbb",
@@ -301,9 +300,9 @@ def test_a_visit_that_fits_no_frame_has_no_map() -> None:
 
 @pytest.mark.parametrize(("seed", "counts"), [(0, (32, 8, 4)), (2, (24, 6, 4)), (3, (16, 4, 2))])
 def test_mazes_are_mapped(seed: int, counts: tuple[int, int, int]) -> None:
-    """3 x 3 cells, of which the robot sees some.
+    """3 x 3 cells. The robot sees some of them.
 
-    What the trace alone says of order and sides keeps the dstates of the last two apart.
+    Order and sides in the trace alone show that the dstates of the last two steps differ.
     """
     walk = maze(3, 3, steps=200, seed=seed, stars=True)
     search = Search(walk.trace, Theory.topological())
@@ -346,7 +345,7 @@ def test_pinned_stretches_leave_all_maps() -> None:
 
 
 def test_what_is_not_told_beforehand_is_found() -> None:
-    """Every answer is refused until clingo was told what order and sides forbid; the maps are the
+    """Every answer is refused until clingo has the rules for order and sides. The maps are the
     same."""
     walk = maze(2, 2, steps=60, seed=1, stars=True)
     expected = solve(walk.trace, Theory.topological(), max_maps=None)
@@ -364,7 +363,8 @@ def test_what_is_not_told_beforehand_is_found() -> None:
 
 
 def test_clingo_is_told_of_a_path_that_an_answer_contradicts() -> None:
-    """Else maps would be the same, but each answer without paths would be forbidden alone."""
+    """Otherwise the maps would be the same, but each answer without paths would be forbidden
+    separately."""
     trace = maze(3, 3, steps=60, seed=0, stars=True).trace
     asked = Search(trace, Theory(star="frame"))._parts.prefixes.engine
     assert isinstance(asked, FramedEngine)
@@ -390,8 +390,8 @@ def test_clingo_is_told_of_a_path_that_an_answer_contradicts() -> None:
     ],
 )
 def test_sides_and_streets_say_the_same(theory: Theory) -> None:
-    """sides_framed.lp, of one path and visits that are one, against paths_framed.lp, of all paths
-    and settled dstates that may have none."""
+    """Compare sides_framed.lp (one path and visits) with paths_framed.lp (all paths and fixed
+    dstates)."""
     contradicted = 0
     for seed in range(3):
         trace = maze(3, 3, steps=60, seed=seed, stars=True).trace
@@ -462,7 +462,7 @@ def test_sides_and_streets_say_the_same(theory: Theory) -> None:
 
 
 def test_when_time_is_over_there_is_a_map_and_a_bound() -> None:
-    """Stopped while paths are sought for the fewest dstates, and while the dstates are."""
+    """Stop the search for paths, and the search for the fewest dstates."""
     walk = maze(3, 3, steps=200, seed=1, stars=True)
     with (
         patch.object(FramedEngine, "_all_with_paths", side_effect=KeyboardInterrupt),
@@ -482,7 +482,7 @@ def test_when_time_is_over_there_is_a_map_and_a_bound() -> None:
 
 
 def test_a_maze_half_explored_is_mapped() -> None:
-    """Few views tell little: order and sides have to."""
+    """Few views distinguish little, so order and sides matter."""
     trace = maze(10, 10, steps=4000, seed=2, stars=True).trace.prefix(145)
     solution = solve(trace, Theory.topological(), max_maps=3)
     assert solution.status is Status.OPTIMAL
@@ -493,7 +493,7 @@ def test_a_maze_half_explored_is_mapped() -> None:
 
 
 def test_the_engine_goes_on_where_a_limit_stopped_it() -> None:
-    """Wherever that is: it proves the same in the last part of the time."""
+    """The search may stop anywhere. It proves the same in the last part of the time."""
     trace = maze(10, 10, steps=150, seed=0, stars=True).trace
     fewest: set[int] = set()
     stopped = 0
@@ -523,8 +523,8 @@ def test_the_engine_goes_on_where_a_limit_stopped_it() -> None:
 
 
 def test_what_was_stopped_while_it_was_prepared_is_prepared_again() -> None:
-    """Else the time that is kept for any map would be spent on the engine of a shorter prefix, and
-    its map be taken for the whole trace's."""
+    """Otherwise the time reserved for any map would go to the engine of a shorter prefix, whose map
+    would be taken for one of the whole trace."""
     walk = maze(3, 3, steps=120, seed=1, stars=True)
     search = Search(walk.trace, Theory.topological(), time_limit=100)
     engine = search._parts.prefixes.engine
@@ -543,8 +543,7 @@ def test_what_was_stopped_while_it_was_prepared_is_prepared_again() -> None:
 
 
 def test_ctrl_c_in_the_last_part_of_the_time_leaves_no_engine_to_go_on_with() -> None:
-    """Perhaps clingo was told half of a core: what it would say then of the longer trace may be
-    wrong."""
+    """Clingo may have got half of a core. Then its answer for the longer trace may be wrong."""
     trace = maze(3, 3, steps=80, seed=1, stars=True).trace
     search = Search(trace.prefix(70), Theory.topological(), time_limit=100)
     with patch.object(
@@ -575,7 +574,7 @@ def test_an_error_leaves_no_engine_to_go_on_with() -> None:
 
 
 def test_maps_of_a_known_cost_are_listed_for_the_whole_trace() -> None:
-    """A shorter prefix has maps with fewer dstates, and those alone would be listed."""
+    """A shorter prefix has maps with fewer dstates, and only those would be listed."""
     trace = maze(3, 3, steps=70, seed=44, stars=True).trace
     first = Search(trace, Theory.topological(), max_maps=1)
     known = next(iter(first))
@@ -603,7 +602,7 @@ def places(walk: Walk, chart: FramedChart) -> list[object]:
 def test_what_fails_to_be_transitive_is_among_the_scattered(
     states: list[tuple[int, int]], data: st.DataObject
 ) -> None:
-    """Visits at places, but for some pairs that are left out, turned otherwise, or added."""
+    """Visits at places, with some pairs left out, rotated or added."""
     every = {
         (i, j): (t - s) % 4
         for j, (q, t) in enumerate(states)
@@ -640,7 +639,7 @@ def test_annealing_finds_the_places_of_a_maze() -> None:
 @settings(max_examples=15)
 @given(framed_traces(), st.integers(1, 20))
 def test_a_guess_holds_the_stars(trace: Trace, sweeps: int) -> None:
-    """Also one that is not sure: visits of a place have the same star in its frame."""
+    """Check an uncertain guess, too: the visits of a place have the same star in its frame."""
     chart = Chart.framed(trace, Log(trace, Theory(star="frame")))
     if chart is None:
         return
@@ -672,7 +671,7 @@ def framed_engine(trace: Trace, theory: Theory) -> FramedEngine:
 @settings(max_examples=10)
 @given(framed_traces(), framed_theories(), st.lists(st.integers(-1, 4), min_size=9, max_size=9))
 def test_any_guess_is_merged_to_a_map(trace: Trace, theory: Theory, guess: list[int]) -> None:
-    """Of the causal axioms. A guess that is a map stays as it is."""
+    """Only the causal axioms count. A guess that is a map stays as it is."""
     asked = framed_engine(trace, theory)
     if asked._visits._program is None:
         return  # the trace fits no frame

@@ -1,9 +1,9 @@
-"""No file makes a traceback: 1,000 damaged files, of every kind and through every verb that reads
-it, end as documented.
+"""1,000 damaged files of every kind, read by every verb that takes them, end as documented and
+without a traceback.
 
-Each is a small valid file with a few things changed: bytes, numbers, texts, types, whole branches
-of JSON, members of archives. What comes out is a proper answer, or one line on stderr that holds
-nothing that steers a terminal. The files are the same in every run.
+Each is a small valid file with a few changes: bytes, numbers, texts, types, branches of JSON,
+members of archives. The result is a proper answer, or one line on stderr without control
+characters. The files are the same in every run.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ YAML = (
     "image: map.pgm\nresolution: 0.5\norigin: [-0.5, -0.5, 0.0]\noccupied_thresh: 0.65\nnegate: 0\n"
 )
 
-# What each kind of file is read by. FILE is the damaged one; the others are sound.
+# The commands that read each kind of file. FILE is the damaged file. The others are intact.
 COMMANDS: dict[str, list[str]] = {
     "trace.jsonl": [
         "solve FILE --time-limit 0.3 --memory-limit 4000",
@@ -333,7 +333,7 @@ def _spots(value: Any) -> Iterator[tuple[Any, Any]]:
 
 
 def _archive(data: bytes, rng: random.Random) -> bytes:
-    """An archive that is sound but for one of its members."""
+    """An archive with one damaged member."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
     name = rng.choice(list(members))
@@ -399,7 +399,7 @@ def cases(batch: int) -> Iterator[tuple[str, str, random.Random]]:
         yield kind, rng.choice(COMMANDS[kind]), rng
 
 
-@pytest.mark.filterwarnings("ignore")  # the command line prints what it is warned of
+@pytest.mark.filterwarnings("ignore")  # the command line prints warnings
 @pytest.mark.parametrize("batch", range(BATCHES))
 def test_damaged_files_end_as_documented(
     batch: int, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -420,7 +420,7 @@ def test_damaged_files_end_as_documented(
 
 
 def problem(command: str, code: int, out: str, err: str) -> str | None:
-    """What is wrong with how a command ended, if anything."""
+    """Describe what is wrong with the end of a command; None if nothing is wrong."""
     lines = [line for line in err.splitlines() if not line.startswith("ssh-abduction: warning: ")]
     if code not in CODES:
         return "the exit code is not documented"

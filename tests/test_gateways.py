@@ -1,5 +1,5 @@
-"""Stars of any number of gateways: as values, in tolerance, under the axioms of gateways.lp, and in
-worlds with streets at any angles."""
+"""Stars of any number of gateways: as values, within tolerance, under the axioms of gateways.lp,
+and in worlds with streets at any angles."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_a_star_survives_a_round_trip(tmp_path: Path) -> None:
     trace = Trace.load(tmp_path / "t.jsonl")
     again = [json.loads(line) for line in trace.to_lines()]
     expected = [json.loads(line) for line in lines]
-    expected[2]["star"][2] = 270.0  # an object that says no more than a bearing does
+    expected[2]["star"][2] = 270.0  # an object with only a bearing
     assert again == expected
     assert trace.steps[2].star == (0, Gateway(180, 90, None, None))
 
@@ -265,8 +265,7 @@ TURNS: tuple[Any, ...] = (
     {"name": "first", "kind": "turn", "turn": "right", "gateway": 1},
     {"name": "second", "kind": "turn", "turn": "left", "gateway": 2},
 )
-# The axioms that may be left out: without a heading of its own a dstate would be turned in several
-# ways.
+# The axioms that may be left out. Without gateway_heading a dstate could have several headings.
 LEFT_OUT = (
     "gateway_frame",
     "gateway_turn",
@@ -343,7 +342,7 @@ def test_solver_and_checker_agree_with_the_brute_force(trace: Trace, data: st.Da
 @given(traces(), st.data())
 def test_stars_of_dstates_alone(trace: Trace, data: st.DataObject) -> None:
     """star=alike: solver and checker against the brute force, which tries all ways to pair
-    gateways; the maps of the bare causal theory are judged by it, too."""
+    gateways. The maps of the plain causal theory are judged, too."""
     theory = Theory.causal().replace(
         star="alike", prefer=data.draw(st.sampled_from([("dstates",), ()]))
     )
@@ -362,7 +361,7 @@ def test_stars_of_dstates_alone(trace: Trace, data: st.DataObject) -> None:
 @settings(max_examples=8)
 @given(traces(), st.sampled_from(LEFT_OUT[:5]))
 def test_checker_rejects_what_the_brute_force_does_not_find(trace: Trace, left_out: str) -> None:
-    """The maps of a theory that lacks an axiom, under the axioms that have it."""
+    """Judge the maps of a theory that lacks an axiom by all axioms."""
     _, allowed = minimal_maps(trace, GATEWAYS.replace(prefer=()))
     for ssh_map in solve(
         trace, GATEWAYS.replace(prefer=(), without=(left_out,)), max_maps=20, time_limit=100
@@ -372,7 +371,7 @@ def test_checker_rejects_what_the_brute_force_does_not_find(trace: Trace, left_o
 
 
 def test_an_opening_not_observed_matches_both() -> None:
-    """Out and back: behind the robot it is unknown, at first, whether there is a gateway."""
+    """Out and back. At first it is unknown whether a gateway is behind the robot."""
     for back in (0, 1):
         trace = Trace.from_steps(
             "abca",
@@ -391,8 +390,7 @@ def test_an_opening_not_observed_matches_both() -> None:
 
 
 def test_the_axioms_agree_with_frames_of_four_slots() -> None:
-    """Where turns are named by their bearings, four gateways at right angles are a frame of four
-    slots."""
+    """If bearings name turns, four gateways at right angles are a frame of four slots."""
     from worlds import TOURS
     from worlds import drive as drive_streets
 
@@ -443,9 +441,9 @@ def test_worlds_of_any_gateways_are_mapped_right(name: str) -> None:
 
 
 def test_a_bend_ends_two_paths() -> None:
-    """Once round six bends of 120 degrees: six paths, though three pairs of them are parallel.
+    """Once around six bends of 120 degrees. There are six paths, although three pairs are parallel.
 
-    Without the axiom some are taken for one.
+    Without the axiom some become one path.
     """
     tour = drive(planar.hexagon(), 0, 1, 12, random.Random(0))
     trace = tour.trace
@@ -472,8 +470,8 @@ def test_streets_at_any_angles_are_mapped_right(noise: float, unseen: bool) -> N
 
 
 def test_no_axiom_forbids_the_true_map() -> None:
-    """Hubs with a ring road: bearings may be off by less than their spread, and gateways behind the
-    robot need not be observed."""
+    """Hubs with a ring road. Bearings may be off by less than their spread, and gateways behind the
+    robot may be unobserved."""
     tour = drive(planar.wheel(5), "hub", 0, 24, random.Random(5), noise=9, unseen=True)
     pairs = [(i, j) for j in range(24) for i in range(j)]
     same = [(i, j) for i, j in pairs if tour.truth[i] == tour.truth[j]]
@@ -507,7 +505,7 @@ def test_online_maps_general_stars() -> None:
 def test_maps_with_headings_in_degrees_survive_files(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What solve prints of a triangle is read by check and show."""
+    """`check` and `show` read the output of `solve` for a triangle."""
     tour = drive(planar.triangle(), 0, 1, 9, random.Random(0))
     tour.trace.save(tmp_path / "t.jsonl")
     assert main(["solve", str(tmp_path / "t.jsonl"), "--json"]) == 0

@@ -1,5 +1,4 @@
-"""The fewest places where that needs no search: corridors of different landmarks, there and
-back."""
+"""The fewest places without a search: corridors with different landmarks, there and back."""
 
 from __future__ import annotations
 
@@ -26,7 +25,7 @@ ARMS = {
 
 
 def corridor(landmarks: int, drives: int = 1, alike: int = 0, seed: int = 0) -> Trace:
-    """Drives up and down a corridor with different landmarks, some of which look alike."""
+    """Drives up and down a corridor with landmarks. Some of them look alike."""
     names = {(way, i): f"{way}{i}" for way in "ab" for i in range(landmarks)}
     chance = random.Random(seed)
     for key in chance.sample(list(names), alike):
@@ -42,7 +41,7 @@ def corridor(landmarks: int, drives: int = 1, alike: int = 0, seed: int = 0) -> 
 
 
 def arms(kind: str, length: int) -> Trace:
-    """Up and down arms that meet at one place, all landmarks different."""
+    """Drives up and down arms that meet at one place. All landmarks differ."""
     seen, done = ["c0"], list[str]()
     for number, turn in enumerate(ARMS[kind]):
         for way in ("out", "back"):
@@ -127,5 +126,5 @@ def test_a_long_corridor_needs_no_search_for_places() -> None:
 
 
 def test_a_member_that_is_distinct_from_itself_does_not_hang_the_search() -> None:
-    """Labels that break an axiom may tell so. clingo then finds no map with them."""
+    """Labels that break an axiom may show it. Clingo then finds no map with them."""
     assert pairwise_distinct([4, 5], [(4, 4), (4, 5), (5, 4)]) == [4, 5]

@@ -1,5 +1,5 @@
-"""Displacements that are wrong altogether: against all sets of steps whose displacements may be
-left out, the checker, and walks whose jumps are known."""
+"""Wrong displacements, against all sets of steps without their displacements, the checker, and
+walks with known jumps."""
 
 from __future__ import annotations
 
@@ -34,8 +34,7 @@ NOISE = Odometry(along=0.05, across=0.005, heading=0.002)
 
 
 def circuit(steps: int, jumps: tuple[int, ...] = ()) -> Trace:
-    """Round and round a square whose corners look alike; the displacements to some steps are
-    wrong."""
+    """Several rounds of a square with equal corners. The displacements to some steps are wrong."""
     moves = [AWAY if t in jumps else (AHEAD, LEFT)[(t - 1) % 2] for t in range(1, steps)]
     return Trace.from_steps(
         ["pq"[t % 2] for t in range(steps)],
@@ -46,7 +45,7 @@ def circuit(steps: int, jumps: tuple[int, ...] = ()) -> Trace:
 
 @cache
 def carried() -> Solution:
-    """Of a circuit on which the robot was carried away once."""
+    """A circuit during which the robot was carried away once."""
     return solve(circuit(18, (9,)), Theory(jumped=2, weigh="count"), max_maps=None)
 
 

@@ -1,5 +1,5 @@
-"""Odometers that jump, stand still, count another unit or are two: what becomes of the track and of
-the trace."""
+"""The track and the trace if an odometer jumps, stands still, counts another unit, or is two
+odometers."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ def stepwise(scans: Sequence[Scan], step: Callable[[int, Pose], Pose | None]) ->
 
 
 def told(scans: Sequence[Scan]) -> tuple[Track, str]:
-    """The track, and what is said of it."""
+    """The track, and the notes on it."""
     _, track, notes = tracked(RobotLog(tuple(scans), source="drive"))
     return track, " ".join(notes)
 
 
 @pytest.fixture(scope="module")
 def metres(scans: tuple[Scan, ...]) -> float:
-    """The length of the way, of which a good drive is told without a note."""
+    """Measure the length of the way, and check that a good drive has no note."""
     track, notes = told(scans)
     assert (track.cuts, track.breaks, notes) == ((), (), "")
     return float(track.way[-1])

@@ -49,7 +49,7 @@ def streets(*directions: float, length: float = 6.0) -> nx.Graph:
 
 
 def bend(degrees: float) -> nx.Graph:
-    """Two streets that meet; going on means a turn to the left by this many degrees."""
+    """Two streets that meet. To go on, turn left by this many degrees."""
     return streets(180, degrees)
 
 
@@ -119,7 +119,7 @@ def test_a_street_that_goes_straight_on_is_no_place() -> None:
 def test_the_compass_tells_how_the_robot_is_turned(
     heading: float, turn: float, error: float, seed: int
 ) -> None:
-    """Odometry is off by up to 3 % of the turn; images tell it to half a degree."""
+    """Odometry is off by up to 3 % of the turn. Images measure the turn to half a degree."""
     around = exact_panorama(FIVE, (0.1, 0.2, heading))
     image = Laser().scan(FIVE, np.array([[0.1, 0.2, heading + turn]]), np.random.default_rng(seed))[
         0

@@ -1,4 +1,4 @@
-"""The ladder: what each kind of evidence is worth, one more on each rung."""
+"""The ladder: the effect of each kind of evidence. Each rung has one more."""
 
 from __future__ import annotations
 

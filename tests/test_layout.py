@@ -58,7 +58,7 @@ def mapped(edges: Streets) -> SSHMap:
 
 
 def spiral(turns: int) -> SSHMap:
-    """Streets that go round and round, each turn to the right."""
+    """Streets in a spiral of right turns."""
     places = range(turns + 1)
     edges = streets(*((f"p{i}", "ESWN"[i % 4], f"p{i + 1}") for i in places[:-1]))
     return mapped(edges)

@@ -846,7 +846,7 @@ def test_a_summary_counts_the_seeds_in_which_a_claim_holds(measured: Run) -> Non
 
 @pytest.fixture(scope="module")
 def five_circuits() -> tuple[Trace, BootstrapLearner]:
-    """A run of five circuits, and what is learnt from it."""
+    """A run of five circuits, and the learner after it."""
     trace = simulate(World.named("notched-rectangle"), tours=5, seed=503)
     return trace, BootstrapLearner().fit(trace)
 

@@ -1,5 +1,5 @@
-"""Limits are promises: time, memory, Ctrl-C and SIGTERM are heeded whatever clingo is at, and what
-is known by then is printed."""
+"""Limits of time and memory, Ctrl-C and SIGTERM always hold, whatever clingo does. What is known by
+then is printed."""
 
 from __future__ import annotations
 
@@ -32,15 +32,14 @@ from ssh_abduction.solver.steps import certificate
 from ssh_abduction.solver.steps.noise import noise_in
 from ssh_abduction.theory.settle import settle
 
-# Seconds in which what has to end soon has ended also on a slow machine that has much else to do.
-# What does not heed its limit takes longer than that. How many seconds an end takes beyond the
-# limit is measured by benchmarks/limits.py.
+# Seconds after which a process that obeys its limit has ended, even on a slow and busy machine. One
+# that ignores its limit takes longer. benchmarks/limits.py measures the seconds beyond the limit.
 SOON = 100
 # 64 million rules
 JOINS = "p(1..400). { q(X,Y) : p(X), p(Y) }. :- p(X), 1 = @go_on(X), q(X,Y), q(Y,Z), q(Z,X)."
 POSIX = pytest.mark.skipif(sys.platform == "win32", reason="signals")
 
-# Sits in clingo, which cannot be stopped, under a guard.
+# Wait in clingo, which cannot be stopped, under a guard.
 DEAF = """
 import sys, clingo
 from ssh_abduction.cli import guard as patience
@@ -61,8 +60,8 @@ with on_ctrl_c(lambda: None), Guard(
 
 @pytest.fixture
 def noisy(tmp_path: Path) -> Path:
-    """Circuits of a rectangle, of which the last view is wrong: as many dstates as steps, and far
-    too many ways to lay streets through them."""
+    """Circuits of a rectangle with a wrong last view. There are as many dstates as steps, and far
+    too many ways to join them to paths."""
     trace = rectangle(40)
     *steps, last = trace.steps
     path = tmp_path / "noisy.jsonl"
@@ -128,8 +127,7 @@ def test_the_search_ends_in_time_with_its_best_map(noisy: Path) -> None:
 )
 @POSIX
 def test_limits_hold_on_traces_with_flaws(case: Case, tmp_path: Path) -> None:
-    """A process that has not ended by itself half a minute after it should have is killed, and has
-    no status then."""
+    """A process that runs half a minute too long is killed, and has no exit status."""
     found = outcome(case, tmp_path)
     assert found.status in ("optimal", "feasible", "unsatisfiable", "unknown")
     assert found.mebibytes <= 1
@@ -311,8 +309,8 @@ def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
 
 
 def is_running(process: int) -> bool:
-    """Whether a process runs; one that has ended may still be listed, where nobody asks how it
-    ended."""
+    """Whether a process runs. A process that has ended may still be listed if nobody reads its
+    status."""
     try:
         os.kill(process, 0)
     except ProcessLookupError:
@@ -325,14 +323,13 @@ VIEWS = [number % 4 for number in range(201)]
 ACTIONS = [number % 2 for number in range(200)]
 
 
-# Circuits of corridors, in which one view is seen in several places, and other things are done
-# there.
+# Circuits of corridors. Several places have one view, and the actions there differ.
 CORRIDORS = [0, 1, 2, 1, 0, 2, 0, 1, 1, 3] * 20
 DONE = ([0, 1, 0, 0, 1, 1, 0, 1, 0, 1] * 20)[:-1]
 
 
 def with_view(step: int) -> tuple[list[int], list[int]]:
-    """Circuits of which one view is wrong."""
+    """Circuits with one wrong view."""
     return [*VIEWS[:step], (VIEWS[step] + 1) % 4, *VIEWS[step + 1 :]], ACTIONS
 
 
@@ -397,7 +394,7 @@ def test_noise_is_told_where_the_search_is_stopped_after_a_minimal_map_is_known(
     search._parts.prefixes.engine._named.size, search._parts.known.stopped = (
         0,
         "time limit",
-    )  # as where the limit ends the listing while clingo is given more
+    )  # as if the limit ended the listing while clingo gets more steps
     noise = search.solution().noise
     assert noise
     assert noise.step == 40

@@ -41,7 +41,7 @@ def labels(chart: FramedChart, found: Located) -> list[int]:
 
 @pytest.mark.parametrize("seed", range(8))
 def test_a_true_map_of_some_visits_tells_the_states_of_all(seed: int) -> None:
-    """The map asks for more visits until it tells all states. It does not need all visits."""
+    """The map asks for more visits until all states are known. It does not need all visits."""
     walk = maze(3, 3, steps=1000, seed=seed, stars=True)
     chart = charted(walk)
     states = true_states(walk, chart)
@@ -57,7 +57,7 @@ def test_a_true_map_of_some_visits_tells_the_states_of_all(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(2))
 def test_a_map_of_a_beginning_explains_all_visits_or_misses_some(seed: int) -> None:
-    """If the map tells all states, they make a map; else it misses visits that it does not have."""
+    """If the map implies all states, they make a map. Otherwise it names missing visits."""
     walk = maze(3, 3, steps=400, seed=seed, stars=True)
     chart = charted(walk)
     for steps in (40, 100, 200):

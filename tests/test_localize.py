@@ -313,7 +313,7 @@ def test_one_misread_view_is_forgiven() -> None:
 
 
 def test_a_robot_is_found_again_where_it_is_as_sure_as_before() -> None:
-    """Opposite corners of the notched rectangle look alike, and what follows them does."""
+    """Opposite corners of the notched rectangle look alike, and so do the dstates after them."""
     (ssh_map,) = solve(rectangle(40), Theory.topological()).maps
     views = [f"v{i % 4}" for i in range(9)] + [f"v{i % 4}" for i in range(3, 10)]
     trace = Trace.from_steps(views, [["right", "travel"][int(v[1]) % 2] for v in views[:-1]])
@@ -342,7 +342,7 @@ def test_views_that_the_map_does_not_have_are_nowhere() -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_another_world_that_shows_the_same_views_is_nowhere(seed: int) -> None:
-    """No view is new there, but what follows what is not as the map has it."""
+    """No view is new there, but their order differs from the map."""
     ssh_map, foreign = true_map(*_walk_of_moore(seed)), true_map(*_walk_of_moore(50 + seed))
     trace, _ = drive(foreign, 60, seed)
     verdicts = [b.verdict for b in Localiser(ssh_map).beliefs(trace)][20:]

@@ -1,4 +1,5 @@
-"""Logs that are shuffled, reversed, of two drives, in other units, or too sparse: each is said."""
+"""A note names each fault: logs that are shuffled, reversed, of two drives, in other units, or too
+sparse."""
 
 from __future__ import annotations
 
@@ -30,7 +31,7 @@ def scans() -> tuple[Scan, ...]:
 
 
 def notes_of(scans: Scans) -> str:
-    """All notes on a log; those that a user reads first come first."""
+    """All notes on a log, in the order in which a user reads them."""
     said: list[str] = []
     _, _, notes = tracked(RobotLog(tuple(scans), source="drive"), said.append)
     assert tuple(said) == notes

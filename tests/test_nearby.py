@@ -1,5 +1,5 @@
-"""Maps near a guess: each is a map, each has fewer dstates, and the last is minimal when the search
-says so, whatever the guess."""
+"""Maps near a guess. Each is a map with fewer dstates than the one before. For any guess, the last
+one is minimal if the search says so."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ CAUSAL = Theory.causal()
 def test_a_search_near_a_guess_changes_no_answer(
     trace: Trace, cores: int, data: st.DataObject
 ) -> None:
-    """From any guess, right or wrong."""
+    """The guess may be right or wrong."""
     expected = solve(trace, CAUSAL, max_maps=None, speedups=PLAIN)
     guess = data.draw(
         st.lists(st.integers(-1, 3), min_size=len(trace), max_size=len(trace)), label="guess"
@@ -89,7 +89,7 @@ def test_known_labels_end_a_search_only_if_they_reach_the_bound() -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_some_maps_where_the_search_near_a_guess_has_the_proof(seed: int) -> None:
-    """Then names may still be fewer than dstates: what is at a rest is no map."""
+    """There may be fewer names than dstates. An answer with a step at a rest is no map."""
     trace = moore(7, 2, steps=60, seed=seed).trace
     with (
         patch.object(name_search, "PATIENCE", 1),
@@ -114,7 +114,7 @@ def test_some_maps_where_the_search_near_a_guess_has_the_proof(seed: int) -> Non
 
 
 def test_a_causal_maze_is_guessed_by_its_turns() -> None:
-    """Annealing, from views and turns alone, comes near what the robot was in."""
+    """Annealing finds a good guess from views and turns alone."""
     walk = maze(3, 3, steps=400, seed=1)
     log = Log(walk.trace, CAUSAL)
     chart = Chart.turned(walk.trace, log, len(log.seen))
@@ -125,13 +125,13 @@ def test_a_causal_maze_is_guessed_by_its_turns() -> None:
 
 
 def test_a_limit_leaves_the_small_map_found_near_a_guess() -> None:
-    """It has no more dstates than the states that the robot was in; what is merged at once has more
-    than twice as many."""
+    """The guess has no more dstates than the robot visited. A map by greedy merging has more than
+    twice as many."""
     walk = maze(4, 4, steps=600, seed=1)
     best: list[int] = []
 
     def stop(_: NameSearch, labels: list[int], __: int) -> tuple[None, bool]:
-        """When there is a small map, the time is over."""
+        """The time is over when there is a small map."""
         best.append(len(set(labels)))
         raise KeyboardInterrupt
 
@@ -159,17 +159,16 @@ def test_a_limit_leaves_the_small_map_found_near_a_guess() -> None:
 
 
 def test_a_search_of_the_whole_trace_keeps_no_time_back() -> None:
-    """What is kept back is for that search; to begin it once more would throw away what it has come
-    to. So it may use the whole limit from its start, and
-    where it is stopped before it has a map, no other search for any map follows.
-    """
+    """The reserved time is for that search, and a restart would lose its progress. So it may use
+    the whole limit from its start. If it is stopped without a map, no other search for any map
+    follows."""
     trace = maze(10, 10, steps=500, seed=0, stars=True).trace
     begun: list[tuple[bool, bool]] = []
     minimise = Prefixes.minimise
 
     def stop(self: Prefixes) -> Found | None:
-        """Before a prefix is searched, the clock is left alone; as soon as the whole trace is to be
-        searched, the time is over."""
+        """The clock runs normally for a prefix. The time is over when the search of the whole trace
+        begins."""
         if self.engine.size < len(trace):
             return minimise(self)
         begun.append((self._task.watch.has_reserve, self._known.best is None))
@@ -213,7 +212,7 @@ def test_a_chart_of_what_is_seen_around() -> None:
 
 
 def test_what_turns_of_any_kind_show_is_put_together() -> None:
-    """Nobody turned to the right of what is behind, nor to what is behind from the left."""
+    """No turn led right from the slot behind, nor left to it."""
     trace = Trace.from_steps("abadaca", ["right", "left", "left", "right", "travel", "around"])
     chart = Chart.turned(trace, Log(trace, CAUSAL), 7)
     a, b, d, c = range(4)  # by first step
@@ -229,7 +228,7 @@ def fewest_dstates(trace: Trace) -> int:
 
 @cache
 def pinned_in_a_maze() -> tuple[Trace, Pinned]:
-    """A long trace in a maze of 6 cells, and what is pinned in all of it."""
+    """A long trace in a maze of 6 cells, and the pinned clique of all of it."""
     trace = maze(2, 3, steps=500, seed=0).trace
     watch = Watch(100.0)
     watch.start()
@@ -249,8 +248,8 @@ def pinned_in_a_maze() -> tuple[Trace, Pinned]:
 def test_a_guess_at_the_beginning_of_a_long_trace_goes_on_if_it_can(
     first: int, guessed: int, goes_on: bool
 ) -> None:
-    """The map of 460 steps in a maze of 6 cells holds to the end. That of 20 or 40 steps is of no
-    use, but if the trace is not too long, all of it is guessed then."""
+    """The map of 460 steps in a maze of 6 cells fits all later steps. The map of 20 or 40 steps
+    does not help. Then the whole trace is guessed if it is not too long."""
     trace, pinned_nodes = pinned_in_a_maze()
     watch = Watch(100.0)
     watch.start()
@@ -265,8 +264,8 @@ def test_a_guess_at_the_beginning_of_a_long_trace_goes_on_if_it_can(
 
 
 def test_of_a_long_trace_clingo_is_given_some_links_at_a_time() -> None:
-    """The simplest come first, and the search may end before all are given. The map is that of a
-    guess at the beginning, or clingo's."""
+    """The simplest links come first, and the search may end before clingo has all. The map is a
+    guess, or from clingo."""
     walk = maze(3, 3, steps=700, seed=1, loops=0.3)
     given: list[int] = []
     add = name_program.NameProgram.add

@@ -1,4 +1,4 @@
-"""The online mapper: as exact as solving anew after each step, quick, and never without a map."""
+"""The online mapper is as exact as solving anew after each step, quick, and always has a map."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def observed(mapper: OnlineMapper, action: Action, step: Step) -> Solution:
 
 
 def limit_steps(mapper: OnlineMapper, limit: float | None) -> None:
-    """Give each further step so many seconds."""
+    """Give each further step this many seconds."""
     keeper = mapper._keeper
     assert isinstance(keeper, MapKeeper)
     for part in (keeper.solver, keeper.mender):
@@ -82,7 +82,7 @@ def sketched(mapper: OnlineMapper) -> SSHMap:
 
 
 def agree(trace: Trace, theory: Theory) -> None:
-    """After every step the answer is what solving the prefix anew gives."""
+    """After every step the answer is that of solving the prefix anew."""
     theory = settle(trace, theory).theory
     _, answers = follow(trace, theory)
     for i, answer in enumerate(answers):
@@ -131,7 +131,7 @@ def test_no_more_maps_than_asked_for(data: st.DataObject) -> None:
 
 
 def test_a_bound_is_known_where_more_maps_of_a_known_cost_are_asked_for() -> None:
-    """Where clingo is given the whole trace at each step, too."""
+    """This also holds if clingo gets the whole trace at each step."""
     actions = "RRRRRVTRRVRRCRCRTRTVRV"
     named = {
         "R": "right",
@@ -161,7 +161,7 @@ def test_circuits_are_replayed(theory: Theory) -> None:
 
 
 def test_a_star_seen_from_another_side_is_no_contradiction() -> None:
-    """Spinning where all looks alike: one dstate, whose pattern is seen in every rotation."""
+    """The robot turns where all looks alike. One dstate shows its pattern in every rotation."""
     stars = [(1, 0, 0, 0), (0, 0, 0, 1), (0, 0, 1, 0), (0, 1, 0, 0)]
     trace = Trace.from_steps("a" * 20, ["right"] * 19, stars=stars * 5)
     mapper, answers = follow(trace, Theory(star="pattern"))
@@ -180,7 +180,7 @@ def test_a_mapper_says_how_far_it_is() -> None:
 def test_sketches_are_consistent(data: st.DataObject) -> None:
     trace = data.draw(
         traces(max_steps=14), label="trace"
-    ).without_displacements()  # what evidence says, a sketch does not know
+    ).without_displacements()  # sketches ignore evidence
     theory = settle(
         trace, data.draw(theories(trace, fixed=(*FOREIGN, *PAIRS, "planar")), label="theory")
     ).theory
@@ -221,7 +221,7 @@ def draft(trace: Trace, theory: Theory, known: int, which: int) -> list[bool]:
 def test_a_map_that_goes_on_like_a_sketch_is_consistent(data: st.DataObject) -> None:
     trace = data.draw(
         traces(max_steps=10), label="trace"
-    ).without_displacements()  # what evidence says, a sketch does not know
+    ).without_displacements()  # sketches ignore evidence
     theory = settle(
         trace, data.draw(theories(trace, fixed=(*FOREIGN, *PAIRS, "planar")), label="theory")
     ).theory
@@ -277,7 +277,7 @@ def test_without_time_there_is_a_map_and_later_the_proof(data: st.DataObject) ->
 
 
 def test_a_limit_leaves_feasible_maps_and_sound_bounds() -> None:
-    """The tour is solved for its first half; then there is no time."""
+    """The first half of the tour is solved. After that there is no time."""
     trace = drive(*TOURS["plus"])
     theory = settle(trace).theory
     half = len(trace) // 2
@@ -299,7 +299,7 @@ def test_a_limit_leaves_feasible_maps_and_sound_bounds() -> None:
         )
         bound = answer.bound.dstates
     assert mapper.solution.status is Status.FEASIBLE
-    assert mapper.searches <= half + (len(trace) - half) // 2 + 1  # not one a step
+    assert mapper.searches <= half + (len(trace) - half) // 2 + 1  # fewer than one a step
 
 
 def explore(trace: Trace, mapper: OnlineMapper) -> list[Solution]:
@@ -311,7 +311,7 @@ def explore(trace: Trace, mapper: OnlineMapper) -> list[Solution]:
 
 
 def test_a_map_that_is_contradicted_is_mended() -> None:
-    """A map of fewer steps is kept as far as possible, and what does not fit is new."""
+    """Keep a map of fewer steps as far as possible. Add new dstates for steps that do not fit."""
     without = contradicted = 0
     for seed in range(6):
         trace = maze(3, 3, steps=120, seed=seed, stars=True).trace
@@ -339,7 +339,7 @@ def test_a_map_that_is_contradicted_is_mended() -> None:
 
 
 def test_mending_in_another_process_ends_with_its_mapper_and_with_the_program() -> None:
-    """Without time for clingo or to mend at once. Without `processes`, nothing is begun."""
+    """There is no time for clingo or for mending. Without `processes`, no process is started."""
     program = """
 import threading
 from instances import maze
@@ -489,7 +489,7 @@ def test_the_trace_settles_displacements_as_it_grows(
             for t, step in enumerate(trace)
         ),
     )
-    theory = theory.replace(weigh="count")  # a robot that drives does not weigh its maps
+    theory = theory.replace(weigh="count")  # maps are not weighed while the robot drives
     _, answers = follow(trace, theory)
     for i in (0, 3, 4, *range(5, steps + 1, 4)):
         answer, anew = answers[i], solve(trace.prefix(i + 1), theory, max_maps=None)

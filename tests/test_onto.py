@@ -1,4 +1,4 @@
-"""A drive is added to a map that stands."""
+"""A drive is added to a known map."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""A theory is open: what is added to it is obeyed everywhere, online and in one go, though no
-speed-up and no checker knows it."""
+"""Added axioms are obeyed everywhere, online and offline, although no speed-up and no checker knows
+them."""
 
 from __future__ import annotations
 
@@ -61,8 +61,8 @@ def with_toy(toy: Toy, theory: Theory) -> Theory:
 @settings(max_examples=2)
 @given(data=st.data())
 def test_an_axiom_that_nothing_knows_is_obeyed(name: str, toy: Toy, data: st.DataObject) -> None:
-    """In one go and step by step, against the brute force; with first prefixes so short that replay
-    would overlook it."""
+    """Solve offline and online, against the brute force. The first prefixes are so short that
+    replay would overlook the axiom."""
     theory = (
         with_toy(toy, THEORIES[name])
         if toy.causal or name != "causal"
@@ -114,7 +114,7 @@ def test_a_rule_about_pairs_of_steps_on_circuits(steps: int, dstates: int) -> No
 
 @pytest.fixture
 def own_encodings(tmp_path: Path) -> Iterator[Path]:
-    """A copy of the encodings that a test may change, and that takes their place."""
+    """A copy of the encodings that a test may change. It replaces them."""
     folder = tmp_path / "encodings"
     shutil.copytree(encodings.folder(), folder)
     caches = (encodings.levels, encodings.axioms, encodings.paths, encodings.keeps)
@@ -128,8 +128,8 @@ def own_encodings(tmp_path: Path) -> Iterator[Path]:
 
 @pytest.fixture
 def wider(own_encodings: Path) -> type[Theory]:
-    """A folder of encodings with one file more, and a theory with one field more: all that somebody
-    does who adds an axiom, and forgets the rest."""
+    """A folder of encodings with one more file, and a theory with one more field, as if somebody
+    adds an axiom and forgets the rest."""
     (own_encodings / "forgetful.lp").write_text(
         "% Toy.\n#program step(t).\n% @axiom(forgetful) No dstate is seen twice more than 10 "
         "steps apart. [a toy] if forgetful\n"
@@ -279,8 +279,7 @@ FAST = {
 @settings(max_examples=10)
 @given(data=st.data())
 def test_what_evidence_refuses_is_forbidden_in_every_engine(name: str, data: st.DataObject) -> None:
-    """An engine that settles dstates first is told of it, too, and its maps are those of the brute
-    force."""
+    """An engine that settles dstates first obeys it, too. Its maps are those of the brute force."""
     theory, kind = FAST[name]
     trace = data.draw(traces(max_steps=5), label="trace")
     if theory.star == "frame" and not trace.has_stars:
@@ -422,7 +421,7 @@ def test_rules_of_any_editor_are_read(data: bytes, tmp_path: Path) -> None:
     apart = Trace.from_steps("a" + "b" * 11 + "a", ["travel"] * 12, displacements=[(1, 0, 0)] * 12)
     assert (
         solve(apart, theory.replace(displacement="none")).maps[0].labels[-1] != 0
-    )  # so the rule is read, and no part of a comment
+    )  # so the rule is not part of a comment
 
 
 @pytest.mark.parametrize(
@@ -450,7 +449,7 @@ def test_rules_of_any_editor_are_read(data: bytes, tmp_path: Path) -> None:
 def test_characters_that_end_clingo_are_refused(
     data: str | bytes, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Clingo aborts the process over them, or reads no further."""
+    """Such files abort clingo, or end its reading."""
     path, trace = tmp_path / "own.lp", tmp_path / "trace.jsonl"
     path.write_bytes(data.encode() if isinstance(data, str) else data)
     Trace.from_steps("aa", ["travel"]).save(trace)
@@ -566,8 +565,7 @@ def test_a_replayed_map_that_breaks_an_axiom_is_an_internal_error_while_a_robot_
 
 
 def test_what_is_asserted_is_told_to_the_engine_with_names() -> None:
-    """More is then apart: the clique that dstates are pinned to is larger, and clingo need not find
-    that out."""
+    """Then more steps differ, so the pinned clique is larger, and clingo need not find that out."""
     trace = Trace.from_steps("ab" * 20, ["travel"] * 39)
     cliques = []
     grow = CausalEngine.grow

@@ -207,7 +207,7 @@ def test_every_verb_that_writes_writes_into_a_pipe(
 
 @pytest.fixture
 def learnt(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
-    """The words of `learning-curve` for a small trace with images and its map."""
+    """The arguments of `learning-curve` for a small trace with images and its map."""
     lines = [{"format": "ssh-trace", "version": 1}]
     lines += [
         {"view": "ab"[i % 2], "image": [1.0 + i % 2, 2.0 + i / 100], "action": "travel"}
@@ -342,13 +342,13 @@ def test_json_goes_to_its_file_while_progress_shows_on_a_terminal(
 @pytest.mark.skipif(sys.platform == "win32", reason="terminals")
 @pytest.mark.parametrize("traces", [1, 2])
 def test_json_is_not_wrapped_on_a_narrow_terminal(traces: int, room: str) -> None:
-    """Nor does it go elsewhere: rich takes over stdout while it shows how far a search is."""
+    """All output goes to stdout. Rich redirects stdout while it shows progress."""
     import pty
     import termios
 
     ours, theirs = pty.openpty()
     attributes = termios.tcgetattr(theirs)
-    attributes[1] &= ~termios.OPOST  # what is printed comes as it is
+    attributes[1] &= ~termios.OPOST  # output is unchanged
     termios.tcsetattr(theirs, termios.TCSANOW, attributes)
     wrong, their_wrong = pty.openpty()
     command = [sys.executable, "-m", "ssh_abduction", "solve", *[room] * traces, "--json"]

@@ -1,5 +1,4 @@
-"""What is installed is what was tested: the wheel holds the encodings, and nothing shadows Python's
-own modules."""
+"""The wheel holds the encodings, and shadows no modules of Python."""
 
 from __future__ import annotations
 
@@ -22,7 +21,7 @@ ROOT = Path(__file__).parent.parent
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the wheel puts into site-packages."""
+    """The files that the wheel puts into site-packages."""
     built, unpacked = tmp_path_factory.mktemp("built"), tmp_path_factory.mktemp("site")
     subprocess.run(
         [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(built)],
@@ -100,7 +99,7 @@ def test_the_first_commands_of_the_readme_run_where_the_wheel_is_installed(
 
 
 def without_speed(text: str) -> str:
-    """The text without seconds and without the number of steps that clingo needed."""
+    """Remove seconds, and the number of steps that clingo needed, from a text."""
     return re.sub(r"\d+\.\d+ s|\d+ of \d+ steps", "_", text)
 
 

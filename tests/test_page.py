@@ -76,7 +76,7 @@ def test_overview_counts_the_maps_that_have_each_place(
         here, there = (overview["nodes"][k]["steps"] for k in (a, b))
         assert any(
             tuple(sorted(pair)) in driven for pair in product(here, there)
-        )  # orders of paths alone make no street
+        )  # the order of a path alone makes no street
         assert agreeing <= count <= 4
 
 
@@ -116,7 +116,7 @@ def test_ranges_are_drawn_at_the_bearings_that_the_header_says() -> None:
     assert drawn is not None
     assert (drawn["first"], drawn["step"]) == (-30.0, 20.0)
     first = drawn["images"][0]
-    assert first[1] == ALPHABET[-1]  # nothing came back: as far as is drawn
+    assert first[1] == ALPHABET[-1]  # no echo came back: drawn to the limit
     assert first[3] == LOST
     assert ALPHABET.index(first[2]) == pytest.approx(2 * ALPHABET.index(first[0]), abs=1)
     assert [beams_of(Trace(steps), count) for count in (180, 181, 361)] == [
@@ -248,7 +248,7 @@ def test_flags_of_a_theory_make_it_again() -> None:
 
 
 def test_page_of_many_maps_of_500_dstates_in_metres_is_small() -> None:
-    """As many drawings as a page holds, with poses that differ in each; more maps share those."""
+    """A page has a limited number of drawings, each with its own poses. Further maps share them."""
     rng, places, maps = np.random.default_rng(0), 250, []
     for _ in range(DRAWN // 500 + 10):
         of_place = rng.integers(31, size=places).tolist()
@@ -563,13 +563,13 @@ def test_assuming_and_explaining_in_the_browser(browser: Any, server: PageServer
     page.choose(0, 1)
     page.until(
         "answer", "different dstates in every map"
-    )  # which is asked as soon as two are chosen
+    )  # the page asks as soon as two are chosen
     assert "no map satisfies the axioms" in page["costs"].text
     page.browser.execute_script(
         "for (const [id, t] of [['first', 0], ['later', 4]]) $(id).value = t;"
         "$('later').dispatchEvent(new Event('change'))"
     )
-    page.click("different")  # which gives up what was asked before
+    page.click("different")  # the new question replaces the last one
     page.until("answer", "With steps 0 and 4 assumed different: optimal: 5 dstates")
     assert "--different 0,4" in page["sentence"].text
     page.click("forget")
@@ -659,7 +659,7 @@ def test_the_page_of_a_joint_map_shows_its_drives(browser: Any, tmp_path: Path) 
     assert page["verdict"].text.startswith("Steps monday:2 and <b>tuesday</b>:0: one dstate")
     values = "return [$('first').value, $('later').value]"
     assert browser.execute_script(values) == ["monday:2", "<b>tuesday</b>:0"]
-    # A step is written by its drive, and told by it.
+    # A step is named by its drive in fields and in sentences.
     write = "$('later').value = arguments[0]; $('later').dispatchEvent(new Event('change'))"
     browser.execute_script(write, "<b>tuesday</b>:1")
     assert page["verdict"].text.startswith("Steps monday:2 and <b>tuesday</b>:1: different")

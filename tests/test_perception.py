@@ -277,7 +277,7 @@ def test_trimmed_quality_where_it_degenerates(monkeypatch: pytest.MonkeyPatch) -
     )  # of a sample
     assert (
         trimmed_quality(many, ~np.isin(np.arange(300), quality.sample_indices(300))) == 0
-    )  # a cluster that the sample does not hold
+    )  # a cluster without an image in the sample
 
 
 def test_one_lost_beam_changes_m_and_not_trimmed_m() -> None:
@@ -337,7 +337,7 @@ def test_the_runner_up_is_what_trimmed_m_likes_about_as_well() -> None:
     assert [(f.k_, f.runner_up_) for f in found.values()] == [(2, None), (2, 4), (2, 4), (4, None)]
     assert (
         found[0.5].trimmed_[2] > 3 * found[0.5].trimmed_[4] > 3 * 2.3
-    )  # Four are well separated, too, though two are much farther apart.
+    )  # Four are also well separated, but two are much farther apart.
     assert found[1.1].runner_up_labels_ is found[1.1].labels_by_k_[4]
     assert (
         found[1.1].labels_by_k_.keys() == found[1.1].trimmed_.keys() == found[1.1].quality_.keys()
@@ -646,13 +646,15 @@ def test_learning_curves_that_cannot_be_drawn(arguments: dict[str, Any], message
         learning_curve(np.ones((6, 2)), [0, 0, 0, 1, 1, 1], **arguments)
 
 
-# what tells two dstates apart
+# what distinguishes two dstates
 
 
 def test_the_feature_that_differs_tells_two_apart() -> None:
     rng = np.random.default_rng(0)
     labels = np.repeat([3, 8, 5], 20)
-    images = rng.normal(0, [0.1, 0.1, 2.0, 0.1], (60, 4))  # The third is loud and tells nothing.
+    images = rng.normal(
+        0, [0.1, 0.1, 2.0, 0.1], (60, 4)
+    )  # The third is noisy and distinguishes nothing.
     images[labels == 8, 1] += 1
     found = telling_features(images, labels, 3, 8)
     for method, shares in found.methods.items():

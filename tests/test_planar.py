@@ -159,8 +159,8 @@ def drawn(joined: Joined) -> bool:
     return is_planar(around)
 
 
-# Route, walls, and the number of maps after the last move: of all, of those whose streets pass no
-# place twice, of planar ones, and of those that are both
+# Route, walls, and numbers of maps after the last move: all, those whose streets pass no place
+# twice, planar ones, and both
 TREES: list[tuple[str, Cells | None, tuple[int, int, int, int]]] = [
     ("ESWN", None, (41, 19, 20, 16)),
     ("ESWNESWN", None, (5677, 1623, 631, 444)),
@@ -180,7 +180,7 @@ def test_the_table_of_numbers_of_maps(
 
 
 def route_trace(route: str) -> Trace:
-    """A robot that starts heading east, sees open gateways only, and turns before it travels."""
+    """A robot that starts facing east, sees only open gateways, and turns before it travels."""
     seen, heading, actions = stars_on(route, None), 1, []
     for way in route:
         quarters, heading = (DIRECTIONS.index(way) - heading) % 4, DIRECTIONS.index(way)

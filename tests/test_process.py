@@ -1,4 +1,4 @@
-"""Work in a process of its own gives what it gives here, and ends when it is no longer wanted."""
+"""Work in another process has the same result as here, and ends when it is no longer needed."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def test_a_process_that_is_killed_stops_the_search() -> None:
 
 
 def test_what_is_left_of_the_memory_is_that_of_the_process() -> None:
-    """Not what this one has used."""
+    """It does not count the memory of this process."""
     held = b"x" * (300 * 2**20)
     limited = Watch(memory=peak_memory() + 200)
     assert in_process(use_memory, 10, watch=limited) == 10

@@ -1,4 +1,4 @@
-"""Start and end of the program: it runs no file of the current folder, and signals end it."""
+"""The program runs no file of the current folder, and signals end it."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def hostile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_file_of_the_current_folder_is_run_if_nothing_is_done_about_it(hostile: Path) -> None:
-    """What the other tests show is not so."""
+    """Without the protection, the modules in the folder are run."""
     subprocess.run([sys.executable, "-c", "import csv"], check=True)
     assert "csv" in (hostile / "mark").read_text()
 
@@ -101,7 +101,7 @@ def test_where_modules_are_looked_for(tmp_path: Path, monkeypatch: pytest.Monkey
         assert program.search_path() == ["", "/lib"]
 
 
-# A verb that sits in clingo, which cannot be stopped and hears nothing.
+# A verb that waits in clingo, which ignores signals.
 DEAF = """
 import sys, clingo
 from ssh_abduction import __main__
@@ -210,7 +210,7 @@ list(workers.answers(leave_a_temporary_file, [(0, {str(told)!r})], 1, lambda: Fa
 
 
 def test_results_of_work_come_in_order() -> None:
-    """Also if the answers come in another order; and work raises where its turn is."""
+    """Answers keep their order, and an error is raised in its turn."""
 
     def backwards(work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], *_: Any) -> Any:
         return iter([work(*task, lambda: False) for task in tasks[::-1]])
@@ -238,7 +238,7 @@ def test_work_that_is_killed_is_an_error() -> None:
 
 
 def until(condition: Callable[[], bool]) -> None:
-    """Wait until something has come about."""
+    """Wait until a condition holds."""
     ends = time.monotonic() + SOON
     while not condition():
         assert time.monotonic() < ends

@@ -1,4 +1,4 @@
-"""On random tiny traces, under random theories, solver and checker agree with the brute force."""
+"""Solver and checker agree with the brute force on random tiny traces and theories."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_solver_lists_the_maps_of_the_brute_force(data: st.DataObject) -> None:
 def test_excuses_are_counted_where_no_pair_of_paths_can_be_excused(
     prefer: tuple[Count, ...],
 ) -> None:
-    """The maps 0, 0 and 0, 1 are both minimal where dstates are not counted."""
+    """The maps 0, 0 and 0, 1 are both minimal if dstates are not counted."""
     trace = Trace.from_steps("aa", ["around"])
     agree(trace, Theory(boundary="defeasible", star="none", prefer=prefer))
 
@@ -82,7 +82,7 @@ def test_excuses_alone_are_minimised_where_no_pair_of_paths_can_be_excused(
 def test_checker_rejects_what_the_brute_force_does_not_find(data: st.DataObject) -> None:
     """The maps of one theory under the axioms of another.
 
-    Where these allow the map, its witnesses may still have to change.
+    If the other axioms allow a map, its witnesses may have to change.
     """
     checker_rejects_foreign_maps(data, data.draw(traces(), label="trace"))
 

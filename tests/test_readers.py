@@ -198,7 +198,7 @@ def test_a_scan_that_is_lost_leaves_no_correction_in_odometry(
     at = next(i for i, line in enumerate(lines) if line.startswith("FLASER 5") and i > 15)
     lines[at : at + 1] = [damage] * (damage is not None)
     if damage is None and not with_neff:
-        return  # A line that is missing without a trace cannot be noticed.
+        return  # A missing line leaves no sign in the log.
     log = read_text(tmp_path / "a.log", *lines)
     assert [d.line for d in log.damaged] == ([] if damage in (None, "FLXSER 5 1 2") else [at + 1])
     kept = odometry[:3] + odometry[4:] if with_neff else odometry[:4] + odometry[5:]
@@ -818,7 +818,7 @@ def test_nothing_that_bytes_can_hold_is_a_crash(tmp_path: Path, name: str) -> No
             assert np.isfinite([*scan.odometry, *(scan.corrected or START)]).all()
     assert (
         read > 5 or name in BAGS or name.endswith(".gz")
-    )  # of gzipped data the check sum is wrong
+    )  # the check sum of gzipped data is wrong
 
 
 def test_memory_does_not_grow_with_what_is_skipped(tmp_path: Path) -> None:

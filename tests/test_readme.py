@@ -1,4 +1,4 @@
-"""The README and the pages of docs/ show only what really happens, and name only what exists."""
+"""Blocks of the README and of docs/ print what the pages show, and pages name only what exists."""
 
 from __future__ import annotations
 
@@ -116,11 +116,11 @@ RUN = [
 
 LINE = re.compile(
     r".*<<'(\w+)'\n(?:.*\n)*?\1\n|(?:.*\\\n)*.+\n"
-)  # with the text that it is given, or with the lines in which it goes on
+)  # with the given text, or with the following lines
 
 
 def run(block: Block) -> tuple[str, int]:
-    """What the lines print here, and the exit code."""
+    """The output of the lines here, and the exit code."""
     with contextlib.redirect_stdout(io.StringIO()) as out:
         if block.language == "python":
             exec(block.lines, {})
@@ -156,7 +156,7 @@ def run_line(line: str) -> int:
 
 
 def printed(command: str) -> tuple[str, int]:
-    """What our own command prints, and the exit code."""
+    """The output of our own command, and the exit code."""
     with contextlib.redirect_stdout(io.StringIO()) as out, warnings.catch_warnings():
         warnings.simplefilter("default")
         code = main(shlex.split(command)[1:])
@@ -185,7 +185,7 @@ def shell(lines: str, given: str = "") -> int:
 
 
 def without_seconds(text: str) -> str:
-    """The text without what depends on the speed of the machine.
+    """Remove from a text what depends on the speed of the machine.
 
     These are seconds, and the number of steps that clingo needed, because other engines take over
     after some time.
@@ -220,7 +220,7 @@ def test_the_shell_lines_of_a_tutorial_can_be_followed_in_an_empty_folder(
     page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(log_maps, "LEAST", 1000.0)  # however slow this machine is
-    monkeypatch.setattr(log_maps, "ladder", lambda *_, **__: ())  # what is shown has none
+    monkeypatch.setattr(log_maps, "ladder", lambda *_, **__: ())  # the shown output has none
     monkeypatch.chdir(tmp_path)
     for block in blocks(page):
         if not block.why:

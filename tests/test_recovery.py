@@ -64,7 +64,7 @@ def followed(
 
 
 def circuit(steps: int, wrong: int | None = None, seen: str = "v3") -> Trace:
-    """Round a rectangle of four views, one of which is perhaps wrong."""
+    """A drive around a rectangle with four views. One view may be wrong."""
     return Trace.from_steps(
         [seen if t == wrong else f"v{t % 4}" for t in range(steps + 1)],
         [("right", "travel")[t % 2] for t in range(steps)],
@@ -197,7 +197,7 @@ def test_a_star_that_is_misread_is_told() -> None:
 
 
 def test_without_time_there_is_a_map_and_a_belief() -> None:
-    """Every search is stopped at once, and the belief goes on by itself.
+    """Every search is stopped at once, and only the belief continues.
 
     Its maps are consistent and have a bound, but they are never certain.
     """
@@ -218,7 +218,7 @@ def test_without_time_there_is_a_map_and_a_belief() -> None:
 def one_of_the_maps(
     trace: Trace, theory: Theory, limit: float | None, maps: int, speedups: Speedups
 ) -> Solved:
-    """As if there were time to prove one map minimal, but not to list all."""
+    """There is time to prove one map minimal, but not to list all."""
     found = solve(trace, theory, max_maps=None)
     return Solved(
         len(trace), found.status, found.maps[-1:], found.bound, complete=False, stopped="time limit"
@@ -292,7 +292,7 @@ def test_a_process_of_its_own_solves_the_trace() -> None:
 
 
 def test_displacements_that_come_later_are_used() -> None:
-    """Maps are sought anew where the trace settles the theory anew."""
+    """Maps are searched anew if the trace changes the settled theory."""
     mapper = OnlineMapper(
         "corner", Theory.causal().replace(misread=1.5), odometry={"along": 0.02}, time_limit=None
     )
@@ -352,7 +352,7 @@ def test_what_does_not_fit_is_refused_and_changes_nothing() -> None:
 
 
 def test_weights_sum_to_one_and_ties_are_told() -> None:
-    """Both kinds at one price: which it was is not known at first, nor said."""
+    """Both kinds have one price. At first it is not known which fault it was."""
     walk = [
         mapper.standing
         for mapper, _ in followed(

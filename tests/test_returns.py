@@ -23,9 +23,9 @@ from ssh_abduction.theory.evidence.together import Together, joint_squares
 
 
 def seen(trace: Trace, truth: tuple[object, ...], dstates: int = 1000) -> SSHMap:
-    """The true map of a walk in a maze, or one with at most so many dstates.
+    """The true map of a walk in a maze, or a map with at most this many dstates.
 
-    In the latter, each further dstate is taken for an earlier one.
+    In such a map each further dstate is merged into an earlier one.
     """
     number: dict[object, int] = {}
     labels = tuple(number.setdefault(state, len(number)) % dstates for state in truth[: len(trace)])
@@ -100,7 +100,7 @@ def joint_excess(returns: Returns, rows: np.ndarray, thresholds: dict[int, float
     ]
     least = np.full(len(i), np.inf)
     for number, unlikely in enumerate(reckoning.unlikely):
-        left = np.flatnonzero(least > 0)  # what one drift explains is not refused
+        left = np.flatnonzero(least > 0)  # a pair that one drift explains is not refused
         squares = joint_squares(reckoning.loops(number), rows[i[left]], rows[j[left]]) + unlikely
         least[left] = np.minimum(least[left], squares - most[left])
     excess[i, j] = excess[j, i] = least
@@ -113,8 +113,8 @@ def joint_excess(returns: Returns, rows: np.ndarray, thresholds: dict[int, float
 def test_bounds_change_no_answer(noise: str, bend: float) -> None:
     """Each return in turn is the only new one.
 
-    The thresholds are so low that many pairs are refused whose returns are not, though the map is
-    true.
+    The thresholds are so low that many pairs are refused though their single returns are not, and
+    the map is true.
     """
     refused = only_together = 0
     for seed in (1, 2) if noise == "white" else (1,):

@@ -123,8 +123,8 @@ def test_rivals_agree_where_their_links_lead_to_the_same_views() -> None:
     found = route(solution, 0, 3)
     assert (found.agree, found.maps) == (tuple(range(1, solution.count + 1)), solution.count)
     assert f"{solution.count} of {solution.count} maps" in found.sentence
-    # Only the map itself, and those like it, expect the same views after the step from which the
-    # next experiment tells the rivals apart.
+    # From the step at which the next experiment distinguishes the rivals, only maps like this one
+    # expect the same views.
     odd = [
         route(solution, None, goal, map=m + 1)
         for m in range(solution.count)
@@ -266,7 +266,7 @@ def test_a_coarse_route_agrees_with_the_fine_one() -> None:
                 continue
             found = route(ssh_map, f"p{start}", f"p{goal}", by=by)
             assert plain.legs == ()
-            # Regions make no route longer, and each goes through the doors in their order.
+            # Regions make no route longer. Each route goes through the doors in order.
             assert found.moves == plain.moves
             doors = [leg.door for leg in found.legs if leg.door is not None]
             places = iter(place for place, _ in groupby(found.places))

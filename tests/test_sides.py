@@ -131,7 +131,7 @@ def test_sides_that_all_rivals_know_and_some() -> None:
     assert found.proven
     assert {0.25, 0.5, 0.75} >= {side.share for side in found.possible} > {0.5}
     assert "16 places beside a path in all maps, 15 in some: " in str(found)
-    # A single map is sure of all that it knows.
+    # A single map is certain of all its sides.
     single = shared_sides(Listing.of(solve(written(BLOCK))))
     assert single is not None
     assert [(side.step, side.along, side.side) for side in single.forced][:2] == [

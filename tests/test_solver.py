@@ -68,14 +68,13 @@ def wandering(seed: int, rooms: int, length: int, views: int) -> Trace:
 
 
 def too_hard() -> Trace:
-    """Two views, sixty rooms: far more than a proof in seconds can do."""
+    """Two views and sixty rooms, too many for a proof in seconds."""
     return wandering(3, rooms=60, length=1500, views=2)
 
 
 @contextmanager
 def clock() -> Iterator[Callable[[float], None]]:
-    """A clock that is put forward by so many seconds where the test says so, for which it would
-    have to wait otherwise."""
+    """A clock that the test advances by some seconds, to avoid waiting."""
     now, ahead = time.perf_counter, [0.0]
     with patch.object(time, "perf_counter", lambda: now() + sum(ahead)):
         yield ahead.append
@@ -115,7 +114,7 @@ def test_prefixes_of_random_machines(seed: int) -> None:
     traces(max_steps=8).flatmap(lambda trace: theories(trace).map(lambda theory: (trace, theory)))
 )
 def test_prefixes_from_one_step_on(case: tuple[Trace, Theory]) -> None:
-    """Every prefix is tried, from the shortest, so that replay has all chances to go wrong."""
+    """Try every prefix, from the shortest on, so that replay fails if it can."""
     trace, theory = case
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(prefixes, "FIRST_PREFIX", 1)
@@ -226,8 +225,8 @@ def test_a_thousand_circuits(theory: Theory) -> None:
 
 
 def test_a_surprise_after_many_circuits_is_not_missed() -> None:
-    """50 circuits and then another view: the closed map is wrong, and the surprise is in the
-    answer."""
+    """50 circuits and then another view. The closed map is wrong, and the answer has a dstate for
+    the new view."""
     circuits = rectangle(48)
     surprised = Trace.from_steps([*circuits.views[:-1], "surprise"], circuits.actions)  # type: ignore[list-item]
     solution = solve(surprised, Theory.causal(), max_maps=None)
@@ -238,7 +237,7 @@ def test_a_surprise_after_many_circuits_is_not_missed() -> None:
     assert solution.cost is not None
     assert (
         solution.cost.dstates == 49
-    )  # a loop of four can end in nothing but v0, so nothing may be closed: 48 + the surprise
+    )  # after a loop of four the view is v0, so no loop may be closed: 48 dstates + 1
 
 
 def test_at_most_so_many_maps() -> None:
@@ -259,8 +258,8 @@ def test_at_most_so_many_maps() -> None:
 
 
 def test_a_stream_of_millions_starts_at_once() -> None:
-    """One and a half circuits have 20,289 consistent maps without sides; two and a half have far
-    more than anyone waits for."""
+    """One and a half circuits have 20,289 consistent maps without sides. Two and a half circuits
+    have far too many to list."""
     theory = Theory(boundary="none", path_order="partial", prefer=())
     search = Search(rectangle(20), theory, max_maps=None)
     first = list(itertools.islice(search, 100))
@@ -360,7 +359,7 @@ def test_ctrl_c_leaves_the_best_map(tmp_path: Path) -> None:
 
 
 def test_a_stream_that_is_left_does_not_abort_python() -> None:
-    """It still has a search of clingo's, in a thread, when Python ends."""
+    """A search of clingo still runs in a thread when Python ends."""
     program = textwrap.dedent("""
         import sys
         from ssh_abduction import Trace
@@ -474,8 +473,7 @@ def test_replay_stops_where_the_map_knows_nothing_or_is_wrong() -> None:
 
 
 def test_mutated_maps_fail_the_check() -> None:
-    """Two labels swapped, a link dropped, an order turned: each is a violation, whatever the
-    map."""
+    """In any map, swapped labels, a dropped link or a reversed order is a violation."""
     mutants = 0
     for trace, theory, ssh_map in maps_of_all_tours():
         assert check(trace, ssh_map, theory) == ()
@@ -514,8 +512,7 @@ def test_nothing_that_infers_reads_the_truth() -> None:
 
 
 def test_a_prefix_that_grew_half_way_is_not_asked_for() -> None:
-    """A limit that stops the growth leaves no old horizon behind: growing on gives what growing at
-    once gives."""
+    """After a limit has stopped the growth, growing on has the same result as growing at once."""
     trace = drive(*TOURS["comb"])
     theory = settle(trace).theory
 
@@ -596,8 +593,8 @@ def test_a_search_runs_once() -> None:
 
 
 def test_costs_are_right_where_a_map_cannot_show_them() -> None:
-    """Without one_place a dstate may be at many places; the map shows the first, the cost counts
-    all."""
+    """Without one_place a dstate may be at many places. The map shows the first one, and the cost
+    counts all."""
     solution = solve(
         Trace.from_steps("aaaaa", ["travel"] * 4),
         Theory(prefer=("places",), without=("one_place",)),
@@ -642,11 +639,11 @@ def test_two_searches_at_once() -> None:
     assert answers[1:] == answers[:-1]
 
 
-# Symmetry: what a trace is called does not matter.
+# Symmetry: names in a trace do not matter.
 
 
 def shape(ssh_map: SSHMap) -> tuple[object, ...]:
-    """A map without the names of views and actions."""
+    """Remove the names of views and actions from a map."""
     return ssh_map.labels, tuple((s.place, s.path, s.direction) for s in ssh_map.dstates)
 
 
@@ -676,7 +673,7 @@ def test_renaming_and_mirroring_leave_the_maps_alone(case: tuple[Trace, Theory])
 
 
 def test_a_map_of_a_prefix_goes_on_when_time_is_over() -> None:
-    """What it does not know is new: far fewer dstates than where hardly a prefix was mapped."""
+    """Unknown steps get new dstates. There are far fewer than if only a short prefix was mapped."""
     trace = maze(4, 4, steps=500, seed=0, loops=0.5, stars=True).trace
     grow = FramedEngine.grow
     found = {}
@@ -699,7 +696,7 @@ def test_a_map_of_a_prefix_goes_on_when_time_is_over() -> None:
 
 
 def test_whether_there_is_one_more_map_is_not_sought_for_long() -> None:
-    """Where the last of those asked for is known, and what comes after it takes its time."""
+    """The search ends after the last map asked for, although the next one would take long."""
     trace = maze(2, 2, steps=200, seed=0).trace
     every = solve(trace, Theory.causal(), max_maps=None)
     assert (every.complete, every.stopped) == (True, None)

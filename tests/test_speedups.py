@@ -1,5 +1,5 @@
-"""No speed-up changes an answer: each switched off alone, all of them, and none, against each other
-and the un-accelerated encoding."""
+"""No speed-up changes an answer. One, all or none are off, and the answers are compared with each
+other and with the plain encoding."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ PLAIN = Speedups.without(NAMES)
 
 @st.composite
 def machines(draw: st.DrawFn, most_steps: int = 14) -> Trace:
-    """A walk in a random machine of few states, or any trace at all: maps that close, and maps that
+    """A walk in a random machine of few states, or any random trace. So some maps close, and others
     do not."""
     if draw(st.booleans()):
         return draw(traces(max_steps=8, closures=True))
@@ -79,8 +79,7 @@ def machines(draw: st.DrawFn, most_steps: int = 14) -> Trace:
 def test_any_choice_of_speedups_lists_the_maps_of_the_plain_encoding(
     trace: Trace, off: set[str], data: st.DataObject
 ) -> None:
-    """With prefixes, patience and what is held back so small that all of it happens on short
-    traces."""
+    """Prefixes, waiting times and buffers are so small that short traces use them all."""
     expected = solve(trace, Theory.causal(), max_maps=None, speedups=PLAIN)
     first = data.draw(st.sampled_from([2, 5, 32]), label="first prefixes")
     at_once = data.draw(st.sampled_from([4, 8000]), label="at once")
@@ -108,7 +107,7 @@ def test_any_choice_of_speedups_lists_the_maps_of_the_plain_encoding(
 
 @pytest.mark.parametrize("seed", [0, 3])
 def test_names_read_from_where_actions_lead_are_those_read_whole(seed: int) -> None:
-    """Though there are no spare names at first, so that some have to be added."""
+    """At first there are no spare names, so some have to be added."""
     read, answers = names_lp.NameReader.read, []
 
     def compared(reader: names_lp.NameReader, model: clingo.Model) -> dict[int, int]:
@@ -131,7 +130,7 @@ def test_names_read_from_where_actions_lead_are_those_read_whole(seed: int) -> N
 
 @contextmanager
 def noted_reads() -> Iterator[set[str]]:
-    """The speed-ups that are asked for meanwhile, but by the table itself."""
+    """The speed-ups that the search looks up in the table meanwhile."""
     read: set[str] = set()
     get = Speedups.__getattribute__
 
@@ -162,7 +161,7 @@ CASES = {
 
 @contextmanager
 def hurried() -> Iterator[None]:
-    """What is done only where a search takes its time is done at once."""
+    """Steps that need a slow search are done at once."""
     with (
         patch.multiple(choosing, FEW_STEPS=0, STEPWISE=-1.0),
         patch.multiple(name_search, PATIENCE=0, CORES=0),
@@ -180,7 +179,7 @@ def reads_of(case: str) -> list[str]:
 
 
 def test_each_speedup_is_asked_for_in_some_case() -> None:
-    """Else the cases below would say nothing of it."""
+    """Otherwise the cases below would not test the speed-up."""
     read = {name for case in CASES for name in reads_of(case)}
     # Only the online mapper asks for `processes`. tests/test_onto.py has cases with `digest`, and
     # tests/test_nearby.py has cases with `annealed`.
@@ -201,8 +200,8 @@ def test_each_speedup_that_is_read_off_alone(case: str) -> None:
 
 @pytest.mark.parametrize("most", [1, 2, 5])
 def test_as_many_maps_as_asked_for(most: int) -> None:
-    """Spurs off a ring that look alike: with what is lazy, and what is held back, the number asked
-    for comes, and no map twice."""
+    """Equal spurs off a ring. With lazy links and buffers, the search lists as many maps as asked
+    for, and no map twice."""
     trace = Trace.from_steps(
         "abacabadabacab",
         ["travel", "right", "travel", "left", "right", "right", "travel"] + ["travel", "left"] * 3,
@@ -231,8 +230,8 @@ def test_merging_greedily_gives_a_map(trace: Trace) -> None:
 @settings(max_examples=25)
 @given(machines(most_steps=30))
 def test_apart_steps_are_apart_in_no_map_together(trace: Trace) -> None:
-    """The matrix against its definition, step by step; and the cliques against all there are, as
-    networkx finds them."""
+    """The matrix equals its definition, step by step. The cliques are compared with all cliques, by
+    networkx."""
     log = Log(trace, Theory.causal())
     continuations = Continuations(log.seen, log.actions)
     apart, graph = continuations.apart(), nx.empty_graph(len(trace))
@@ -259,8 +258,8 @@ def test_apart_steps_are_apart_in_no_map_together(trace: Trace) -> None:
 
 @pytest.mark.parametrize("period", [1, 2, 7])
 def test_continuations_of_circuits(period: int) -> None:
-    """They have almost all of the trace in common, so that it takes many doublings to tell them
-    apart."""
+    """The steps have nearly the whole trace in common, so it takes many doublings to distinguish
+    them."""
     seen = [step % period for step in range(1000)]
     continuations = Continuations(seen, [0] * 999)
     assert len(continuations.clique()) == period
@@ -268,7 +267,7 @@ def test_continuations_of_circuits(period: int) -> None:
 
 
 def test_a_search_without_greedy_merging_has_a_bound_when_time_is_over() -> None:
-    """The clique is a bound before clingo has said anything."""
+    """The clique is a bound before clingo has any answer."""
     trace = Trace.from_steps("abcabd", ["travel"] * 5)
     with patch.object(choosing, "FEW_STEPS", 0):
         search = Search(trace, Theory.causal(), speedups=Speedups.without("greedy"))
@@ -296,8 +295,8 @@ def test_a_removed_speedup_is_left_out_with_a_warning(capsys: pytest.CaptureFixt
 @settings(max_examples=8)
 @given(traces(max_steps=12))
 def test_steps_merged_by_evidence_make_a_map(trace: Trace) -> None:
-    """So they do where each step was a dstate, and these are merged while they can be."""
-    theory = settle(trace, Theory.causal().replace(joint=1)).theory  # merging knows of pairs alone
+    """The result is the same as that of merging dstates of one step each, as long as possible."""
+    theory = settle(trace, Theory.causal().replace(joint=1)).theory  # merging knows only pairs
     log = Log(trace, theory)
     chart = Chart.of_steps(log, len(trace))
     apart, links = chart.apart(), chart.links
@@ -313,15 +312,14 @@ def test_steps_merged_by_evidence_make_a_map(trace: Trace) -> None:
 
 
 def test_dstates_that_are_one_are_merged() -> None:
-    """A machine of two states, of which the odd and even visits are told apart."""
+    """A machine of two states. Only odd and even visits differ."""
     log = Log(trace := Trace.from_steps("ababababa", ["go"] * 8), Theory.causal())
     chart = Chart.of_steps(log, len(trace))
     assert thinned(chart, [0, 1, 2, 3, 0, 1, 2, 3, 0]) == [0, 1, 0, 1, 0, 1, 0, 1, 0]
 
 
 def test_a_limit_leaves_a_map_of_merged_steps() -> None:
-    """Twice as good as one that is made at once, where clingo takes its time and no guess is
-    annealed."""
+    """If clingo is slow and no guess is annealed, the map is twice as good as a greedy one."""
     walk = maze(5, 5, steps=1600, seed=0)
     with (
         patch.multiple(name_search, PATIENCE=1, CORES=1),
@@ -341,7 +339,7 @@ def test_a_limit_leaves_a_map_of_merged_steps() -> None:
 
 @pytest.mark.parametrize("seed", [0])
 def test_a_limit_leaves_the_small_map_of_a_guess(seed: int) -> None:
-    """Of a machine that does not turn."""
+    """A machine without turns."""
     walk = moore(12, 2, steps=800, seed=seed)
     with (
         patch.multiple(name_search, PATIENCE=1, CORES=1),
@@ -357,8 +355,8 @@ def test_a_limit_leaves_the_small_map_of_a_guess(seed: int) -> None:
 
 @pytest.mark.parametrize("off", ["", "lazy"])
 def test_maps_found_before_a_limit_strikes_are_given(off: str) -> None:
-    """Though they are held back until it is known that the links that clingo was given are enough;
-    and the one that showed what is minimal, too."""
+    """Maps are held back until clingo's links are known to be enough, also the map that showed the
+    minimum."""
     found = named.NamedLabels._answers_of
 
     def stopped(self: named.NamedLabels, spares: int) -> Iterator[dict[int, int]]:
@@ -385,7 +383,7 @@ def test_a_guess_that_takes_too_much_memory_is_not_begun() -> None:
 
 
 def test_what_cannot_be_stopped_is_not_begun_where_time_is_short() -> None:
-    """clingo is not told where names lead, if the limit would be over before it can be stopped.
+    """Clingo does not get the rules for names if the limit would end before it can be stopped.
 
     The clique is a bound by then.
     """

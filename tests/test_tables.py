@@ -1,5 +1,4 @@
-"""The tables of docs/explanation/theory.md: minimal maps of known traces under known theories, each
-solved, counted and checked."""
+"""Solve, count and check the minimal maps in the tables of docs/explanation/theory.md."""
 
 from __future__ import annotations
 
@@ -35,7 +34,7 @@ Expected = int | tuple[int, ...]
 
 @cache
 def solved(trace: Trace, theory: Theory) -> Solution:
-    """All minimal maps, which several tables ask for."""
+    """All minimal maps; several tables need them."""
     return solve(trace, theory, max_maps=None)
 
 
@@ -272,8 +271,8 @@ NOTCHED += [
 
 
 def cornered(trace: Trace) -> Trace:
-    """The notched rectangle with the stars of its corners: open ahead after the turn, and to the
-    right before it."""
+    """The notched rectangle with the stars of its corners. The way is open ahead after a turn, and
+    to the right before it."""
     stars = [(0, 1, 1, 0), (1, 1, 0, 0)]
     return Trace.from_steps(
         trace.views, trace.actions, stars=[stars[i % 2] for i in range(len(trace))]
@@ -399,7 +398,7 @@ def test_half_a_circuit_tells_aliased_dstates_apart(first: int, second: int, act
     ("actions", "equal"), [(8, {(0, 8)}), (9, {(0, 8), (1, 9)}), (10, {(0, 8), (1, 9), (2, 10)})]
 )
 def test_which_equalities_are_possible(actions: int, equal: set[tuple[int, int]]) -> None:
-    """Section 6.2: what holds in at least one consistent map."""
+    """Section 6.2: sentences that hold in at least one consistent map."""
     maps = solve(rectangle(actions), P2.replace(prefer=()), max_maps=None).maps
     assert {
         (i, j)

@@ -357,7 +357,7 @@ def test_steps_are_named_by_their_drives(
     assert "joint_trace: expected --together" in capsys.readouterr().err
 
 
-# Mazes that the beam was not made for: those of seeds 20 to 23 were looked at.
+# The beam was developed on seeds 20 to 23, not on these mazes.
 MAZES = [*of_mazes(3, 20, range(3), truth.Noise(Odometry(**truth.NOISE)))]
 
 

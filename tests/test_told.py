@@ -1,5 +1,5 @@
-"""What commands tell beside their answers: the log, -q and -v, lines of progress, names that were
-perhaps meant, completions."""
+"""Messages of commands beside their answers: the log, -q and -v, progress, suggestions for wrong
+names, completions."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MESSAGE = re.compile(r"ssh-abduction: \d+\.\d\d s: [\w.]+: .+")
 
 
 def lines(capsys: pytest.CaptureFixture[str], *words: str, code: int = 0) -> tuple[str, list[str]]:
-    """What a command prints, and its lines on stderr."""
+    """The output of a command, and its lines on stderr."""
     assert main(words) == code
     captured = capsys.readouterr()
     return re.sub(r"\d+\.\d\d s", "_ s", captured.out), captured.err.splitlines()
@@ -146,7 +146,7 @@ def test_lines_of_progress_come_now_and_then(
     seconds = itertools.count()
     monkeypatch.setattr(
         verbosity, "time", Mock(monotonic=lambda: next(seconds))
-    )  # a second passes whenever somebody looks
+    )  # a second passes at each look
     monkeypatch.setattr(verbosity, "EVERY", 4.0)
     some = lines(capsys, "solve", tee)[1]
     assert some

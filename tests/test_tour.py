@@ -1,4 +1,4 @@
-"""Tours through what is untried: shortest, and what they leave for the way back."""
+"""Shortest tours through untried actions, and what they leave for the way back."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""The benchmark of truth: what it takes for a true map is true, and its traces have the
-displacements that their poses say."""
+"""The benchmark of truth recognises true maps, and its traces have displacements that agree with
+their poses."""
 
 from __future__ import annotations
 
@@ -87,8 +87,8 @@ def test_a_map_is_true_if_its_dstates_and_its_places_are() -> None:
 
 @pytest.mark.slow
 def test_the_table_says_which_maps_are_true(capsys: pytest.CaptureFixture[str]) -> None:
-    """On the route of ACES3 views and openings alone are explained by 19 dstates, of which no map
-    is true."""
+    """On the route of ACES3, 19 dstates explain views and openings alone. None of these maps is
+    true."""
     options = truth.arguments().parse_args(["--family", "aces3", "--seeds", "1", "--stars"])
     said = truth.report(
         truth.chosen(options), Theory.topological().replace(displacement="none"), 30
@@ -114,8 +114,8 @@ def test_joins_are_reliable_where_their_probabilities_are_their_shares() -> None
 
 
 def test_what_is_refused_of_true_maps_is_counted() -> None:
-    """A true map is hardly ever refused, and always where its displacements are those of another
-    route; with errors that repeat the scale is off."""
+    """A true map is hardly ever refused. It is always refused with the displacements of another
+    route. Errors that repeat make the scale wrong."""
     white, repeating = reject.walks(3, 30, 7)
     assert (white.trace.odometry or NOISE).bend == 0 < (repeating.trace.odometry or EXACT).bend
     assert reject.true_map(white).labels == reject.true_map(repeating).labels

@@ -1,4 +1,5 @@
-"""The judges of benchmarks/: what a robot truly visited, and what the skeleton of its map says."""
+"""The judges of benchmarks/: which places a robot truly visited, and what the skeleton of its map
+says."""
 
 from __future__ import annotations
 
@@ -65,8 +66,7 @@ def test_the_route_of_aces_is_recognised_and_another_is_refused() -> None:
 
 
 def test_a_trace_with_the_names_of_true_places_has_the_true_map() -> None:
-    """The route of examples/aces3-route.jsonl, laid onto scans: its names come back, and so does
-    what evaluate says of it."""
+    """The route of aces3-route.jsonl on scans has the same names and the same evaluation."""
     shipped = Trace.load(ROOT / "examples" / "aces3-route.jsonl")
     poses = aces_poses()
     truth = Truth.of_aces(poses)
@@ -122,8 +122,8 @@ def test_events_are_matched_to_visits_one_by_one() -> None:
 def test_passes_without_an_event_are_noticed() -> None:
     way = [*range(14), *range(13, -1, -1), *range(14)]
     truth = Truth(np.array([(float(x), 0.0, 0.0) for x in way]))
-    # To 6 m it came back twice, and has an event one of these times, as seen from either event
-    # there; to 13 m it came back once, without one.
+    # The robot came back to 6 m twice, with an event once, as seen from either event there. It came
+    # back to 13 m once, without an event.
     assert passes(Events((6, 13, 34), ("a", "b", "a")), truth) == (5, 2)
 
 
@@ -152,7 +152,7 @@ def test_events_in_buildings_are_at_doors_or_in_rooms(tmp_path: Path) -> None:
     ).isomorphic  # one door, both ways
     late = judged(Events((4, 6), ("b", "c")), truth)
     assert (late.recall, late.named.maps[0].places_right, late.isomorphic) == (0, True, False)
-    assert truth.doorways == (Visit("door 0", 1, 3),)  # in and out by one door is one
+    assert truth.doorways == (Visit("door 0", 1, 3),)  # in and out by one door counts once
 
 
 def test_branches_that_hardly_leave_their_junction_are_cut_off() -> None:

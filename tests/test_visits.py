@@ -1,5 +1,4 @@
-"""Maps are judged by poses, and by relative poses: the pairs are counted naively, too, and
-relations lead where they were made to lead."""
+"""Maps are judged by poses and relative poses, and the pairs are also counted naively."""
 
 from __future__ import annotations
 

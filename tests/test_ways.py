@@ -1,5 +1,5 @@
-"""The full theory where places have no frames: dstates settled before places and paths, against the
-plain encoding, and in mazes."""
+"""The full theory without frames. Dstates are settled before places and paths. Maps are compared
+with those of the plain encoding, and mazes are solved."""
 
 from __future__ import annotations
 
@@ -59,8 +59,8 @@ def bare_theories(draw: st.DrawFn) -> Theory:
 @settings(max_examples=5)
 @given(st.data())
 def test_the_maps_of_the_plain_encoding(data: st.DataObject) -> None:
-    """Told of paths that an answer contradicts, or only of links that do not go together; with few
-    names at first; a minimal map known, or not."""
+    """Clingo gets the paths that an answer contradicts, or only incompatible links. It starts with
+    few names. A minimal map is known or not."""
     trace = data.draw(traces(max_steps=7), label="trace").without_stars().without_displacements()
     theory = data.draw(bare_theories(), label="theory")
     contrary = data.draw(st.sampled_from([0, 1, ways.CONTRARY]), label="contrary")
@@ -89,8 +89,8 @@ def test_the_maps_of_the_plain_encoding(data: st.DataObject) -> None:
 @settings(max_examples=6, deadline=None, derandomize=True)
 @given(st.data())
 def test_what_is_refused_together_is_what_the_plain_encoding_is_told(data: st.DataObject) -> None:
-    """Two returns of a minimal map, to dstates or to places, are forbidden: the maps that are left
-    are those of the readable encodings, which are told the same."""
+    """Forbid two returns of a minimal map, to dstates or to places. The other maps are those of the
+    readable encodings with the same rule."""
     trace = data.draw(traces(max_steps=9), label="trace").without_stars()
     task = Task.of(settle(trace, data.draw(bare_theories(), label="theory")))
     plain, engine = (
@@ -129,8 +129,8 @@ def test_what_is_refused_together_is_what_the_plain_encoding_is_told(data: st.Da
 
 
 def test_a_limit_while_labels_are_listed_is_a_limit() -> None:
-    """Labels with the fewest dstates are listed after a map with so few is known: that it is known
-    ends the search for it, and not the list."""
+    """Labels with the fewest dstates are listed after such a map is known. A known map ends the
+    search, but not the list."""
     trace = maze(3, 3, steps=30, seed=0).trace
     theory = settle(trace).theory
     known = solve(trace, theory).maps[0].labels
@@ -155,7 +155,7 @@ def maps_of_a_maze() -> frozenset[SSHMap]:
 
 @pytest.mark.parametrize("off", ["", "clique", "lazy", "core_guided"])
 def test_a_maze_without_stars(off: str) -> None:
-    """All minimal maps of forty steps, by whatever helps; the bound has a certificate."""
+    """All minimal maps of forty steps, with all speed-ups. The bound has a certificate."""
     trace = maze(2, 2, steps=40, seed=1).trace
     with patch.object(choosing, "STEPWISE", -1.0):
         search = Search(trace, max_maps=None, speedups=Speedups.without(off))
@@ -192,8 +192,8 @@ def maps_of_the_route() -> tuple[SSHMap, ...]:
 
 @pytest.mark.parametrize("settled", [False, True], ids=["step by step", "dstates first"])
 def test_maps_that_are_refused_do_not_count_among_those_that_are_listed(settled: bool) -> None:
-    """Two steps may not be at one place, which they are in most of the minimal maps: few maps are
-    no complete list, and all that are left are found."""
+    """Two steps may not be at one place, though they are in most minimal maps. A few maps are no
+    complete list, and all remaining maps are found."""
     trace, theory = (
         Trace.load(EXAMPLES / "aces3-route.jsonl"),
         Theory(star="none", prefer=("dstates", "places", "paths")),
@@ -240,7 +240,7 @@ def test_few_of_many_maps() -> None:
 
 @pytest.mark.parametrize("name", ["forget", "fits", "_control_for"])
 def test_what_ends_the_settling_of_dstates_leaves_the_map(name: str) -> None:
-    """Whatever it is at: the map that was known before is the answer."""
+    """At any time, the map that was known before is the answer."""
     trace = maze(2, 2, steps=120, seed=1).trace
     with (
         patch.object(choosing, "STEPWISE", -1.0),
@@ -252,8 +252,7 @@ def test_what_ends_the_settling_of_dstates_leaves_the_map(name: str) -> None:
 
 
 def test_a_robot_that_goes_on_where_that_ended() -> None:
-    """The first search of a mapper may be of many steps; what it proved holds for the steps that
-    come."""
+    """The first search of a mapper may have many steps. What it proved holds for later steps."""
     trace = maze(2, 2, steps=30, seed=1).trace
     first = trace.prefix(26)
     with patch.object(choosing, "STEPWISE", -1.0):

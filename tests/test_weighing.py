@@ -32,8 +32,8 @@ Told = tuple[Key, frozenset[tuple[int, str]]]  # a map, and the step and kind of
 
 
 def cheapest(trace: Trace, theory: Theory) -> tuple[float, set[Key]]:
-    """The least cost, and the maps that have it: of those with the same dstates and places, the
-    ones with the fewest paths."""
+    """The least cost and the maps that have it. Of maps with the same dstates and places, take
+    those with the fewest paths."""
     squares = LeastSquares(trace)
     found: dict[tuple[object, object], tuple[float, int, set[Key]]] = {}
     toys = [toy for toy in TOYS if toy.rules in theory.rules]
@@ -78,8 +78,8 @@ def weighed(theory: Theory, prices: tuple[float, float, float]) -> Theory:
 
 
 def cheapest_with_faults(trace: Trace, theory: Theory) -> tuple[float, set[Told]]:
-    """The least cost, and the maps that have it, by trying all views and all sets of wrong
-    displacements. The corrected traces are mapped without faults."""
+    """The least cost and the maps that have it. Try all views and all sets of wrong displacements,
+    and map the corrected traces without faults."""
     settled = settle(trace, theory).theory
     moved = [t for t, step in enumerate(trace.steps) if step.displacement is not None]
     views = sorted({str(view) for view in trace.views}) if theory.misread else []
@@ -288,7 +288,7 @@ def test_more_returns_never_fit_better_and_a_core_is_minimal(route: truth.Known)
 @settings(max_examples=10)
 @given(st.data())
 def test_the_checker_and_the_solver_have_one_misfit(data: st.DataObject) -> None:
-    """The errors of displacements and the poses of dstates are two ways to one number."""
+    """Errors of displacements and poses of dstates give the same number."""
     seed = data.draw(st.integers(0, 10_000), label="seed")
     (known,) = truth.mazes(3, 12, [seed], truth.Noise(Odometry(**DEFAULT)))
     names = truth.partition(known.dstates)
@@ -313,7 +313,7 @@ def test_misfits_may_exceed_what_is_said_where_the_robot_is_off_its_dstates(
     least: float,
     most: float,
 ) -> None:
-    """The odometry is worse than it says, by a factor."""
+    """The errors of the odometry are larger than stated, by a factor."""
     said = {name: factor * value for name, value in truth.NOISE.items()}
     odometry = Odometry(**{**DEFAULT, **said, "scale": 0.05, "bend": 0.0035, "offset": offset})
     search = Search(replace(route.trace, odometry=odometry))

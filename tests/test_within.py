@@ -1,4 +1,4 @@
-"""Maps that cost more than the least: for each number of what is preferred first, the best ones."""
+"""Nearly minimal maps: the best ones for each value of the first preference."""
 
 from __future__ import annotations
 
@@ -100,8 +100,7 @@ def test_the_true_map_of_the_real_route_is_within_three_dstates() -> None:
 
 
 def test_without_an_order_behind_dstates_all_maps_of_so_few_dstates_are_listed() -> None:
-    """Then the levels are what clingo counts of maps with dstates, at most one more than the
-    least."""
+    """Then the levels are those of clingo, with at most one dstate more than the least."""
     route = Trace.load(ACES3)[:16]
     solution = solve(route, Theory(prefer=("dstates",)), max_maps=None, within=1)
     assert [(level.cost.dstates, level.count) for level in solution.levels] == [(12, 3), (13, 4)]
@@ -175,7 +174,7 @@ def test_a_wrong_within_is_an_error(within: object) -> None:
 
 @pytest.fixture(scope="module")
 def near() -> dict[str, Any]:
-    """What `solve --set within=3 --json` prints of the real route."""
+    """The output of `solve --set within=3 --json` for the real route."""
     with contextlib.redirect_stdout(io.StringIO()) as printed:
         assert main(["solve", ACES3, "--set", "within=3", "--json"]) == 0
     return dict(json.loads(printed.getvalue()))
@@ -210,7 +209,7 @@ def test_the_json_says_what_each_map_costs(near: dict[str, Any]) -> None:
 def test_a_file_of_near_minimal_maps_is_not_taken_at_its_word(
     near: dict[str, Any], change: dict[str, Any], fault: str | None
 ) -> None:
-    """A change to maps names those that are listed, by their numbers."""
+    """After a change to maps, the numbers name the listed ones."""
     chosen = change.get("maps", range(near["count"]))
     answer = near | change | {"maps": [near["maps"][i] for i in chosen], "count": len(chosen)}
     maps = [SSHMap.from_dict(ssh_map) for ssh_map in answer["maps"]]

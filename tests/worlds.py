@@ -20,7 +20,7 @@ Streets = dict[str, dict[str, str]]
 
 
 def written(text: str) -> Trace:
-    """A trace in the notation of the tables: views and actions in turn, such as "a T b R c".
+    """A trace in the notation of the tables: views and actions alternate, such as "a T b R c".
 
     T followed by letters is a travel of its own.
     """
@@ -30,8 +30,8 @@ def written(text: str) -> Trace:
 
 
 def rectangle(actions: int, views: int = 4, turn: str = "R") -> Trace:
-    """The notched rectangle after so many actions: a turn and a travel in turn, the views repeating
-    after `views`."""
+    """The notched rectangle after some actions: turns and travels alternate, and `views` views
+    repeat."""
     kinds = [ACTIONS[turn], "travel"]
     return Trace.from_steps(
         [f"v{i % views}" for i in range(actions + 1)], [kinds[i % 2] for i in range(actions)]
