@@ -181,12 +181,7 @@ class _Reasoning:
         return False
 
     def _differing_map(self, settled: Settled, labels: Sequence[int]) -> SSHMap | None:
-        """Find a map with these labels in which a doubt about places or paths is true; else None.
-
-        Args:
-            settled: The best maps with these labels.
-            labels: The dstate of each step.
-        """
+        """Find a map with these labels in which a doubt about places or paths holds, or None."""
         return settled.map_with(
             [
                 (sort, labels[i], labels[j], one)

@@ -69,9 +69,7 @@ def _moved(best: Rival, visit: Sequence[int], place: int, moved: Collection[int]
     """Return the dstates and places of a map after some visits to a place get a new place.
 
     Args:
-        best: The map.
         visit: For each step, the first step of its visit.
-        place: The place; without places, the dstate.
         moved: The first steps of the visits that get a new place.
     """
     at = best.places or best.dstates

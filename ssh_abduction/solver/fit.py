@@ -277,13 +277,7 @@ class Poses:
         return sigmas
 
     def _differences(self, first: NDArray[np.int_], second: NDArray[np.int_], size: int) -> Any:
-        """Make the matrix that maps a vector to differences of its entries: second minus first.
-
-        Args:
-            first: The index of the entry to subtract, for each difference.
-            second: The index of the entry to subtract it from.
-            size: The length of the vector.
-        """
+        """Make the matrix that maps a vector to differences of its entries: second minus first."""
         rows = np.arange(len(first))
         ones = np.ones(len(first))
         entries = (
@@ -411,7 +405,6 @@ class Poses:
         """Count the independent rotations of groups of headings that displacements leave open.
 
         Args:
-            unknown: The unknowns.
             said: The numbers of the dstates that have displacements.
         """
         groups = np.unique(self._group[said])
@@ -454,7 +447,6 @@ class Poses:
         """Compute the covariance of the position of each dstate, (dstates, 2, 2), in square metres.
 
         Args:
-            unknown: The unknowns.
             origins: Dstates whose poses count as known.
         """
         fixed = [

@@ -129,7 +129,6 @@ class Mending:
         """Yield a map, and remember it, if it is the best one so far.
 
         Args:
-            better: The map, as a map of the trace itself; None for no map.
             mended: The mended trace that it was found for.
         """
         if better is not None and (self._best is None or better.cost < self._best.cost):
@@ -274,10 +273,6 @@ class Mending:
     def _minimal(self, mended: Trace, seconds: float = math.inf) -> tuple[Found | None, bool]:
         """Find the best map of a mended trace.
 
-        Args:
-            mended: The mended trace.
-            seconds: The time that the search may take.
-
         Returns:
             The map, as a map of the trace itself with faults, or None; and whether it is proven
             that this map is minimal, or that there is no map.
@@ -293,9 +288,7 @@ class Mending:
         """Solve a mended trace.
 
         Args:
-            mended: The mended trace.
             most: The number of maps to list; 0 for all.
-            seconds: The time that the search may take.
 
         Returns:
             Minimal maps of the mended trace and True; or the best map known and False.

@@ -217,9 +217,6 @@ def _pinned(theory: Theory, digest: Digest, ssh_map: SSHMap, old: Trace, *, join
 
     Args:
         theory: The theory. Its assertions about old steps are moved to steps of the digest.
-        digest: The digest of the old drives.
-        ssh_map: Their map.
-        old: The old drives.
         joins: Whether to assert equal dstates, too. The fast engine for frames can obey this. With
             other theories, it would switch fast engines off.
     """

@@ -70,11 +70,7 @@ class Parts:
         self.watch.stop()
 
     def _engine_after(self, after: Parts) -> Engine:
-        """Return the engine of an earlier search if it can take more steps, else a new engine.
-
-        Args:
-            after: The parts of the search for the first steps of the trace.
-        """
+        """Return the engine of an earlier search if it can take more steps, else a new engine."""
         self.watch.use_reserve()
         before = after.prefixes.engine
         is_outgrown = not before.goes_on or (isinstance(before, StepEngine) and may_name(self.task))

@@ -332,7 +332,6 @@ class Prefixes:
         at the end whether the stars of all steps fit the map.
 
         Args:
-            ssh_map: The map.
             known: Use only the links between this many first steps; None for all of the prefix.
 
         Returns:

@@ -330,10 +330,8 @@ class Search:
         """Solve a mended trace (its faults are corrected) within the limits of this search.
 
         Args:
-            mended: The mended trace.
             theory: A theory without faults.
             most: The number of maps to list at most; 0 for all.
-            seconds: The time that this may take.
 
         Returns:
             The minimal maps (none if the trace has no map) and True; or the best map known after

@@ -353,8 +353,6 @@ def _read_shared(data: Any, of_step: Sequence[int] | None, steps: int, where: st
         data: The field of the file.
         of_step: The number of the dstate of each step, if the file has one number for each dstate;
             None if it has one number for each step.
-        steps: The number of steps of the trace.
-        where: The name of the field in error messages.
     """
     expected = steps if of_step is None else len(set(of_step))
     always = data.get("always") if isinstance(data, Mapping) else None

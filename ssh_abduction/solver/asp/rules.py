@@ -60,7 +60,6 @@ def _check(rules: Rules, others: tuple[Rules, ...], files: tuple[str, ...]) -> N
     """Check a file of rules. Raises TheoryError if a rule is not allowed.
 
     Args:
-        rules: The file.
         others: Other files of rules. The file may read the predicates that they define.
         files: The names of the encodings. The file may read the predicates that they define.
     """

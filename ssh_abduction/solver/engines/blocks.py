@@ -125,10 +125,8 @@ class Blocks:
         """Find the shortest block from `begin` that needs a fault.
 
         Args:
-            begin: The first step of the block.
             fault: The block ends after this step.
             reach: The expected number of steps from `fault` to the end. The search starts there.
-            most: The number of dstates that a map may have.
 
         Returns:
             The step after the last one of the block. The block may be a few steps longer than the
@@ -156,13 +154,7 @@ class Blocks:
         return end > low and not self._takes_fault(begin, end, most)
 
     def _takes_fault(self, begin: int, end: int, most: int) -> bool:
-        """Whether a clique shows that a block needs a fault: it has more than `most` steps.
-
-        Args:
-            begin: The first step of the block.
-            end: The step after the last one.
-            most: The number of dstates that a map may have.
-        """
+        """Whether a clique shows that a block needs a fault: it has more than `most` steps."""
         self.watch.check()
         return (
             end - begin > most
@@ -174,12 +166,6 @@ class Blocks:
         self, begin: int, end: int, places: Sequence[int], most: int
     ) -> tuple[int, int] | None:
         """Widen a block to include the next faults of the known map, if they are close together.
-
-        Args:
-            begin: The first step of the block.
-            end: The step after the last one.
-            places: The steps of all faults of the known map, in order.
-            most: The number of dstates that a map may have.
 
         Returns:
             The end of the wider block and the cost of the known map's faults in it, in tenths;
@@ -211,12 +197,6 @@ class Blocks:
 
         Each view has enough names for all dstates, so the rest (the one name that all dstates
         without a name of their own share) is not needed.
-
-        Args:
-            begin: The first step of the block.
-            end: The step after the last one.
-            most: The number of dstates that a map may have.
-            tenths: The cost that its faults may have, in tenths of dstates.
         """
         proven = self._proven.get((begin, end))
         if proven is None or proven[0] < most or proven[1] < tenths:

@@ -334,8 +334,6 @@ class FaultyEngine:
         """Make a map of the whole trace, with its cost.
 
         Args:
-            labels: The dstate of each step.
-            slips: The steps whose action slipped.
             number: A dict from the name of each dstate to its number. Used if `shows` is None.
             shows: The view of each dstate; None to derive it from its name.
         """
@@ -352,13 +350,6 @@ class FaultyEngine:
         """Correct the views of dstates, so that each dstate has a view that is seen there.
 
         A dstate whose view is always misread gets the view that is seen there most often.
-
-        Args:
-            labels: The dstate of each step.
-            shown: The view of each dstate.
-
-        Returns:
-            The corrected views.
         """
         views = list(shown)
         for s in set(labels) - {s for t, s in enumerate(labels) if shown[s] == self._seen[t]}:

@@ -209,12 +209,7 @@ class FramedEngine:
         return self._all_with_paths(cost[0])
 
     def _all_with_paths(self, dstates: int, besides: Sequence[int] = ()) -> Iterator[Naming]:
-        """Yield all labels with this many dstates that paths fit, each once.
-
-        Args:
-            dstates: The number of dstates.
-            besides: Labels to leave out: the dstate of each node.
-        """
+        """Yield all labels with this many dstates that paths fit, each once."""
         known: set[Hashable] = {tuple(besides)}
         fitted: dict[tuple[int, ...], Fitted] = {}
 
@@ -262,7 +257,6 @@ class FramedEngine:
         The pairs are those that follow from the trace alone, by the axioms of order and sides.
 
         Args:
-            size: The number of steps.
             before: The chart of fewer steps, if there is one. Then only its pairs are taken.
 
         Returns:

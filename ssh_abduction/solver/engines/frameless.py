@@ -126,7 +126,6 @@ class FramelessEngine:
         the displacements depends only on its dstates and places.
 
         Args:
-            every: Labels; each is the dstate of each node.
             mode: Clingo's opt-mode for the best maps of one labelling.
         """
         left, sooner, first = iter(every), list[list[int]](), set[SSHMap]()
@@ -156,12 +155,7 @@ class FramelessEngine:
                 yield settled
 
     def _all_that_fit(self, dstates: int, besides: Sequence[int] = ()) -> Iterator[list[int]]:
-        """Yield all labels with this many dstates that places and paths fit, each once.
-
-        Args:
-            dstates: The number of dstates.
-            besides: Labels to leave out: the dstate of each node.
-        """
+        """Yield all labels with this many dstates that places and paths fit, each once."""
         return all_accepted(
             ask=lambda: self._named.all_of(dstates, 0),
             refuse=self._fitting.why_not,

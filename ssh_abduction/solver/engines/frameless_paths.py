@@ -67,10 +67,6 @@ class _Far:
     def of(cls, labels: Sequence[int], equalities: Collection[Equality]) -> _Far | None:
         """Translate a forbidden set of equalities of steps to a constraint on dstates.
 
-        Args:
-            labels: The dstate of each step.
-            equalities: Equalities of steps that must not all hold.
-
         Returns:
             The constraint. None if it cannot be violated: an equality of dstates does not hold in
             the labels, or the prefix does not have all the steps yet.
@@ -223,8 +219,6 @@ class PlacesAndPaths:
         """Find the best map in which each place is one of its homes (`engines/homes.py`).
 
         Args:
-            labels: The dstate of each step.
-            control: A control that has the possible homes.
             fewest: A lower bound on the number of paths.
 
         Returns:
@@ -355,12 +349,8 @@ class PlacesAndPaths:
         """Make a control whose answers are places and paths of dstates.
 
         Args:
-            links: Links between dstates.
-            dstates: Further dstates, which may have no links.
-            options: Options of clasp.
             far: Constraints that evidence puts on the places of dstates.
             single: Merge places and segments only if they must be one.
-            parts: The parts of the program to ground.
             labels: The dstate of each step, so that paths stay on one floor; empty to ignore that.
         """
         control = Control(options, self._asker.watch.check, PREPARING)
@@ -388,11 +378,6 @@ class PlacesAndPaths:
         """Make a control whose answers are the places and paths that fit labels.
 
         The last control is kept, as the next question often needs the same one.
-
-        Args:
-            labels: The dstate of each step.
-            options: Options of clasp.
-            parts: The parts of the program to ground.
         """
         key = tuple(labels), tuple(options), tuple(parts)
         if self._asked is None or self._asked[0] != key:
@@ -490,9 +475,7 @@ def _go_on_at_home(control: Control, homes: Mapping[int, list[int]], parts: Iter
     """Ground the remaining parts of a control, and restrict each place to its homes.
 
     Args:
-        control: A control in which the parts `BEFORE_MERGING` are grounded.
         homes: For each place, the fixed places that it may be.
-        parts: All parts of the program.
     """
     control.add("homes", [], paths_lp.tight_facts(homes))
     control.ground(

@@ -218,12 +218,7 @@ class NamedLabels:
             )
 
     def _listed(self, dstates: int, enough: int) -> Iterator[list[int]]:
-        """Yield labels with this many dstates, in the order in which clingo lists them.
-
-        Args:
-            dstates: The number of dstates.
-            enough: Stop after this many labels; 0 for all.
-        """
+        """Yield labels with this many dstates, in the order in which clingo lists them."""
         program, spares = self.program, dstates - len(self.clique)
         if spares < 0:
             return
@@ -266,9 +261,6 @@ class NamedLabels:
 
         Args:
             spares: The cost, as a number of spare names.
-
-        Returns:
-            Whether there was such an answer.
         """
         assert self._search is not None  # `grow` comes first
         answers = self._asker.answers(

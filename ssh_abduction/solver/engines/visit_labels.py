@@ -157,9 +157,6 @@ class VisitLabels:
         """Give clingo all that it lacks about these visits of a chart.
 
         Args:
-            chart: The chart with all visits and nodes.
-            visits: The visits that clingo shall have.
-            order: Nodes in the order of choice.
             anew: Make a new control first.
         """
         known = 0 if anew else len(self.program.fits)

@@ -270,11 +270,7 @@ class VisitProgram:
         return found
 
     def _avoid_first(self, places: Iterable[int]) -> None:
-        """Assume that none of these new nodes is first. Count the nodes that are first in any case.
-
-        Args:
-            places: The positions of the nodes in the order of choice.
-        """
+        """Assume that no node at these new positions is first. Count those first in any case."""
         atoms = self._asker.control.symbolic_atoms
         for place in places:
             atom = atoms[visits_lp.first(place)]

@@ -162,7 +162,6 @@ def _options(chart: FramedChart, spares: int) -> States:
     """List the possible states of each visit.
 
     Args:
-        chart: The chart of the visits.
         spares: The least number of spare names of each kind of place.
 
     Returns:
@@ -215,8 +214,6 @@ def _spare(kinds: Sequence[_Kind], pinned: Sequence[int], spares: int) -> dict[_
     """Return the spare names of each kind of place. Pinned visits have the names before them.
 
     Args:
-        kinds: The kind of the place of each visit.
-        pinned: Visits that are pairwise distinct.
         spares: The least number of spare names of a kind.
     """
     named = Counter(kinds[visit] for visit in pinned)

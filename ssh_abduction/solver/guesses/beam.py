@@ -180,8 +180,6 @@ class Beam:
 
         Args:
             options: Ways to extend the beam by step t, sorted by cost.
-            t: The step.
-            width: The number of hypotheses to keep.
             checked: Whether to drop hypotheses that the checker refuses.
         """
         most, dearest = width, math.inf
@@ -240,8 +238,6 @@ class Beam:
         """Extend a beam to its first `end` steps, and check each hypothesis at each step.
 
         Args:
-            beam: The beam.
-            end: The number of steps.
             joins: Whether new dstates and places cost their prices, so that returns are cheaper. If
                 False, they are free, and the robot returns to a place only if it has to.
         """
@@ -272,7 +268,6 @@ class Beam:
         """Make the map of a hypothesis; None if it contradicts the axioms or the evidence.
 
         Args:
-            found: The hypothesis.
             since: The number of its first steps that were checked against the evidence already.
         """
         look_at_clock()

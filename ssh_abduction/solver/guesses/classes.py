@@ -203,8 +203,6 @@ class Classes:
         """Try to merge a class with each of some dstates, and rank these by the evidence.
 
         Args:
-            root: The root of the class.
-            fits: The dstates to try.
             forced: Whether two known dstates may be merged.
 
         Returns:

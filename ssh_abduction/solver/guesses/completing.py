@@ -88,7 +88,6 @@ def _on(
     """Add the courses and headings of dstates to a map.
 
     Args:
-        ssh_map: The map.
         courses: The path and direction of each dstate that is on a path.
         headings: The heading of each dstate, as a slot; None if no dstate has one.
     """
@@ -131,9 +130,6 @@ def _courses(
     """Find the paths: follow travels, turns around and opposite dstates from each dstate.
 
     Args:
-        ssh_map: The map without paths.
-        trace: The trace.
-        theory: The theory.
         opposite: Pairs of dstates that face opposite ways at one place.
 
     Returns:
@@ -178,9 +174,6 @@ def _orders(
     """Sort the places of each path by its travels, and put the ends of paths first or last.
 
     Args:
-        ssh_map: The map without paths.
-        trace: The trace.
-        courses: The path and direction of each dstate that is on a path.
         ends: Pairs (dstate, direction): the path of the dstate ends ahead of it (0) or behind it
             (180).
 

@@ -150,7 +150,6 @@ class _Map:
         """Find the dstate at a step that predicts the most of the following steps.
 
         Args:
-            step: The step.
             least: The least number of steps that the dstate has to predict.
             link: The unknown link to this step. Each try assumes that it leads to the dstate.
 

@@ -88,7 +88,6 @@ class _Place:
 
         Args:
             seen: What the step sees.
-            step: The number of the step.
             move: What was seen before at this place, and the turn since; None if there was none.
         """
         turns = self.turns

@@ -178,10 +178,8 @@ def _apart_in_map(
     leads from them to dstates that are apart.
 
     Args:
-        seen: The view of each dstate.
         links: Triples (dstate, action, dstate).
         excluded: Pairs of dstates that must not be merged.
-        check: Called now and then; may raise to stop.
 
     Returns:
         A matrix of dstates x dstates.

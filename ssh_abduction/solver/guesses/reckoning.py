@@ -279,8 +279,6 @@ def _conditioned(
     """Condition a Gaussian on the equality of some entries with others, up to some variance.
 
     Args:
-        mean: The means.
-        covariance: Their covariance.
         first: The indices of entries: x and y, and perhaps a heading.
         second: The indices of the entries that should be equal to them.
         spreads: The variance of each difference, in square metres and square radians.

@@ -268,12 +268,6 @@ class Sketch:
     def _known_ahead(self, place: int, path: int, direction: int, step: Step) -> int | None:
         """Return the dstate at which a travel to a known place ends.
 
-        Args:
-            place: The place.
-            path: The path of the travel.
-            direction: The direction along the path.
-            step: The step after the travel.
-
         Returns:
             The dstate; None if the step contradicts what was seen at the place.
         """

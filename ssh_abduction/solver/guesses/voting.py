@@ -257,8 +257,6 @@ class Merging:
         """Find how to turn the group of another visit before it is merged with that of this visit.
 
         Args:
-            visit: This visit.
-            other: The other visit.
             turn: Slot K of this visit shall be slot K + turn of the other.
 
         Returns:
@@ -277,8 +275,6 @@ class Merging:
         """Compute the gain of merging the groups of two visits, and all groups that follow.
 
         Args:
-            first: A visit.
-            second: Another visit.
             turn: Slot K of the first visit shall be slot K + turn of the second.
 
         Returns:

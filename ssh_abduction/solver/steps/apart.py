@@ -253,9 +253,7 @@ def _grown(apart: Matrix, kept: list[int], random: np.random.Generator) -> list[
     Each time add the candidate that is apart from the most other candidates. Chance breaks ties.
 
     Args:
-        apart: Which nodes are apart, as a matrix of nodes x nodes.
         kept: The nodes to begin with, which are pairwise apart.
-        random: The source of random numbers.
     """
     left = np.flatnonzero(apart[kept].all(axis=0)) if kept else np.arange(len(apart))
     found = list(kept)

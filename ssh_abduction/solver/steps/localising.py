@@ -126,10 +126,6 @@ class _Localiser:
 
         If the map lacks a link for the action from one of the states, any state that fits the next
         visit is possible.
-
-        Args:
-            possible: The possible states of this visit.
-            visit: This visit.
         """
         slot, action = self._leaves[visit]
         there = {self._leads.get((faced(state, slot), action)) for state in possible}

@@ -85,14 +85,9 @@ def _map(
     """Make a map from the atoms of an answer. Steps name dstates and places: the first step there.
 
     Args:
-        trace: The trace.
-        is_at: The dstate of each step.
-        place: The place of each step; empty for a causal map.
         course: The path and the direction of each step that is along a path.
         heading: The heading of each step, if places have frames or gateways.
         before: Triples of a path and two places on it, the earlier one first.
-        excused: Pairs of paths that side_of_branch is not applied to.
-        faults: Steps and kinds of faults.
         theory: The theory, for the costs of faults; None for a map without faults.
     """
     views = views_of(is_at, trace, faults)
@@ -203,8 +198,6 @@ def _paths(
     """Make the paths of a map, each with its places in order.
 
     Args:
-        count: The number of paths.
-        dstates: The dstates, with their places and paths.
         before: Triples of a path and two places, the earlier one first.
     """
     on: list[set[int]] = [set() for _ in range(count)]
