@@ -29,7 +29,7 @@ answer contradicts.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain, islice
 
@@ -58,18 +58,12 @@ class FramedEngine:
     lists_least = True
     goes_on = True
 
-    def __init__(self, task: Task, around: Mapping[int, Sequence[int]] | None = None) -> None:
-        """Begin with an empty prefix.
-
-        Args:
-            task: The problem, the limits and the speed-ups.
-            around: For each observation, the observations ahead, right, back and left of a robot
-                that makes it, as in `Chart.framed`. None if the steps have stars.
-        """
+    def __init__(self, task: Task) -> None:
+        """Begin with an empty prefix."""
         self.asker = Asker(task.watch)
         self.intact = True
         self.paths = len(task.trace)  # names for paths are never short
-        self._task, self._around = task, around
+        self._task = task
         self._sides = FramedSides(task.theory, self.asker)
         self._fitting = FramedPaths(task, self.asker)
         self._visits = VisitLabels(task, self.asker, self._charted, self._sides)
@@ -94,7 +88,7 @@ class FramedEngine:
 
     def with_paths(self, paths: int) -> FramedEngine:
         """Make a new engine. `paths` changes nothing, as there are always enough names here."""
-        return FramedEngine(self._task, self._around)
+        return FramedEngine(self._task)
 
     def over(self, task: Task) -> FramedEngine:
         """Go on with a longer trace, and return this engine itself.
@@ -172,7 +166,7 @@ class FramedEngine:
             The map; None if the steps fit no frames, or no paths fit. Paths are only merged if they
             must be one.
         """
-        chart = Chart.framed(self._task.trace, self._task.log, around=self._around)
+        chart = Chart.framed(self._task.trace, self._task.log)
         if chart is None:
             return None
         guess = [-1] * len(chart.seen)
@@ -262,7 +256,7 @@ class FramedEngine:
         Returns:
             The chart; None if the steps fit no frames.
         """
-        chart = Chart.framed(self._task.trace, self._task.log, size, self._around)
+        chart = Chart.framed(self._task.trace, self._task.log, size)
         return None if chart is None else self._fitting.charted(chart, before)
 
 

@@ -101,7 +101,6 @@ def all_accepted(
 def smaller(
     members: list[Member],
     shrunk: Callable[[list[Member]], list[Member] | None],
-    tries: int | None = None,
 ) -> list[Member]:
     """Reduce a list of members to a small part that still has a property.
 
@@ -111,12 +110,11 @@ def smaller(
         members: A list that has the property.
         shrunk: Given a list, returns a part of it with the property (perhaps all of it); None if
             the list lacks the property.
-        tries: Stop after this many failed tries; None for no limit.
 
     Returns:
-        The remaining members. Without `tries` none of them could be left out when it was tried.
+        The remaining members. None of them could be left out when it was tried.
     """
-    size, failed = len(members), 0
+    size = len(members)
     while size := size // 2:
         start = 0
         while start < len(members) and len(members) > 1:
@@ -125,7 +123,4 @@ def smaller(
                 members = fewer
                 continue
             start += size
-            failed += 1
-            if failed == tries:
-                return members
     return members

@@ -92,22 +92,14 @@ class Continuations:
         # The length of the common prefix of neighbours, in views and actions.
         self._shared = 2 * (here - self._sorted[:-1]) + (shown[here] == shown[there])
 
-    def apart_from(self, step: int, actions: int = 0) -> Matrix:
-        """Find the steps that are apart from one step.
-
-        Args:
-            step: The step.
-            actions: Count only steps whose views differ after at least this many actions.
-
-        Returns:
-            A flag for each step: a row of `apart`.
-        """
+    def apart_from(self, step: int) -> Matrix:
+        """Find the steps that are apart from one step: a flag for each step, a row of `apart`."""
         place, steps = self._place[step], len(self._place)
         shared = np.empty(steps, dtype=int)
         shared[:place] = np.minimum.accumulate(self._shared[:place][::-1])[::-1]
         shared[place + 1 :] = np.minimum.accumulate(self._shared[place:])
         # After an even number of common views and actions, the next to differ is a view.
-        differ = (shared % 2 == 0) & (shared >= 2 * actions)
+        differ = shared % 2 == 0
         differ[place] = False
         row: Matrix = differ[self._place] | self.excluded_from(step)
         return row
