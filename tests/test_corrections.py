@@ -188,6 +188,26 @@ def test_what_a_person_says_is_obeyed_at_each_later_solve(
     assert json.loads(capsys.readouterr().out)["theory"]["different"] == [[1, 4]]
 
 
+def test_a_place_is_renamed_by_any_step_at_it(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    building = str(folder / "building")
+    # Monday ends at the place where it began.
+    assert main(["name", building, "monday:0", "hall"]) == 0
+    assert main(["name", building, "monday:3", "lobby"]) == 0
+    assert "the place of monday:0 is 'lobby'" in capsys.readouterr().out
+    assert [n.name for n in load_corrections(building).names] == ["lobby"]
+
+
+@pytest.mark.parametrize("name", ["5", "p4", "place 4", "path2", "region 0"])
+def test_a_name_that_reads_as_a_number_is_refused(
+    name: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["name", str(folder / "building"), "p1", name]) == 1
+    assert f"give another one, such as 'room {name}'" in capsys.readouterr().err
+    assert not (folder / "building" / "corrections.yaml").exists()
+
+
 def test_a_name_stays_at_its_steps_when_places_get_other_numbers() -> None:
     """Solved after Tuesday, the place that Monday first sees has another number."""
     said = Corrections(MARKS).with_name("start", "place", "monday:0")
@@ -338,7 +358,9 @@ def test_names_stand_in_all_that_is_made_of_a_map(
     assert to_networkx(ssh_map, "topological").nodes["path", 0]["name"] == "hall"
     assert content_of([ssh_map])["maps"][0]["names"] == {"path 0": "hall", "place 1": "kitchen"}
     assert route(ssh_map, 0, "kitchen").goal == "place 1 (kitchen)"
-    with pytest.raises(MapError, match="or a place as p0, or kitchen, got 'den'"):
+    with pytest.raises(
+        MapError, match="or a place as p0, or a region as region0, or kitchen, got 'den'"
+    ):
         route(ssh_map, 0, "den")
     ssh_map.save(folder / "map.json")
     for verb in (["show"], ["route", "--to", "kitchen"], ["view", "-o", str(folder / "p.html")]):

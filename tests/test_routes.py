@@ -14,6 +14,7 @@ from worlds import rectangle, written
 from ssh_abduction import SSHMap, Theory, Trace, route, solve
 from ssh_abduction.cli import main
 from ssh_abduction.data import MapError
+from ssh_abduction.data.map_parts import Name
 from ssh_abduction.data.maps import DState, Fit, MapPath, Pose
 from ssh_abduction.solver import with_regions
 
@@ -136,7 +137,10 @@ def test_rivals_agree_where_their_links_lead_to_the_same_views() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"start": 99, "goal": 1}, "from: expected a dstate, 0 to 7, or a place as p0, got 99"),
+        (
+            {"start": 99, "goal": 1},
+            "from: expected a dstate, 0 to 7, or a place as p0, or a region as region0, got 99",
+        ),
         ({"start": 0, "goal": "p9"}, "to: expected p0 to p3, got 'p9'"),
         ({"start": 0, "goal": True}, "to: expected a dstate"),
         ({"start": 0, "goal": 1, "avoid": ["x"]}, r"avoid\[0\]: expected a dstate"),
@@ -273,6 +277,22 @@ def test_a_coarse_route_agrees_with_the_fine_one() -> None:
             assert all(door in places for door, _ in groupby(doors))
             told += len(found.legs)
     assert told
+
+
+def test_a_route_to_a_region_ends_at_its_nearest_place() -> None:
+    ssh_map = maze(2)
+    assert ssh_map.regions
+    named = replace(ssh_map, names=(Name("region", 1, "west wing"),))
+    inside = named.regions[1].places if named.regions else ()
+    for start in named.places:
+        lengths = [len(route(named, f"p{start}", f"p{goal}").moves) for goal in inside]
+        found = route(named, f"p{start}", "west wing")
+        assert found == route(named, f"p{start}", "region1")
+        assert found.places[-1] in inside
+        assert len(found.moves) == min(lengths)
+    assert "is in region 1 (west wing)" in route(named, f"p{inside[0]}", "west wing").sentence
+    with pytest.raises(MapError, match="or a region as region0, or west wing, got 'region99'"):
+        route(named, 0, "region99")
 
 
 def test_a_route_says_the_regions_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

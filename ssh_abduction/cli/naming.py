@@ -30,6 +30,7 @@ def add_parser(verbs: Verbs) -> None:
 def run(options: argparse.Namespace) -> int:
     standing = Standing.load(options.maps, options.map)
     kind, step = standing.thing(options.what)
+    step = standing.step_of_name(kind, step)
     file = standing.save(standing.corrections.with_name(options.name, kind, step))
     print(printable(f"the {kind} of {step} is {options.name!r}, in {named(file)}"))
     return 0

@@ -23,8 +23,8 @@ def add_parser(verbs: Verbs) -> None:
         dest="start",
         metavar="A",
         help=(
-            "start: the number of a dstate, or a place by number or name, such as p3 or kitchen "
-            "(default: the robot's last dstate)"
+            "start: the number of a dstate, or a place or region by number or name, such as p3, "
+            "region2 or kitchen (default: the robot's last dstate)"
         ),
     )
     parser.add_argument(
@@ -32,14 +32,14 @@ def add_parser(verbs: Verbs) -> None:
         dest="goal",
         metavar="B",
         required=True,
-        help="goal: the number of a dstate, or a place by number or name, such as p3 or kitchen",
+        help="goal: a dstate, place or region, named likewise",
     )
     parser.add_argument(
         "--avoid",
         nargs="+",
         action="extend",
         metavar="X",
-        help="dstates, and places such as p3, that the route must not visit",
+        help="dstates, places and regions that the route must not visit",
     )
     by = (
         "what to minimise: actions or metres, by moves that the robot did before; or places, by "

@@ -111,6 +111,19 @@ class Standing:
             )
         return kind, step_name(self.drives, first)
 
+    def step_of_name(self, kind: str, step: str) -> str:
+        """Return the step whose name the thing at this step has; this step if it has no name.
+
+        Args:
+            kind: "place", "path" or "region".
+            step: A step, such as "monday:12".
+        """
+        number = self._at(kind, step)
+        names = self.corrections.known_in(self.drives).names
+        return next(
+            (n.step for n in names if (n.kind, self._at(kind, n.step)) == (kind, number)), step
+        )
+
     def step(self, text: str) -> str:
         """Return the name of a step, such as "monday:12". Raise MapError if there is none."""
         try:
@@ -195,6 +208,9 @@ class Standing:
                 f"{brief(text)}, which is between two; say it by a step, such as 'monday:12 left'"
             )
         return 90.0 * (quarter % 4)
+
+    def _at(self, kind: str, step: str) -> int | None:
+        return self._of(kind, self.map.dstate_at[step_of(self.drives, step)])
 
     def _of(self, kind: str, label: int) -> int | None:
         dstate = self.map.dstates[label]

@@ -13,6 +13,7 @@ meaning when the map is solved again, and when drives are added.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -37,6 +38,8 @@ from ssh_abduction.data.trace import Trace, checked_trace
 FORMAT, VERSION = "ssh-corrections", 1
 # The kinds of pairs of steps, which are fields of a theory.
 PAIRS = ("same", "different", "elsewhere", "same_place")
+# How verbs write the number of a dstate, place, path or region. No name may read so.
+_NUMBER = re.compile(r"((p|place|path|region) ?)?[0-9]+")
 # The directions of gateways by name, in degrees clockwise from ahead.
 DIRECTIONS = {"ahead": 0.0, "right": 90.0, "back": 180.0, "left": 270.0}
 
@@ -327,10 +330,19 @@ class Corrections:
         )
 
     def _check_names(self) -> None:
-        """Raise MapError if two sentences give one name, or name one thing twice."""
+        """Raise MapError if two sentences give one name, or name one thing twice.
+
+        A name that reads as a number is wrong, too.
+        """
         where = self.source or "corrections"
         first: dict[tuple[str, ...], int] = {}
         for i, naming in enumerate(self.names):
+            if _NUMBER.fullmatch(naming.name):
+                raise MapError(
+                    f"{where}: names[{i}]: expected a name such as kitchen, got "
+                    f"{brief(naming.name)}, which is how to write a dstate, place, path or region "
+                    f"by its number; give another one, such as 'room {naming.name}'"
+                )
             for key, what in (
                 ((naming.kind, naming.name), f"another name than {brief(naming.name)}"),
                 ((naming.kind, naming.step, ""), f"one name for the {naming.kind}"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from collections.abc import Set as AbstractSet
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -11,6 +12,7 @@ import networkx as nx
 
 from ssh_abduction.data.errors import MapError, brief, is_whole
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.regions import Region
 from ssh_abduction.output.layout import located
 
 if TYPE_CHECKING:
@@ -69,14 +71,15 @@ class MoveGraph:
         """Find the dstates that a user names.
 
         Args:
-            name: The number of a dstate; or a place for all dstates there: "p3", or its name.
+            name: The number of a dstate; or a place or region for all dstates there: "p3",
+                "region2", or its name.
             field: The parameter that the name was given for, for messages.
 
         Returns:
             The dstates, and words for them, such as "dstate 4" or "place 3".
 
         Raises:
-            MapError: There is no such dstate or place. The message names those that exist.
+            MapError: There is no such dstate, place or region. The message names those that exist.
         """
         count, text = len(self.map.dstates), str(name)
         own = next((n.id for n in self.map.names if (n.kind, n.text) == ("place", name)), None)
@@ -85,16 +88,27 @@ class MoveGraph:
         if isinstance(name, str) and text[:1] == "p" and _is_number(text[1:]):
             place = int(text[1:])
             return self._dstates_at(place, field), self.map.called("place", place)
+        region = self._region(text)
+        if region is not None:
+            return self._dstates_in(region.places), self.map.called("region", region.id)
         is_number = is_whole(name) or (isinstance(name, str) and _is_number(text))
         if is_number and 0 <= int(text) < count:
             return {int(text)}, f"dstate {int(text)}"
         places = f", or a place as p{self.map.places[0]}" if self.map.places else ""
-        names = [n.text for n in self.map.names if n.kind == "place"]
+        places += ", or a region as region0" if self.map.regions else ""
+        names = [n.text for n in self.map.names if n.kind in ("place", "region")]
         places += f", or {', '.join(names)}" if names else ""
         raise MapError(
             f"{field}: expected a dstate, 0 to {count - 1}{places}, got {brief(name)}; "
             "ssh-abduction show lists them"
         )
+
+    def _region(self, name: str) -> Region | None:
+        """Find a region by its name, or by its number as in "region2"; None if there is none."""
+        own = {n.id for n in self.map.names if (n.kind, n.text) == ("region", name)}
+        number = name.removeprefix("region").strip() if name.startswith("region") else ""
+        own |= {int(number)} if _is_number(number) else set()
+        return next((region for region in self.map.regions or () if region.id in own), None)
 
     def nodes_in(self, places: AbstractSet[int]) -> set[Node]:
         """Find all nodes that are at these places."""
@@ -263,7 +277,7 @@ class MoveGraph:
             place: The number of the place.
             field: The parameter that it was given for, for messages.
         """
-        members: set[Node] = {s.id for s in self.map.dstates if s.place == place}
+        members = self._dstates_in({place})
         if not members:
             known = sorted({s.place for s in self.map.dstates if s.place is not None})
             there = "a dstate, as the map has no places"
@@ -274,6 +288,10 @@ class MoveGraph:
                 "ssh-abduction show lists them"
             )
         return members
+
+    def _dstates_in(self, places: Collection[int]) -> set[Node]:
+        """Find the dstates at these places."""
+        return {s.id for s in self.map.dstates if s.place in places}
 
     def _place(self, node: Node) -> int:
         """Return the place of a node. A dstate without a place gets its own negative number."""

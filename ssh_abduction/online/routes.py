@@ -79,7 +79,7 @@ class Route:
         map: The number of the map, from 1.
         by: What the route minimises: "actions", "places" or "metres".
         start: The dstate where it begins.
-        goal: The dstate or place where it ends, in words.
+        goal: The dstate, place or region where it ends, in words.
         view: The view at the start.
         place: The place of the start; None if the dstate has no place.
         moves: The moves, in order.
@@ -147,9 +147,13 @@ class Route:
             return (
                 f"dstate {self.start} is {self.goal}: there is nothing to do"
                 if self.goal == f"dstate {self.start}"
-                else f"dstate {self.start} is at {self.goal}"
+                else f"dstate {self.start} is {self._within} {self.goal}"
             )
         return f"from dstate {self.start} to {self.goal}: {', '.join(parts)}"
+
+    @property
+    def _within(self) -> str:
+        return "in" if self.goal.startswith("region") else "at"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the route as a dict for JSON, as `route --json` prints it.
@@ -185,21 +189,21 @@ def route(
     avoid: Iterable[int | str] = (),
     map: int | str = 1,
 ) -> Route:
-    """Find the shortest route from one dstate or place to another.
+    """Find the shortest route from one dstate, place or region to another.
 
     Args:
         maps: A solution, maps of one trace, or one map.
-        start: The number of a dstate, or a place, such as "p3" or "kitchen", which means any dstate
-            there; None for the dstate of the last step.
-        goal: The number of a dstate, or a place, such as "p3" or "kitchen".
+        start: The number of a dstate; or a place or region, such as "p3", "region2" or "kitchen",
+            which means any dstate there; None for the dstate of the last step.
+        goal: A dstate, place or region, named likewise.
         by: What to minimise. "actions" and "metres" use links only, so the robot did each move
             before. "places" minimises travels, and also uses moves that the paths of the map imply.
-        avoid: Dstates, and places such as "p3" or "kitchen", that the route must not visit.
+        avoid: Dstates, places and regions that the route must not visit, named likewise.
         map: The number of the map to use, from 1, or its id.
 
     Raises:
-        MapError: There is no such dstate, place or map; no route exists; the map has no poses for
-            "metres", or no paths for "places".
+        MapError: There is no such dstate, place, region or map; no route exists; the map has no
+            poses for "metres", or no paths for "places".
     """
     if not isinstance(by, str) or by not in BY:
         raise MapError(
@@ -212,7 +216,7 @@ def route(
     graph = MoveGraph(ssh_map, by)
     here, _ = graph.nodes(ssh_map.dstate_at[-1] if start is None else start, "from")
     there, goal_named = graph.nodes(goal, "to")
-    if goal_named.startswith("place"):
+    if not goal_named.startswith("dstate"):
         there = graph.nodes_at_places_of(there)
     closed = _closed(graph, avoid)
     for nodes, name in ((here, "from"), (there, "to")):
@@ -223,17 +227,15 @@ def route(
             )
     start_place, goal_place = _place_of(graph, here), _place_of(graph, there)
     aside: set[Node] = set()
-    legs: tuple[Leg, ...] = ()
-    if start_place is not None and goal_place is not None:
+    if by == "places" and start_place is not None and goal_place is not None:
         # First plan the coarse route by regions, then the route itself. By links alone, a robot may
         # have to enter a region only to turn around. So close regions only for a route by places.
-        legs = coarse_route(ssh_map, start_place, goal_place)
-        if by == "places":
-            aside = graph.nodes_in(off_the_way(ssh_map, start_place, goal_place))
+        aside = graph.nodes_in(off_the_way(ssh_map, start_place, goal_place))
     way = graph.shortest(here - closed, there - closed, closed | aside)
     if way is None:
         _raise_no_route(graph, here, there, closed, goal_named)
     moves = tuple(_move(graph, a, b) for a, b in pairwise(way))
+    begin, end = (graph.course(node)[0] for node in (way[0], way[-1]))
     first = way[0]
     assert isinstance(first, int)  # routes begin at dstates
     is_known = all(move.known for move in moves)
@@ -247,7 +249,7 @@ def route(
         moves=moves,
         agree=_agreeing(ssh_map, first, moves, listing.maps) if is_known else (),
         maps=len(listing.maps),
-        legs=legs,
+        legs=() if begin is None or end is None else coarse_route(ssh_map, begin, end),
     )
 
 
