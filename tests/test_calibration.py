@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from perception.places.calibration import calibrated, factor_of
 from perception.places.closures import Closing
+from perception.places.importing import calibrated, factor_of
 from perception.places.matching import Match
 from perception.places.track import Array, Track, points_turned
 from perception.places.visits import Visit

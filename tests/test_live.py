@@ -16,7 +16,7 @@ from test_log_checks import backwards, in_degrees, of_two_clocks, with_poses
 
 from perception.errors import LogError
 from perception.places.importing import import_live, import_log, stream_visits
-from perception.places.watching import LOOKS
+from perception.places.live import LOOKS
 from perception.readers.logs import SURVEYED, live_log, read_log
 from perception.readers.scans import RobotLog, Scan
 from perception.readers.writers import write_carmen

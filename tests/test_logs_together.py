@@ -15,9 +15,8 @@ import pytest
 from coarse import every_second_beam
 
 from perception.errors import LogError
-from perception.places.between import closures_between, scenes_of
 from perception.places.importing import Imported, import_log
-from perception.places.joining import join_logs
+from perception.places.joining import closures_between, join_logs, scenes_of
 from perception.readers.scans import RobotLog
 from perception.readers.writers import write_carmen
 from simulator.tours import record

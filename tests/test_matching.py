@@ -17,8 +17,7 @@ from perception.places.following import _matched
 from perception.places.local_map import CELL, PackedPatch, Patch
 from perception.places.matching import Match, Scene, Turned, match
 from perception.places.tracing import to_trace
-from perception.places.track import Track, points_turned
-from perception.places.trust import Trust
+from perception.places.track import Track, Trust, points_turned
 from perception.places.visits import Visit
 from perception.readers.scans import RobotLog
 from ssh_abduction.data.odometry import between

@@ -31,7 +31,7 @@ from ssh_abduction.page import html
 from ssh_abduction.page.assumed import assumptions
 from ssh_abduction.page.content import DRAWN, content_of
 from ssh_abduction.page.html import Page
-from ssh_abduction.page.images import ALPHABET, LOST, beams_of, drawn_images
+from ssh_abduction.page.replays import ALPHABET, LOST, beams_of, drawn_images
 from ssh_abduction.page.server import PageServer
 from ssh_abduction.rivals import Listing
 from ssh_abduction.solver.asp.process import _under_way
@@ -142,7 +142,7 @@ def test_images_of_a_sidecar_file_and_panoramas_are_shown(
     assert (drawn["kind"], drawn["rows"], drawn["columns"]) == ("panorama", 2, 3)
     assert drawn["images"][1][0] == ALPHABET[0]
     assert drawn["images"][0][0] > drawn["images"][1][0]
-    monkeypatch.setattr("ssh_abduction.page.images.MOST", 1)
+    monkeypatch.setattr("ssh_abduction.page.replays.MOST", 1)
     with pytest.warns(UserWarning, match="2 images are more than a page holds"):
         assert drawn_images(trace) is None
     (tmp_path / "images.npz").unlink()

@@ -912,7 +912,7 @@ def test_logs_of_real_robots(name: str) -> None:
 def test_docstrings_run() -> None:
     import doctest
 
-    for name in ("scans", "graphs", "writers"):
+    for name in ("scans", "carmen_survey", "writers"):
         result = doctest.testmod(importlib.import_module(f"perception.readers.{name}"))
         assert result.failed == 0
         assert result.attempted > 0

@@ -22,8 +22,15 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from perception.places.jumps import Doubt, Unknown, unknown_steps
-from perception.places.track import Array, Track, points_moved, points_turned, rotation, wrapped
-from perception.places.trust import Trust
+from perception.places.track import (
+    Array,
+    Track,
+    Trust,
+    points_moved,
+    points_turned,
+    rotation,
+    wrapped,
+)
 from perception.readers.scans import Pose, RobotLog, Scan
 from ssh_abduction.data.odometry import between, moved
 

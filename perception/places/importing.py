@@ -3,10 +3,16 @@
 The robot need not have stopped at distinctive states. If it passed a junction or turned around,
 the local map shows what it would have seen from the middle of the place. Kuipers
 & Beeson (2002) planned this: to localise without physical motion to the actual location.
+
+Scan matching estimates covariances by the same constants for every robot. The closures of the log
+measure how far the track of this robot is really off. So its covariances are multiplied by the
+factor that makes the errors at the closures most probable. A steady drift of the heading is
+estimated at the same time and removed from these errors, as the covariances do not include it.
 """
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -18,12 +24,21 @@ import numpy as np
 from perception.errors import ImageWarning, LogError
 from perception.places import jumps, log_checks
 from perception.places.agreement import disagreement
-from perception.places.calibration import calibrated
-from perception.places.closures import find_closures
+from perception.places.closures import (
+    DRIFTS,
+    GATE,
+    INFLATED,
+    Closing,
+    errors_of,
+    find_closures,
+    seen_from,
+    uncertainty,
+    without_drift,
+)
 from perception.places.distinctive import WIDTH, WINDOW, find_visits
 from perception.places.following import follow, turned_wrongly
 from perception.places.live import LiveLog
-from perception.places.tracing import to_trace
+from perception.places.tracing import DRIFT, to_trace
 from perception.places.track import Track
 from perception.places.visits import Visit, patches_of
 from perception.readers.scans import Damage, RobotLog, Scan
@@ -40,6 +55,17 @@ _log = log_of("ssh_abduction.perception.places")
 SEEN = 12
 # Largest share of scans before which a track may be broken.
 MOST_BREAKS = 0.1
+# Standard deviations of the error of a closure, in metres and radians (docs/measurements/logs.md).
+ERROR = (0.05, 0.05, math.radians(0.5))
+# The factors that are tried, and the standard deviation of the prior of their natural logarithm.
+# Because of this prior, a few closures do not change the covariances much.
+FACTORS = 2.0 ** np.arange(-7, 5, 0.5)
+CHANGE = 0.5
+# WRONG is the share of closures that are wrong. The errors of wrong closures are uniformly
+# distributed in the ellipsoid that the gate of `closures` allows. VOLUME is the natural logarithm
+# of its volume if the covariance is the unit matrix, so that it is a ball.
+WRONG = 0.02
+VOLUME = math.log(4 / 3 * math.pi * (INFLATED * GATE) ** 1.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,3 +321,40 @@ def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
     begin = time.process_time()
     yield
     seconds[stage] = round(time.process_time() - begin, 3)
+
+
+def calibrated(track: Track, visits: Sequence[Visit], closings: Sequence[Closing]) -> Track:
+    """Return a track with covariances that agree with the closures.
+
+    Args:
+        track: Trajectory of the robot.
+        visits: The visits, in order.
+        closings: The closures between them; with none, the track stays as it is.
+    """
+    return replace(track, covariances=track.covariances * factor_of(track, visits, closings))
+
+
+def factor_of(track: Track, visits: Sequence[Visit], closings: Sequence[Closing]) -> float:
+    """Estimate the factor that corrects the covariances of a track; 1 if there is no closure."""
+    if not closings:
+        return 1.0
+    scans = [visit.scan for visit in visits]
+    middles = np.array([visit.middle for visit in visits])
+    first, last = [c.first for c in closings], [c.last for c in closings]
+    matches = np.array([(*c.match.shift, c.match.turn) for c in closings])
+    spreads = np.array(
+        [uncertainty(track, scans[c.first], scans[c.last], middles[c.last]) for c in closings]
+    )
+    spread = FACTORS[:, None, None, None] * spreads + np.diag(ERROR) ** 2  # (factors, closures)
+    inverse, size = np.linalg.inv(spread), np.linalg.slogdet(math.tau * spread)[1]
+    wrong = math.log(WRONG) - VOLUME - np.linalg.slogdet(spreads + np.diag(ERROR) ** 2)[1] / 2
+    best = np.full(len(FACTORS), -np.inf)
+    for drift in DRIFTS:
+        poses = without_drift(middles, track.way[scans], drift)
+        off = errors_of(seen_from(poses[first], poses[last]), matches)
+        squares = np.einsum("ni,fnij,nj->fn", off, inverse, off)
+        right = math.log(1 - WRONG) - (squares + size) / 2
+        fits = np.logaddexp(right, wrong).sum(axis=1) - (drift / DRIFT) ** 2 / 2
+        best = np.maximum(best, fits)
+    best -= (np.log(FACTORS) / CHANGE) ** 2 / 2
+    return float(FACTORS[best.argmax()])

@@ -15,8 +15,7 @@ import numpy as np
 from perception.errors import LogError
 from perception.places import jumps
 from perception.places.following import POOR
-from perception.places.track import Array, Track, wrapped
-from perception.places.trust import Trust
+from perception.places.track import Array, Track, Trust, wrapped
 from perception.places.units import FAR_OFF, LEAST_WAY, SIDEWAYS, SPARSE, ahead, units_of, way_of
 from perception.readers.scans import Pose, RobotLog
 from ssh_abduction.data.errors import named

@@ -7,15 +7,15 @@ from collections.abc import Collection
 from contextlib import suppress
 from typing import Generic, TypeVar
 
-from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.maps import Fault, SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.axioms import Interrupted
-from ssh_abduction.explain.changes import changes_at, changes_in_words
 from ssh_abduction.solver import (
     Cost,
     LimitError,
     Progress,
     Search,
+    Status,
     Stop,
     Watch,
     check_limit,
@@ -145,3 +145,36 @@ class Question(ABC, Generic[_Answer]):
         if search.stopped in ("interrupted", "memory limit"):
             self.stopped = search.stopped
         self._over()
+
+
+def changes_at(ssh_map: SSHMap, places: Collection[int | None]) -> tuple[Fault, ...]:
+    """Find the changes of gateways at these places of a map."""
+    return tuple(f for f in ssh_map.faults if f.kind == "changed" and f.place in places)
+
+
+def changes_in_words(
+    changes: Collection[Fault], cost: Cost, nats: float | None, without: Search
+) -> list[str]:
+    """Say what changed, and what a map costs without changes.
+
+    Args:
+        changes: Some changes of a map.
+        cost: The cost of this map.
+        nats: Its cost in nats; None if maps are not weighed.
+        without: An ended search for the best map without any changes.
+
+    Returns:
+        A sentence for each change; and one for the map without changes.
+    """
+    said = [f"{change}; this change costs {change.cost:g} dstates" for change in changes]
+    if without.status is Status.UNSATISFIABLE:
+        return [*said, "without changes there is no map"]
+    if without.cost is None:
+        return [*said, "no map without changes was found in time"]
+    best = "the best map" if without.status is Status.OPTIMAL else "the best map found"
+    if nats is not None and without.nats is not None:
+        more = f"costs {without.nats:.1f} nats, not {nats:.1f}"
+    else:
+        changed = f"{cost.dstates} and changes for {cost.faults:g}"
+        more = f"has {without.cost.dstates} dstates, not {changed}"
+    return [*said, f"without changes, {best} {more}"]

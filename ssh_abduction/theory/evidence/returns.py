@@ -17,8 +17,7 @@ from ssh_abduction.data.drives import drives_of, named_steps
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
-from ssh_abduction.theory.evidence.closing import Closing
-from ssh_abduction.theory.evidence.courses import Course, hold
+from ssh_abduction.theory.evidence.closing import Closing, Course, hold
 from ssh_abduction.theory.evidence.protocol import Equality
 from ssh_abduction.theory.pairs import NO_PAIRS, Earlier, Pairs
 
