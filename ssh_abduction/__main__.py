@@ -46,14 +46,10 @@ def run() -> "NoReturn":
 
 
 def _interrupt(number: int, frame: "FrameType | None") -> None:
-    """Handle a signal: raise KeyboardInterrupt, or end the program if a module is being loaded.
+    """Handle a signal: raise KeyboardInterrupt, or end the program while a module is being loaded.
 
-    While modules are loaded, there is no result that could be lost. A KeyboardInterrupt would be
-    unsafe then: C code, such as that of numpy, prints a traceback or turns it into another error.
-
-    Args:
-        number: The number of the signal, SIGINT (Ctrl-C) or SIGTERM.
-        frame: The Python frame that the signal interrupted.
+    A KeyboardInterrupt would be unsafe there: C code, such as that of numpy, prints a traceback or
+    turns it into another error.
     """
     program.heard.append(number)
     while frame is not None:

@@ -54,9 +54,7 @@ def numbered_by_first_visit(m: Reading) -> Found:
 def _numbered(what: str, ids: Sequence[int], visits: Iterable[tuple[int, int | None]]) -> Found:
     """Check that ids are 0, 1, 2, … by first visit, and that each is visited.
 
-    Args:
-        ids: The ids that the map lists.
-        visits: Pairs of a step and the id visited there, sorted by step; None for no id.
+    `visits` has a step and the id visited there (None for no id), by step.
     """
     if list(ids) != list(range(len(ids))):
         yield [], f"The ids of the {what} are not 0, 1, 2, … in this order."
@@ -223,11 +221,7 @@ def _is_allowed(m: Reading, kind: str) -> bool:
 
 
 def _what_is_wrong(m: Reading, fault: Fault) -> str | None:
-    """Describe in a sentence why a fault is not allowed or contradicts the trace or the map.
-
-    Returns:
-        The sentence; None if nothing is wrong.
-    """
+    """Say why a fault is not allowed or contradicts trace or map; None if nothing is wrong."""
     fault = replace(fault, step=m.named(fault.step))
     i, kind = fault.step, fault.kind
     without_stars = kind == "misseen" and m.theory.star not in ("pattern", "frame")

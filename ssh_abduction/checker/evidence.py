@@ -117,9 +117,7 @@ def closure(m: Reading) -> Found:
 def _p_value(match: Closure, odometry: Odometry, freedom: int) -> float:
     """Compute how probable a closure at least this far from zero is if both poses are one.
 
-    Args:
-        odometry: The noise model, with the errors of poses at visits.
-        freedom: 2 to compare positions, 3 to compare poses.
+    `freedom` is 2 to compare positions, 3 to compare poses.
     """
     import numpy as np
     from scipy.special import chdtrc  # scipy.stats has the same, and loads for half a second

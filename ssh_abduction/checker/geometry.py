@@ -167,14 +167,9 @@ def _closing(trace: Trace, first: int, last: int) -> Closing:
 def _returns(
     trace: Trace, ssh_map: SSHMap, theory: Theory, drifts: Drifts, of_arrivals: bool = False
 ) -> Iterator[Return]:
-    """Find the returns of a map whose closing error is known.
+    """Yield the returns with a known closing error: first step, last step, degrees of freedom.
 
-    Args:
-        of_arrivals: Whether to leave out returns to dstates in which a step is not the first one of
-            its visit. Returns to places always have first steps of visits.
-
-    Yields:
-        Returns: first step, last step, and degrees of freedom.
+    Returns to places have first steps of visits. With `of_arrivals`, returns to dstates do, too.
     """
     place = {s.id: s.place for s in ssh_map.dstates}
     size = min(len(trace), len(ssh_map.dstate_at))
@@ -200,14 +195,7 @@ def _returns(
 
 
 def _most(theory: Theory, freedom: int, together: bool) -> float:
-    """Compute the chi-square above which returns are rejected.
-
-    Args:
-        theory: The theory, with the allowed probability of a false rejection, and the number of
-            returns.
-        freedom: The degrees of freedom of all returns of one test.
-        together: Whether pairs of returns are tested.
-    """
+    """Compute the chi-square above which a return, or (`together`) a pair, is rejected."""
     share = theory.reject / 2 if theory.joint > 1 else theory.reject
     tests = theory.returns * (theory.returns - 1) / 2 if together else theory.returns
     return float(2 * gammainccinv(freedom / 2, share / max(tests, 1)))
@@ -272,15 +260,10 @@ def _refused_together(
 
 
 def _sets(rows: Steps, filtered: ErrorFilter, most: float) -> Iterator[tuple[Steps, Steps]]:
-    """Find the pairs of returns whose loops overlap and that need a test.
+    """Yield the pairs of returns whose loops overlap and that need a test, in portions.
 
-    Args:
-        rows: The returns (first step, last step, degrees of freedom), sorted by last step, (m, 3).
-        filtered: The poses without drift.
-        most: The least chi-square at which a pair may be rejected.
-
-    Yields:
-        Portions of the pairs, each as two arrays of indices into `rows`.
+    A portion is two arrays of indices into `rows`: first step, last step and degrees of freedom of
+    each return, sorted by last step, (m, 3). `most` is the least chi-square that may be rejected.
     """
     alone = _Alone(filtered, rows)
     found = []
@@ -328,14 +311,7 @@ def _unsafe(
 ) -> tuple[Steps, Steps]:
     """Find the pairs that need a test, among the pairs whose later return ends at step `end`.
 
-    Args:
-        filtered: The poses without drift.
-        rows: The returns, sorted by last step, (m, 3).
-        end: The last step of the later return.
-        most: The least chi-square at which a pair may be rejected.
-
-    Returns:
-        The indices into `rows` of the earlier returns, and those of the later returns.
+    Arguments are those of `_sets`. Returns the indices of the earlier and of the later returns.
     """
     later = np.arange(*np.searchsorted(rows[:, 1], [end, end + 1]))
     earlier = np.arange(
@@ -364,13 +340,9 @@ def _unsafe(
 
 
 def _common_ends(rows: Steps, here: Steps, others: Steps) -> Steps:
-    """Count the ends that the loops of two returns have in common.
+    """Count the ends that the loops of the returns `here` and `others` (indices) have in common.
 
     Both returns share the error by which the robot is off its dstate at such an end.
-
-    Args:
-        here: Indices into `rows` of one return of each pair.
-        others: Indices into `rows` of the other return of each pair.
     """
     same: Steps = (rows[here, :2] == rows[others, :2]).sum(-1)
     return same
@@ -379,9 +351,7 @@ def _common_ends(rows: Steps, here: Steps, others: Steps) -> Steps:
 def _is_safe(share: Array, squares: Array, most: float) -> NDArray[np.bool_]:
     """For each pair of returns, tell whether the bound shows that it is not rejected.
 
-    Args:
-        squares: The sum of the chi-squares of both returns.
-        most: The least chi-square at which a pair may be rejected.
+    `squares` are the sums of the chi-squares of both returns.
     """
     left = 1 - squares / most
     safe: NDArray[np.bool_] = (left > 0) & (share + MARGIN <= left**2)
@@ -389,12 +359,7 @@ def _is_safe(share: Array, squares: Array, most: float) -> NDArray[np.bool_]:
 
 
 def _square_together(filtered: ErrorFilter, rows: Steps, here: Steps, others: Steps) -> Array:
-    """Compute the chi-square of each pair of returns; 0 if a closing error of the pair is unknown.
-
-    Args:
-        here: The index into `rows` of one return of each pair.
-        others: The index into `rows` of the other return of each pair.
-    """
+    """Compute the chi-square of each pair of returns; 0 if a closing error is unknown."""
     m = len(others)
     begin, end = (
         np.maximum(rows[others, 0], rows[here, 0]),

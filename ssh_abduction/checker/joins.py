@@ -118,10 +118,9 @@ def _named(joins: Sequence[Join]) -> str:
 
 
 class _Classes:
-    """Classes of steps that share a property. At first each step is a class. Classes can be merged.
+    """Classes of steps that share a property.
 
-    Args:
-        steps: The number of steps.
+    At first each step is a class. Classes can be merged.
     """
 
     def __init__(self, steps: int) -> None:

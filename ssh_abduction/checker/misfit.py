@@ -239,11 +239,7 @@ class _Errors:
     def _row(self, pose: Array, own: Array, first: int, last: int) -> Array:
         """Compute the derivatives of the pose at `last` minus that at `first`, (3, unknowns).
 
-        Args:
-            pose: The poses of all steps, (steps, 3).
-            own: The derivatives of each movement by its own unknowns, (steps, 3, 5).
-            first: The earlier step.
-            last: The later step.
+        `own` has the derivatives of each movement by its own unknowns, (steps, 3, 5).
         """
         along = slice(first + 1, last + 1)
         rest = pose[last, :2] - pose[along, :2]
@@ -258,14 +254,10 @@ class _Errors:
 
 
 def _off_dstates(trace: Trace) -> Array:
-    """Compute by how much the robot may be off the pose of its dstate at each step.
+    """The standard deviations of the robot's error at dstates, (steps, 3), metres and radians.
 
     Turns do not move the robot, so the k steps of a visit share one error of position. To count
-    this error once, each of the steps gets k times its variance.
-
-    Returns:
-        The standard deviations of x, y and heading, (steps, 3), in metres and radians; empty if the
-        odometry declares no such errors.
+    this error once, each of the steps gets k times its variance. Empty if none are declared.
     """
     odometry = trace.odometry or Odometry()
     if not odometry.offset and not odometry.facing:
@@ -339,14 +331,7 @@ def _frame(
     known: dict[int, int],
     position: dict[int, complex],
 ) -> _Frame | None:
-    """Find the frame of a stretch, by a dstate or two places whose poses are known already.
-
-    Args:
-        pose: The pose of each step; those of `steps` are in the frame of the stretch.
-
-    Returns:
-        The position and the heading of the origin of the stretch; None if they are undetermined.
-    """
+    """Find the origin of a stretch, by a dstate or two places with known poses; else None."""
     for t in steps:
         if dstates[t] in known:
             at, heading = pose[known[dstates[t]]]

@@ -179,14 +179,10 @@ class Edges:
         )
 
     def _gateways(self) -> dict[Arm, Arm] | None:
-        """Find the arms that are one gateway.
+        """Find the arms that are one gateway: a dict from each arm to the arm that represents it.
 
         A turn around faces what was behind. A gateway leads to one gateway, so if two arms are one,
-        the arms at their far ends are one.
-
-        Returns:
-            A dict from each arm to the arm that represents its gateway; None if a gateway leads to
-            two places.
+        the arms at their far ends are one. None if a gateway leads to two places.
         """
         one = {(s, side): (s, side) for s in self.place_of for side in (1, -1)}
 
@@ -296,23 +292,13 @@ def _parts(
 
 
 def _is_turned(faced: Mapping[int, int], turn: tuple[int, int, int]) -> bool:
-    """Tell whether headings fit a turn. They do if one of its two headings is not chosen yet.
-
-    Args:
-        faced: The heading of each dstate that has one so far.
-        turn: The dstate before the turn, the quarters of the turn, and the dstate after it.
-    """
+    """Tell whether headings fit a turn. They do if one of its two headings is not chosen yet."""
     s, quarters, t = turn
     return s not in faced or t not in faced or (faced[s] + quarters - faced[t]) % 4 == 0
 
 
 def _goes_round(order: Sequence[Arm], sequence: Sequence[Arm]) -> bool:
-    """Tell whether gateways are distinct, and clockwise in a circular order.
-
-    Args:
-        order: The circular order.
-        sequence: The gateways. Those that the order does not have yet are skipped.
-    """
+    """Tell whether the gateways of `told` that `order` has are distinct and clockwise in it."""
     there = [order.index(gateway) for gateway in sequence if gateway in order]
     return (
         len(set(sequence)) == len(sequence)
@@ -321,12 +307,9 @@ def _goes_round(order: Sequence[Arm], sequence: Sequence[Arm]) -> bool:
 
 
 def _orders(gateways: Sequence[Arm], sequences: Sequence[Sequence[Arm]]) -> list[tuple[Arm, ...]]:
-    """List all clockwise orders of gateways that agree with some sequences.
+    """List all clockwise orders of gateways that agree with sequences that were told.
 
     Orders that differ by a rotation are listed once: each starts with the first gateway.
-
-    Args:
-        sequences: Sequences of gateways that are known to follow each other clockwise.
     """
     orders: list[tuple[Arm, ...]] = [()]
     for gateway in gateways:

@@ -134,11 +134,7 @@ def _common_actions(trace: Trace, i: int, j: int) -> list[str]:
 
 
 def _not_apart(trace: Trace, i: int, j: int, word: Sequence[str]) -> str | None:
-    """Say why a word (list of actions) does not show that two steps are at different dstates.
-
-    Returns:
-        A sentence; None if the word shows it.
-    """
+    """Say why a word does not show that two steps are at different dstates; None if it does."""
     for k, name in enumerate(word):
         for step in (i + k, j + k):
             action = trace.steps[step].action if step < len(trace) else None

@@ -151,7 +151,10 @@ def is_pair(pair: object) -> bool:
 
 
 def _sides(name: str, m: Reading) -> Found:
-    """Check the axiom `name` about sides."""
+    """Find the side of a path in each map, by the first steps at a place and along a path.
+
+    It is None if the map does not know it. Pairs that no map knows are left out.
+    """
     for conflict in m.once(_conflicts):
         if name in conflict.axioms:
             yield conflict.steps, conflict.message

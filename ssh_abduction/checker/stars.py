@@ -111,11 +111,7 @@ def _rotated(star: Openings, quarters: int) -> Openings:
 
 
 def _one_star(seen: Iterable[tuple[DState, Openings, int]], how: str) -> Found:
-    """Check that the stars seen at each place are equal.
-
-    Args:
-        seen: A dstate, a star in a form that all steps at its place share, and its first step.
-    """
+    """Check that the stars seen at each place are equal, in a form that all steps there share."""
     known: dict[int, tuple[Openings, int]] = {}
     for s, star, i in seen:
         if s.place is not None:

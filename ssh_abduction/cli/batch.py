@@ -167,10 +167,6 @@ class Question:
         """Make a guard that ends this process at its limits, if it only solves this trace.
 
         Otherwise return a context manager that does nothing.
-
-        Args:
-            number: The index of the trace.
-            given_up: Returns whether the answer is not needed any more.
         """
 
         def last_words(why: Stop) -> tuple[Answer, int]:
@@ -274,13 +270,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _printed(answers: Generator[Answer], total: int, stop: StopFlag) -> list[int]:
-    """Print all lines in the order of the traces, and return the exit codes of the answers.
-
-    Args:
-        answers: The answers in any order.
-        total: The number of traces.
-        stop: Is set after Ctrl-C.
-    """
+    """Print all lines in the order of the traces, and return the exit codes of the answers."""
     lines: dict[int, str] = {}  # the lines that wait for an earlier trace
     codes: list[int] = []
     turn = 0
@@ -315,10 +305,9 @@ def _forget_memory() -> None:
 
 @contextlib.contextmanager
 def _progress(total: int) -> Iterator[tuple[Callable[[str], None], Callable[[], None]]]:
-    """Show a progress bar on stderr, if it is a terminal, while the block runs.
+    """Show a progress bar on stderr, if it is a terminal.
 
-    Yields:
-        A function that prints a line, and a function that moves the bar on by one trace.
+    Yield what prints a line and what advances it.
     """
     if not sys.stderr.isatty():
         yield partial(print, flush=True), lambda: None

@@ -146,13 +146,8 @@ def _bound(
 ) -> bool:
     """Check the lower bound and the other claims in a file of maps, and print the result.
 
-    Args:
-        doubt: Why clingo's proofs may not hold for this trace and theory; None if they do.
-        solved: The theory in the file, in which no field is "auto".
-        broken: Whether some maps break axioms.
-
-    Returns:
-        Whether all claims hold, and no map has fewer dstates than proven.
+    `doubt` says why clingo's proofs may not hold for this trace and theory. Returns whether all
+    claims hold.
     """
     fewest = min((len(m.dstates) for m in maps), default=None)
     if RESTS_ON - set(theory.axioms):

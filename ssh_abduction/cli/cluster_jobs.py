@@ -94,11 +94,8 @@ def _answers(
     """Yield answers in any order, and find out which files kill their workers.
 
     When a worker is killed, all files that it was working on are suspects. Try each suspect again
-    alone. If its worker is killed again, the file is to blame and gets a lost answer.
-
-    Args:
-        attempt: Takes a list of files to work on, and a list to which it appends the files whose
-            worker was killed. Yields the answers for all other files.
+    alone. If its worker is killed again, the file is to blame and gets a lost answer. `attempt`
+    appends the suspects to its second argument.
     """
     suspects: list[Task] = []
     yield from attempt([*enumerate(paths)], suspects)
@@ -165,14 +162,10 @@ def _on_workers(
     tasks: list[Task],
     killed: list[Task],
 ) -> Iterator[Any]:
-    """Yield the answers for some files from the workers of a cluster.
+    """Yield the answers for some files from the workers of a cluster, at most `most` at a time.
 
     Files are read here, so that workers need not share the disk. This uses Dask directly, because
-    joblib's backend for Dask hangs when a worker is killed.
-
-    Args:
-        most: The largest number of files on the cluster at a time.
-        killed: Receives the files whose worker was killed.
+    joblib's backend for Dask hangs when a worker is killed. `killed` receives the files of such.
     """
     from distributed import KilledWorker, as_completed
 

@@ -81,11 +81,7 @@ def _how_to_obey(maps: Path) -> str:
 
 
 def _pair(standing: Standing, kind: str, pair: str) -> tuple[str, str]:
-    """Read a pair of steps, such as "monday:12,tuesday:3", from the option for this kind of pair.
-
-    Raises:
-        MapError: The text is no pair of two steps of the map.
-    """
+    """Read a pair of steps, such as "monday:12,tuesday:3", or raise MapError."""
     steps = [standing.step(step.strip()) for step in pair.split(",")]
     if len(steps) != 2 or steps[0] == steps[1]:
         raise MapError(

@@ -190,15 +190,11 @@ class MapQuestion:
         answer_last: Callable[[MapAnswer], None],
         tell: Callable[[str], None],
     ) -> MapAnswer:
-        """Map one log, or several together.
+        """Map one log, or several together, from `files`, which may be copies.
 
-        Args:
-            number: The index of the log.
-            files: The files to read, which may be copies.
-            content: The digest of the logs before they are read; None if there is none. If a log
-                changes later, the next call sees another digest and maps them again.
-            given_up: Returns whether the answer is not needed any more.
-            answer_last: Takes the answer if the process has to end because clingo does not stop.
+        `content` is the digest of the logs before they are read. If a log changes later, the next
+        call sees another digest and maps them again. `answer_last` takes the answer if clingo does
+        not stop.
         """
         begun: list[LogMapping] = []  # one entry, once the logs are read
         names = [named_after(path) for path in paths]
@@ -452,11 +448,7 @@ def _here(question: MapQuestion, logs: Sequence[str], folder: Path) -> int:
 def _kept(
     answers: Iterator[MapAnswer], paths: list[str], folders: dict[str, Path]
 ) -> Iterator[int]:
-    """Write the files of each answer and print its line, as they come. Yield the exit codes.
-
-    Args:
-        answers: The answers in any order.
-    """
+    """Write the files of each answer and print its line, as they come. Yield the exit codes."""
     for answer in answers:
         path, code = paths[answer.number], answer.code
         try:
@@ -476,14 +468,9 @@ def _say(answer: MapAnswer, folder: Path) -> None:
 
 
 def _theory(options: argparse.Namespace) -> tuple[Theory | None, dict[str, Any]]:
-    """Find the theory that the options ask for.
+    """Find the theory that the options ask for, and the fields that the user set.
 
-    Returns:
-        The theory and an empty dict, if the user names a theory. Otherwise None, as the theory then
-        depends on the log, and the fields that the user set.
-
-    Raises:
-        TheoryError: A choice is wrong, or contradicts another one.
+    The theory is None, as it depends on the log, unless the user names one. Then the dict is empty.
     """
     asked = theory_of(options)
     choices = {name: getattr(asked, name) for name in choices_of(options)}

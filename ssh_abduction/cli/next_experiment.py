@@ -153,11 +153,7 @@ def _lines(experiment: Experiment) -> Iterator[str]:
 
 
 def _tree(plan: Plan, indent: str) -> Iterator[str]:
-    """Yield a plan as indented lines.
-
-    First come the actions. Then, for each view that may be seen, come the maps that remain and the
-    plan for these.
-    """
+    """Yield a plan as indented lines: actions, and for each view the maps left and their plan."""
     if plan.branches:
         yield f"{indent}{printable(', '.join(plan.actions))}"
     for branch in plan.branches:

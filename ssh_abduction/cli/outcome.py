@@ -118,10 +118,7 @@ _second_opinions: WeakKeyDictionary[Search, list[str]] = WeakKeyDictionary()
 
 
 def _second_opinion(search: Search, solution: Solution) -> list[str]:
-    """Warn if the second best number of views (the runner-up) gives another map.
-
-    The list is empty if it gives the same map, or if too little time is left to find out.
-    """
+    """Warn if the second best number of views (the runner-up) gives another map, in time."""
     if search not in _second_opinions:
         limit = search.limits.time_limit
         left = None if limit is None else limit - solution.seconds.total

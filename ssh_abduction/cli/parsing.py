@@ -207,11 +207,7 @@ class Parser(argparse.ArgumentParser):
         return options
 
     def _with_replacements(self, words: list[str], notes: list[str]) -> list[str]:
-        """Replace options of version 0.1.0 by their new form.
-
-        Returns:
-            The new words.
-        """
+        """Replace options of version 0.1.0 by their new form."""
         at = next((i for i, word in enumerate(words) if not word.startswith("-")), None)
         if at is None:
             return words
@@ -233,14 +229,7 @@ class Parser(argparse.ArgumentParser):
         return done
 
     def _replacement(self, word: str, rest: list[str], notes: list[str]) -> list[str] | None:
-        """Find the new form of an option of version 0.1.0.
-
-        Args:
-            notes: Gets a sentence if the option is replaced.
-
-        Returns:
-            The words of the new form; None if `word` is no such option.
-        """
+        """The new form of an option of version 0.1.0, with a note; None for other words."""
         if self._drops(word, rest, notes):
             return []
         flag, equals, value = word.partition("=")
@@ -265,15 +254,9 @@ class Parser(argparse.ArgumentParser):
         return [f"--{new}={value}"]
 
     def _drops(self, word: str, rest: list[str], notes: list[str]) -> bool:
-        """Drop an option that has no successor, with its value.
+        """Drop an option without a successor, with its value in `rest`, and note it.
 
-        Args:
-            word: The option, or --set, perhaps with "=VALUE".
-            rest: The words behind it. The value, or NAME=VALUE behind --set, is removed.
-            notes: Gets a sentence if the option is dropped.
-
-        Returns:
-            Whether `word` is such an option.
+        False for others.
         """
         is_set = word == "--set" and bool(rest)
         flag, equals, _ = (f"--{rest[0]}" if is_set else word).partition("=")
@@ -302,14 +285,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def _exported(words: list[str], at: int, notes: list[str]) -> list[str]:
-    """Replace `show --dot`, `--graphml` or `--svg` of version 0.1.0 by an `export` command.
-
-    Args:
-        at: The index of the verb.
-
-    Returns:
-        The new words.
-    """
+    """Replace `show --dot`, `--graphml` or `--svg` of version 0.1.0 by an `export` command."""
     kept, target = [], None
     rest = words[at + 1 :]
     while rest:
@@ -333,10 +309,6 @@ def _note(old: str, new: str) -> str:
 
 
 def _meant(word: object, names: Iterable[str]) -> str:
-    """Make a hint such as "; did you mean star?" if a name is similar to a word; else "".
-
-    Args:
-        names: The names that it may mean.
-    """
+    """Make a hint such as "; did you mean star?" if a name is similar to a word; else ""."""
     near = difflib.get_close_matches(str(word), list(names), n=1)
     return f"; did you mean {near[0]}?" if near else ""

@@ -300,8 +300,7 @@ def _camera(options: argparse.Namespace) -> Camera | None:
 def _with_table(trace: Trace, target: str) -> Trace:
     """Write the panoramas of a trace to an .npz file beside it.
 
-    Returns:
-        The trace, whose images are now indices into that file.
+    Its images are then indices into it.
     """
     import io
     from dataclasses import replace

@@ -244,8 +244,7 @@ def _joint(paths: Sequence[str]) -> Trace:
 class _Text:
     """Prints the result of a search for people.
 
-    Attributes:
-        kept: The first maps that were found. Further maps are only counted.
+    `kept` has the first maps; others are only counted.
     """
 
     def __init__(self, search: Search, obeying: Obeying) -> None:
@@ -267,14 +266,7 @@ class _Text:
         return _text(chain(lines, self._obeying.blamed(explanation)))
 
     def last_words(self, why: Stop) -> tuple[str, int]:
-        """Make the output for a process that must end although its search does not stop.
-
-        Args:
-            why: Why the process must end.
-
-        Returns:
-            The text to print, and the exit code.
-        """
+        """The text and exit code of a process that must end although its search does not stop."""
         solution = self._search.snapshot(why)
         kept = (
             tuple(self.kept) if solution.status is Status.OPTIMAL and self.kept else solution.maps
@@ -305,13 +297,9 @@ class _Json:
         return [ssh_map for ssh_map, _ in self._held]
 
     def searched(self, say: Callable[[Callable[[], str]], None]) -> Explanation | None:
-        """Run the search, and keep or print the maps.
+        """Run the search, and keep or print (`say`) the maps.
 
-        Args:
-            say: Prints the text that a function returns.
-
-        Returns:
-            Why there is no map; None if there is one.
+        Return why there is no map, or None.
         """
         say(self._opening)
         for ssh_map in self._search:
@@ -339,14 +327,7 @@ class _Json:
         return f"\n],{dump(end)[1:]}\n"
 
     def last_words(self, why: Stop) -> tuple[str, int]:
-        """Complete the JSON printed so far, as the process must end and its search does not stop.
-
-        Args:
-            why: Why the process must end.
-
-        Returns:
-            The text that completes the JSON, and the exit code.
-        """
+        """The rest of the JSON, and the exit code, if the process must end before its search."""
         solution = self._search.snapshot(why)
         warn(warnings_of(self._search, solution))
         words = ("" if self._begun else self._opening()) + self._let_go()
@@ -428,12 +409,8 @@ def _lines(
 def _progress(prints_meanwhile: bool) -> Iterator[Any]:
     """Show a line of progress on stderr while the block runs, if stderr is a terminal.
 
-    Args:
-        prints_meanwhile: Whether output is printed during the search. If that goes to a terminal,
-            no progress is shown.
-
-    Yields:
-        A function that shows a Progress; None if no progress is shown.
+    Yield a function that shows a Progress. It is None if nothing is shown, as then output that is
+    printed meanwhile goes to a terminal.
     """
     if (
         not sys.stderr.isatty()

@@ -166,12 +166,9 @@ class Standing:
         return self._seen_from(best, self._rounded(drawn[best] - COMPASS[way], text))
 
     def _seen_from(self, label: int, way: float) -> tuple[tuple[str, float], ...]:
-        """List the steps at the place of a dstate, each with the direction of a gateway.
+        """List the steps at the place of a dstate, with the direction of a gateway in degrees.
 
         Without headings, only the steps at the dstate itself are listed.
-
-        Args:
-            way: The direction of the gateway from this dstate, in degrees clockwise from ahead.
         """
         here = self.map.dstates[label]
         unit = 90 if self.in_quarters else 1

@@ -121,12 +121,7 @@ def pair(text: str) -> tuple[int, int]:
 
 
 def _labelled(options: argparse.Namespace) -> tuple[Any, Any, Any]:
-    """Load what a recogniser can learn from.
-
-    Returns:
-        The images of steps with a known label, (n, d); these labels, (n,); and a recogniser that is
-        not trained yet.
-    """
+    """The images, (n, d), and labels, (n,), of steps with a label, and an untrained recogniser."""
     from perception.recognition import recogniser
 
     images, labels, _, features = _mapped(options)
@@ -134,12 +129,7 @@ def _labelled(options: argparse.Namespace) -> tuple[Any, Any, Any]:
 
 
 def _mapped(options: argparse.Namespace) -> tuple[Any, Any, SSHMap, Any]:
-    """Load the images and labels of the trace and map that the options name.
-
-    Returns:
-        The images of steps with a known label, (n, d); these labels, (n,); the map that they come
-        from; and a transformer of images to vectors, which is not fitted yet.
-    """
+    """The images, (n, d), and labels, (n,), of steps with a label, their map, and a transformer."""
     from perception.appearance import features_of
     from perception.images import images_of
     from ssh_abduction.learning.learner import labels_of

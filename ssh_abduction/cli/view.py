@@ -138,9 +138,8 @@ def run(options: argparse.Namespace) -> int:
 def _assuming(listing: Listing, trace: Trace, theory: Theory) -> dict[str, Any]:
     """Compute the costs of assumptions that the page can show without a server.
 
-    Returns:
-        A dict. `texts` lists the different texts. `pairs` has, for each pair of steps "i,j", the
-        indices of two texts: the cost if both are one dstate, and if they are different ones.
+    `pairs` has, for each pair of steps "i,j", the indices of two of the `texts`: the cost if both
+    are one dstate, and if they are different ones.
     """
     from ssh_abduction.page.assumed import assumptions
 
@@ -162,14 +161,7 @@ def _assuming(listing: Listing, trace: Trace, theory: Theory) -> dict[str, Any]:
 
 
 def _run(options: argparse.Namespace, trace: Trace | None, data: Any) -> Run | None:
-    """Make the localised run that the options ask for; None if they ask for none.
-
-    Args:
-        trace: The trace that was mapped; None if it is unknown.
-
-    Raises:
-        AbductionError: A file is wrong, or the run is missing.
-    """
+    """Make the localised run that the options ask for; None if they ask for none."""
     from ssh_abduction.data.trace import Trace
     from ssh_abduction.page.replays import Run
 
@@ -189,14 +181,7 @@ def _run(options: argparse.Namespace, trace: Trace | None, data: Any) -> Run | N
 
 
 def _with_beliefs(followed: Trace, file: str, data: Any) -> Run:
-    """Make a run with beliefs from a file.
-
-    Args:
-        file: The file, as `localise --json` writes it.
-
-    Raises:
-        MapError: The file is malformed, or is of another run or other maps.
-    """
+    """Make a run with beliefs from a file, as `localise --json` writes it, or raise MapError."""
     from ssh_abduction.data.map_file import read_json
     from ssh_abduction.data.maps import maps_of
     from ssh_abduction.page.replays import Run

@@ -144,10 +144,7 @@ def with_fingerprints(trace: Trace) -> tuple[Drive, ...]:
 
 
 def _fingerprint(steps: Sequence[Step]) -> str:
-    """Return a digest of the fields of steps that a solver reads, with stars as the robot saw them.
-
-    It has 16 hexadecimal digits.
-    """
+    """Return a digest, of 16 hexadecimal digits, of the fields of steps that a solver reads."""
     lines = [step.to_json() for step in steps]
     for i, (step, line) in enumerate(zip(steps, lines, strict=True)):
         if SEEN in step.extra:

@@ -300,12 +300,8 @@ def _fitted(
 ) -> tuple[Turned, ...] | None:
     """Do what `fit` does, with a cache: maps of growing prefixes have many places in common.
 
-    Args:
-        headings: The headings of their dstates, which have to fit; None if they need not. Dstates
-            that differ only in their heading are equal, so it is an argument of its own.
-        made: Pairs of these sights, and the turns that lead from the first to the second.
-        axioms: Names of the axioms that hold.
-        most: How many gateways may change between drives.
+    Dstates that differ only in their heading are equal, so `headings` is an argument of its own.
+    `made` has pairs of these sights, and the turns that lead from the first to the second.
     """
     turns = {(a, b): actions for a, b, actions in made}
 
@@ -376,8 +372,7 @@ def _closed(read: Turned) -> frozenset[int]:
 def _changes(closed: Mapping[int, frozenset[int]]) -> float:
     """Count the gateways that change from each drive at a place to the next; inf if too many.
 
-    Args:
-        closed: For each drive at the place, the gateways that are closed.
+    `closed` has the gateways that are closed, for each drive.
     """
     in_order = [closed[drive] for drive in sorted(closed)]
     counts = [len(a ^ b) for a, b in pairwise(in_order)]
@@ -451,13 +446,7 @@ def _allowed(
 ) -> bool:
     """Whether the axioms allow these frames and shifts for two sights at one place.
 
-    Args:
-        a: The earlier sight, or `b` itself.
-        seen_a: Its frame and shift.
-        b: The later sight.
-        seen_b: Its frame and shift.
-        axioms: Names of the axioms that hold.
-        as_shown: Whether the headings that the dstates have must fit, too.
+    The sight `a` is not later than `b`. With `as_shown`, the headings of the dstates must fit, too.
     """
     (first, back), (then, on) = seen_a, seen_b
     shift = (on - back) % max(first.slots, 1)

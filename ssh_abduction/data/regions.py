@@ -106,14 +106,7 @@ def of_members(members: Mapping[Reason, Collection[int]]) -> tuple[Region, ...]:
 
 
 def _smallest_around(places: frozenset[int], before: Iterable[frozenset[int]]) -> tuple[int, ...]:
-    """Find the smallest earlier sets that contain these places and more.
-
-    Args:
-        before: The earlier sets.
-
-    Returns:
-        The indices of the sets that contain the places, but no other such set.
-    """
+    """The indices of the smallest earlier sets that contain these places and more."""
     around = {i: other for i, other in enumerate(before) if places < other}
     return tuple(
         i for i, other in around.items() if not any(within < other for within in around.values())

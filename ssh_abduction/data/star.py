@@ -366,13 +366,7 @@ def _is_seen(entry: Entry) -> bool:
 
 
 def _entry(value: Any, count: int, four: bool, where: str) -> Entry:
-    """Check and return an entry of a star.
-
-    Args:
-        value: What the trace or the caller gives.
-        count: The number of entries of the star.
-        four: Whether the star is written as four of 0, 1 or None.
-    """
+    """Check and return one of `count` entries of a star; `four` for four of 0, 1 or None."""
     if isinstance(value, Gateway):
         value = {name: getattr(value, name) for name in _FIELDS}
     if isinstance(value, Mapping):
@@ -388,11 +382,7 @@ def _entry(value: Any, count: int, four: bool, where: str) -> Entry:
 
 
 def _gateway(value: Mapping[str, Any], count: int, where: str) -> Gateway:
-    """Check and return a gateway that is given as an object.
-
-    Args:
-        count: The number of entries of the star.
-    """
+    """Check and return a gateway that is given as an object."""
     if unknown := [name for name in value if name not in _FIELDS]:
         raise TraceError(
             f"{where}: expected fields out of {', '.join(_FIELDS)}, got {brief(unknown[0])}; "

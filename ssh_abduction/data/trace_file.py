@@ -100,11 +100,7 @@ def read_trace(file: BinaryIO, source: str) -> dict[str, Any]:
 
 
 def _record(raw: bytes, where: str) -> dict[str, Any]:
-    """Parse a line and return its object.
-
-    Args:
-        raw: The line. If it is the first one, it may begin with a byte order mark.
-    """
+    """Parse a line and return its object. The first line may begin with a byte order mark."""
     is_first = where.endswith(":1")
     if is_first:
         _refuse_other_files(raw, where)
@@ -195,12 +191,7 @@ def _header(record: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 
 def _step(record: Mapping[str, Any], where: str, actions: dict[str, Action]) -> Step:
-    """Make a step of the object on a line.
-
-    Args:
-        actions: The actions of earlier steps, by name. Equal actions become one object. A new
-            action is added.
-    """
+    """Make a step of the object on a line. Equal actions become one object, kept in `actions`."""
     given = {name: record.get(name) for name in _STEP_FIELDS}
     if given["view"] is not None:
         given["view"] = checked_view(given["view"], f"{where}: view")

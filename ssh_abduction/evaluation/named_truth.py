@@ -189,17 +189,9 @@ def tells_names(trace: Trace) -> bool:
 
 
 class _Truth:
-    """The true names of the dstate, place, path and course of each step.
+    """The true names of the dstate, place, path and course of each step; None for unknown ones.
 
-    Attributes:
-        trace: The trace.
-        dstates: The name of the true dstate of each step; None if unknown.
-        places: The name of the true place of each step; None if unknown.
-        paths: The name of the true path of each step; None if unknown.
-        courses: The true path and direction of each step; None if unknown.
-
-    Raises:
-        TraceError: No step has a name, or a dstate has two places, paths or courses.
+    Raises TraceError if no step has a name, or a dstate has two places, paths or courses.
     """
 
     def __init__(self, trace: Trace) -> None:
@@ -348,12 +340,7 @@ def _evaluated(ssh_map: SSHMap, truth: _Truth) -> MapEvaluation:
 
 
 class _Sort:
-    """One sort of thing (dstates, places, paths or courses) in a map and in the truth.
-
-    Args:
-        said: The thing that the map has for each step; None for nothing.
-        true: The true thing of each step; None if unknown.
-    """
+    """One sort of thing (dstates, places, paths or courses) in a map and in the truth, by step."""
 
     def __init__(self, said: Sequence[Hashable], true: Sequence[Hashable]) -> None:
         self.said, self.true = said, true
@@ -414,12 +401,9 @@ class _Sort:
     def edges(
         self, hops: Iterable[int], edge: Callable[[int, Hashable, Hashable], Hashable]
     ) -> tuple[float | None, float | None]:
-        """Compute the precision and recall of edges, under the assignment.
+        """Precision and recall of edges, made of `hops` (steps t with an edge to t + 1).
 
-        Args:
-            hops: The steps t such that an edge leads from step t to step t + 1.
-            edge: A function that makes an edge of such a step and the things at both ends. Equal
-                edges count once.
+        Equal ones are one.
         """
         if not self.of_map:
             return None, None

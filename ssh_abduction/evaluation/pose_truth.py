@@ -282,8 +282,7 @@ def _pose(value: Any, where: str) -> Pose | None:
 class _Poses:
     """The truth by the poses of a trace.
 
-    Attributes:
-        known: For each step, whether its pose is known, (n,).
+    `told` says for each step whether its pose is known, (n,).
     """
 
     name = "poses"
@@ -300,21 +299,19 @@ class _Poses:
         self._poses = np.array([(math.nan,) * 3 if pose is None else pose for pose in poses])
 
     def seen_from(self, step: int) -> tuple[Array, Array, Array]:
-        """Compare the poses of all steps with the pose of one step.
+        """Compare the poses of all steps with the pose of one step, (n,).
 
-        Returns:
-            Distances in metres, (n,), differences of headings in degrees, (n,), and the possible
-            errors of the distances in metres, (n,). Values are NaN if a pose is unknown.
+        The result is distances in metres, differences of headings in degrees, and possible errors
+        of the distances in metres. Values are NaN if a pose is unknown.
         """
         dx, dy, turned = (self._poses - self._poses[step]).T
         return np.hypot(dx, dy), _degrees(turned), np.zeros(len(dx))
 
 
 class _Related:
-    """The truth by relations, at the times of the steps of a trace.
+    """The truth by relations.
 
-    Attributes:
-        known: For each step, whether its time is near related times, (n,).
+    `told` says whether the time of each step is near related times, (n,).
     """
 
     name = "relations"
@@ -363,16 +360,10 @@ def _degrees(radians: Array) -> Array:
 def _verdicts(
     truth: _Poses | _Related, visit: Steps, near: float, turned: float
 ) -> tuple[Verdicts, Verdicts]:
-    """Judge each pair of visits, and each pair of steps of different visits.
+    """Judge each pair of visits, (v, v), and each pair of steps of different visits, (n, n).
 
-    Args:
-        visit: The visit of each step, (n,), counted from 0.
-        near: The greatest distance of two poses at one place in metres.
-        turned: The greatest difference of two headings at one dstate in degrees.
-
-    Returns:
-        The verdicts UNKNOWN, APART, RETURN or STAYED on pairs of visits, (v, v), and on pairs of
-        steps, (n, n). The row is the earlier one of a pair. All other entries are UNKNOWN.
+    Poses at one place are at most `near` metres apart, and headings at one dstate at most `turned`
+    degrees. The row is the earlier one of a pair. All other entries are UNKNOWN.
     """
     steps = np.arange(len(visit))
     # A visit has the pose of the first of its steps whose pose is known.
@@ -400,24 +391,13 @@ def _verdicts(
 
 
 def _pairs(verdicts: Verdicts, visit: Steps) -> Pairs:
-    """Count the pairs of different visits by verdict.
-
-    Args:
-        verdicts: The verdict on each pair, (n, n).
-        visit: The visit of each row, (n,).
-    """
+    """Count the pairs of different visits by verdict, (n, n), with the visit of each row, (n,)."""
     counts = Counter(verdicts[visit[:, None] < visit].tolist())
     return Pairs(counts[APART] + counts[RETURN], counts[RETURN], counts[STAYED], counts[UNKNOWN])
 
 
 def _evaluated(ssh_map: SSHMap, visit: Steps, places: Verdicts, dstates: Verdicts) -> MapVisits:
-    """Measure the accuracy of a map.
-
-    Args:
-        visit: The visit of each step, (n,).
-        places: The verdicts on pairs of visits, (v, v).
-        dstates: The verdicts on pairs of steps, (n, n).
-    """
+    """Measure a map by the verdicts on pairs of visits (`places`) and of steps (`dstates`)."""
     at = [ssh_map.dstates[label] for label in ssh_map.dstate_at]
     one = np.equal.outer(*[[s.id for s in at]] * 2)
     if not ssh_map.places:
@@ -435,13 +415,7 @@ def _evaluated(ssh_map: SSHMap, visit: Steps, places: Verdicts, dstates: Verdict
 
 
 def _joined(one: NDArray[np.bool_], verdicts: Verdicts, things: int) -> MapPairs:
-    """Count the judged pairs that a map has at one place (or dstate).
-
-    Args:
-        one: For each pair, whether the map has both at one place (or dstate), (n, n).
-        verdicts: The verdict on each pair, (n, n). Entries that are UNKNOWN do not count.
-        things: The number of places (or dstates) of the map.
-    """
+    """Count the judged pairs, (n, n), that a map has at `one` place or dstate out of `things`."""
     right = int((one & (verdicts == RETURN)).sum())
     return MapPairs(
         things,

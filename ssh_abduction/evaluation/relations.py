@@ -171,11 +171,7 @@ class Relations:
         return found
 
     def _composed(self, node: int, before: Sequence[int], poses: dict[int, Pose]) -> Pose:
-        """Compose the pose at a node along the shortest way.
-
-        Args:
-            before: For each node, the node before it on its shortest way.
-        """
+        """Compose the pose at a node along the shortest way, from the node `before` each node."""
         way = []
         while node not in poses:
             way.append(node)

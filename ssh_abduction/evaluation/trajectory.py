@@ -283,15 +283,7 @@ def _is_number(field: str) -> bool:
 
 
 def _pose(fields: Sequence[str], where: str) -> tuple[float, Pose, float, float]:
-    """Read a line.
-
-    Returns:
-        The time in seconds, the pose (x, y, heading) on the floor, the height in metres, and the
-        cosine of the angle by which the pose leans.
-
-    Raises:
-        TraceError: The line is malformed.
-    """
+    """Read a line: seconds, pose on the floor, height in metres, and the cosine of its lean."""
     if len(fields) != len(FIELDS) or not all(map(_is_number, fields)):
         hint = {
             12: "; this looks like a file of KITTI, which has no times",
@@ -315,13 +307,7 @@ def _pose(fields: Sequence[str], where: str) -> tuple[float, Pose, float, float]
 
 
 def _warn_of_space(source: str, rise: float, leaning: int, count: int) -> None:
-    """Warn if a trajectory is not on a floor, for example because it is that of a camera.
-
-    Args:
-        rise: The difference between the greatest and the least height in metres.
-        leaning: The number of poses that lean by more than 30 degrees.
-        count: The number of poses.
-    """
+    """Warn if a trajectory is not on a floor, as its height changes (metres) or its poses lean."""
     if rise > FLAT or 2 * leaning > count:
         warnings.warn(
             f"{named(source)}: expected a trajectory on a floor, x and y in metres, got one that "

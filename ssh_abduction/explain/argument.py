@@ -76,12 +76,10 @@ def derive(
 
 @dataclass(frozen=True)
 class _Line:
-    """A line of an argument: new conclusions from some links and the lines before it.
+    """A line of an argument: new conclusions from `group`, links, and the lines before it.
 
-    Attributes:
-        group: The links, pairs of an axiom and a step.
-        conclusions: The new conclusions. Empty if the line reaches a contradiction.
-        supposed: Whether the line holds only under the supposition that leads to a contradiction.
+    Without conclusions, it reaches a contradiction. A supposed line holds only under the
+    supposition that leads to it.
     """
 
     group: tuple[tuple[str, int], ...]
@@ -194,14 +192,9 @@ class Argument:
         assumed: Sequence[Assumption],
         known: frozenset[clingo.Symbol],
     ) -> tuple[tuple[str, int], ...] | None:
-        """Find the first link of `left` that gives a new conclusion or a contradiction.
+        """Find the first link of `left`, in a tuple, with a new conclusion or a contradiction.
 
-        Args:
-            left: The links not yet in the argument.
-            assumed: The supposition, if there is one.
-
-        Returns:
-            The link, alone in a tuple; None if no single link gives anything new.
+        None if no single link gives anything new.
         """
         for link in left:
             active = _active([*placed, link])
@@ -216,9 +209,7 @@ class Argument:
     ) -> None:
         """Add a line if some known conclusions are new.
 
-        Args:
-            known: All conclusions that hold with these links.
-            supposed: Whether they hold only under the supposition.
+        If `supposed`, they need the supposition.
         """
         new = known - self._born.keys()
         if new:
@@ -284,12 +275,8 @@ class Argument:
     ) -> tuple[list[clingo.Symbol], tuple[tuple[str, int], ...]]:
         """Find a minimal set of earlier conclusions that imply a conclusion, and its links.
 
-        Args:
-            conclusion: The conclusion; None for the contradiction at the end.
-
-        Returns:
-            The earlier conclusions, and the links: those of the line of the conclusion, and earlier
-            ones that are needed again.
+        None stands for the contradiction at the end. The links are those of the line of the
+        conclusion, and earlier ones that are needed again.
         """
         line = self._line_of(conclusion)
         number = len(self._lines) - 1 if conclusion is None else self._born[conclusion]
@@ -342,12 +329,7 @@ class Argument:
         premises: tuple[int, ...],
         needed: Sequence[tuple[str, int]],
     ) -> Inference:
-        """Put a line into words.
-
-        Args:
-            conclusions: The conclusions of the line; None for the contradiction.
-            premises: The indices of the lines that it follows from.
-        """
+        """Put a line into words. `premises` are the indices of the lines that it follows from."""
         line = self._line_of(conclusions[0])
         known = [symbol for symbol, born in self._born.items() if born <= self._lines.index(line)]
         self._words.know(known)
@@ -373,11 +355,7 @@ class Argument:
         premises: dict[clingo.Symbol | None, list[clingo.Symbol]],
         links: dict[clingo.Symbol | None, tuple[tuple[str, int], ...]],
     ) -> str:
-        """Summarise the argument: the premises and axioms of the last line with several premises.
-
-        Args:
-            goal: The last conclusion; None for a contradiction.
-        """
+        """Summarise the argument by the last line with several premises."""
         conclusion = goal
         while len(premises[conclusion]) == 1:
             conclusion = premises[conclusion][0]

@@ -32,15 +32,7 @@ class Interrupted(Exception):  # noqa: N818 - not an error
 
 
 class _Answer(NamedTuple):
-    """A model of clingo, read as a map.
-
-    If axioms are relaxed, the map may break some of them.
-
-    Attributes:
-        labels: The dstate of each step.
-        places: The place of each step; None for a step at no place.
-        ssh_map: The map.
-    """
+    """A model of clingo, read as a map. If axioms are relaxed, the map may break some of them."""
 
     labels: tuple[int, ...]
     places: tuple[int | None, ...]
@@ -53,12 +45,9 @@ class _Answer(NamedTuple):
 
 
 class _Seen(NamedTuple):
-    """A model that clingo found during an argument.
+    """A model that clingo found during an argument: its conclusions, and the links that it breaks.
 
-    Attributes:
-        conclusions: The conclusions that hold in the model.
-        broken: The `active` atoms (an axiom at a step) that the model breaks.
-        one: The atoms of the pairs of steps that are one dstate in the model.
+    `one` has the atoms of the pairs of steps that are one dstate in the model.
     """
 
     conclusions: frozenset[clingo.Symbol]
@@ -327,15 +316,10 @@ class Axioms:
     def _refused(
         self, answer: _Answer, active: Collection[tuple[str, int]]
     ) -> tuple[str, Refusal] | None:
-        """Find equalities of a model that some evidence rejects.
+        """Find equalities of a model that some evidence rejects, with the axiom of the evidence.
 
-        Args:
-            active: The pairs (axiom, step) that have to hold, if the axioms are relaxed. Then a
-                rejection counts only if its axiom is active at the step of `_judged_at`.
-
-        Returns:
-            The name of the axiom of the evidence and the equalities; None if all evidence accepts
-            the model.
+        If axioms are relaxed, a rejection counts only if its axiom is in `active` at the step of
+        `_judged_at`.
         """
         for evidence in self._evidence:
             if not self._pairs:
@@ -367,26 +351,16 @@ class Axioms:
     def _refused_together(
         self, displacement: Displacement, answer: _Answer, step: int
     ) -> Refusal | None:
-        """Find two returns of a model that displacements reject together.
+        """Find two returns, the later one to `step`, that displacements reject together.
 
         A return is two steps at one dstate or at one place.
-
-        Args:
-            step: The last step of the later return.
-
-        Returns:
-            The two equalities; None if no such pair is rejected.
         """
         if displacement.joint == 1:
             return None
         return displacement.returns_of(self._trace).refused_at(answer.labels, answer.places, step)
 
     def _forbid(self, refusal: Refusal, where: clingo.Symbol | None = None) -> None:
-        """Add a constraint that these equalities do not all hold.
-
-        Args:
-            where: An atom. If given, the constraint applies only while this atom is true.
-        """
+        """Add a constraint that these equalities do not all hold, while `where` is true."""
         name = f"told_{self._refusals}"
         self._refusals += 1
         self._control.add(name, [], facts.forbidden_equalities(refusal, where))
@@ -464,8 +438,7 @@ class Axioms:
     ) -> list[clingo.Symbol]:
         """Drop unneeded pairs (axiom, step) in their order, whole axioms first.
 
-        Returns:
-            The `active` atoms of the pairs that are left.
+        Return the atoms left.
         """
         # the last unsat core: as long as all of it is kept, there is no map
         core: set[clingo.Symbol] | None = None

@@ -220,12 +220,10 @@ class TraceQuestion(Question[TraceExplanation]):
     def _observations(
         self, stretch: range
     ) -> Iterator[tuple[int, str, str, Iterable[tuple[str | None, Trace, Theory]]]]:
-        """List the observations of a stretch, with their alternatives.
+        """Yield the step, kind, value and alternatives of each observation of a stretch.
 
-        Yields:
-            The step, kind and value of an observation, and its alternatives. An alternative is the
-            other value in words (None if the observation is dropped), the changed trace, and the
-            changed theory.
+        An alternative is the other value in words (None if the observation is dropped), the changed
+        trace, and the changed theory.
         """
         trace, theory = self.trace, self.theory
         names = named_steps(drives_of(trace), len(trace))

@@ -296,8 +296,7 @@ class PairQuestion(Question[PairExplanation]):
     def _list_minimal_maps(self, settled: bool) -> None:
         """List minimal maps, and count those of each side.
 
-        Args:
-            settled: Whether the verdict is already final. Then only look for any one map.
+        If the verdict is `settled`, look for one.
         """
         left = self._watch.left()
         seconds = (

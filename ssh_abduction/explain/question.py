@@ -97,11 +97,7 @@ class Question(ABC, Generic[_Answer]):
         return self.stopped is not None
 
     def _solved(self, trace: Trace, theory: Theory, maps: int | None, seconds: float) -> Search:
-        """Make a search for maps.
-
-        Args:
-            maps: List at most this many maps; None for all.
-        """
+        """Make a search for maps."""
 
         def end_with_this(_: Progress) -> None:
             if self._over():
@@ -125,11 +121,7 @@ class Question(ABC, Generic[_Answer]):
         cost: Cost | None,
         nats: float | None,
     ) -> tuple[str, ...]:
-        """Say which gateways at some places changed between drives, and what that costs.
-
-        Args:
-            nats: Its cost in nats; None if maps are not weighed.
-        """
+        """Say which gateways at some places changed between drives, and what that costs."""
         changes = changes_at(ssh_map, places)
         if not changes or cost is None:
             return ()

@@ -208,10 +208,9 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
         return ViewClusterer(random_state=0, isolated=ISOLATED if theory.misread else None)
 
     def _followed(self, traces: Traces, looks: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Follow traces on the map. Return the dstate of each step, (m,), or -1 if it is unknown.
+        """Follow traces on the map, by the dstate that each image looks like, (m,).
 
-        Args:
-            looks: The dstate that the image of each step looks like, (m,).
+        Unknown ones are -1.
         """
         views = self.clusterer_.predict(self.features_.transform(traces.images))
         return labels_on(self.map_, traces, views, looks)

@@ -124,13 +124,9 @@ def _has_turns_of_its_own(ssh_map: SSHMap) -> bool:
 def _links_of(
     sources: NDArray[np.intp], targets: NDArray[np.intp], weights: NDArray[np.float64], number: int
 ) -> Links:
-    """Make the links of one action from weights of pairs of dstates.
+    """Make the links of one action from weights of pairs of dstates, (n,).
 
-    Args:
-        sources: The dstates where the action begins, (n,).
-        targets: The dstates where it ends, (n,).
-        weights: How likely each pair is, relative to other pairs with the same source, (n,).
-        number: The number of dstates.
+    A weight says how likely a pair is, relative to other pairs with the same source.
     """
     totals = np.bincount(sources, weights, number)
     missing = np.where(totals > 0, 0.0, 1.0)

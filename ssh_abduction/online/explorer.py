@@ -309,11 +309,7 @@ class Explorer:
         )
 
     def _ending(self, unique: bool) -> Ending:
-        """Say why the exploration ended, or would end now.
-
-        Args:
-            unique: Whether all minimal maps have the same dstates and places.
-        """
+        """Say why the exploration ended, or would end now. `unique`: all minimal maps are alike."""
         if self.solution.status is Status.UNSATISFIABLE:
             return "contradicted"
         if not self._is_stuck:
@@ -325,11 +321,7 @@ class Explorer:
         return "done" if unique else "inseparable" if self.solution.complete else "time"
 
     def _is_true(self, unique: bool) -> bool | None:
-        """Whether the map is unique and true; None if the robot's steps have no truth.
-
-        Args:
-            unique: Whether all minimal maps have the same dstates and places.
-        """
+        """Whether the map is unique and true; None if the robot's steps have no truth."""
         if all(truth is None for truth in self._truths):
             return None
         if not unique:
@@ -389,10 +381,7 @@ class Explorer:
         """Find actions that test whether one of the returns of the minimal map is wrong.
 
         A return is a pair of visits that the map has at one place. The actions distinguish the map
-        from the best map without this return.
-
-        Returns:
-            The actions; empty if no doubt is left that the robot can test.
+        from the best map without this return. They are empty if no doubt is left to test.
         """
         trace, theory, dstates = self.mapper.trace, self.mapper.theory, len(best.dstates)
         for doubt in self._doubts.in_doubt(best, trace):

@@ -205,11 +205,8 @@ class Rival:
     ) -> Rival:
         """Extend this rival by a step at the dstate `there`.
 
-        Args:
-            link: The name of the action if this step adds a link; else None.
-            new: The view and star of the dstate if it is new; else None.
-            faults: The faults that this step adds.
-            tenths: The cost of these faults, in tenths of dstates.
+        `link` names the action if the step adds a link. `new` is the view and star of a new dstate.
+        `tenths` is the cost of the faults that it adds, in tenths of dstates.
         """
         tenths += DSTATE if new else 0
         return Rival(

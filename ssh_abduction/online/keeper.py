@@ -172,13 +172,7 @@ class MapKeeper:
             self.drafts.add(found[0], self.trace)
 
     def _solution(self, began: float) -> Solution:
-        """Make the solution for the steps so far.
-
-        It has the minimal maps, else one consistent map, else no map.
-
-        Args:
-            began: When the step began, by `time.perf_counter`.
-        """
+        """The solution so far: the minimal maps, else one consistent map, else no map."""
         asked = self.solver.solution
         assert asked is not None
         minimal, steps = self.minimal, len(self.trace)

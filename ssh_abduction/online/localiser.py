@@ -236,12 +236,9 @@ class Localiser:
         return None if view is None else self._shown.get(view, NOVEL)
 
     def _spread(self, ratios: NDArray[np.float64]) -> Observation:
-        """Make an observation of an image.
+        """Make an observation of an image, from f(o|x) / q(o) for each dstate x that is known.
 
         For a dstate that the recogniser knows no image of, the ratio is 1, as at an unknown place.
-
-        Args:
-            ratios: f(o|x) / q(o) of the image, for each dstate x that the recogniser knows.
         """
         assert self._seen is not None
         spread = np.ones(self._number)
@@ -282,12 +279,7 @@ class Localiser:
         return Belief(moved, entered + stayed, akin=akin)
 
     def _alike(self, before: Observation | None, move: Move, seen: Observation | None) -> float:
-        """Compute p(o'|akin) / q(o') for two observations with an action between them.
-
-        Args:
-            before: The observation o before the action; None if there was none.
-            seen: The observation o' after it; None if there was none.
-        """
+        """Compute p(o'|akin) / q(o') for two observations with an action between them."""
         links = self._moves.links(move)
         if before is None or seen is None or links is None:
             return 1.0
@@ -315,12 +307,7 @@ class Localiser:
         return alike
 
     def _weighed(self, expected: Belief, seen: Observation | None, alike: float = 1.0) -> Belief:
-        """Compute the belief after an observation o: the product in equation 2, normalised.
-
-        Args:
-            expected: The belief before the observation.
-            seen: The observation; None if there was none.
-        """
+        """Compute the belief after an observation o: the product in equation 2, normalised."""
         weights = self._products(expected, seen)
         unknown = expected.akin * alike + 1 - expected.akin  # p(o|nowhere) / q(o)
         nowhere = expected.nowhere * unknown
@@ -342,12 +329,7 @@ class Localiser:
         )
 
     def _products(self, expected: Belief, seen: Observation | None) -> NDArray[np.float64]:
-        """Multiply the probability of each dstate x by p(o|x) / q(o), (N,).
-
-        Args:
-            expected: The belief before the observation o.
-            seen: The observation; None multiplies by 1.
-        """
+        """Multiply the probability of each dstate x by p(o|x) / q(o), (N,)."""
         p = expected.probabilities
         if seen is None:
             return p.copy()
@@ -356,10 +338,7 @@ class Localiser:
         return products
 
     def _likelihood(self, recogniser: Any) -> ImageLikelihood:
-        """Make the object that computes how probable an image is at each dstate.
-
-        Raises LocaliserError if a label of the recogniser is no dstate of the map.
-        """
+        """Make the object that computes how probable an image is at each dstate."""
         from perception.likelihood import ImageLikelihood
 
         found = ImageLikelihood.of(recogniser)

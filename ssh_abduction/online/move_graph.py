@@ -226,13 +226,7 @@ class MoveGraph:
                     self._imply(course, other, around if self._is_around(course, other) else None)
 
     def _imply(self, source: Node, target: Node, action: str | None) -> None:
-        """Add a move that the paths of the map imply, unless the map has a link for it.
-
-        Add no move to another floor, as paths do not lead there.
-
-        Args:
-            action: The name of its action; None if it is unknown.
-        """
+        """Add an implied move, unless the map has a link for it or it leads to another floor."""
         is_known = self._graph.has_edge(source, target)
         if not is_known and self._floor(source) == self._floor(target):
             cost = self._cost(source, target, UNTRIED_MOVE if action else OPEN_TURN)
@@ -253,15 +247,7 @@ class MoveGraph:
         return move + (self._travel_cost if travels else 0.0)
 
     def _only_action(self, *, onward: bool) -> str | None:
-        """Find the only action of its kind, if there is only one.
-
-        Args:
-            onward: True for the action that leads on along a path to another place. False for the
-                action that turns around.
-
-        Returns:
-            The name of the action; None if the links of the map have none or several.
-        """
+        """The only action that leads onward along a path, or turns around; None if not one."""
         dstates, names = self.map.dstates, set()
         for source, action, target in self.map.links:
             s, x = dstates[source], dstates[target]
@@ -271,11 +257,9 @@ class MoveGraph:
         return names.pop() if len(names) == 1 else None
 
     def _dstates_at(self, place: int, field: str) -> set[Node]:
-        """Find the dstates at a place. Raise MapError if the map has no such place.
+        """Find the dstates at a place.
 
-        Args:
-            place: The number of the place.
-            field: The parameter that it was given for, for messages.
+        Raise MapError, naming `field`, if the map has no such place.
         """
         members = self._dstates_in({place})
         if not members:

@@ -125,11 +125,7 @@ class Recovery:
             self.solver.begin_in_background(self._trace, self._theory)
 
     def _solution(self, began: float) -> Solution:
-        """Make the solution for the steps so far: the minimal maps, else the best rival, else none.
-
-        Args:
-            began: When the step began, by `time.perf_counter`.
-        """
+        """The solution so far: the minimal maps, else the best rival, else none."""
         maps, steps = self._maps, len(self._trace)
         maps.drop_inconsistent()
         lead, solved = maps.lead, maps.solved

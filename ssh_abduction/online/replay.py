@@ -111,11 +111,7 @@ class MinimalMaps:
         return untried
 
     def _outcome(self, replayed: ReplayedMap, trace: Trace, action: str, pairs: Pairs) -> Outcome:
-        """Extend a map by the last step if both the map and the evidence allow it.
-
-        Args:
-            action: The name of the action before the last step.
-        """
+        """Extend a map by the last step if both the map and the evidence allow it."""
         outcome = replayed.follow(action, self._seen[-1], pairs)
         if outcome is Outcome.PREDICTED and not self._judging.allows_grown(
             trace, replayed.map(), len(trace) - 1

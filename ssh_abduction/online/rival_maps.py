@@ -262,11 +262,9 @@ class RivalMaps:
         return Scale.of(self._theory, RARE, dstates, len(self._views)).shares(rivals)
 
     def _sentence(self, t: int, lead: Rival, there: int, seen: Seen) -> str:
-        """Describe a step that contradicts the best map.
+        """Describe step t, which contradicts the best map.
 
-        Args:
-            t: The number of the step.
-            there: The dstate at which this map expected the step.
+        It expected the step at the dstate `there`.
         """
         kinds = [kind for kind in ("misread", "slipped") if getattr(self._theory, kind)]
         expected = lead.shows[there]

@@ -330,12 +330,9 @@ def _raise_no_route(
 def _agreeing(
     ssh_map: SSHMap, start: int, moves: Sequence[Move], maps: Sequence[SSHMap]
 ) -> tuple[int, ...]:
-    """Find the maps in which the moves of a route lead to the same views.
+    """The numbers, from 1, of the maps in which the moves of a route lead to the same views.
 
     Each map begins where it has the robot at the steps that `ssh_map` has at `start`.
-
-    Returns:
-        The numbers of these maps, from 1.
     """
     steps = [t for t, label in enumerate(ssh_map.dstate_at) if label == start]
     agree = []
@@ -350,11 +347,7 @@ def _agreeing(
 def _leads_to(
     leads: dict[tuple[int, str], int], ssh_map: SSHMap, dstate: int, moves: Sequence[Move]
 ) -> bool:
-    """Whether a map has links for the actions of these moves, and they lead to the same views.
-
-    Args:
-        leads: The dstate that each link leads to, by its dstate and the name of its action.
-    """
+    """Whether a map has links for the actions of these moves, and they lead to the same views."""
     for move in moves:
         target = leads.get((dstate, move.action or ""))
         if target is None or ssh_map.dstates[target].view != move.view:

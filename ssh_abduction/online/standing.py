@@ -90,14 +90,7 @@ def chances_of(theory: Theory) -> Chances:
 
 @dataclass(frozen=True, slots=True)
 class _Located:
-    """The belief in one map after the first steps, and the localiser that continues it.
-
-    Attributes:
-        map_key: The dstates and links of the map.
-        localiser: The localiser in this map.
-        belief: The belief.
-        steps: The number of actions that the belief includes.
-    """
+    """The belief in a map after the first steps, and the localiser that continues it."""
 
     map_key: object
     localiser: Localiser
@@ -222,9 +215,6 @@ def _is_decided(maps: RivalMaps, rivals: Sequence[Rival], shares: Sequence[float
 
     All minimal maps must be known and predict the same from here on. Rivals that predict this too
     must have at least the probability CERTAIN, together with the minimal maps.
-
-    Args:
-        rivals: The rivals that later steps have to decide between.
     """
     if not maps.is_complete:
         return False

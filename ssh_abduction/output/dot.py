@@ -32,9 +32,6 @@ def _clusters(ssh_map: SSHMap, places: set[int], after: int, indent: str = "  ")
 
     Of two such regions, one contains the other, or they have no place in common. The largest come
     first.
-
-    Args:
-        indent: The spaces before each line.
     """
     lines, left = [], set(places)
     for region in (ssh_map.regions or ())[after:]:

@@ -130,16 +130,10 @@ def headings_by(
 
 
 def _synchronised(graph: nx.MultiDiGraph[Any], first: Course, robust: bool) -> dict[Course, float]:
-    """Find the headings of the courses of a connected part, relative to the first course.
+    """Find the headings of the courses of a connected part, in radians from the first course.
 
     With `robust`, the sum of absolute errors is minimised, not the sum of squares. This is done by
     averaging again and again, with weights that are lower for turns with larger errors.
-
-    Args:
-        first: The course with the heading 0.
-
-    Returns:
-        The heading of each course in radians counterclockwise.
     """
     # Begin with headings along a tree of turns.
     angles = {first: 0.0}

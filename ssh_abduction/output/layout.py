@@ -167,10 +167,8 @@ def travelled(ssh_map: SSHMap, path: MapPath) -> list[tuple[int, int]]:
 class _Drawing:
     """Computes the layout of a map without poses.
 
-    A spot is the id of a place, or a negative number for a dstate without a place.
-
-    Args:
-        degrees: For each action's name, the degrees clockwise that it turns, and their weight.
+    A spot is the id of a place, or a negative number for a dstate without a place. `degrees` has,
+    for each action's name, the degrees clockwise that it turns, and their weight.
     """
 
     def __init__(self, ssh_map: SSHMap, degrees: Mapping[str, tuple[float, float]]) -> None:
@@ -234,13 +232,9 @@ class _Drawing:
         return Layout({}, tuple((float(x), float(y), None) for x, y in at / nearest))
 
     def _course(self, s: DState, whole: bool) -> tuple[Course, float]:
-        """Find the course of a dstate: the path, or part of a path, that is drawn straight.
+        """The course of a dstate, and the radians from its heading to that of the dstate.
 
-        Args:
-            whole: Whether whole paths are straight. Otherwise only their segments are.
-
-        Returns:
-            The course, and the radians from the heading of the course to that of the dstate.
+        A course is drawn straight. It is a `whole` path, or a part of one.
         """
         if s.path is None:
             return (-1 - s.id,), 0.0
@@ -252,10 +246,6 @@ class _Drawing:
 
         They join neighbours on paths. If only segments are straight, the robot's travels along
         paths are streets, too.
-
-        Args:
-            headings: The heading of each dstate, in radians.
-            whole: Whether whole paths are straight.
         """
         # The heading of direction +1 of each path at each of its spots.
         facing = {
@@ -291,8 +281,7 @@ class _Drawing:
     def _packed(self, at: Mapping[int, Point]) -> dict[int, Point]:
         """Move parts of the map that no street connects side by side.
 
-        Returns:
-            The new position of each spot. The first one is at (0, 0).
+        The first spot is at (0, 0).
         """
         graph: nx.Graph[Any] = nx.Graph()
         graph.add_nodes_from(self.spots)

@@ -131,11 +131,7 @@ class _Picture:
         return pose.x * self.scale, -pose.y * self.scale
 
     def along(self, s: DState, ahead: float, left: float = 0.0) -> Point:
-        """Find a point of the page relative to a dstate.
-
-        Args:
-            ahead: How far ahead of the dstate the point is, in units of the page times `unit`.
-        """
+        """The point `ahead` and `left` of a dstate, in units of the page times `unit`."""
         pose, u = self.poses[s.id], self.unit
         x, y = self.on_page(pose)
         cos, sin = math.cos(pose.heading) * u, math.sin(pose.heading) * u
@@ -162,14 +158,7 @@ class _Picture:
         return titled(title, circle)
 
     def ellipse(self, spot: Point, spread: tuple[float, float, float]) -> list[str]:
-        """Draw an ellipse of two standard deviations around a point of the page.
-
-        Args:
-            spread: The covariance (xx, xy, yy) in square metres.
-
-        Returns:
-            The ellipse; an empty list if it is too small or too large to draw.
-        """
+        """Draw two standard deviations of a covariance (xx, xy, yy) in m², if of a fit size."""
         (major, minor), angle = axes(spread)
         rx, ry = DEVIATIONS * major * self.scale, DEVIATIONS * minor * self.scale
         if rx < 0.5 or rx > WIDEST:
@@ -269,12 +258,7 @@ class _Picture:
     def label(
         self, label: str, spots: Iterable[Point], colour: str, size: float, weight: str = "normal"
     ) -> list[str]:
-        """Draw a label at the first point where it overlaps nothing; empty if there is none.
-
-        Args:
-            spots: The points to try, in order.
-            size: The font size, before it is reduced for lack of room.
-        """
+        """Draw a label at the first point where it overlaps nothing; else nothing."""
         w, h = self.half(label, size)
         for x, y in spots:
             if all(
@@ -364,10 +348,7 @@ class _Picture:
         ]
 
     def scale_bar(self) -> list[str]:
-        """Draw a scale bar below the map on the left.
-
-        Its length in metres is 1, 2 or 5 times a power of ten.
-        """
+        """Draw a scale bar of 1, 2 or 5 times a power of ten metres, below the map on the left."""
         left, below = min(x for x, _ in self.points), max(y for _, y in self.points) + 24
         metres = _round_length(120 / self.scale)
         right = left + metres * self.scale
@@ -436,14 +417,9 @@ def _spots(ssh_map: SSHMap, poses: Sequence[Pose]) -> list[Point]:
 
 
 def _scale(spots: Sequence[Point], nearest: float) -> tuple[float, float]:
-    """Choose a scale at which places are far enough apart and the page is not too large.
+    """The units of the page for each metre, and the factor for the size of marks, at most 1.
 
-    Args:
-        spots: Positions of places, in metres.
-        nearest: The distance that the two nearest places should have, in units of the page.
-
-    Returns:
-        Units of the page for each metre, and a factor for the size of marks, at most 1.
+    Places are far enough apart, the `nearest` two by that many units, and the page not too large.
     """
     extent = max((max(numbers) - min(numbers) for numbers in zip(*spots, strict=True)), default=0.0)
     if extent < 1e-3:  # one place, or all in one spot

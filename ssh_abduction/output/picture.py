@@ -182,10 +182,9 @@ def _freest(taken: list[float]) -> float:
 
 
 def _causal(ssh_map: SSHMap, found: Layout) -> tuple[list[str], list[Point]]:
-    """Draw a map without places: its dstates, and links as arrows.
+    """Draw a map without places: dstates, and links as arrows.
 
-    Returns:
-        The marks, and the points that the page has to include.
+    Return marks and points to include.
     """
     spots = [_on_page(x, y) for x, y, _ in found.dstates]
     faults = faults_of(ssh_map)

@@ -92,11 +92,7 @@ def _draw_dstate(
 ) -> tuple[float, float]:
     """Draw a dstate as a triangle ahead of its place, or as its number in a circle.
 
-    Args:
-        pose: Its position, and its heading in radians (None if it is unknown).
-
-    Returns:
-        The position of the mark.
+    Return the place.
     """
     x, y, heading = pose
     middle = {"ha": "center", "va": "center"}

@@ -40,13 +40,10 @@ BEAM = 3
 
 @dataclass(frozen=True, slots=True)
 class _State:
-    """A drawing in the search that separates streets.
+    """A drawing in the search that separates streets: its cost, and the positions, (spots, 2).
 
-    Attributes:
-        value: The cost of the drawing.
-        at: The positions of the spots, (spots, 2).
-        conditions: The inequalities that were added to the program.
-        left_alone: The pairs of streets that may stay near or cross.
+    `conditions` are the inequalities that were added, `left_alone` the pairs of streets that may
+    stay near or cross.
     """
 
     value: float
@@ -133,12 +130,7 @@ class StreetProgram:
         return cost
 
     def _solved(self, more: Sequence[_Condition]) -> tuple[_Points, float]:
-        """Solve the program with more inequalities.
-
-        Returns:
-            The positions of the spots, (spots, 2), and their cost, crossings included. The cost is
-            infinite if the inequalities contradict each other.
-        """
+        """Solve with more inequalities: positions, (spots, 2), and cost (inf if contradictory)."""
         n = len(self.spots)
         if not len(self.ends):
             return np.zeros((n, 2)), 0.0
@@ -163,13 +155,9 @@ class StreetProgram:
         return at, float(answer.fun) + CROSSING * len(self._near(at))
 
     def _ways_apart(self, e: int, f: int) -> Iterator[list[_Condition]]:
-        """Yield the ways to separate two streets, each as a list of inequalities.
+        """Yield the ways to separate the streets e and f, each as a list of inequalities.
 
         One street is on a side of the other or, if both are parallel, ahead of it or behind it.
-
-        Args:
-            e: The index of one street.
-            f: The index of the other.
         """
         parallel = abs(float(self.across[e] @ self.along[f])) < PARALLEL
         for normal in (self.across[e], self.along[e] if parallel else self.across[f]):
@@ -198,20 +186,14 @@ def _difference(p: int, q: int, way: NDArray[np.float64]) -> dict[int, float]:
 
 
 def _side(a: _Points, b: _Points, c: _Points) -> NDArray[np.float64]:
-    """For each line from a to b, find the side of point c: positive on the left.
-
-    All arguments have the shape (n, 2), the result (n,).
-    """
+    """For each line from a to b, (n, 2), find the side of point c: positive on the left, (n,)."""
     (ux, uy), (vx, vy) = (b - a).T, (c - a).T
     side: NDArray[np.float64] = ux * vy - uy * vx
     return side
 
 
 def _distance(p: _Points, a: _Points, b: _Points) -> NDArray[np.float64]:
-    """Compute the distance of each point p from the line segment between a and b.
-
-    All arguments have the shape (n, 2), the result (n,).
-    """
+    """The distance of each point p, (n, 2), from the line segment between a and b, (n,)."""
     way = b - a
     length = np.maximum(np.sum(way * way, axis=1), 1e-12)
     share = np.clip(np.sum((p - a) * way, axis=1) / length, 0, 1)

@@ -95,11 +95,7 @@ def assumptions(
 
 
 def _agreed(labels: list[tuple[int, ...]], steps: int) -> Iterator[tuple[Pair, bool]]:
-    """Yield the pairs of steps on which all maps agree, and whether both are one dstate.
-
-    Args:
-        steps: The number of first steps to consider.
-    """
+    """Yield the pairs of steps on which all maps agree, and whether both are one dstate."""
     for later in range(steps):
         for earlier in range(later):
             said = {of_map[earlier] == of_map[later] for of_map in labels}

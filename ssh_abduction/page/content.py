@@ -248,13 +248,8 @@ def _layouts(
 ) -> list[tuple[int, Layout]]:
     """Draw the first map and, if time and size allow, the maps with other dstates or places.
 
-    Args:
-        entries: The entry of each map in the content. If the map has a drawing, it gets the key
-            `layout`: the index in the returned list.
-        trace: The trace, if it is known.
-
-    Returns:
-        Pairs of the index of a map and its drawing.
+    The entry of a drawn map in `told` gets the key `layout`: the index in the returned list of
+    pairs of the index of a map and its drawing.
     """
     layouts: list[tuple[int, Layout]] = []
     drawn: dict[Hashable, int] = {}
@@ -320,11 +315,7 @@ def _corners(found: Layout, ssh_map: SSHMap, unit: float) -> list[list[float]]:
 
 
 def _lifts(found: Layout, ssh_map: SSHMap, unit: float) -> list[list[Any]]:
-    """Find both ends of each lift between two places, with its actions.
-
-    Returns:
-        For each lift: x and y of one end, x and y of the other end, and the actions in words.
-    """
+    """For each lift between two places: x and y of both ends, and the actions in words."""
     floor = [s.floor for s in ssh_map.dstates]
     actions: dict[tuple[int, int], set[str]] = {}
     for source, action, target in ssh_map.links:
@@ -338,16 +329,10 @@ def _lifts(found: Layout, ssh_map: SSHMap, unit: float) -> list[list[Any]]:
 
 
 def _ellipses(found: Layout, ssh_map: SSHMap, unit: float) -> list[list[float]]:
-    """Find the ellipses that show how uncertain the positions of places are.
+    """The ellipses of uncertain positions: a dstate, two standard deviations, and an angle.
 
-    A dstate without a place has its own ellipse.
-
-    Args:
-        unit: The unit for lengths, in metres.
-
-    Returns:
-        For each ellipse: the id of a dstate at its middle, the standard deviations along both axes,
-        and the angle of the first axis in radians counterclockwise.
+    A dstate without a place has its own ellipse. The angle of the first axis is in radians
+    counterclockwise.
     """
     assert ssh_map.fit is not None
     extent = max(
@@ -367,11 +352,7 @@ def _ellipses(found: Layout, ssh_map: SSHMap, unit: float) -> list[list[float]]:
 
 
 def _spots(first: SSHMap, found: Layout) -> list[Spot]:
-    """Find where each step is drawn: at its place in the first map, or at its dstate without one.
-
-    Returns:
-        For each step x, y and the heading in radians (None if it is unknown).
-    """
+    """Where each step is drawn: x, y and heading (radians) of its place, or of its dstate."""
     unit = _unit(found)
     spots: list[Spot] = []
     for label in first.dstate_at:

@@ -20,16 +20,10 @@ Pair: TypeAlias = frozenset[Steps]
 
 
 class _Counts:
-    """Counts the maps that have each dstate, place and street.
+    """Counts the maps that have each dstate, place and street, given by its steps.
 
-    A dstate or place is given by its steps, a street by the steps of its two places.
-
-    Attributes:
-        dstates: The number of maps with each dstate.
-        places: The number of maps with each place.
-        streets: The number of maps with each street.
-        along: For each dstate or street, and each set of steps along its path: the number of maps
-            with both. A key has a number in place of these steps.
+    `along` counts, for each dstate or street and each set of steps along its path, the maps with
+    both. A key has a number in place of these steps.
     """
 
     def __init__(self) -> None:

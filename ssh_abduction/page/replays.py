@@ -89,11 +89,7 @@ def replays(
 
 
 def _replay(trace: Trace, name: str, views: Sequence[str]) -> dict[str, Any]:
-    """Make the replay of a trace.
-
-    Args:
-        views: For each step, the text to show if the step has no view.
-    """
+    """Make the replay of a trace."""
     replay: dict[str, Any] = {
         "name": name,
         "steps": [_step(step, view) for step, view in zip(trace.steps, views, strict=True)],
@@ -103,11 +99,7 @@ def _replay(trace: Trace, name: str, views: Sequence[str]) -> dict[str, Any]:
 
 
 def _step(step: Step, view: str) -> dict[str, Any]:
-    """Make a dict of what was observed at a step, and of the next action.
-
-    Args:
-        view: The text to show if the step has no view.
-    """
+    """Make a dict of what was observed at a step, and of the next action."""
     record: dict[str, Any] = {
         "view": view if step.view is None else str(step.view),
         "action": step.action.name if step.action else None,
@@ -144,18 +136,10 @@ def _steps_of_map(first: SSHMap) -> list[dict[str, Any]]:
 
 
 def _beliefs(maps: Sequence[SSHMap], labelings: Sequence[int], run: Run) -> dict[str, Any]:
-    """Compute the beliefs of a run in the maps, as far as there is time.
+    """Compute the beliefs of a run in the maps, by labeling, as far as there is time.
 
-    Maps with the same labeling have the same links, and therefore the same beliefs.
-
-    Args:
-        labelings: For each map, the number of its labeling.
-
-    Returns:
-        For the number of each labeling, as text, a belief for each step.
-
-    Raises:
-        MapError: The beliefs are malformed, or not one for each step.
+    Maps with the same labeling have the same links, and therefore the same beliefs. Malformed ones
+    raise MapError.
     """
     found: dict[str, Any] = {}
     end = time.process_time() + BELIEVING
@@ -178,12 +162,7 @@ def _beliefs(maps: Sequence[SSHMap], labelings: Sequence[int], run: Run) -> dict
 
 
 def _belief(belief: dict[str, Any], count: int) -> list[Any]:
-    """Shorten a belief to [verdict, nowhere, [[dstate, probability], …]], and check it.
-
-    Args:
-        belief: The belief as a dict from `Belief.to_dict`.
-        count: The number of dstates of the map.
-    """
+    """Check and shorten a belief to [verdict, nowhere, [[dstate, probability], …]]."""
     try:
         likely = sorted(
             ((int(s), float(p)) for s, p in belief["probabilities"]), key=lambda pair: -pair[1]
@@ -292,15 +271,9 @@ def _text(shares: NDArray[np.float64]) -> str:
 def _panoramas(
     held: Sequence[NDArray[np.float64] | None], shape: Any, each: int
 ) -> dict[str, Any] | None:
-    """Encode panoramas, with rows and columns left out so that they are short enough.
+    """Encode panoramas, with rows and columns left out so that each has few characters.
 
-    Args:
-        held: The image of each step; None for a step without one.
-        each: The largest number of characters for an image.
-
-    Returns:
-        The dict that `drawn_images` returns; None if the images do not have the shape, or are too
-        many.
+    None if the images do not have the shape, or are too many.
     """
     if (
         not isinstance(shape, list)

@@ -330,12 +330,7 @@ def compare(maps: Maps, other: Maps | None = None) -> Comparison:
 def _depending(
     asked: Sequence[Asked], options: Sequence[NDArray[np.intp]], table: Table
 ) -> tuple[list[dict[Matter, tuple[int, ...]]], dict[Matter, tuple[int, ...]]]:
-    """Find the steps that depend on one choice alone, and those that depend on several.
-
-    Returns:
-        For each choice, the steps of each sort that depend on it alone, and the steps of each sort
-        that depend on several choices.
-    """
+    """Find the steps that depend on each choice alone, and those that depend on several."""
     of_choice: list[dict[Matter, set[int]]] = [{} for _ in options]
     together: dict[Matter, set[int]] = {}
     sizes = [np.bincount(option) for option in options]
@@ -360,11 +355,7 @@ def _in_order(steps: dict[Matter, set[int]]) -> dict[Matter, tuple[int, ...]]:
 def _choice(
     asked: Sequence[Asked], option: NDArray[np.intp], differing: dict[Matter, tuple[int, ...]]
 ) -> Choice:
-    """Make a choice.
-
-    Args:
-        differing: The value for `Choice.differing`.
-    """
+    """Make a choice."""
     members = members_of(option.tolist())
     options = [
         Option(tuple(bool(a.column[maps[0]]) for a in asked), tuple(i + 1 for i in maps))
@@ -428,18 +419,10 @@ def _check_backbone(shared: Backbone, listed: Backbone, listing: Listing) -> Non
 
 
 def _contradiction(claimed: Shared, seen: Shared, in_one: Sequence[int]) -> tuple[int, int] | None:
-    """Find two steps about which the backbone is wrong.
+    """Find two steps that are one by the backbone but not in a listed map, or vice versa.
 
     Two steps are *one* if they are at one dstate (or one place, along one path or one course,
     depending on the sort).
-
-    Args:
-        claimed: The backbone for one sort: the steps that are one in all maps, or in some.
-        seen: The same, for the listed maps only.
-
-    Returns:
-        Two steps that are one in all maps by the backbone, but differ in a listed map; or that are
-        one in no map by the backbone, but one in a listed map. None if there are no such steps.
     """
     first_of: dict[int, int] = {}
     for t, number in enumerate(claimed.always):

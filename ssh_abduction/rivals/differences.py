@@ -275,13 +275,9 @@ def _changes(table: Table, sort: Sort) -> Iterable[Change]:
 
 
 def _groups(classes: Sequence[int], ones: Sequence[int]) -> list[list[int]]:
-    """Group classes that are one in a map.
+    """Group the classes that are one in a map, by its row in `Table.ones`.
 
-    Args:
-        ones: The row of a map in `Table.ones`.
-
-    Returns:
-        The groups, without the classes that have no place, path or course in the map.
+    Classes without a place, path or course in the map are left out.
     """
     groups: dict[int, list[int]] = {}
     for c in classes:

@@ -127,11 +127,7 @@ def joins_of_drives(listing: Listing) -> tuple[DrivePair, ...]:
 
 
 def _placings(listing: Listing) -> tuple[list[_Placing], list[float], bool]:
-    """Find the place of each step in each map.
-
-    Returns:
-        For each map the place of each step, the weight of each map, and whether these are all maps.
-    """
+    """The place of each step in each map, the weights of the maps, and whether these are all."""
     weighed = listing.weighed
     if weighed is not None:
         at: list[_Placing] = [rival.places or rival.dstates for rival in weighed.rivals]
@@ -159,16 +155,7 @@ def _pair(
     proven: bool,
     count: int | None,
 ) -> DrivePair:
-    """Find the places that two drives share.
-
-    Args:
-        one: The earlier drive.
-        other: The later drive.
-        weights: The weight of each map. The weights sum to 1.
-        of: "place"; or "dstate", if maps have no places.
-        proven: Whether these are all maps.
-        count: The number of maps; None if their weights are probabilities.
-    """
+    """Find the places that two drives share. `of` is "dstate" if maps have no places."""
     forced: list[DriveJoin] = []
     possible: list[DriveJoin] = []
     excluded = 0

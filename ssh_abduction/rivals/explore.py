@@ -274,12 +274,9 @@ class Laboratory:
     ) -> tuple[list[int], dict[int, tuple[list[int], list[int]]]] | None:
         """Find the sequence of actions up to a difference with the greatest gain per action.
 
-        The gain is log(n / m) if m of n rivals are left in the worst case.
-
-        Returns:
-            The actions, and a dict from each observation after them to the machines that predict it
-            (as indices of `machines`) and their states. None if no known links distinguish the
-            machines.
+        The gain is log(n / m) if m of n rivals are left in the worst case. Returns the actions and,
+        by what is then seen, indices of `machines` and states. None if no known links distinguish
+        them.
         """
         weights = np.array([len(self._groups[m]) for m in machines])
         total, least = int(weights.sum()), int(weights.max())
@@ -343,9 +340,7 @@ class Laboratory:
     ) -> dict[Consequence, list[int]] | None:
         """Find what rivals predict for an action at a joint state (a state of each machine).
 
-        Returns:
-            A dict from each prediction to the rivals that make it, as indices from 0. None if the
-            action is impossible there, or if all rivals are sure of the same outcome.
+        None if the action is impossible there, or if all rivals are sure of the same outcome.
         """
         here = int(self._table.sights[machines[0], states[0]])
         done = self._actions[action]

@@ -118,11 +118,7 @@ def options_of(columns: Sequence[Bools] | Bools, maps: int) -> NDArray[np.intp]:
 
 
 def _split(column: Bools, groups: NDArray[np.intp]) -> int:
-    """Count the pairs of maps that are in one group but answer a question differently.
-
-    Args:
-        groups: The number of the group of each map, from 0.
-    """
+    """Count the pairs of maps that are in one group but answer a question differently."""
     sizes = np.bincount(groups)
     yes = np.bincount(groups, weights=column).astype(np.int64)
     return int((yes * (sizes - yes)).sum())

@@ -159,11 +159,7 @@ def shortest_flow(
 
 
 def _parts_cut_off(used: Sequence[Move], start: int) -> list[set[int]]:
-    """Find the connected parts of a flow without the start, as sets of stances.
-
-    Args:
-        start: The number of the stance where the robot is.
-    """
+    """Find the connected parts of a flow without the start (a stance), as sets of stances."""
     near = reached_from(used, start)
     left = [move for move in used if move.source not in near]
     parts: list[set[int]] = []

@@ -142,10 +142,7 @@ class Sights:
 
 
 class _Reading:
-    """A function that reads the star of a step.
-
-    A call returns a key and the star. Stars that cannot be distinguished have the same key.
-    """
+    """Reads the star of a step, with a key that stars share if they cannot be distinguished."""
 
     def __init__(self, trace: Trace, theory: Theory, steps: Sequence[int] = ()) -> None:
         self._trace, self._theory = trace, theory

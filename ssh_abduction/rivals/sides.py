@@ -140,11 +140,9 @@ def only_in(
 def _sides(
     maps: Sequence[SSHMap], steps: Sequence[int]
 ) -> dict[tuple[int, int], list[_Side | None]]:
-    """Find on which side of a path each place lies in each map.
+    """Find the side of a path in each map, by the first steps at a place and along a path.
 
-    Returns:
-        A dict from the first step at a place and the first step along a path to the side in each
-        map; None in a map that does not know the side. Pairs that no map knows are left out.
+    It is None if the map does not know it. Pairs that no map knows are left out.
     """
     beside = [
         {
@@ -183,11 +181,7 @@ def _course(path: int | None, direction: int | None) -> tuple[int, int] | None:
 def _side(
     right: dict[tuple[int, int], set[int]], place: int | None, course: tuple[int, int] | None
 ) -> _Side | None:
-    """Return the side of a course on which a place lies; None if it is unknown.
-
-    Args:
-        right: For each course of a map, the places that lie right of it.
-    """
+    """The side of a course on which a place lies, by the places `right` of it; else None."""
     if course is None:
         return None
     if place in right[course]:

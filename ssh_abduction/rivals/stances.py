@@ -115,11 +115,9 @@ class Stances:
         return found
 
     def _rooms(self) -> list[tuple[int, float]]:
-        """Group dstates that turns link into rooms.
+        """Group dstates that turns link into rooms: each one's room and heading, in degrees.
 
-        Returns:
-            For each dstate the number of its room, and the heading in the room in degrees
-            clockwise. The headings of two dstates differ by the angle of the turn between them.
+        The headings of two dstates differ by the angle of the turn between them.
         """
         turns: dict[int, list[tuple[int, float]]] = {n: [] for n in self._links}
         for n, tried in self._links.items():

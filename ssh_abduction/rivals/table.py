@@ -121,11 +121,7 @@ class Table:
         )
 
     def _shared(self, ones: Ints) -> Shared:
-        """Find what the maps share of one sort.
-
-        Args:
-            ones: The array of the sort in `ones`.
-        """
+        """Find what the maps share of one sort."""
         _, column = np.unique(ones, axis=1, return_inverse=True)
         number: dict[Hashable, int] = {}
         named = (ones != NONE).all(axis=0).tolist()
@@ -148,10 +144,9 @@ class Table:
 
 
 def _common_classes(labelings: Sequence[Ints]) -> Ints:
-    """Find the class of each step, shape (steps,).
+    """Find the class of each step, (steps,), numbered from 0 by first step.
 
-    Steps are in one class if they have equal labels in each labeling. Classes are numbered from 0
-    by first step.
+    Steps are in one class if they have equal labels in each labeling.
     """
     classes = labelings[0].astype(np.int64)
     for labels in labelings[1:]:

@@ -65,15 +65,9 @@ def _spots(poses: Sequence[Pose], imported: Imported) -> list[Pose]:
 def _next(
     drives: Sequence[Drive], ssh_map: SSHMap | None, laid: Sequence[int]
 ) -> tuple[int, list[tuple[int, int]]]:
-    """Choose the drive to move next: the one that shares most places with the moved drives.
+    """Choose the drive to move next: the one that shares most places with the moved drives, `laid`.
 
-    Args:
-        ssh_map: The map that says which places drives share; None if there is no map.
-        laid: The indices of the drives that were moved already.
-
-    Returns:
-        The index of the drive; and pairs of a step of a moved drive and a step of this drive, at
-        one place. There are no pairs if no other drive shares a place with the moved drives.
+    Return its index, and pairs of a step of a moved drive and a step of this drive at one place.
     """
     known: dict[object, list[int]] = defaultdict(list)
     for k in laid:
@@ -123,14 +117,7 @@ def _fitted(
 
 
 def _turned(ssh_map: SSHMap | None, first: int, second: int) -> float:
-    """Compute the heading at one step minus that at another step of the same place, in radians.
-
-    Args:
-        first: The step that is subtracted.
-
-    Returns:
-        Radians counterclockwise; 0 if the map has no poses.
-    """
+    """The heading at `second` minus that at `first`, radians counterclockwise; 0 without poses."""
     assert ssh_map is not None
     if ssh_map.fit is None or not ssh_map.fit.poses:
         return 0.0

@@ -231,12 +231,7 @@ def _bands(
     middles: Mapping[int, Array],
     edges: Sequence[tuple[int | None, int | None, Array]],
 ) -> Iterator[str]:
-    """Draw a band for each region behind one place, along the courses between its places.
-
-    Args:
-        middles: (2,) the middle of each place.
-        edges: The two places and the course, (n, 2) metres, of each edge.
-    """
+    """Draw a band for each region behind one place, along the courses between its places."""
     for region, width in banded(ssh_map, BROAD * sheet.unit):
         here = [middles[p].tolist() for p in region.places if p in middles]
         ways = [_line([sheet.on_page(middle)] * 2) for middle in here]
@@ -257,11 +252,8 @@ def _edges(
 ) -> Iterator[tuple[int, Array]]:
     """Yield the edges: the step at which the robot first set out, and the course, (n, 2) metres.
 
-    An edge that several drives took comes once for each drive.
-
-    Args:
-        middles: (2,) the point of each place to which edges lead. At other places, edges follow
-            the course of the robot through the place.
+    An edge that several drives took comes once for each drive. Edges lead to the `middles` of
+    places. At other places, they follow the course of the robot through the place.
     """
     known: dict[tuple[int, frozenset[int]], list[Array]] = defaultdict(list)
     for t, action in enumerate(imported.trace.actions):

@@ -25,9 +25,8 @@ def one_thread(user_api: str | None = None) -> AbstractContextManager[Any]:
 def _controller(user_api: str | None) -> Any:
     """Find the libraries that this process has loaded. Do this once, as it takes milliseconds.
 
-    Args:
-        user_api: The value that `one_thread` got. Each value has its own controller, as libraries
-            of other kinds may be loaded later.
+    Each value of `user_api` has its own controller, as libraries of other kinds may be loaded
+    later.
     """
     from threadpoolctl import ThreadpoolController
 

@@ -286,14 +286,7 @@ class _Checked(tuple[Pair, ...]):
 
 
 def _pairs(field: str, value: Any) -> tuple[Pair, ...]:
-    """Check pairs of steps, and return each once, with the earlier step first.
-
-    Args:
-        value: Pairs of numbers, or texts such as "3,12".
-
-    Raises:
-        TheoryError: The value has another form.
-    """
+    """Check pairs of steps, numbers or texts such as "3,12", and return each once, sorted."""
     if isinstance(value, _Checked):
         return value
     mend = f"write {field}=[(3, 12)] (--{field.replace('_', '-')} 3,12)"

@@ -129,15 +129,9 @@ def _orders(ends: Sequence[int], allows: Callable[[Ends], bool]) -> list[Ends]:
 def _one_place_more(
     drawn: dict[Place, Ends], orders: Mapping[Place, Sequence[Ends]], place_of: Sequence[Place]
 ) -> Iterator[dict[Place, Ends]]:
-    """Draw one more place, in each possible way.
+    """Draw one more place, in each possible way by the clockwise `orders` around it.
 
     The place is a neighbour of a drawn place, and has the fewest possible ways of all neighbours.
-
-    Args:
-        orders: The allowed clockwise orders of ends around each place.
-
-    Returns:
-        For each way, the ends around each place that is drawn then.
     """
     near = {
         place_of[end ^ 1]: None
@@ -167,9 +161,6 @@ def _leaves_room(
 
     To test this, shrink each such part to one place. Its ends are in the order in which the face
     meets them.
-
-    Args:
-        orders: The allowed clockwise orders of ends around each place.
     """
     part = _parts_of_rest(drawn, orders, place_of)
     following = {
@@ -204,11 +195,7 @@ def _leaves_room(
 def _parts_of_rest(
     drawn: Mapping[Place, Ends], orders: Mapping[Place, Sequence[Ends]], place_of: Sequence[Place]
 ) -> dict[Place, Place]:
-    """Find the connected parts of the places that are not drawn.
-
-    Returns:
-        A dict from each of these places to one place of its part, the same for the whole part.
-    """
+    """The connected parts of the places that are not drawn: from each place to one of its part."""
     part: dict[Place, Place] = {}
     for first in orders:
         queue = [] if first in drawn or first in part else [first]

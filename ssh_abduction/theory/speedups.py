@@ -185,11 +185,7 @@ def _has_bare_places(theory: Theory) -> bool:
 
 
 def _kept_by(*names: str, and_also: Iterable[str] = ()) -> Callable[[], frozenset[str]]:
-    """Make a function that returns the axioms that some fast encodings keep.
-
-    Args:
-        and_also: Axioms that the Python code around the encodings keeps.
-    """
+    """Make a function that returns the axioms that fast encodings, and Python around them, keep."""
     return lambda: encodings.keeps(*names) | frozenset(and_also)
 
 

@@ -178,10 +178,9 @@ def _triple(found: FoundMaps) -> str:
 
 
 def _trend(run: Run) -> float:
-    """Compute how much the largest offset grows over the whole run, as a share of its mean.
+    """How much the largest offset grows over the whole run, as a share of its mean.
 
-    The growth is the slope of a straight line through the offsets of the tours, times the number of
-    tours.
+    The growth is that of a straight line through the offsets of the tours.
     """
     largest = np.array([max(row[:2]) for row in run.spread])
     slope = np.polyfit(np.arange(len(largest)), largest, 1)[0]

@@ -281,11 +281,8 @@ def _labelling(learner: BootstrapLearner, truth: NDArray[Any]) -> Labelling:
 def _contrast(e: Experiment, seed: int, trace: Trace, alone: NDArray[Any], k: int) -> Contrast:
     """Measure the results without a part of the method.
 
-    Args:
-        seed: The seed of all noise.
-        trace: The trace, with images at dstates.
-        alone: The cluster of each image of the trace, with as many clusters as dstates.
-        k: The chosen number of views. Images at equal distances are clustered into as many.
+    `alone` has the cluster of each image, with as many clusters as dstates. `k` is the chosen
+    number of views, also of images at equal distances.
     """
     truth = true_dstates(trace)
     shared = {name for pair in _aliased(alone, truth) for name in pair}
@@ -302,9 +299,9 @@ def _contrast(e: Experiment, seed: int, trace: Trace, alone: NDArray[Any], k: in
 
 
 def _step(trace: Trace) -> float:
-    """Compute the spacing of images, in metres, that gives about one image per step of a trace.
+    """The spacing of images, in metres, that gives about one image for each step of a trace.
 
-    The spacing is the length of the route, |dx| + |dy| summed, divided by the number of steps.
+    The length of the route is its |dx| + |dy| summed.
     """
     poses = np.array([step.truth["pose"][:2] for step in trace.steps])
     return round(float(np.abs(np.diff(poses, axis=0)).sum() / len(poses)), 2)

@@ -103,12 +103,7 @@ def notched(depth: float) -> World:
 def _driven(
     notch: float, seed: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[Any]]:
-    """Drive all tours of the experiment.
-
-    Returns:
-        For each pose (x, y, heading) the mean pose at its dstate, (n, 3), the offset from this
-        mean, (n, 3), and the true dstate, (n,).
-    """
+    """Drive all tours. Return each pose's mean at its dstate and its offset, (n, 3), and dstate."""
     trace = simulate(notched(notch), EXPERIMENTS["notched-rectangle"].tours, seed)
     truth = true_dstates(trace)
     poses = np.array([step.truth["pose"] for step in trace.steps])

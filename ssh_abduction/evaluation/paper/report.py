@@ -105,10 +105,7 @@ def reproduce(
 
 
 def _each(work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], jobs: int) -> Iterator[Any]:
-    """Yield the results of `work` for these tasks, in their order, from `jobs` processes.
-
-    Exceptions of `work` are raised here, and KeyboardInterrupt if the user interrupts.
-    """
+    """Yield the results of `work` for these tasks, in their order, from `jobs` processes."""
     processes = min(effective_n_jobs(jobs), len(tasks))
     if processes == 1:
         for task in tasks:
@@ -141,8 +138,7 @@ def _done(
 ) -> tuple[int, Any]:
     """Call `work` in a worker process.
 
-    Returns:
-        The number of the task, and the result, or the exception that `work` raised.
+    Return the task's number, and the result or the exception.
     """
     try:
         return number, work(*task)

@@ -209,12 +209,7 @@ def _joined(before: Road, after: Road) -> Road:
 
 
 def _is_turn(here: int | None, there: int | None, length: float) -> bool:
-    """Whether a road is a turn on the spot.
-
-    Args:
-        here: The place where it begins; None if it is unknown.
-        there: The place where it ends; None if it is unknown.
-    """
+    """Whether a road is a turn on the spot."""
     return length < LEAST if here is None or there is None else here == there
 
 
@@ -233,11 +228,9 @@ def _places(ssh_map: SSHMap, drawn: Layout) -> tuple[Stop, ...]:
 
 
 def _streets(ssh_map: SSHMap) -> dict[tuple[int, int], Way]:
-    """Find the pairs of places between which the robot travelled, in each direction.
+    """Find the action, path and direction of the travels between two places, in each direction.
 
-    Returns:
-        For each pair (start, end): the action, path and direction. The action is None if the robot
-        travelled only from the end to the start.
+    The action is None if the robot travelled only from the end to the start.
     """
     ends: dict[tuple[int, int], Way] = {}
     for path in ssh_map.paths:

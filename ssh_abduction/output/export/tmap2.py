@@ -83,13 +83,7 @@ def _action() -> dict[str, Any]:
 def _node(
     stop: Stop, leaving: list[Road], names: dict[int, str], pointset: str, frame: str, facing: float
 ) -> dict[str, Any]:
-    """Make a node with its goal tolerances, the octagon around it, and the edges from it.
-
-    Args:
-        leaving: The roads that begin there.
-        frame: The name of the coordinate frame of the positions.
-        facing: The tolerance of the heading, in radians.
-    """
+    """Make a node with its goal tolerances, the octagon around it, and the edges from it."""
     corners = [math.tau * (i + 0.5) / 8 for i in range(8)]
     return {
         "meta": {"map": pointset, "node": names[stop.id], "pointset": pointset},

@@ -60,12 +60,7 @@ class Closure:
         return None
 
     def _refused(self, trace: Trace, places: bool) -> Iterator[tuple[int, int]]:
-        """Yield the pairs of steps of the closures that are rejected.
-
-        Args:
-            places: Whether the steps are compared as places, by their positions alone. Otherwise
-                they are compared as dstates.
-        """
+        """Yield the pairs of steps, as places or as dstates, of the closures that are rejected."""
         if not trace.closures or (places and not self.has_places):
             return
         from scipy.special import gammainccinv
@@ -78,12 +73,7 @@ class Closure:
 
 
 def _square(match: Match, odometry: Odometry, places: bool) -> float:
-    """Compute the chi-square of a closure if its two steps have one position, or one pose.
-
-    Args:
-        odometry: The noise model, for the errors at both steps.
-        places: Whether only positions are compared, and not headings.
-    """
+    """The chi-square of a closure if its two steps have one position (`places`), or one pose."""
     import numpy as np
 
     kept = 2 if places else 3

@@ -63,11 +63,7 @@ def _lifted(trace: Trace) -> tuple[int, ...]:
 
 @lru_cache(maxsize=8)
 def _pairs(stretches: tuple[int, ...], lifted: tuple[int, ...]) -> Pairs:
-    """Pair each step on the stretch before a lift with each step on the stretch behind it.
-
-    Args:
-        lifted: The steps that a lift leads to.
-    """
+    """Pair each step on the stretch before a lift with each step on the stretch behind it."""
     steps: dict[int, list[int]] = {}
     for t, stretch in enumerate(stretches):
         steps.setdefault(stretch, []).append(t)
@@ -91,11 +87,7 @@ def _meetings(ssh_map: SSHMap) -> Iterator[Equality]:
 
 
 def _way(one: int, other: int, beside: dict[int, dict[int, Equality]]) -> list[Equality]:
-    """Find the fewest meetings that connect two stretches; empty if none connect them.
-
-    Args:
-        beside: For each stretch, the stretches that it meets at a dstate or place, and where.
-    """
+    """Find the fewest meetings that connect two stretches; empty if none connect them."""
     came: dict[int, int] = {one: one}
     queue = [one]
     for stretch in queue:

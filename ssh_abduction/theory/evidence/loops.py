@@ -158,16 +158,9 @@ class Loops:
         return np.diag([odometry.offset**2, odometry.offset**2, odometry.facing**2])
 
     def _white(self, i: Steps, j: Steps, end: Steps, other_end: Steps) -> Array:
-        """Return the covariances, between closings, that the noise of some displacements causes.
+        """The covariances, m x 3 x 3, between closings from the noise of displacements from i to j.
 
-        Args:
-            i: The steps from which these displacements lead, m.
-            j: The steps to which they lead, m.
-            end: The steps at which the loops end, m.
-            other_end: The steps at which the other loops end, m.
-
-        Returns:
-            The covariances, m x 3 x 3.
+        The loops end at `end`, the other loops at `other_end`, m each.
         """
         sums = self.moments[j] - self.moments[i]
         position, mixed, mixed_across = (
@@ -376,8 +369,7 @@ class _Rows:
     def extended(self, size: int, new: Array) -> _Rows:
         """Return the first `size` rows, followed by new rows.
 
-        The result is this object if it has room and nobody added other rows meanwhile. Otherwise
-        the rows are copied.
+        They are copied if this object has no room.
         """
         total = size + new.shape[1]
         with self._lock:
@@ -391,26 +383,16 @@ class _Rows:
 
 
 def _parts(trace: Trace, start: int = 0, missing: int = 0) -> Steps:
-    """Return, for each step from `start` on, the number of missing displacements up to it.
-
-    Args:
-        missing: The number for the step before.
-    """
+    """Return, for each step from `start` on, the number of missing displacements up to it."""
     unknown = [t > 0 and trace.steps[t].displacement is None for t in range(start, len(trace))]
     parts: Steps = missing + np.cumsum(unknown, dtype=int)
     return parts
 
 
 def _sums(trace: Trace, start: int, stop: int, bends: Array, last: Array) -> Array:
-    """Compute the poses, moments and ways of some steps for each drift, as in Loops.
+    """The poses, moments and ways of steps, as in Loops: drifts x steps x COLUMNS.
 
-    Args:
-        stop: The step after the last one.
-        bends: The drifts, in radians a metre.
-        last: The row of the step before, drifts x COLUMNS; zeros if there is none.
-
-    Returns:
-        An array of drifts x steps x COLUMNS.
+    `bends` are the drifts in radians a metre, `last` the row of the step before, drifts x COLUMNS.
     """
     moved, noise = np.zeros((stop - start, 3)), np.zeros((stop - start, 3, 3))
     for t in range(max(start, 1), stop):

@@ -119,11 +119,9 @@ class Planar:
         at: Mapping[int, int],
         distinct: bool,
     ) -> bool:
-        """Whether some travels and turns cannot be drawn without a crossing.
+        """Whether travels and turns that begin at `moves` cannot be drawn without a crossing.
 
-        Args:
-            moves: The steps at which these travels and turns begin.
-            distinct: Whether different dstates at a place face different slots.
+        With `distinct`, different dstates at a place face different slots.
         """
         shown = _Shown(trace, moves, labels, at, stars=self.stars)
         return not (
@@ -144,15 +142,10 @@ def _first_moves(trace: Trace, labels: Sequence[int]) -> list[int]:
 
 
 class _Shown:
-    """What some travels and turns of a trace show.
+    """What some travels and turns of a trace show, as keys of dicts, which keep their order.
 
-    Attributes:
-        travels: For each travel, the dstate where it starts and the dstate where it ends. These
-            are keys of a dict, which keeps their order.
-        turns: For each turn at a place, the dstate before it, the direction, and the dstate after
-            it; also keys of a dict.
-        places: The place of each dstate.
-        stars: The openings seen at each dstate, clockwise from ahead.
+    A travel has its first and last dstate, a turn at a place also its direction. `places` has the
+    place of each dstate, `stars` the openings seen there, clockwise from ahead.
     """
 
     def __init__(
@@ -188,10 +181,6 @@ def _can_draw_framed(shown: _Shown, turns: bool, distinct: bool) -> bool:
 
     Turns fix the headings of the dstates that they link, relative to each other. The others may
     have any heading that the stars (openings seen) allow.
-
-    Args:
-        turns: Whether the axioms allow using the turns.
-        distinct: Whether different dstates at a place face different slots.
     """
     group, slot, agree = _groups(shown, turns)
     ahead = {s: (place, group[s], slot[s]) for s, place in shown.places.items()}
@@ -222,17 +211,10 @@ def _slots_of(
     ends: Sequence[End],
     distinct: bool,
 ) -> list[dict[End, int]]:
-    """List all ways to choose slots for the ends of edges at a place.
+    """List all ways to choose slots for the ends of edges at a place, as dicts from end to slot.
 
-    Ways that differ only by a rotation of the whole place count once.
-
-    Args:
-        group: For each dstate, the first dstate of its group that turns link.
-        slot: For each dstate, its slot relative to that first dstate.
-        distinct: Whether different dstates at a place face different slots.
-
-    Returns:
-        For each way, the slot of each end.
+    Ways that differ only by a rotation of the whole place count once. `group` has the first dstate
+    that turns link to each dstate, and `slot` the slot relative to that.
     """
     here = [s for s in shown.places if shown.places[s] == place]
     groups = list(dict.fromkeys(group[s] for s in here))
@@ -281,12 +263,9 @@ def _are_paired(edges: Collection[frozenset[Side]]) -> bool:
 
 
 def _groups(shown: _Shown, turns: bool) -> tuple[dict[int, int], dict[int, int], bool]:
-    """Find the groups of dstates that turns link.
+    """Group the dstates that turns link.
 
-    Returns:
-        A dict from each dstate to the first dstate of its group; a dict from each dstate to the
-        number of slots from the heading of that first dstate to its own; and whether all turns
-        agree on these numbers.
+    Returns the first dstate of each one's group, its slots from there, and whether all turns agree.
     """
     links: dict[int, list[tuple[int, int]]] = {dstate: [] for dstate in shown.places}
     for x, turn, y in shown.turns if turns else ():
@@ -320,9 +299,6 @@ def _can_draw_sided(shown: _Shown, crossing: bool) -> bool:
 
     A turn shows which gateway is to the right of an edge, if both its dstates are at an edge.
     After turning around, a robot faces the gateway that was behind it.
-
-    Args:
-        crossing: Whether two edges cross if a turn leads from one to the other.
     """
     same = _Classes()
     for x, turn, y in shown.turns:
@@ -356,15 +332,9 @@ def _can_draw_sided(shown: _Shown, crossing: bool) -> bool:
 
 
 def _paired(shown: _Shown, same: _Classes) -> list[frozenset[Gateway]] | None:
-    """Find the edges, each between two gateways.
+    """Find the edges, each between two gateways. None if a gateway leads to two places.
 
-    Gateways of one place that lead to the same gateway become one.
-
-    Args:
-        same: Which arms are known to be one gateway. Those that become one are added.
-
-    Returns:
-        The edges; None if a gateway leads to gateways of different places.
+    Gateways of one place that lead to the same gateway become one, also in `same`.
     """
     joined = [
         ((shown.places[x], (x, AHEAD)), (shown.places[y], (y, BACK))) for x, y in shown.travels
@@ -386,10 +356,7 @@ def _paired(shown: _Shown, same: _Classes) -> list[frozenset[Gateway]] | None:
 
 
 def _at_edges(shown: _Shown) -> set[int]:
-    """Return the dstates at which travels start or end.
-
-    Dstates that turning around links to them are added.
-    """
+    """The dstates at which travels start or end, and those that turning around links to them."""
     found = {dstate for travel in shown.travels for dstate in travel}
     around = [{x, y} for x, turn, y in shown.turns if turn == "around"]
     while more := {dstate for pair in around if pair & found for dstate in pair} - found:
@@ -398,12 +365,7 @@ def _at_edges(shown: _Shown) -> set[int]:
 
 
 def _can_complete(order: list[Arm], others: list[Arm], clockwise: Sequence[Sequence[Arm]]) -> bool:
-    """Whether other arms can be inserted into a clockwise order so that it agrees with all turns.
-
-    Args:
-        order: The clockwise order of some arms.
-        clockwise: The clockwise orders that turns show.
-    """
+    """Whether other arms can join a clockwise order so that it agrees with all turns."""
     if not all(_is_clockwise(order, sequence) for sequence in clockwise):
         return False
     if not others:

@@ -101,13 +101,9 @@ class Returns:
         return [0, *(t for t, action in enumerate(self.trace.actions, 1) if action.kind != "turn")]
 
     def _tested(self, since: int = 0) -> _Tested:
-        """List the possible returns that end at step `since` or later.
+        """The first and last steps of possible returns, from `since` on, to places and dstates.
 
         Loops are left out if a displacement is missing on the way, or if the heading is lost.
-
-        Returns:
-            Two arrays, with the first step and the last step of each return: for places at True,
-            and for dstates at False.
         """
         views: dict[object, list[int]] = defaultdict(list)
         for t, step in enumerate(self.trace.steps):
@@ -119,16 +115,9 @@ class Returns:
         }
 
     def _loops_within(self, groups: Sequence[Sequence[int]], since: int = 0) -> tuple[Steps, Steps]:
-        """List the loops that end at step `since` or later, between two steps of one group.
+        """The first and last steps of loops, from `since` on, between steps of one sorted group.
 
         Loops are left out if a displacement is missing on the way, or if the heading is lost.
-
-        Args:
-            groups: Groups of steps, each sorted.
-            since: The earliest step where a loop may end.
-
-        Returns:
-            Two arrays, with the first step and the last step of each loop.
         """
         import numpy as np
 
@@ -154,11 +143,7 @@ class Returns:
         )
 
     def _pairs_of(self, tested: _Tested, since: int = 0) -> Pairs:
-        """Return the pairs of steps that are different, because the displacements reject a return.
-
-        Args:
-            tested: All possible returns, or those that end at new steps.
-        """
+        """The pairs of steps that are different, as displacements reject a return."""
         far = self._refused_among(*tested[True], True)
         known = self._pairs or NO_PAIRS
         elsewhere = Pairs.joined([known, Pairs.of(elsewhere=far)]).elsewhere
@@ -200,11 +185,7 @@ class Returns:
         return float(2 * gammainccinv(freedom / 2, share / max(tests, 1)))
 
     def _refused_among(self, first: Steps, last: Steps, places: bool) -> list[tuple[int, int]]:
-        """List the returns that are rejected alone: they close badly for every drift of heading.
-
-        Args:
-            places: Whether these are returns to places. Then only positions are compared.
-        """
+        """The returns, to `places` or dstates, that close badly for every drift of heading."""
         import numpy as np
 
         from ssh_abduction.theory.evidence.loops import chi_squares
@@ -228,13 +209,7 @@ class Returns:
         return list(zip(first.tolist(), last.tolist(), strict=True))
 
     def _steps_of_visits(self, elsewhere: Earlier, since: int) -> Iterator[tuple[int, int]]:
-        """Yield the pairs of steps of visits to different places that views do not distinguish.
-
-        Args:
-            elsewhere: For the first step of a visit, the first steps of earlier visits to other
-                places.
-            since: The earliest step that may be the later one of a pair.
-        """
+        """Yield the pairs of steps of visits to different places that views do not distinguish."""
         if not self.evidence.turns_stay:
             return
         end = dict(zip(self.arrivals, [*self.arrivals[1:], len(self.trace)], strict=True))
@@ -250,12 +225,8 @@ class Returns:
     ) -> Steps:
         """List the returns of a map: pairs of visits whose first steps are at one place or dstate.
 
-        Args:
-            since: The earliest step where a return may end.
-
-        Returns:
-            One row for each return, sorted by last step: the first step, the last step, and 1 for a
-            return to a dstate or 0 for one to a place.
+        Each row has the first step, the last step, and 1 for a dstate or 0 for a place, by last
+        step.
         """
         return self._returns_among(labels, [places[label] for label in labels], since)
 
@@ -460,9 +431,9 @@ class Returns:
         )
 
     def _begin_of_visit(self, step: int) -> int:
-        """Return the first step of the visit that a step belongs to.
+        """The first step of the visit that a step belongs to.
 
-        If turns may leave their place, it is the step itself.
+        If turns may leave places, the step itself.
         """
         return self.arrivals[bisect(self.arrivals, step) - 1] if self.evidence.turns_stay else step
 

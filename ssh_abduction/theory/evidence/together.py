@@ -135,15 +135,7 @@ class Together:
         return worst
 
     def _overlapping(self, later: Steps, new: Mask) -> Sequence[Steps]:
-        """Find the rows that may share displacements with some rows, and end no later.
-
-        Args:
-            later: The indices of these rows. They end at one step.
-            new: Whether each return is new.
-
-        Returns:
-            The indices of the rows found, in parts that fit into memory.
-        """
+        """The rows that may share displacements with `later` rows, in parts that fit in memory."""
         stop = int(later[-1]) + 1
         begin = int(np.searchsorted(self.rows[:stop, 1], self.rows[later, 0].min(), side="right"))
         earlier = np.arange(begin, stop)
@@ -155,14 +147,8 @@ class Together:
     def _unsafe(self, end: int, later: Steps, earlier: Steps, new: Mask) -> tuple[Steps, Steps]:
         """Find the pairs that the first bound does not accept, for the drift that is tried first.
 
-        Args:
-            end: The step at which the later rows end.
-            later: The indices of the later rows.
-            earlier: The indices of the earlier rows.
-            new: Whether each return is new.
-
-        Returns:
-            Two arrays: the index of the later row and of the earlier row of each pair.
+        Rows `later` end at step `end`. Returns the index of the later and of the earlier row of
+        each pair.
         """
         alone, rows = self._of_each(self._number), self.rows
         first = rows[later, 0]
@@ -187,12 +173,10 @@ class Together:
         return later[these], earlier[others]
 
     def _is_safe(self, share: Array, squares: Array, number: int) -> Mask:
-        """Mark the pairs of returns that a bound shows not to be rejected.
+        """Mark the pairs of returns that a bound shows not to be rejected, for the drift `number`.
 
-        Args:
-            share: An upper bound on s squared (see the head of this module).
-            squares: The sums of the chi-squares of both returns.
-            number: The index of the drift.
+        `share` bounds s squared (see the head of this module). `squares` are sums of two
+        chi-squares.
         """
         allowed = min(self._thresholds.values()) - self._reckoning.unlikely[number]
         left = 1 - squares / allowed if allowed > 0 else np.full_like(squares, -1.0)
@@ -200,15 +184,7 @@ class Together:
         return safe
 
     def _least_excess(self, end: int, later: Steps, earlier: Steps) -> Array:
-        """Return the chi-square of each pair minus the threshold, for the drift with the least.
-
-        It is 0 if the chi-square is below the threshold.
-
-        Args:
-            end: The step at which the later rows end.
-            later: The index of the later row of each pair.
-            earlier: The index of the earlier row of each pair.
-        """
+        """Return `_excess` of each pair, for the drift with the least."""
         excess = np.full(len(later), np.inf)
         others = (number for number in range(len(self._reckoning.bends)) if number != self._number)
         for number in (self._number, *others):
@@ -221,16 +197,7 @@ class Together:
         return excess
 
     def _excess(self, number: int, end: int, later: Steps, earlier: Steps) -> Array:
-        """Return the chi-square of each pair minus the threshold, for one drift.
-
-        It is 0 if the chi-square is below the threshold.
-
-        Args:
-            number: The index of the drift.
-            end: The step at which the later rows end.
-            later: The index of the later row of each pair.
-            earlier: The index of the earlier row of each pair.
-        """
+        """Return the chi-square of each pair minus the threshold, at least 0, for one drift."""
         alone, rows, loops = self._of_each(number), self.rows, self._loops(number)
         squares = alone.square[later] + alone.square[earlier]
         # The stretch that both loops share.
@@ -265,11 +232,8 @@ class Together:
     def _largest_share(self, alone: _Alone, returns: Steps, noise: Array) -> Array:
         """Return an upper bound on the largest eigenvalue of S^-1 F for some returns.
 
-        S is the covariance of a return, and F the part of it that noise and repeated errors cause.
-
-        Args:
-            returns: The indices of the returns.
-            noise: The covariance that the noise causes, m x 9.
+        S is the covariance of a return, and F the part of it that `noise`, m x 9, and repeated
+        errors cause.
         """
         product = alone.inverse[returns].reshape(-1, 3, 3) @ (
             noise + alone.repeated[returns]
@@ -344,22 +308,12 @@ def _common_ends(these: Steps, others: Steps) -> Steps:
     """Count the ends that the loops of two returns share: the beginning, the end, or both.
 
     There the robot is off its dstate by one error, which is in both loops.
-
-    Args:
-        these: Rows of returns, as in `Together.rows`.
     """
     return np.asarray((these[..., :2] == others[..., :2]).sum(-1))
 
 
 def _alone(closing: Array, covariance: Array, repeated: Array, one_dstate: Steps) -> _Alone:
-    """Compute what is known about each of m returns alone.
-
-    Args:
-        closing: The errors at the end of the loops, m x 3.
-        covariance: Their covariances, m x 3 x 3.
-        repeated: The parts of the covariances from errors that repeat, m x 3 x 3.
-        one_dstate: 1 for a return to a dstate, 0 for one to a place.
-    """
+    """Compute what is known about each of m returns alone, from closing errors, m x 3."""
     _cut_off_headings(closing, covariance, one_dstate)
     inverse: Array = np.asarray(np.linalg.inv(covariance), dtype=float)
     inverse[one_dstate == 0, 2, 2] = 0.0
