@@ -136,15 +136,7 @@ def strongest(shares: ArrayLike, most: float = 0.5) -> str:
 def _neighbours(
     images: Floats, second: NDArray[np.bool_]
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """For each image, find the nearest other image of its dstate and of the other dstate.
-
-    Args:
-        images: (n, d) images of two dstates.
-        second: (n,) whether each image is of the second dstate.
-
-    Returns:
-        Two arrays, (n,), of indices of images.
-    """
+    """For each image, the index of the nearest other one of its dstate, and of the other dstate."""
     distances = cdist(images, images)
     np.fill_diagonal(distances, np.inf)
     same = second[:, None] == second

@@ -150,9 +150,7 @@ class ImageLikelihood:
     def _features(self, images: ArrayLike) -> NDArray[np.float64]:
         """Compute the features, (n, d), that the last estimator of the pipeline compares.
 
-        Raises:
-            PerceptionError: The images are no table of finite numbers, or have another length than
-                the learnt ones.
+        Raises PerceptionError for images that are no finite table or have another length.
         """
         try:
             table = np.asarray(equal_length(images), np.float64)
@@ -198,11 +196,7 @@ class ImageLikelihood:
         return known, self._log_density(np.sum((features - self.centre) ** 2, axis=1), self.spread)
 
     def _log_density(self, squares: NDArray[np.float64], mean: float) -> NDArray[np.float64]:
-        """Log density of an isotropic Gaussian in `dimensions` dimensions.
-
-        Args:
-            mean: Mean squared distance from the centre.
-        """
+        """Log density of an isotropic Gaussian, by squared distances and their mean."""
         return np.asarray(
             -0.5 * self.dimensions * (np.log(2 * np.pi * mean / self.dimensions) + squares / mean)
         )

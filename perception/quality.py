@@ -310,15 +310,7 @@ class _Cells:
         self.bounds = np.maximum(gap, 0) ** 2
 
     def shortest_leaving(self, components: Integers) -> tuple[Floats, Integers]:
-        """Find the shortest edge that leaves each component.
-
-        Args:
-            components: (n,) component of each image, a number from 0 to c - 1.
-
-        Returns:
-            For each component, the squared length of the edge, (c,), and the indices of the images
-            at its ends, (c, 2).
-        """
+        """The squared length, (c,), and images, (c, 2), of each component's shortest edge."""
         search = _Search(self.images, components[self.order])
         pairs = np.argsort(self.bounds, kind="stable")
         # The products are small: threads would wait for each other longer than they work.
@@ -363,11 +355,7 @@ class _Search:
         self.ends = np.zeros((len(self.best), 2), np.intp)
 
     def improve(self, lower: Floats, slack: float, row: int, column: int) -> None:
-        """Search a block of pairs for shorter edges.
-
-        Args:
-            lower: (rows, columns) lower bounds of the squared distances of the pairs.
-        """
+        """Search a block of pairs for shorter edges, by lower bounds of their squared distances."""
         components, least = self.components[row : row + len(lower)], lower.min(axis=1)
         hot = np.flatnonzero(least < self.best[components])
         if not len(hot):
@@ -392,11 +380,7 @@ class _Search:
 
 
 def _halves(images: Floats, members: Integers) -> Iterator[Integers]:
-    """Split images into cells of at most CELL images, recursively at the median of a long axis.
-
-    Yields:
-        Indices of the images of each cell.
-    """
+    """Split images into cells of at most CELL, recursively at the median of a long axis."""
     if len(members) <= CELL:
         yield members
         return
@@ -473,11 +457,7 @@ def _rounding(beams: int, dtype: type[np.floating[Any]], reach: float) -> float:
 
 
 def _numbered(labels: ArrayLike, count: int | None = None) -> Integers:
-    """Replace the labels by numbers 0, 1, …
-
-    Raises:
-        PerceptionError: The labels are no row of at least one label (exactly `count`, if given).
-    """
+    """Replace the labels by numbers 0, 1, …, or raise if they are no row (of `count`)."""
     of = np.asarray(labels)
     if of.ndim != 1 or not len(of) or (count is not None and len(of) != count):
         raise PerceptionError(

@@ -249,11 +249,9 @@ def _deal(
 ) -> tuple[NDArray[np.intp], tuple[Any, ...]]:
     """Divide the images into folds, one class after the other, as cards are dealt.
 
-    The sizes of two folds differ by at most one image, in total and within each class.
-
-    Returns:
-        The fold of each image, (n,), with -1 for an image that is never tested; and the classes
-        that are never tested, because they have a single image.
+    The sizes of two folds differ by at most one image, in total and within each class. An image
+    that is never tested, as it is the only one of its class, has fold -1. These classes are
+    returned, too.
     """
     if folds < 2:
         raise PerceptionError(f"folds: expected at least 2, got {folds}")

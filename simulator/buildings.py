@@ -142,10 +142,6 @@ def _span(flat: Opening, walls: Array) -> tuple[float, float]:
     """Find where the wall with a door begins and ends, in metres along the wall from the door.
 
     An outline may have corners within a straight wall, so connected stretches are joined.
-
-    Args:
-        flat: The door, as an opening without depth.
-        walls: (n, 4) walls of a room of the door.
     """
     # (n, 2 ends, along and across)
     ends = np.stack([flat.frame(walls[:, :2]), flat.frame(walls[:, 2:])], axis=1)
@@ -161,13 +157,7 @@ def _span(flat: Opening, walls: Array) -> tuple[float, float]:
 
 
 def _across(flat: Opening, wall: Array, along: float) -> float:
-    """Measure how many metres to the left of a door's middle a wall lies.
-
-    Args:
-        flat: The door, as an opening without depth.
-        wall: (4,) the wall.
-        along: Where to measure: metres along the door from its middle.
-    """
+    """Measure how many metres to the left of a door's middle a wall lies, `along` from it."""
     ends = flat.frame(wall.reshape(2, 2))
     return float(np.interp(along, *ends[np.argsort(ends[:, 0])].T))
 

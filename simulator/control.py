@@ -189,13 +189,7 @@ def travel(driver: Driver) -> None:
 
 
 def _steer(seen: Sight, reach: float, stride: float) -> float:
-    """Compute the turn during the next stride, in radians, that leads to the line and along it.
-
-    Args:
-        seen: The walls that the robot sees.
-        reach: Half the width of a corridor in metres.
-        stride: Length of the stride in metres.
-    """
+    """Compute the turn during the next stride, in radians, that leads to the line and along it."""
     offset = seen.offset(reach)
     wanted = 0.0 if offset is None else -math.atan(1.5 * float(np.clip(offset, -0.5, 0.5)))
     return (wanted - seen.tilt) * min(1.0, abs(stride) / 0.12)

@@ -65,13 +65,9 @@ def follow(driver: Driver, space: FreeSpace, way: Array) -> Iterator[int]:
 
 
 def _come_to(way: Array, at: int, driver: Driver) -> int:
-    """Find the index of the nearest upcoming point of the route.
+    """Find the index of the nearest upcoming point of the route, (n, 2) metres, from `at` on.
 
     If several points are equally near, it is the last of them, so that a route may turn back.
-
-    Args:
-        way: (n, 2) route in metres.
-        at: Index of the last point that was reached.
     """
     off = np.hypot(*(way[at : at + round(1.5 * AIM / CELL)] - np.array(driver.robot.pose[:2])).T)
     nearest = len(off) - 1 - int((off[::-1]).argmin())
@@ -79,11 +75,7 @@ def _come_to(way: Array, at: int, driver: Driver) -> int:
 
 
 def _stride(driver: Driver, way: Array, aim: float) -> None:
-    """Turn towards the aim, a point on the route, and drive if the aim is roughly ahead.
-
-    Args:
-        way: (n, 2) rest of the route in metres.
-    """
+    """Turn towards the aim, a point on the route, and drive if the aim is roughly ahead."""
     x, y, heading = driver.robot.pose
     goal = way[: 2 + round(aim / CELL)][-1]
     turn = math.remainder(math.atan2(goal[1] - y, goal[0] - x) - heading, math.tau)
@@ -99,20 +91,10 @@ def _stride(driver: Driver, way: Array, aim: float) -> None:
 def _around_obstacles(
     driver: Driver, space: FreeSpace, image: Array, way: Array, numbers: Cells, at: int
 ) -> tuple[Array, Cells]:
-    """Plan the route again if the laser shows a new obstacle on it.
+    """Plan the route again if the laser shows a new obstacle on it, or raise SimulatorError.
 
-    Args:
-        space: Free space, in which new obstacles are marked.
-        image: (180,) ranges in metres.
-        way: (n, 2) current route in metres.
-        numbers: (n,) index in the given route of each point of the current route.
-        at: Index in the current route of the last point that was reached.
-
-    Returns:
-        The new route, and its `numbers`.
-
-    Raises:
-        SimulatorError: There is no way around the obstacle.
+    `numbers` has the index in the given route of each point of the current route, and changes with
+    it.
     """
     seen = _obstacles(driver, space, image)
     ahead = slice(at, at + round(WATCH / CELL))
@@ -140,11 +122,7 @@ def _around_obstacles(
 
 
 def _obstacles(driver: Driver, space: FreeSpace, image: Array) -> Array:
-    """Find new obstacles in an image, and mark them in the free space.
-
-    Returns:
-        (n, 2) points in metres that are neither known walls nor obstacles that were marked before.
-    """
+    """Find new obstacles in an image, (n, 2) metres, and mark them in the free space."""
     x, y, heading = driver.robot.pose
     near = image < WATCH
     angles = heading + BEARINGS[near]

@@ -150,12 +150,8 @@ class Pilot:
     def _follow(self, began: float, heed: float) -> float:
         """Follow the midline until a wall is ahead, or until a side was open and is closed again.
 
-        Args:
-            began: Distance driven at the beginning of the travel, in metres.
-            heed: Distance driven up to which walls ahead and open sides are ignored.
-
-        Returns:
-            Metres for which a side was open; 0 if a wall is ahead.
+        Up to the distance `heed`, walls ahead and open sides are ignored. Returns the metres for
+        which a side was open; 0 if a wall is ahead.
         """
         robot, reach = self.driver.robot, self.reach
         course = robot.odometry[2]  # Direction of the street by odometry.
@@ -197,11 +193,7 @@ class Pilot:
             self.driver.go(way / strides)
 
     def _climb(self) -> bool:
-        """Climb to the fixed point of the place, and turn to the dstate nearest to the old heading.
-
-        Returns:
-            Whether this is a place, which has a fixed point.
-        """
+        """Climb to the place's fixed point, if any, and turn to the dstate near the old heading."""
         came = self.driver.robot.odometry[2]
         for _ in range(TRIES):
             straight_on = came - self.driver.robot.odometry[2]
@@ -222,11 +214,7 @@ class Pilot:
         return place.fixed is not None
 
     def _go(self, goal: complex) -> None:
-        """Drive towards a point of the panorama, forward or back, at most `reach` metres.
-
-        Args:
-            goal: Complex number: metres ahead of the panorama's frame, and metres to its left.
-        """
+        """Drive towards a point of the panorama (metres ahead + left i), at most `reach` metres."""
         forward = cmath.phase(goal) if abs(cmath.phase(goal)) <= math.pi / 2 else cmath.phase(-goal)
         self._face(forward)
         self._straight(min(abs(goal), self.reach) * (1 if forward == cmath.phase(goal) else -1))
@@ -268,13 +256,7 @@ class Pilot:
 
 
 def _is_open(image: Array, side: int, reach: float) -> bool:
-    """Whether a side is open: there is no near wall between 75 and 90 degrees.
-
-    Args:
-        image: (180,) ranges in metres.
-        side: 1 for the left, -1 for the right.
-        reach: Half the width of a street in metres.
-    """
+    """Whether a side, 1 for left or -1, is open: no near wall between 75 and 90 degrees."""
     beams = (
         image[-15:] * np.sin(BEARINGS[-15:]) if side > 0 else image[:15] * np.sin(-BEARINGS[:15])
     )

@@ -279,14 +279,9 @@ class _Reader:
 
 
 def _cells(fields: MapFile, path: Path) -> Cells:
-    """Read the image of a map, and turn its pixels into cells.
+    """Read the image of a map as cells: 100 is occupied, 0 free, -1 unknown, others between.
 
-    Returns:
-        (rows, columns) with the top row first: 100 is occupied, 0 free, -1 unknown, and 1 to 99 in
-        between.
-
-    Raises:
-        SimulatorError: The image cannot be read. The text names the YAML file and the image.
+    The top row is first. Raises SimulatorError, with both files, if the image cannot be read.
     """
     from PIL import Image, UnidentifiedImageError  # Imported here because it loads slowly.
 
@@ -341,16 +336,9 @@ def _cells(fields: MapFile, path: Path) -> Cells:
 def _shades(
     image: Image.Image, with_alpha: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_] | bool]:
-    """Measure the brightness of the pixels of an image.
+    """Measure the brightness of the pixels, from 0 to 1, and the mask of opaque ones (or True).
 
-    Args:
-        image: An image in grey, colours or a palette.
-        with_alpha: Whether opacity counts as a fourth colour, as in mode trinary. Then all pixels
-            count as opaque.
-
-    Returns:
-        (rows, columns) brightness from 0 (black) to 1, and the mask of opaque pixels; True if all
-        are opaque.
+    With `with_alpha`, as in mode trinary, opacity is a fourth colour, and all pixels are opaque.
     """
     if image.mode == "F":
         raise ValueError("pixels that are floating-point numbers, for which map_server has no rule")

@@ -336,13 +336,7 @@ def _beginnings(segments: Array) -> Array:
 
 
 def _albedo(textures: Array, along: Array, height: Array) -> Array:
-    """The share of light that points of walls reflect, (r, c, 3).
-
-    Args:
-        textures: (c, 13 + 6 WAVES) texture of the wall of each column.
-        along: (c,) metres along the wall.
-        height: (r, c) metres above the floor.
-    """
+    """The share of light that points of walls reflect, (r, c, 3), by the wall of each column."""
     base, stripe, skirting, stripes, waves = np.split(textures, [3, 6, 9, 13], axis=1)
     period, share, phase, board = stripes.T
     striped = ((along / period + phase) % 1 < share)[None, :, None] & (height < 0.75 * CEILING)[

@@ -158,11 +158,7 @@ class _Reader:
     def pair(
         self, portal: Element, numbers: Mapping[str, int], here: int, where: str
     ) -> tuple[int, int]:
-        """Read the indices of the two rooms of a door, in ascending order.
-
-        Args:
-            here: Index of the room in which the door is listed.
-        """
+        """Read the indices of the two rooms of a door, in ascending order."""
         names = [target.text or "" for target in portal.findall("target/id")]
         rooms = sorted({numbers[name] for name in names if name in numbers})
         if len(names) != 2 or len(rooms) != 2 or here not in rooms:
@@ -196,14 +192,9 @@ class _Reader:
 
 
 def _matched(here: Sequence[Point], there: Sequence[Point]) -> Iterator[Point]:
-    """Match the doors between two rooms. A door may be drawn on one or both sides of the wall.
+    """Match the doors that two rooms list. A door may be drawn on one or both sides of the wall.
 
-    Args:
-        here: Positions of the doors that one room lists.
-        there: Positions of the doors that the other room lists.
-
-    Yields:
-        The position of each door: the mean of two matched positions, or a position without a match.
+    Yields the mean of two matched positions, or a position without a match.
     """
     distances = np.array([[math.dist(a, b) for b in there] for a in here]).reshape(
         len(here), len(there)

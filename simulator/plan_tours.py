@@ -263,12 +263,7 @@ def _view(bearings: Sequence[float]) -> str:
 def _star(
     plan: Plan, stand: Stand, bearings: Sequence[float], spread: float
 ) -> tuple[Sighted, ...]:
-    """The star of a room: its gateways, sorted by bearing, each with its opposite gateway.
-
-    Args:
-        bearings: Bearing of each gateway in degrees, in the order of the plan.
-        spread: Error of the bearings that the star states, in degrees.
-    """
+    """The star of a room: its gateways, sorted by bearing, each with its opposite gateway."""
     found = plan.gateways[stand.room]
     order = sorted(range(len(found)), key=lambda k: bearings[k])
     opposite = [found[k].opposite for k in order]

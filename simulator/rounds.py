@@ -136,11 +136,9 @@ class Rooms:
 
 
 def _sides(building: Building, number: int) -> dict[int, Point]:
-    """The points at which the robot begins and ends to drive through a door.
+    """The points at which the robot begins and ends to drive through a door, by room.
 
-    Returns:
-        Dict from each of the two rooms to the point (x, y) on its side of the door, in metres.
-        Empty if it is unclear which room is on which side.
+    Empty if it is unclear which room is on which side.
     """
     opening, door = building.openings[number], building.plan.doors[number]
     sides = [opening.point(0.0, side * (opening.depth / 2 + APPROACH)) for side in (-1, 1)]
@@ -227,11 +225,9 @@ class Round:
 
 
 def _legs(rooms: Rooms, home: int, metres: float, chance: np.random.Generator) -> Iterator[Within]:
-    """Draw the legs of a round at random.
+    """Draw the legs of a round at random: a room, and the doors of entry and leaving.
 
-    Yields:
-        For each room: its index, the door by which the robot enters, and the door by which it
-        leaves. None instead of a door means the middle of the room.
+    None instead of a door means the middle of the room.
     """
     passed: Counter[int] = Counter()
     room, came, done = home, None, 0.0

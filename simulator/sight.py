@@ -181,10 +181,7 @@ def _spacing(values: Array) -> Array:
 def _line(values: Array, weights: Array, chosen: NDArray[np.bool_]) -> float | None:
     """The coordinate of the longest wall across an axis; None if no wall is LONG enough.
 
-    Args:
-        values: (n,) coordinate of each point on the axis, in metres.
-        weights: (n,) metres of wall that each point represents.
-        chosen: (n,) mask of the points that are searched.
+    Points have weights in metres of wall. Those that are not `chosen` are not searched.
     """
     picked, length = values[chosen], weights[chosen]
     if len(picked) < 5:

@@ -178,11 +178,7 @@ def _place(world: World, pose: Array) -> str | None:
 
 
 def _stops(driver: Driver, world: World, tours: int) -> Iterator[tuple[int, str]]:
-    """Drive to the places of all tours.
-
-    Yields:
-        Before each place: its number, counted on from tour to tour, and its name.
-    """
+    """Drive to the places of all tours. Before each, yield its number over all tours, and name."""
     for tour in range(tours):
         if tour:
             driver.world = world.arranged(driver.rng)
@@ -215,11 +211,7 @@ def _driver(
     body: Body | None,
     tolerance: Tolerance | None,
 ) -> Driver:
-    """Make a robot at the start of a world.
-
-    Raises:
-        SimulatorError: An argument is invalid, there is no route, or the robot has no room.
-    """
+    """Make a robot at the start of a world."""
     an_instance("world", world, World, SimulatorError, mend="take World.named or World.load")
     a_whole_number("tours", tours, SimulatorError, 1, MOST_TOURS)
     a_whole_number("seed", seed, SimulatorError)
@@ -337,11 +329,7 @@ def _evenly(
 def _legs(
     driver: Driver, world: World, tours: int, pilot: Corridors | Pilot | None = None
 ) -> Iterator[tuple[int, str]]:
-    """Drive all tours.
-
-    Yields:
-        Before each action: its number, counted on from tour to tour, and its name.
-    """
+    """Drive all tours. Before each action, yield its number over all tours, and its name."""
     pilot = pilot or (Pilot(driver) if world.angles == "any" else Corridors(driver))
     watch = Watch(world, driver, tours)
     with watch.start():

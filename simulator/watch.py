@@ -152,11 +152,7 @@ class Watch:
         return min(ahead)[1] if ahead else None
 
     def _because(self, before: Pose | None = None) -> str:
-        """The likely causes of an error, as the end of a message; empty if there are none.
-
-        Args:
-            before: Pose where the action began; None for the current pose.
-        """
+        """The likely causes of an error since a pose, to end a message; empty if there are none."""
         found = list(self._causes(before or self.driver.robot.pose))
         return f". Likely cause: {'; or '.join(found)}" if found else ""
 

@@ -246,13 +246,8 @@ def _fov(scan: Scan) -> float:
 def _apart(log: RobotLog, turns: Array, stretch: float = 1.0) -> Array | None:
     """How far the points of two scans lie apart, if the odometry moves one scan to the other.
 
-    Args:
-        turns: (n,) angles in radians by which the laser is rotated on the robot.
-        stretch: Factor by which the angle between beams is multiplied.
-
-    Returns:
-        (n,) mean distance to the nearest point in metres, for each of `turns`; None if there are
-        too few pairs.
+    The laser is rotated by each of `turns` radians, and angles between beams are stretched. The
+    result is the mean distance in metres for each turn; None if there are too few pairs.
     """
     apart = []
     for first, second in _pairs(log):

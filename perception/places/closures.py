@@ -93,12 +93,7 @@ def find_closures(
 def _closings(
     scene: Callable[[int], Scene], asked: Sequence[tuple[int, _Gate]], last: int
 ) -> Iterator[Closing]:
-    """Match a visit with earlier ones, and yield the closures.
-
-    Args:
-        scene: Makes the scene of a visit from its index.
-        asked: Index and gate of each earlier visit to try.
-    """
+    """Match a visit with earlier ones, and yield the closures."""
     if not asked:
         return
     turns = [gate.turns for _, gate in asked]
@@ -146,12 +141,7 @@ class _Gate:
 
 
 class _Gates:
-    """Makes the gate of any two visits.
-
-    Args:
-        visits: The visits, in order.
-        apart: Metres that the robot drove at least between two visits to be matched.
-    """
+    """Makes the gate of any two visits that are `apart` metres of driving, in order."""
 
     def __init__(self, track: Track, visits: Sequence[Visit], apart: float) -> None:
         """Compute the middles for each drift."""
@@ -189,11 +179,7 @@ class _Gates:
 
 
 class _Corrected:
-    """The positions of visits by the track, if each closure corrects the poses after it.
-
-    Args:
-        visits: The visits, in order.
-    """
+    """The positions of visits by the track, if each closure corrects the poses after it."""
 
     def __init__(self, visits: Sequence[Visit]) -> None:
         """Start without any correction."""

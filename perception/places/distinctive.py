@@ -92,11 +92,7 @@ def visits_of(posed: Iterable[Followed], width: float = WIDTH) -> Iterator[Visit
 
 
 class _Detector:
-    """Finds the visits in an unbroken part of a drive.
-
-    Args:
-        width: Width of the robot in metres.
-    """
+    """Finds the visits in an unbroken part of a drive."""
 
     def __init__(self, width: float) -> None:
         """Start before the first scan."""
@@ -234,13 +230,7 @@ class _Detector:
 
 @dataclass(frozen=True, eq=False)
 class _Sighting:
-    """A junction in the local map of a milestone.
-
-    Attributes:
-        milestone: Number of the milestone, from 0.
-        way: Metres driven up to it.
-        junction: The junction.
-    """
+    """A junction in the local map of a milestone, a number from 0, after `way` metres."""
 
     milestone: int
     way: float
@@ -249,12 +239,7 @@ class _Sighting:
 
 @dataclass(eq=False)
 class _Chain:
-    """Sightings of one junction at successive milestones.
-
-    Attributes:
-        number: Number of the chain, in the order in which they began.
-        sightings: The sightings, in order.
-    """
+    """Sightings of one junction at successive milestones, with a number in order of beginning."""
 
     number: int
     sightings: list[_Sighting]
@@ -282,25 +267,15 @@ def _middle(sightings: Sequence[_Sighting]) -> Array:
 
 
 def _distance(middle: Array, radius: float, junction: Junction) -> float | None:
-    """The distance of a junction from a chain in metres; None if it is too far for one place.
-
-    Args:
-        middle: The middle of the chain: (2,) metres.
-        radius: The radius of the chain in metres.
-    """
+    """The distance of a junction from a chain in metres; None if it is too far for one place."""
     far = math.dist(middle, junction.middle)
     return far if far < max(SAME, SHARE * min(radius, junction.radius)) else None
 
 
 def _stays(far: Array, radius: float) -> Iterator[tuple[int, int]]:
-    """Find the parts of a trajectory that are in a disc.
+    """Yield the first and last index of each part of a trajectory, (n,) metres, in a disc.
 
-    Args:
-        far: (n,) distance from the middle of the disc in metres.
-        radius: Radius of the disc in metres.
-
-    Yields:
-        The first and the last index of each part. The robot stays until it is LEFT metres outside.
+    The robot stays until it is LEFT metres outside.
     """
     begin = None
     for i, distance in enumerate(far.tolist()):

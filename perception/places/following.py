@@ -104,13 +104,7 @@ def follow(log: RobotLog, trust: Trust | None = None) -> Track:
 
 @dataclass(frozen=True)
 class _Follower:
-    """Computes the track of a log.
-
-    Attributes:
-        log: The log.
-        trust: Standard deviations of the errors of the odometer.
-        steps: Scans for which the odometry of the step before them cannot be trusted.
-    """
+    """Computes the track of a log."""
 
     log: RobotLog
     trust: Trust
@@ -238,20 +232,9 @@ class _Step:
 def _bridged(
     points: Array, normals: Array, recent: deque[tuple[Array, Array]], last: Pose, before: Pose
 ) -> tuple[Pose, Array, float] | None:
-    """Match a scan without odometry.
+    """Match a scan without odometry: its pose, covariance, and share of points on walls, or None.
 
     Two guesses are tried: the robot moved as it did before, or it stood still.
-
-    Args:
-        points: (m, 2) points of the scan in metres.
-        normals: (m, 2) unit normals.
-        recent: Points and normals of previous scans, in the frame of the track.
-        last: Pose of the previous scan.
-        before: Motion to the previous scan.
-
-    Returns:
-        The pose, the covariance of the motion, and the share of the points on walls; None if the
-        scan matches at neither guess.
     """
     wide = np.diag(UNKNOWN) ** 2
     onward, stayed = (
@@ -363,18 +346,9 @@ def _matched(
 ) -> tuple[Pose, Array, float]:
     """Match a scan with the walls that previous scans saw.
 
-    Args:
-        points: (m, 2) points of the scan in metres.
-        normals: (m, 2) unit normals.
-        recent: Points and normals of previous scans, in the frame of the track.
-        last: Pose of the previous scan.
-        onward: Expected motion since the previous scan.
-        prior: (3, 3) covariance of that motion.
-        most: By how much the heading may differ from the expected one, in radians.
-
-    Returns:
-        The pose; the covariance of the motion, in the frame of the robot at the previous scan; and
-        the share of the points on walls.
+    `onward` is the expected motion since the previous scan, `prior` its (3, 3) covariance. The
+    heading differs by at most `most` radians. Returns the pose; the covariance of the motion, in
+    the frame of the robot at the previous scan; and the share of the points on walls.
     """
     turn: Array = np.eye(3)
     turn[:2, :2] = rotation(last[2])
@@ -445,12 +419,8 @@ class _Fit:
     def improved(self, guess: Array, weight: Array) -> tuple[float, Array, Array]:
         """Move a pose until the points lie on the walls, by Gauss-Newton steps.
 
-        Args:
-            guess: (3,) initial pose.
-            weight: (3, 3) inverse covariance of the guess.
-
-        Returns:
-            The share of the points on walls, the pose, (3,), and its inverse covariance, (3, 3).
+        `weight` is the (3, 3) inverse covariance of the guess. Returns the share of the points on
+        walls, the pose, and its inverse covariance.
         """
         information, pose, share = weight, guess, 0.0
         for count in range(ROUNDS):

@@ -92,11 +92,7 @@ def join_logs(logs: Sequence[RobotLog], parts: Sequence[Imported]) -> tuple[Robo
 
 
 def _closings(parts: Sequence[Imported], counts: Sequence[int]) -> Iterator[Closing]:
-    """Yield the closures between drives, with visits numbered over all drives.
-
-    Args:
-        counts: The number of visits before each drive.
-    """
+    """Yield the closures between drives, with visits numbered over all drives."""
     scenes = [scenes_of(part) for part in parts]
     for a, b in combinations(range(len(parts)), 2):
         for closing in closures_between(parts[a], parts[b], scenes[a], scenes[b]):
@@ -120,15 +116,7 @@ def _named(names: Sequence[str | None], notes: Sequence[Sequence[str]]) -> tuple
 
 
 def _joint_track(tracks: Sequence[Track], begins: Sequence[int]) -> tuple[Track, list[Array]]:
-    """Join tracks.
-
-    Args:
-        begins: The number of the first scan of each drive, over all drives.
-
-    Returns:
-        The track, which is broken where a drive starts; and (2,) by how many metres each track was
-        shifted.
-    """
+    """Join tracks to one that is broken where a drive starts. Each is shifted, (2,) metres."""
     poses = [tracks[0].poses]
     shifts = [np.zeros(2)]
     for track in tracks[1:]:
@@ -206,10 +194,8 @@ def closures_between(
 class _Relations:
     """What n matches say about how two frames relate.
 
-    Attributes:
-        turns: (n,) rotation of the later frame, in radians.
-        here: (n, 2) middle of the later visit in the earlier frame, in metres.
-        there: (n, 2) middle of the later visit in its own frame.
+    `turns` are rotations of the later frame, in radians. The middle of the later visit is `here` in
+    the earlier frame and `there` in its own, (n, 2) metres.
     """
 
     turns: Array

@@ -113,11 +113,7 @@ def usual_step(log: RobotLog) -> float:
 
 
 def _of_source(scans: tuple[Scan, ...], members: NDArray[np.intp]) -> tuple[Scan, ...]:
-    """Replace the odometry of all scans by that of one source, inter- and extrapolated.
-
-    Args:
-        members: Indices of the scans of that source.
-    """
+    """Replace the odometry of all scans by that of one source, inter- and extrapolated."""
     from scipy.interpolate import interp1d
 
     poses = np.array([scans[number].odometry for number in members])
@@ -296,29 +292,17 @@ def unknown_steps(log: RobotLog) -> Unknown:
 
 
 def _targets(steps: NDArray[np.bool_]) -> frozenset[int]:
-    """The indices of the scans that steps lead to.
-
-    Args:
-        steps: (n - 1,) mask of the steps between n scans.
-    """
+    """The indices of the scans that steps, (n - 1,), lead to."""
     return frozenset((np.flatnonzero(steps) + 1).tolist())
 
 
 def _impossible(
     log: RobotLog, seconds: NDArray[np.float64] | None, paused: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Find impossible steps and doubtful ones.
+    """Find impossible steps and doubtful ones, (n - 1,) masks. The doubtful include the impossible.
 
     A step is impossible if it is long in metres, longer than the usual step, and too long for the
-    time that it took.
-
-    Args:
-        seconds: (n - 1,) duration of each step; None if unknown.
-        paused: (n - 1,) mask of the steps that took unusually long.
-
-    Returns:
-        Masks, (n - 1,), of the impossible and of the doubtful steps. Impossible steps are also
-        doubtful.
+    time that it took. `paused` are those that took unusually long.
     """
     far, over_two = _far(log, 1), _far(log, 2)
     if not far.any():
@@ -343,10 +327,9 @@ def _moved_while_still(
 ) -> tuple[frozenset[int], tuple[tuple[int, int], ...]]:
     """Find stretches in which the odometer stands still, but the laser shows a motion.
 
-    Returns:
-        The scans before which there was a pause and somebody moved the robot; and the first and
-        last scan of each stretch with a motion. Both are empty if the odometer mostly stands
-        still, because then there is no odometry.
+    Returns the scans before which there was a pause and somebody moved the robot; and the first and
+    last scan of each such stretch. Both are empty if the odometer mostly stands still, because then
+    there is no odometry.
     """
     still = stands_still(log)
     if is_missing(log):

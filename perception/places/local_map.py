@@ -198,12 +198,7 @@ class LocalMaps:
     def _trail(
         self, begin: int, end: int, first: NDArray[np.int64], shape: tuple[int, ...]
     ) -> Bools:
-        """Mask of the cells on the trajectory of the window.
-
-        Args:
-            end: Scan after the last of the window.
-            first: Cell at the corner of the patch, counted from the origin.
-        """
+        """Mask of the cells, from the cell `first` on, of the trajectory of the window."""
         path = self._recent.poses(begin, end)[:, :2]
         legs = [
             np.linspace(a, b, 2 + int(math.dist(a, b) / CELL)) for a, b in itertools.pairwise(path)

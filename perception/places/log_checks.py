@@ -307,12 +307,7 @@ def _contradictions(log: RobotLog, track: Track) -> list[int]:
 
 
 def _intruding(log: RobotLog, track: Track, one: int, other: int) -> tuple[int, int]:
-    """Count the points of scan `one` in the free space of scan `other`.
-
-    Returns:
-        The number of points that lie nearer to the laser of `other` than the walls that it saw
-        there, and the number of points that it should have seen.
-    """
+    """Count the points of a scan in the free space of another, and those it should have seen."""
     pose = moved(_pose(track, one), log.scans[one].laser.mount)
     scan, laser = log.scans[other], log.scans[other].laser
     x, y, heading = between(moved(_pose(track, other), laser.mount), pose)
@@ -331,13 +326,7 @@ def _intruding(log: RobotLog, track: Track, one: int, other: int) -> tuple[int, 
 
 
 def _neighbours(ranges: Array, beam: Array, best: Callable[..., Array]) -> Array:
-    """Take the best range of each beam and its two neighbours, (k,).
-
-    Args:
-        ranges: (n,) ranges in metres.
-        beam: (k,) indices of beams.
-        best: np.min for the shortest of the three ranges, np.max for the longest.
-    """
+    """Take the `best` (np.min or np.max) range of each beam, (k,), and its two neighbours, (k,)."""
     return best([ranges[beam - 1], ranges[beam], ranges[beam + 1]], axis=0)
 
 

@@ -201,14 +201,7 @@ class Turned:
 
 
 def _spread_out(at: Array) -> Array:
-    """Distribute each point over the four cells around it, by its distances from them.
-
-    Args:
-        at: (n, 2) rows and columns of the points, as fractions of cells.
-
-    Returns:
-        (SIDE, SIDE) the weight of points in each cell.
-    """
+    """The weight of points in each cell, (SIDE, SIDE). Each is spread over four cells."""
     corner = np.floor(at)
     rest = at - corner
     cells = corner.astype(np.intp)
@@ -246,12 +239,9 @@ def match(first: Scene, second: Turned) -> Match | None:
 
 
 def _scores(first: _Spectra, second: _Spectra, least: float) -> Array:
-    """The coarse score of each rotation and shift: (n, shifts, shifts).
+    """The coarse score of each rotation and shift, (n, shifts, shifts).
 
-    Args:
-        first: The spectra of the first place, conjugated.
-        second: The spectra of the second place.
-        least: The score is divided by this number of observed points at least.
+    The spectra of the first place are conjugated. The score is divided by at least `least` points.
     """
     walls, blurred, observed = first
     points, soft, seen = second
@@ -269,11 +259,7 @@ def _correlated(products: _Spectra) -> _Floats:
 
 
 def _spread(less: Array) -> float:
-    """The standard deviation of the shift in metres.
-
-    Args:
-        less: (n, shifts, shifts) scores minus the best one.
-    """
+    """The standard deviation of the shift in metres, by scores minus the best one."""
     weights = np.exp(SHARPNESS * less).sum(axis=0)
     weights /= weights.sum()
     x, y = (float((weights * grid).sum()) for grid in (_X, _Y))

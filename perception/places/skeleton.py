@@ -107,10 +107,6 @@ def _with_mouths(found: list[Fork], mouths: list[Fork], far: float) -> list[Fork
     """Combine the junctions of a skeleton without shores and with shores.
 
     Those with shores are taken. A junction amid an open space, far from all of these, is kept.
-
-    Args:
-        found: The junctions of the skeleton without shores.
-        far: Distance of a shore from obstacles, in cells.
     """
     # The disc of a junction amid an open space is as large as those of the mouths around it.
     amid = [
@@ -198,14 +194,7 @@ def pruned(graph: Graph) -> Graph:
 
 
 def _out(edge: Edge, nodes: Mapping[int, Node], degrees: Mapping[int, int]) -> float | None:
-    """Compute by how many metres a branch to prune leads out of the disc of its junction.
-
-    Args:
-        degrees: The number of edges of each node.
-
-    Returns:
-        The metres; None if the edge is no dead end, or leads far enough to stay.
-    """
+    """Compute how many metres a dead end leads out of its junction's disc; None if it stays."""
     if degrees[edge.ends[0]] < 3 or degrees[edge.ends[1]] > 1 or nodes[edge.ends[1]].cut:
         return None
     junction, end = (nodes[node] for node in edge.ends)
@@ -247,10 +236,7 @@ def _are_one(
 ) -> bool:
     """Check whether the junctions of an edge are in one open space.
 
-    Args:
-        heads: For each end of the edge, the junction with the largest disc among those that were
-            merged with that end.
-        distance: (rows, columns) distance of each cell to the nearest obstacle, in cells.
+    `heads` has, for each end, the junction with the largest disc of those merged with that end.
     """
     first, second = (nodes[node] for node in heads)
     rows, columns = np.rint(edge.cells).astype(int).T
@@ -265,9 +251,7 @@ def _are_one(
 def _branches(graph: Graph, group: set[int], radius: float) -> list[Array]:
     """List the lines that lead away from a group of merged junctions.
 
-    Args:
-        radius: Radius of the merged junction in cells. Lines within the group that are shorter than
-            its diameter are left out.
+    Lines within the group that are shorter than its diameter are left out.
     """
     found = []
     for edge in graph.edges:
@@ -299,11 +283,7 @@ def bends(graph: Graph, distance: Array, out: float) -> Iterator[Bend]:
 def _bends_of(edge: Edge, first: float, last: float, distance: Array, out: float) -> Iterator[Bend]:
     """Find the bends of one line, the sharpest first. See `bends`.
 
-    Args:
-        first: Length of the line in the disc of its first node, in cells.
-        last: Length of the line in the disc of its last node, in cells.
-        distance: (rows, columns) distance of each cell to the nearest obstacle, in cells.
-        out: How far outside the disc of a cell directions are measured, in cells.
+    The discs of its nodes hold its `first` and `last` cells, by length.
     """
     cells = edge.cells
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(cells, axis=0).T))])
@@ -318,13 +298,10 @@ def _bends_of(edge: Edge, first: float, last: float, distance: Array, out: float
 
 
 def _turns(cells: Array, along: Array, radii: Array, out: float) -> Array:
-    """Compute by how many radians a line turns at each cell, (n,).
+    """Compute by how many radians a line of cells, (n, 2), turns at each of them, (n,).
 
-    Args:
-        cells: (n, 2) rows and columns.
-        along: (n,) length of the line up to each cell.
-        radii: (n,) radius of the disc of each cell, in cells.
-        out: How far outside the disc of a cell directions are measured, in cells.
+    `along` is the length up to each cell, `radii` has the discs, and directions are measured `out`
+    cells outside these.
     """
 
     def at(where: Array) -> Array:

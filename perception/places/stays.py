@@ -44,11 +44,8 @@ RIM, SMALL = 0.5, 0.5
 class _Turn:
     """A scan at which the robot turned around, or at which the drive begins or ends.
 
-    Attributes:
-        way: Metres driven up to it.
-        stride: The metres before and after the scan over which directions of motion are measured.
-        angle: The angle between these directions in radians.
-        scan: Index of the scan.
+    `way` is in metres. Over `stride` metres before and after the scan, directions differ by
+    `angle`.
     """
 
     way: float
@@ -124,10 +121,8 @@ class Stays:
     def _may_overlap(self, last: Visit, scan: int, begin: int | None = None) -> bool:
         """Whether a visit may overlap with the visit before it.
 
-        Args:
-            last: The visit before it.
-            scan: The scan nearest to the middle of the visit, or the earliest that it may be.
-            begin: The first scan of the visit, or the earliest that it may be; None for `scan`.
+        `scan` is nearest to its middle, and `begin` its first one, or the earliest that they may
+        be.
         """
         soon = self._recent.way(scan) <= self._recent.way(last.scan) + STAY
         return soon and (scan if begin is None else begin) <= last.end + 2
@@ -244,13 +239,9 @@ class Stays:
         return _in_order(replace(visit, ways=tuple(ways), arrived=numbers[0], left=numbers[1]))
 
     def _crossing(self, visit: Visit, side: int) -> float | None:
-        """The direction in radians in which the robot crosses the disc of a place.
+        """The direction in radians in which the robot enters (side -1) or leaves (1) a disc.
 
-        Args:
-            side: -1 for entering the disc, 1 for leaving it.
-
-        Returns:
-            None if the log begins or ends in the disc.
+        None if the log begins or ends in the disc.
         """
         way = self._recent.way(visit.scan)
         turns = [one.scan for _, one in self._found if not one.support]
@@ -295,13 +286,9 @@ def _in_order(visit: Visit) -> Visit:
 
 
 def _taken(ways: list[Way], bearing: float) -> int:
-    """Find the way out that the robot took, and return its index in `ways`.
+    """Find the way out that the robot took, by its bearing in radians, as an index of `ways`.
 
     The way with nearly this bearing becomes sure. If there is none, a new way is added.
-
-    Args:
-        ways: The ways out of a place. They are changed.
-        bearing: Direction in which the robot crossed the disc, in radians.
     """
     near = [k for k in range(len(ways)) if apart(ways[k].bearing, bearing) < MERGED]
     if not near:

@@ -176,12 +176,7 @@ def _parts(mask: Bools) -> list[list[int]]:
 
 
 def _in_order(cells: Sequence[int], steps: Sequence[int]) -> list[int]:
-    """The cells of a line from one end to the other.
-
-    Args:
-        cells: The numbers of the cells, ascending.
-        steps: The offsets of the eight neighbours of a cell, in the order in which they are tried.
-    """
+    """The cells of a line from one end to the other. `steps` are tried in their order."""
     left = set(cells)
     is_end = (cell for cell in cells if sum(cell + step in left for step in steps) < 2)
     cell: int | None = next(is_end, cells[0])
@@ -196,12 +191,9 @@ def _in_order(cells: Sequence[int], steps: Sequence[int]) -> list[int]:
 def _add_line(
     graph: Graph, line: NDArray[np.int64], touched: Sequence[list[int]], distance: Array
 ) -> None:
-    """Add a line to a graph, with a node at each of its ends that is at no junction.
+    """Add a line, (n, 2), to a graph, with a node at each of its ends that is at no junction.
 
-    Args:
-        line: (n, 2) rows and columns along the line.
-        touched: The junctions that touch its first and its last cell.
-        distance: (rows, columns) distances to the outside, in cells.
+    `touched` has the junctions that touch its first and its last cell.
     """
     if len(line) == 1:  # Both ends are at one cell.
         touched = [touched[0][:1], touched[0][1:2]]
@@ -217,13 +209,7 @@ def _add_line(
 
 
 def _forks_beside(known: Mapping[int, int], cell: int, steps: Sequence[int]) -> list[int]:
-    """List the numbers of the junctions that touch a cell, ascending.
-
-    Args:
-        known: The number of the junction at each cell of a junction.
-        cell: The cell.
-        steps: The offsets of the eight neighbours of a cell.
-    """
+    """List the numbers of the junctions that touch a cell, ascending."""
     return sorted({known[cell + step] for step in steps if cell + step in known})
 
 

@@ -128,10 +128,7 @@ def _step(
 ) -> Step:
     """Make one step, without its action.
 
-    Args:
-        visit: Visit that the step belongs to.
-        last: Visit and pose of the last step; None for the first step. The displacement leads from
-            this pose, unless the track is cut between.
+    The displacement leads from the pose of the `last` step, unless the track is cut between.
     """
     onward = covariance = None
     cuts = [] if last is None else track.cuts_between(last[0].scan, visit.scan)
@@ -213,11 +210,7 @@ def _covariance(track: Track, begin: int, end: int, first: Pose, last: Pose) -> 
 
 
 def _with_turns(steps: list[Step], visits: Sequence[Visit]) -> list[Step]:
-    """Add the turns between two steps of a visit.
-
-    Args:
-        steps: The steps. Those that end with a travel have their action.
-    """
+    """Add the turns between two steps of a visit, to steps with the actions of travels."""
     done = list(steps)
     for i, step in enumerate(steps[:-1]):
         if step.action is None:

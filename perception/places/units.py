@@ -70,13 +70,10 @@ def units_of(log: RobotLog) -> tuple[Units, list[str]]:
 
 
 def _length(log: RobotLog) -> tuple[float, list[str]]:
-    """Recognise the unit of length.
+    """Recognise how many units make a metre, 1 if no unit fits, with a note.
 
     It is recognised on a stretch of the log: in the right unit, the odometry there agrees with scan
     matching.
-
-    Returns:
-        How many units make a metre, 1 if no unit fits, and a list of at most one note.
     """
     usual = jumps.usual_step(log)
     if usual <= SPARSE:

@@ -168,15 +168,7 @@ def _of_folder(path: Path, folder: Path, stack: ExitStack) -> Files:
 
 
 def _open_part(path: Path, files: Files, folder: Path, stack: ExitStack) -> None:
-    """Open one file, and add its reader to those of the drive.
-
-    Args:
-        files: Open files of the drive; receives the reader and notes.
-        folder: Temporary folder, for an unpacked copy or a link.
-
-    Raises:
-        LogError: No message can be read.
-    """
+    """Open one file, and add its reader and notes to those of the drive, or raise LogError."""
     source = named(path)
     here = folder / f"{len(list(folder.iterdir()))}{dict(MAGICS.values())[files.format]}"
     with path.open("rb") as file:
@@ -214,11 +206,7 @@ def _by_rosbags(path: Path, format: str, stack: ExitStack) -> Any:
 
 
 def _copied(file: IO[bytes], here: Path, source: str) -> list[str]:
-    """Unpack a file to the path `here`, as far as it is intact.
-
-    Returns:
-        One note if the file is cut or damaged; otherwise none.
-    """
+    """Unpack a file to the path `here`, as far as it is intact, with a note if it is not."""
     with here.open("wb") as copy:
         try:
             copied(unpacked(file, source), copy, source)
@@ -240,11 +228,7 @@ def _format(path: Path) -> str | None:
 
 
 def _drive(part: Path) -> str:
-    """The name of the drive that a part belongs to.
-
-    It is the name of the file without the number of the part and without the ending of a packed
-    file.
-    """
+    """The name of the drive of a part: its file's, without the number and the ending of packing."""
     stem, ending = NAMES.sub("", part.name), NAMES.search(part.name)
     found = PART.match(stem)
     return f"{found['drive'] if found else stem}.{ending[1] if ending else ''}"

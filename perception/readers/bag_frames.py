@@ -95,14 +95,7 @@ def frames_of(bag: Bag, seen: set[str], damaged: list[Damage]) -> Frames:
 
 
 def _record(frames: Frames, child: str, parent: str, transform: Any, is_static: bool) -> Frame:
-    """Record a message with the transform from a parent frame to a child frame.
-
-    Returns:
-        All that is known of this transform.
-
-    Raises:
-        Damaged: The numbers are no pose.
-    """
+    """Record a message with the transform from a parent frame to a child frame."""
     move, turn = transform.translation, transform.rotation
     flat = flat_pose(move, turn)
     parents = frames.setdefault(child, {})

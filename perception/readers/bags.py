@@ -130,16 +130,9 @@ def _scan_topics(bag: Bag, named: Sequence[str]) -> list[str]:
 
 
 def _chosen(bag: Bag, kinds: Sequence[str], name: str | None, option: str) -> str | None:
-    """Choose a topic: the named one, or the only one with messages of some kinds.
+    """Choose a topic: the named one, or the only one with messages of some kinds, if any.
 
-    Args:
-        name: Name of the topic; None for the only one.
-
-    Returns:
-        The topic; None if no topic has such messages.
-
-    Raises:
-        LogError: The named topic does not exist, or several topics exist and none is named.
+    Raises LogError if the named topic does not exist, or several exist and none is named.
     """
     counts = {topic: count for topic, count in bag.topics(*kinds).items() if count}
     short = kinds[0].rpartition("/")[2]
@@ -166,14 +159,9 @@ def _chosen(bag: Bag, kinds: Sequence[str], name: str | None, option: str) -> st
 
 
 def _survey(bag: Bag, topics: Sequence[str]) -> tuple[dict[str, NDArray[np.float64]], Counter[str]]:
-    """Count the scans of a bag.
+    """Count the scans of a bag by frame, with their times, (n, 2), by topic, or raise LogError.
 
-    Returns:
-        For each topic, the time in the header and the time of recording of each scan, (n, 2), in
-        seconds; and the number of scans of each frame.
-
-    Raises:
-        LogError: No scan can be read.
+    The times are in seconds: that in the header, and that of recording.
     """
     times: dict[str, list[tuple[float, float]]] = {}
     frames: Counter[str] = Counter()
@@ -191,17 +179,10 @@ def _survey(bag: Bag, topics: Sequence[str]) -> tuple[dict[str, NDArray[np.float
 def _odometer(
     bag: Bag, topic: str, damaged: list[Damage], notes: list[str]
 ) -> tuple[Track, str, str]:
-    """Read the poses of the odometer.
+    """Read the poses of the odometer, the name of their frame, and that of the frame of the robot.
 
-    Args:
-        damaged: Receives the messages that cannot be read.
-        notes: Receives a note if several programs publish the topic.
-
-    Returns:
-        The poses, the name of their frame, and that of the frame of the robot.
-
-    Raises:
-        LogError: No message can be read.
+    `damaged` receives the messages that cannot be read, `notes` a note if several programs publish
+    the topic. Raises LogError if no message can be read.
     """
     tracks: dict[tuple[str, str, str], Track] = {}
     for connection, number, recorded, message in bag.messages({topic}):
@@ -242,17 +223,7 @@ def _odometer(
 
 
 def _odometer_of_transforms(bag: Bag, frames: Frames, frame: str) -> tuple[Track, str, str]:
-    """Take the poses of the odometer from the transforms from `odom` to the robot.
-
-    Args:
-        frames: Transforms between frames.
-
-    Returns:
-        The poses, the name of their frame, and that of the frame of the robot.
-
-    Raises:
-        LogError: No transform changes over time.
-    """
+    """Take what `_odometer` returns from the transforms from `odom` to the robot."""
     chain = [(child, parent_of(frames, child)) for child in ancestors(frames, frame)]
     moving = [(child, one) for child, one in chain if one.track is not None]
     found = next(
@@ -269,11 +240,7 @@ def _odometer_of_transforms(bag: Bag, frames: Frames, frame: str) -> tuple[Track
 
 
 def _of_one_source(track: Track, called: str, notes: list[str]) -> Track:
-    """Keep the poses of the largest source if the poses of several sources alternate.
-
-    Args:
-        notes: Receives a note if there are several sources.
-    """
+    """Keep the poses of the largest source if those of several alternate, and note it."""
     sources = sources_of(track)
     if len(sources) == 1:
         return track
@@ -313,11 +280,7 @@ class _ScanPoses:
     by_stamp: bool
 
     def at(self, time: float) -> tuple[Pose, Pose | None]:
-        """The pose by the odometer at a time in seconds, and the corrected pose, if there is one.
-
-        Raises:
-            Damaged: There is no odometry at that time.
-        """
+        """The poses by odometer and corrected (if any) at a time in seconds, or Damaged."""
         if not self.odometry.covers(time):
             begin, end = self.odometry.times[[0, -1]]
             raise Damaged(
@@ -335,14 +298,7 @@ class _ScanPoses:
 def _scans(
     bag: Bag, topics: set[str], where: _ScanPoses, damaged: list[Damage]
 ) -> Iterator[Scan | Damage]:
-    """Yield the scans of a bag.
-
-    Args:
-        damaged: Damage that was found during the survey. It is yielded first.
-
-    Yields:
-        Scans, and `Damage` for messages that cannot be read.
-    """
+    """Yield the scans of a bag, and `Damage` for what cannot be read."""
     yield from damaged
     for connection, number, recorded, message in bag.messages(topics):
         if isinstance(message, Damage):
@@ -360,10 +316,7 @@ def _scans(
 def _measured(message: Any, mount: Pose, is_flipped: bool) -> tuple[NDArray[np.float64], Laser]:
     """Read the ranges of a message, and describe its laser. Raises Damaged.
 
-    Args:
-        message: A LaserScan or MultiEchoLaserScan.
-        mount: Pose of the laser in the frame of the robot.
-        is_flipped: Whether the laser hangs upside down, so that its beams turn clockwise.
+    The beams of a flipped laser, which hangs upside down, turn clockwise.
     """
     first, step, nearest, reach = (
         float(v)

@@ -180,9 +180,7 @@ def _scans(
 ) -> Iterator[Scan | Damage]:
     """Yield the scans, and damage for lines that cannot be read.
 
-    Args:
-        mount: Pose of the laser in the frame of the robot.
-        reach: Reach of the laser in metres, if the lines of the scans do not give it.
+    `reach` is that of the laser in metres, if the lines do not give it.
     """
     # Scans without poses wait here for the next ODOM line.
     waiting: list[Scan | Damage] = []
@@ -281,10 +279,9 @@ class _Odometer:
         self.restarts |= self.meaning == "restarts" and tag != b"ODOM"
 
     def pose_of(self, line: ScanLine) -> tuple[Pose, Pose | None]:
-        """Compute the pose by the odometer at a scan, and the corrected pose, if it is known.
+        """The pose by the odometer at a scan, and the corrected pose, if any.
 
-        Raises:
-            Damaged: The pose should be that of a vertex, but there is none with this pose.
+        Raises Damaged if it should be that of a vertex, but there is none with this pose.
         """
         first, second = line.first, line.second
         if first is None or second is None:
@@ -329,10 +326,7 @@ class _Odometer:
         return replace(item, odometry=odometry, corrected=self._corrected(odometry))
 
     def _corrected(self, odometry: Pose) -> Pose | None:
-        """The true pose, from the last corrected pose and the odometry since then.
-
-        None if there was no corrected pose yet.
-        """
+        """The true pose, from the last corrected pose, if any, and the odometry since then."""
         return (
             moved(self.truth[0], between(self.truth[1], odometry))
             if self.truth is not None
@@ -345,10 +339,7 @@ def _measured(
 ) -> tuple[NDArray[np.float64], Laser]:
     """The ranges of a scan in metres, and its laser.
 
-    Args:
-        mount: Pose of the laser in the frame of the robot.
-        reach: Reach of the laser in metres, if the line does not give it.
-        fov: Field of view in radians, if the line does not give the geometry of the laser.
+    `reach`, in metres, and `fov`, in radians, hold if the line does not give them.
     """
     beams = len(line.ranges)
     if line.shape is None:

@@ -427,11 +427,7 @@ def _count_restart(
 ) -> None:
     """Count whether the ODOM line after a scan repeats the pose of the scan.
 
-    Args:
-        survey: Receives the counts.
-        before: Pose and time of the ODOM line before the scan.
-        pose: Pose of the ODOM line after the scan.
-        time: Time of the ODOM line after the scan, in seconds.
+    `before` has the pose and time, in seconds, of the ODOM line before the scan.
     """
     if line.second is None or before is None or before[0] == line.second:
         return

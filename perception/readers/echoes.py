@@ -268,11 +268,7 @@ def _kinds(scan: Scan) -> dict[str, Bools]:
 
 
 def _survey(scans: Sequence[Scan], options: LaserOptions) -> tuple[Meaning, list[str]]:
-    """Find out what the ranges of one laser mean.
-
-    Returns:
-        The meaning, and notes on it.
-    """
+    """Find out what the ranges of one laser mean."""
     laser, notes = scans[0].laser, list[str]()
     reach = options.reach(laser.reach)
     if options.no_return is None and (repeated := _repeated(scans)) is not None:
@@ -308,11 +304,7 @@ def _survey(scans: Sequence[Scan], options: LaserOptions) -> tuple[Meaning, list
 
 
 def _repeated(scans: Sequence[Scan]) -> tuple[float, float] | None:
-    """Find the range that means "nothing came back".
-
-    Returns:
-        The range in metres, and its share of all beams; None if there is no such range.
-    """
+    """Find the range that means "nothing came back", in metres, and its share of all beams."""
     laser = scans[0].laser
     with np.errstate(invalid="ignore"):
         kept = [
@@ -344,14 +336,7 @@ def _repeated(scans: Sequence[Scan]) -> tuple[float, float] | None:
 
 
 def _without_measurement(scans: Sequence[Scan], reach: float) -> tuple[frozenset[str], list[str]]:
-    """Find out which kinds of beams without a measurement mean that nothing came back.
-
-    Args:
-        reach: Reach of the laser in metres.
-
-    Returns:
-        These kinds, a subset of KINDS; and notes on beams without a measurement.
-    """
+    """Find the kinds of beams without a measurement that mean "nothing came back"."""
     counts = dict.fromkeys(KINDS, 0)
     beside: dict[str, list[Array]] = {kind: [] for kind in KINDS}
     lengths: list[Array] = []

@@ -127,14 +127,7 @@ def scan_line(tokens: list[bytes]) -> ScanLine | None:
 
 
 def _ranges(tokens: list[bytes], at: int) -> tuple[NDArray[np.float64], int]:
-    """Parse ranges that come after their number.
-
-    Args:
-        at: Index of the word with the number of ranges.
-
-    Returns:
-        (n,) metres, and the index of the word after the ranges.
-    """
+    """Parse ranges behind their number, at index `at`: metres, (n,), and the index behind them."""
     count = _whole(tokens[at] if at < len(tokens) else b"", "beams")
     if count == 0:
         raise Damaged("expected at least one beam, got none")

@@ -141,11 +141,7 @@ def _mcap(path: Path) -> Iterator[Message]:
 
 
 def _mcap_records(stream: IO[bytes], size: int) -> Iterator[tuple[int, bytes]]:
-    """Read the intact records of an MCAP stream of `size` bytes, including those in chunks.
-
-    Yields:
-        The kind and the content of each record.
-    """
+    """Yield the kind and content of the intact records of an MCAP stream, also in chunks."""
     while len(head := stream.read(9)) == 9:
         kind, length = struct.unpack("<BQ", head)
         data = stream.read(min(length, size))
@@ -184,11 +180,7 @@ def _ros1(path: Path) -> Iterator[Message]:
 
 
 def _ros1_records(stream: IO[bytes], size: int) -> Iterator[tuple[dict[bytes, bytes], bytes]]:
-    """Read the intact records of a ROS 1 stream of `size` bytes, including those in chunks.
-
-    Yields:
-        The fields of the header and the content of each record.
-    """
+    """Yield the header fields and content of intact records of ROS 1, also in chunks."""
 
     def part() -> tuple[bytes, bool]:
         """Read the next header or content of a record; return it, and whether it is complete."""
@@ -255,11 +247,7 @@ def _fields(data: bytes) -> dict[bytes, bytes]:
 
 
 def _unpacked(packed: str, data: bytes) -> bytes:
-    """Unpack the content of a chunk, as far as it exists.
-
-    Raises:
-        KeyError: The compression is unknown.
-    """
+    """Unpack the content of a chunk, as far as it exists. KeyError: unknown compression."""
     if packed in ("", "none"):
         return data
     from lz4.frame import LZ4FrameDecompressor

@@ -216,13 +216,9 @@ def _write_bag(path: Path, scans: Iterable[Scan], covariances: NDArray[np.float6
 def _messages(
     store: Any, scans: Iterable[Scan], covariances: NDArray[np.float64] | None, is_ros1: bool
 ) -> Iterator[tuple[str, int, Any]]:
-    """Make the messages of all scans.
+    """Yield topic, time in nanoseconds and message of all scans, or raise LogError.
 
-    Yields:
-        For each message: its topic, its time in nanoseconds, and the message.
-
-    Raises:
-        LogError: There is no scan, a time is negative, or the laser is not always mounted equally.
+    There has to be a scan. Times are not negative, and the laser is always mounted equally.
     """
     types = store.types
     mounted: set[Pose] = set()
@@ -270,9 +266,7 @@ def _messages(
 class _Maker:
     """Makes messages with one time.
 
-    Args:
-        numbering: Keyword argument with the sequence number of the header, for ROS 1; empty for
-            ROS 2.
+    For ROS 1, `numbering` has the sequence number of the header.
     """
 
     def __init__(self, types: Any, stamp: Any, numbering: dict[str, int]) -> None:
@@ -294,12 +288,7 @@ class _Maker:
         return self.types["tf2_msgs/msg/TFMessage"](transforms=[stamped])
 
     def odometry(self, pose: Pose, covariance: NDArray[np.float64]) -> Any:
-        """Make an Odometry message.
-
-        Args:
-            pose: x and y in metres, heading in radians.
-            covariance: (3, 3) covariance of the pose.
-        """
+        """Make an Odometry message of a pose with a (3, 3) covariance."""
         geometry, unknown = "geometry_msgs/msg/", np.zeros(36)
         # ROS has six dimensions; only three (plane) are known.
         known = np.zeros((6, 6))
