@@ -21,8 +21,8 @@ from worlds import TOURS, drive, rectangle
 from ssh_abduction import OnlineMapper, Solution, SSHMap, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data import Action, Odometry, Step, TheoryError, TraceError
-from ssh_abduction.online.background_mending import mended_map
 from ssh_abduction.online.keeper import MapKeeper
+from ssh_abduction.online.mender import mended_map
 from ssh_abduction.solver import Status
 from ssh_abduction.solver.guesses.tree import Sketch
 from ssh_abduction.solver.steps.chart import Chart
@@ -344,9 +344,9 @@ def test_mending_in_another_process_ends_with_its_mapper_and_with_the_program() 
 import threading
 from instances import maze
 from ssh_abduction import OnlineMapper, solve
-from ssh_abduction.online import background_mending
+from ssh_abduction.online import background
 from ssh_abduction.theory import Speedups
-background_mending.has_processors = lambda: True
+background.has_processors = lambda: True
 
 def begun(**options):
     trace = maze(10, 10, steps=200, seed=1, stars=True).trace

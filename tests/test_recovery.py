@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 from unittest.mock import patch
 
 import pytest
@@ -19,7 +20,8 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.data import TheoryError, TraceError
 from ssh_abduction.online import Belief
 from ssh_abduction.online import background_solve as solving
-from ssh_abduction.online.background_solve import BackgroundSolve, Solved
+from ssh_abduction.online.background import BackgroundTask
+from ssh_abduction.online.background_solve import MEANWHILE, Solved
 from ssh_abduction.online.hypotheses import Rival, Scale
 from ssh_abduction.online.recovery import Recovery
 from ssh_abduction.solver import Status
@@ -233,7 +235,8 @@ def test_what_takes_too_long_for_a_step_is_solved_while_the_robot_drives(
     trace, solved = circuit(30, wrong=17), solving.solved
     begun = []
 
-    def begin(now: Trace, theory: Theory, maps: int, speedups: Speedups) -> BackgroundSolve:
+    def begin(*task: Any) -> BackgroundTask[Solved]:
+        _, _, now, theory, _, maps, speedups = task
         found = solved(now, theory, None, maps, speedups)
         begun.append(len(now))
         ends = len(now) + 3
@@ -248,7 +251,7 @@ def test_what_takes_too_long_for_a_step_is_solved_while_the_robot_drives(
         return Stub()  # type: ignore[return-value]
 
     mapper = None
-    with patch.object(BackgroundSolve, "begun", begin), patch.object(solving, "solved", in_a_step):
+    with patch.object(BackgroundTask, "begun", begin), patch.object(solving, "solved", in_a_step):
         for mapper, solution in followed(trace, BOTH, NO_TIME):  # noqa: B007
             pass
     assert begun
@@ -270,7 +273,7 @@ class Busy:
 
 def test_where_clingo_cannot_be_stopped_in_time_steps_do_not_wait_for_it_again() -> None:
     with (
-        patch.object(BackgroundSolve, "begun", lambda *told: Busy()),
+        patch.object(BackgroundTask, "begun", lambda *told: Busy()),
         patch.object(solving, "OVERRUN", 0),
     ):
         answers = list(followed(circuit(30, wrong=17), BOTH, NO_TIME))
@@ -280,13 +283,14 @@ def test_where_clingo_cannot_be_stopped_in_time_steps_do_not_wait_for_it_again()
 
 def test_a_process_of_its_own_solves_the_trace() -> None:
     trace = circuit(20, wrong=17)
-    meanwhile = BackgroundSolve(trace, BOTH, None, Speedups())
+    meanwhile = BackgroundTask(solving.solved, trace, BOTH, MEANWHILE, None, Speedups())
     found = meanwhile.result()
     assert meanwhile.done()
     assert found is not None
     assert (found.status, found.complete, found.steps) == (Status.OPTIMAL, True, 21)
     assert found.maps == solve(trace, BOTH, max_maps=None).maps
-    ended = BackgroundSolve(circuit(2000, wrong=17), BOTH, None, Speedups())
+    long = circuit(2000, wrong=17)
+    ended = BackgroundTask(solving.solved, long, BOTH, MEANWHILE, None, Speedups())
     del ended  # and with it the process
     assert not _under_way
 

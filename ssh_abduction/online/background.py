@@ -1,4 +1,4 @@
-"""Run work in the background while the robot drives."""
+"""Run work in another process while the robot drives."""
 
 from __future__ import annotations
 
@@ -8,25 +8,36 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Generic, TypeVar
 
-from ssh_abduction.solver import LimitError, Watch
+from ssh_abduction.solver import LimitError, Watch, has_processors, in_process
+from ssh_abduction.theory.speedups import Speedups
 
 Result = TypeVar("Result")
 
 
 class BackgroundTask(Generic[Result]):
-    """Work that runs in a thread. It is stopped when this object is garbage collected.
+    """A function that runs in another process, until this object is garbage collected.
 
     Args:
-        work: The function that does the work and returns its result. It gets a watch, and should
-            stop when the watch is interrupted. It should start a process for long work.
+        function: The function. It also gets a `watch`, and should stop when this is interrupted.
+        arguments: Its other arguments.
     """
 
-    def __init__(self, work: Callable[[Watch], Result | None]) -> None:
+    def __init__(self, function: Callable[..., Result | None], *arguments: object) -> None:
         self._found: Future[Result | None] = Future()
         watch = Watch()
-        thread = threading.Thread(target=_do, args=(work, watch, self._found), daemon=True)
+        thread = threading.Thread(
+            target=_do, args=(function, arguments, watch, self._found), daemon=True
+        )
         weakref.finalize(self, _end, watch, thread)
         thread.start()
+
+    @classmethod
+    def begun(
+        cls, speedups: Speedups, function: Callable[..., Result | None], *arguments: object
+    ) -> BackgroundTask[Result] | None:
+        """Start and return a task; None with only one processor, or without `processes`."""
+        can_begin = speedups.processes and has_processors()
+        return cls(function, *arguments) if can_begin else None
 
     def done(self) -> bool:
         """Whether the work has ended."""
@@ -37,10 +48,15 @@ class BackgroundTask(Generic[Result]):
         return self._found.result()
 
 
-def _do(work: Callable[[Watch], Result | None], watch: Watch, found: Future[Result | None]) -> None:
+def _do(
+    function: Callable[..., Result | None],
+    arguments: tuple[object, ...],
+    watch: Watch,
+    found: Future[Result | None],
+) -> None:
     """Do the work, and store its result or its exception in `found`."""
     try:
-        found.set_result(work(watch))
+        found.set_result(in_process(function, *arguments, watch=watch))
     except LimitError:
         found.set_result(None)
     except BaseException as error:

@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from functools import partial
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.online.background import BackgroundTask
 from ssh_abduction.online.options import StepOptions
-from ssh_abduction.solver import Bound, Status, Stop, Watch, has_processors, in_process, solve
+from ssh_abduction.solver import Bound, Status, Stop, Watch, solve
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 
@@ -73,34 +72,6 @@ def solved(
     return Solved(len(trace), found.status, found.maps, found.bound, found.complete, found.stopped)
 
 
-class BackgroundSolve(BackgroundTask[Solved]):
-    """A background task that solves a trace in another process, for at most MEANWHILE seconds.
-
-    Args:
-        trace: The steps so far.
-        theory: The theory, in which no field is "auto".
-        maps: List at most this many maps; None lists all.
-        speedups: The speed-ups that are on.
-    """
-
-    def __init__(self, trace: Trace, theory: Theory, maps: int | None, speedups: Speedups) -> None:
-        super().__init__(partial(_solve, trace, theory, maps, speedups))
-
-    @staticmethod
-    def begun(
-        trace: Trace, theory: Theory, maps: int | None, speedups: Speedups
-    ) -> BackgroundSolve | None:
-        """Start and return the task; None with only one processor, or without `processes`."""
-        can_begin = speedups.processes and has_processors()
-        return BackgroundSolve(trace, theory, maps, speedups) if can_begin else None
-
-
-def _solve(
-    trace: Trace, theory: Theory, maps: int | None, speedups: Speedups, watch: Watch
-) -> Solved:
-    return in_process(solved, trace, theory, MEANWHILE, maps, speedups, watch=watch)
-
-
 class FaultSolver:
     """Solves a growing trace with faults again each time that it has grown enough.
 
@@ -115,7 +86,7 @@ class FaultSolver:
 
     def __init__(self, options: StepOptions, searches: int = 0) -> None:
         self.searches = searches
-        self.background: BackgroundSolve | None = None
+        self.background: BackgroundTask[Solved] | None = None
         self._options = options
         self._next_search = 0  # no search before the trace has this many steps
         # clingo cannot be stopped while it grounds a step. If the last search took far too long,
@@ -160,8 +131,9 @@ class FaultSolver:
         Returns:
             Whether a search is running there. False if processes cannot be used.
         """
-        self.background = self.background or BackgroundSolve.begun(
-            trace, theory, self._options.max_maps, self._options.speedups
+        speedups = self._options.speedups
+        self.background = self.background or BackgroundTask.begun(
+            speedups, solved, trace, theory, MEANWHILE, self._options.max_maps, speedups
         )
         return self.background is not None
 

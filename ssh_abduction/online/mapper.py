@@ -265,7 +265,7 @@ def _preload_engine(theory: Theory) -> None:
     if theory.level == "causal":
         importlib.import_module("ssh_abduction.solver.engines.causal")
     elif row("visits").holds_for(theory):
-        importlib.import_module("ssh_abduction.online.background_mending")
+        importlib.import_module("ssh_abduction.solver.engines.framed")
 
 
 class TheorySettler:

@@ -1,22 +1,23 @@
 """Mend maps while the robot drives, for when clingo finds no minimal map in time.
 
-To mend a map is to change it so that it fits a step that contradicts it.
+To *mend* a map that later steps contradict, keep as many of its dstates (distinctive states: a
+place and a heading) as possible, and add new dstates for what does not fit. The result satisfies
+the axioms of the theory (`solver/engines/framed.py`), but need not be minimal. This needs a theory
+that numbers the directions at each place (a frame).
 """
 
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.online.background import BackgroundTask
 from ssh_abduction.online.options import StepOptions
-from ssh_abduction.solver import AT_ONCE
-from ssh_abduction.theory.speedups import row
+from ssh_abduction.solver import AT_ONCE, Watch
+from ssh_abduction.theory.settle import Problem
+from ssh_abduction.theory.speedups import Speedups, row
 from ssh_abduction.theory.theory import Theory
-
-if TYPE_CHECKING:
-    from ssh_abduction.online.background_mending import MapMending
 
 # A first estimate: mending takes this many seconds times the square of the number of steps.
 MENDING = 5e-7
@@ -32,7 +33,7 @@ class Mender:
     """
 
     def __init__(self, options: StepOptions) -> None:
-        self.mending: MapMending | None = None  # under way in another process
+        self.mending: BackgroundTask[SSHMap] | None = None  # under way in another process
         self.options = options
         self._seconds = MENDING
 
@@ -73,15 +74,37 @@ class Mender:
         Returns:
             The mended map of all steps; None if none was made at once.
         """
-        from ssh_abduction.online.background_mending import MapMending, mended_map  # loads numpy
-
-        steps, now = len(trace), time.perf_counter()
+        steps, now, speedups = len(trace), time.perf_counter(), self.options.speedups
         assert self.options.time_limit is not None
         if self._seconds * steps**2 <= self.options.time_limit - (now - began):
-            found = mended_map(trace, theory, contradicted, self.options.speedups)
+            found = mended_map(trace, theory, contradicted, speedups)
             self._seconds = (time.perf_counter() - now) / steps**2
             return found
-        self.mending = self.mending or MapMending.begun(
-            trace, theory, self.options.speedups, contradicted
+        self.mending = self.mending or BackgroundTask.begun(
+            speedups, mended_map, trace, theory, contradicted, speedups
         )
         return None
+
+
+def mended_map(
+    trace: Trace, theory: Theory, known: SSHMap, speedups: Speedups, watch: Watch | None = None
+) -> SSHMap | None:
+    """Mend a map of the first steps of a trace that the later steps contradict.
+
+    Args:
+        trace: The whole trace.
+        theory: The theory, in which no field is "auto".
+        known: The map of the first steps.
+        speedups: The speed-ups that are on.
+        watch: Limits the work, and can interrupt it; None for no limit.
+
+    Returns:
+        A map of the whole trace, with new dstates for whatever does not fit; None if none is found.
+    """
+    from ssh_abduction.solver import FramedEngine, Task  # loads numpy
+
+    watch = watch or Watch()
+    found = FramedEngine(Task.of(Problem.of(trace, theory), watch, speedups)).map_mended_from(
+        known.dstate_at
+    )
+    return found.map if found else None
