@@ -52,6 +52,7 @@ from ssh_abduction.cli import (
 )
 from ssh_abduction.cli import reproduce as reproduction
 from ssh_abduction.cli.guard import Guard
+from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.parsing import Parser
 from ssh_abduction.cli.verbosity import add_verbosity, telling
 from ssh_abduction.data.errors import AbductionError, named, printable
@@ -176,16 +177,11 @@ def _main(arguments: Sequence[str] | None) -> int:
         with telling(options, for_programs), warnings.catch_warnings(record=True) as caught:
             warnings.filterwarnings("default", category=DeprecationWarning, module="ssh_abduction")
             try:
-                for note in options.notes:
-                    print(f"ssh-abduction: warning: {note}", file=sys.stderr)
+                warn(options.notes)
                 with Guard(lambda: None, lambda _: ("", program.interrupted_code()), None, None):
                     code = int(options.run(options))
             finally:
-                for warning in caught:
-                    print(
-                        f"ssh-abduction: warning: {printable(str(warning.message))}",
-                        file=sys.stderr,
-                    )
+                warn([printable(str(warning.message)) for warning in caught])
         sys.stdout.flush()
     except AbductionError as error:
         print(f"ssh-abduction: {error}", file=sys.stderr)

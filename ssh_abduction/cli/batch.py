@@ -25,12 +25,10 @@ from ssh_abduction.cli.options import theory_of
 from ssh_abduction.cli.outcome import (
     Given,
     all_given,
-    dump,
     ending,
     exit_code,
     explained,
     given_by,
-    map_record,
     on_ctrl_c,
     opening,
     warn,
@@ -38,10 +36,11 @@ from ssh_abduction.cli.outcome import (
 )
 from ssh_abduction.cli.text import headline
 from ssh_abduction.data.errors import AbductionError, SolverError, named
+from ssh_abduction.data.files import json_line
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.no_map import Explanation
 from ssh_abduction.runtime.program import SIGNALLED
-from ssh_abduction.solver import Backbone, Search, Solution, Start, Stop, workers
+from ssh_abduction.solver import Backbone, Search, Solution, Start, Stop, workers, written_map
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 
@@ -198,14 +197,12 @@ class Question:
     ) -> Answer:
         """Make the answer for a solution: its line, exit code and warnings."""
         if self.json:
-            count = len(maps)
-            records = list(map(map_record, maps))
-            line = dump(
+            line = json_line(
                 {
                     "trace": path,
                     **opening(search),
-                    "maps": records,
-                    **ending(search, solution, explanation, count, backbone),
+                    "maps": [written_map(*given) for given in maps],
+                    **ending(search, solution, explanation, len(maps), backbone),
                 }
             )
         else:
@@ -231,7 +228,7 @@ class Question:
         """Make the answer for a trace that could not be solved because of an error."""
         message = in_a_line(error)
         line = (
-            dump({"trace": path, "status": "error", "error": message})
+            json_line({"trace": path, "status": "error", "error": message})
             if self.json
             else f"{named(path)}: error: {message}"
         )

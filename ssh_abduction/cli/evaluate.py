@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from typing import TYPE_CHECKING
 
 from ssh_abduction.cli.options import Verbs, add_maps, add_trace, read_maps, trace_of
+from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.text import counted, table
 from ssh_abduction.data.errors import MapError, named
 from ssh_abduction.data.files import json_line
@@ -128,13 +128,14 @@ def run(options: argparse.Namespace) -> int:
         raise MapError(f"{named(options.maps)}: {error}") from None
     for visits in judged:
         if not visits.places.judged:
-            print(f"ssh-abduction: warning: {_nothing_judged(visits)}", file=sys.stderr)
+            warn([_nothing_judged(visits)])
         if visits.by_both is not None and visits.by_both[1] < ALIKE * visits.by_both[0]:
-            print(
-                "ssh-abduction: warning: relations and the poses of the trace agree on "
-                f"{visits.by_both[1]} of {counted(visits.by_both[0], 'pairs')} of visits only: "
-                f"are {named(options.relations)} relations of this log?",
-                file=sys.stderr,
+            warn(
+                [
+                    "relations and the poses of the trace agree on "
+                    f"{visits.by_both[1]} of {counted(visits.by_both[0], 'pairs')} of visits only: "
+                    f"are {named(options.relations)} relations of this log?"
+                ]
             )
     if options.json:
         record = {"count": len(maps)} if found is None else found.to_dict()

@@ -17,6 +17,7 @@ from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.obeying import as_corrected
 from ssh_abduction.cli.options import (
     Verbs,
+    add_limits,
     add_theory,
     maps_in,
     number_steps,
@@ -24,9 +25,10 @@ from ssh_abduction.cli.options import (
     theory_of_maps,
     trace_in,
 )
-from ssh_abduction.cli.outcome import dump, on_ctrl_c
+from ssh_abduction.cli.outcome import on_ctrl_c
 from ssh_abduction.data.drives import step_named
 from ssh_abduction.data.errors import AbductionError, named
+from ssh_abduction.data.files import json_line
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.mend import TraceExplanation, TraceQuestion
@@ -89,15 +91,7 @@ def add_parser(verbs: Verbs) -> None:
         "0 for all (default: 100)",
     )
     parser.add_argument("--json", action="store_true", help="print the explanation as JSON")
-    parser.add_argument(
-        "--time-limit", type=float, metavar="S", help="stop after S seconds and print what is known"
-    )
-    parser.add_argument(
-        "--memory-limit",
-        type=int,
-        metavar="MIB",
-        help="stop when the process has used this many MiB, and print what is known",
-    )
+    add_limits(parser, "what is known")
     parser.add_argument(
         "--corrections",
         metavar="FILE",
@@ -231,7 +225,7 @@ def _as_text(in_map: _InMap | None, explanation: Answer) -> str:
 
 def _as_json(in_map: _InMap | None, explanation: Answer) -> str:
     record = explanation.to_dict()
-    return dump(record | ({"map": in_map.to_dict()} if in_map else {})) + "\n"
+    return json_line(record | ({"map": in_map.to_dict()} if in_map else {})) + "\n"
 
 
 def _exit_code(explanation: Answer) -> int:

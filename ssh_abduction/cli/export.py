@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import sys
 
 from ssh_abduction.cli.options import Verbs, add_map, add_maps, trace_in
-from ssh_abduction.cli.parsing import true_or_false
+from ssh_abduction.cli.outcome import warn
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.trace import Trace
 
@@ -54,8 +53,6 @@ def add_parser(verbs: Verbs) -> None:
             "two neighbours (nav2 and tmap2 only; default: false)"
         ),
         default=False,
-        type=true_or_false,
-        metavar="true|false",
     )
     parser.add_setting(
         "name",
@@ -100,5 +97,5 @@ def run(options: argparse.Namespace) -> int:
     for doubt in doubts(
         chosen, options.to, level=options.level, turns=turns, hide_undecided=options.hide_undecided
     ):
-        print(f"ssh-abduction: warning: {doubt}", file=sys.stderr)
+        warn([doubt])
     return 0

@@ -8,9 +8,9 @@ from __future__ import annotations
 import argparse
 
 from ssh_abduction.cli.options import theory_of
-from ssh_abduction.cli.outcome import dump
 from ssh_abduction.cli.text import counted, table
 from ssh_abduction.data.errors import AbductionError
+from ssh_abduction.data.files import json_line
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime import program
 from ssh_abduction.solver import Front, fault_front
@@ -36,7 +36,7 @@ def run(options: argparse.Namespace) -> int:
         options.front,
         options.time_limit,
     )
-    print(dump(_as_data(front)) if options.json else _as_text(front, options.front))
+    print(json_line(_as_data(front)) if options.json else _as_text(front, options.front))
     return 10 if front.stopped else 0 if front.points else 20
 
 

@@ -18,7 +18,6 @@ from ssh_abduction.cli.options import (
     read_maps,
     trace_in,
 )
-from ssh_abduction.cli.parsing import true_or_false
 from ssh_abduction.cli.text import table
 from ssh_abduction.data.errors import LocaliserError, MapError, named
 from ssh_abduction.data.files import json_line
@@ -81,8 +80,6 @@ def add_parser(verbs: Verbs) -> None:
         "whether the map holds without exception: the defaults of misread, slipped and unmapped "
         "are then 0, and that of reentered is 1 (default: false)",
         default=False,
-        type=true_or_false,
-        metavar="true|false",
     )
     parser.add_argument(
         "--plot",

@@ -6,7 +6,6 @@ import argparse
 
 from ssh_abduction.cli.import_log import add_reading
 from ssh_abduction.cli.options import Verbs, add_theory, output
-from ssh_abduction.cli.parsing import true_or_false
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -62,15 +61,9 @@ def add_parser(verbs: Verbs) -> None:
         "ladder",
         "whether to compute how much each kind of evidence helps (default: true)",
         default=True,
-        type=true_or_false,
-        metavar="true|false",
     )
     parser.add_setting(
-        "again",
-        "whether to map also logs that are already mapped (default: false)",
-        default=False,
-        type=true_or_false,
-        metavar="true|false",
+        "again", "whether to map also logs that are already mapped (default: false)", default=False
     )
     many = parser.add_argument_group("many logs")
     many.add_argument(

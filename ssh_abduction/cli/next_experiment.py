@@ -7,7 +7,15 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.options import Verbs, add_maps, add_theory, add_trace, theory_of, trace_of
+from ssh_abduction.cli.options import (
+    Verbs,
+    add_limits,
+    add_maps,
+    add_theory,
+    add_trace,
+    theory_of,
+    trace_of,
+)
 from ssh_abduction.cli.outcome import on_ctrl_c, warn
 from ssh_abduction.cli.text import table
 from ssh_abduction.data.errors import MapError, named, printable
@@ -43,18 +51,7 @@ def add_parser(verbs: Verbs) -> None:
     )
     add_maps(parser)
     add_trace(parser)
-    parser.add_argument(
-        "--time-limit",
-        type=float,
-        metavar="S",
-        help="stop after S seconds and print the best plan so far",
-    )
-    parser.add_argument(
-        "--memory-limit",
-        type=int,
-        metavar="MIB",
-        help="stop when the process has used this many MiB, and print the best plan so far",
-    )
+    add_limits(parser, "the best plan so far")
     parser.add_argument("--json", action="store_true", help="print JSON")
     add_theory(parser, default="the theory in the file of maps")
     parser.set_defaults(run=run)

@@ -6,10 +6,11 @@ import argparse
 
 from ssh_abduction.cli.obeying import corrections_of
 from ssh_abduction.cli.options import number_steps, theory_of
-from ssh_abduction.cli.outcome import dump, exit_code
+from ssh_abduction.cli.outcome import exit_code
 from ssh_abduction.cli.text import describe, headline
 from ssh_abduction.data.drives import sentence_of, together
 from ssh_abduction.data.errors import AbductionError, printable
+from ssh_abduction.data.files import json_line
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver import Solution, solve
 from ssh_abduction.theory.speedups import Speedups
@@ -40,7 +41,7 @@ def run(options: argparse.Namespace) -> int:
     if options.output is not None:
         solution.save(options.output)
     if options.json:
-        print(dump(solution.to_dict()))
+        print(json_line(solution.to_dict()))
         return exit_code(solution)
     stands = ", ".join(solution.support.onto)
     print(headline(solution, len(solution.maps), None))

@@ -93,6 +93,19 @@ def helps() -> dict[str, str]:
     return {name: " ".join(text.split()).rstrip(".") for name, text in entries}
 
 
+def add_limits(parser: argparse.ArgumentParser, printed: str) -> None:
+    """Add the limits of a search, after which the verb prints `printed`."""
+    parser.add_argument(
+        "--time-limit", type=float, metavar="S", help=f"stop after S seconds and print {printed}"
+    )
+    parser.add_argument(
+        "--memory-limit",
+        type=int,
+        metavar="MIB",
+        help=f"stop when the process has used this many MiB, and print {printed}",
+    )
+
+
 def add_output(parser: argparse.ArgumentParser) -> None:
     """Add the option -o TRACE, which names the trace file to write."""
     parser.add_argument(

@@ -11,13 +11,12 @@ from itertools import zip_longest
 from typing import Any, TypeAlias
 from weakref import WeakKeyDictionary
 
-from ssh_abduction.data.files import json_line
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.explain.axioms import Interrupted
 from ssh_abduction.explain.no_map import Explanation, explain
 from ssh_abduction.learning.runner_up import second_map
 from ssh_abduction.runtime import program
-from ssh_abduction.solver import Backbone, Cost, Search, Solution, Status, written_map
+from ssh_abduction.solver import Backbone, Cost, Search, Solution, Status
 from ssh_abduction.solver import ending as written_ending
 from ssh_abduction.solver import opening as written_opening
 
@@ -53,16 +52,6 @@ def explained(search: Search) -> Explanation | None:
 def opening(search: Search) -> dict[str, Any]:
     """Make the fields of a solution's JSON that come before its maps."""
     return written_opening(search.theory, len(search.trace), search.limits.within)
-
-
-def map_record(given: Given) -> dict[str, Any]:
-    """Make the JSON of a map, with its cost if maps of several costs are listed.
-
-    Args:
-        given: The map; and its cost, or None to leave the cost out.
-    """
-    ssh_map, cost = given
-    return written_map(ssh_map, cost)
 
 
 def given_by(search: Search, ssh_map: SSHMap) -> Given:
@@ -134,11 +123,6 @@ def warn(warnings: Sequence[str]) -> None:
     """Print warnings on stderr."""
     for warning in warnings:
         print(f"ssh-abduction: warning: {warning}", file=sys.stderr)
-
-
-def dump(value: dict[str, Any]) -> str:
-    """Write a value as JSON on one line."""
-    return json_line(value)
 
 
 @contextlib.contextmanager

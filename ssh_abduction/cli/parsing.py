@@ -137,6 +137,8 @@ class Parser(argparse.ArgumentParser):
                 metavar="NAME=VALUE",
                 help="change one of the settings that are listed below; may be given again",
             )
+        if isinstance(default, bool):
+            details |= {"type": true_or_false, "metavar": "true|false"}
         self.settings[name] = Setting(name, help_text, **details)
         self.set_defaults(**{name: default})
 

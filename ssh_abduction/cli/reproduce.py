@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from ssh_abduction.cli.options import Verbs, output
-from ssh_abduction.cli.parsing import true_or_false
 from ssh_abduction.cli.text import table
 from ssh_abduction.data.errors import AbductionError, brief, named
 
@@ -48,8 +47,6 @@ def add_parser(verbs: Verbs) -> None:
         "for notched-rectangle, whether to try other depths of the notch and other spreads of the "
         "robot's poses, too (default: true)",
         True,
-        type=true_or_false,
-        metavar="true|false",
     )
     parser.add_argument(
         "-o",

@@ -6,7 +6,6 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.cli.options import Verbs, add_output, seed, write
-from ssh_abduction.cli.parsing import true_or_false
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import AbductionError, named, printable
 
@@ -33,7 +32,6 @@ SHIPPED = (
     "tower-3",
 )
 
-FLAG: dict[str, Any] = {"type": true_or_false, "metavar": "true|false"}
 METRES: dict[str, Any] = {"type": float, "metavar": "METRES"}
 SHARE: dict[str, Any] = {"type": float, "metavar": "SHARE"}
 
@@ -84,7 +82,7 @@ def add_parser(verbs: Verbs) -> None:
             "ranges",
             {"choices": ("ranges", "panoramas")},
         ),
-        ("stars", "whether to log the openings seen at each place (default: true)", True, FLAG),
+        ("stars", "whether to log the openings seen at each place (default: true)", True, {}),
         (
             "every",
             "metres from one image to the next, to log evenly spaced images instead of images at "

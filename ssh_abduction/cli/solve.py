@@ -15,16 +15,22 @@ from typing import Any
 
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.obeying import Obeying
-from ssh_abduction.cli.options import Verbs, add_theory, maps_in, number_steps, theory_of, trace_in
+from ssh_abduction.cli.options import (
+    Verbs,
+    add_limits,
+    add_theory,
+    maps_in,
+    number_steps,
+    theory_of,
+    trace_in,
+)
 from ssh_abduction.cli.outcome import (
     Given,
     all_given,
-    dump,
     ending,
     exit_code,
     explained,
     given_by,
-    map_record,
     on_ctrl_c,
     opening,
     warn,
@@ -33,6 +39,7 @@ from ssh_abduction.cli.outcome import (
 from ssh_abduction.cli.text import by_displacements, compared, describe, describe_backbone, headline
 from ssh_abduction.data.drives import sentence_of, together
 from ssh_abduction.data.errors import AbductionError
+from ssh_abduction.data.files import json_line
 from ssh_abduction.data.floors import floors_in_words
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
@@ -47,6 +54,7 @@ from ssh_abduction.solver import (
     Status,
     Stop,
     summary_of,
+    written_map,
 )
 from ssh_abduction.theory.speedups import SPEEDUPS, Speedups
 
@@ -113,18 +121,7 @@ def add_parser(verbs: Verbs) -> None:
         "The knee is the number of faults after which further ones save much fewer dstates"
     )
     parser.add_argument("--front", type=int, metavar="K", help=front)
-    parser.add_argument(
-        "--time-limit",
-        type=float,
-        metavar="S",
-        help="stop after S seconds and print the best answer so far",
-    )
-    parser.add_argument(
-        "--memory-limit",
-        type=int,
-        metavar="MIB",
-        help="stop when the process has used this many MiB, and print the best answer so far",
-    )
+    add_limits(parser, "the best answer so far")
     many = parser.add_argument_group(
         "many traces",
         (
@@ -324,7 +321,7 @@ class _Json:
         end = ending(self._search, solution, explanation, self._maps, backbone)
         if blamed := self._obeying.blamed(explanation):
             end["corrections"] = blamed
-        return f"\n],{dump(end)[1:]}\n"
+        return f"\n],{json_line(end)[1:]}\n"
 
     def last_words(self, why: Stop) -> tuple[str, int]:
         """The rest of the JSON, and the exit code, if the process must end before its search."""
@@ -338,7 +335,7 @@ class _Json:
 
     def _opening(self) -> str:
         self._begun = True
-        return dump(opening(self._search))[:-1] + ', "maps": ['
+        return json_line(opening(self._search))[:-1] + ', "maps": ['
 
     def _let_go(self) -> str:
         """Write the maps in memory in the order in which they were found, and forget them."""
@@ -347,7 +344,7 @@ class _Json:
 
     def _line(self, given: Given) -> str:
         self._maps += 1
-        return ("," if self._maps > 1 else "") + "\n" + dump(map_record(given))
+        return ("," if self._maps > 1 else "") + "\n" + json_line(written_map(*given))
 
 
 def _text(lines: Iterable[str]) -> str:

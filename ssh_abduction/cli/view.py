@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.cli.options import Verbs, add_maps, flags_of, trace_beside, trace_in
-from ssh_abduction.cli.parsing import true_or_false
 from ssh_abduction.data.errors import AbductionError, MapError, brief, is_whole, named
 
 if TYPE_CHECKING:
@@ -67,13 +66,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_setting(
         "port", "with --serve, the port (default: any free port)", 0, type=int, metavar="N"
     )
-    parser.add_setting(
-        "open",
-        "whether to open the page in the browser (default: true)",
-        True,
-        type=true_or_false,
-        metavar="true|false",
-    )
+    parser.add_setting("open", "whether to open the page in the browser (default: true)", True)
     parser.set_defaults(run=run)
     parser.epilog = (
         "The page is one file that works without a network. Without --serve, it shows commands "
