@@ -29,9 +29,8 @@ from ssh_abduction.data.drives import starts_of
 from ssh_abduction.data.odometry import between, moved
 from ssh_abduction.evaluation import evaluate_visits
 from ssh_abduction.robot_logs import log_report
-from ssh_abduction.robot_logs.drive_frames import BESIDE, laid_over
 from ssh_abduction.robot_logs.log_maps import map_log
-from ssh_abduction.robot_logs.log_picture import colour_of
+from ssh_abduction.robot_logs.log_picture import BESIDE, colour_of, laid_over
 from ssh_abduction.solver import Solution, solve
 from ssh_abduction.theory.theory import Theory
 

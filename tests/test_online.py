@@ -21,8 +21,8 @@ from worlds import TOURS, drive, rectangle
 from ssh_abduction import OnlineMapper, Solution, SSHMap, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data import Action, Odometry, Step, TheoryError, TraceError
+from ssh_abduction.online.background import mended_map
 from ssh_abduction.online.keeper import MapKeeper
-from ssh_abduction.online.mender import mended_map
 from ssh_abduction.solver import Status
 from ssh_abduction.solver.guesses.tree import Sketch
 from ssh_abduction.solver.steps.chart import Chart

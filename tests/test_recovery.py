@@ -19,9 +19,8 @@ from ssh_abduction import OnlineMapper, Solution, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data import TheoryError, TraceError
 from ssh_abduction.online import Belief
-from ssh_abduction.online import background_solve as solving
-from ssh_abduction.online.background import BackgroundTask
-from ssh_abduction.online.background_solve import MEANWHILE, Solved
+from ssh_abduction.online import background as solving
+from ssh_abduction.online.background import MEANWHILE, BackgroundTask, Solved
 from ssh_abduction.online.hypotheses import Rival, Scale
 from ssh_abduction.online.recovery import Recovery
 from ssh_abduction.solver import Status

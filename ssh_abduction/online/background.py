@@ -1,17 +1,53 @@
-"""Run work in another process while the robot drives."""
+"""Run work in another process while the robot drives: mend maps, or solve a trace with faults.
+
+To *mend* a map that later steps contradict, keep as many of its dstates (distinctive states: a
+place and a heading) as possible, and add new dstates for what does not fit. The result satisfies
+the axioms of the theory (`solver/engines/framed.py`), but need not be minimal. This needs a theory
+that numbers the directions at each place (a frame).
+
+Faults are steps that a map treats as wrong: a misread view, or an action that slipped.
+"""
 
 from __future__ import annotations
 
 import threading
+import time
 import weakref
 from collections.abc import Callable
 from concurrent.futures import Future
+from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from ssh_abduction.solver import LimitError, Watch, has_processors, in_process
-from ssh_abduction.theory.speedups import Speedups
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.trace import Trace
+from ssh_abduction.online.options import StepOptions
+from ssh_abduction.solver import (
+    AT_ONCE,
+    Bound,
+    LimitError,
+    Status,
+    Stop,
+    Watch,
+    has_processors,
+    in_process,
+    solve,
+)
+from ssh_abduction.theory.settle import Problem
+from ssh_abduction.theory.speedups import Speedups, row
+from ssh_abduction.theory.theory import Theory
 
 Result = TypeVar("Result")
+# A search in the background stops after this many seconds. By then the trace is much longer, and it
+# is better to search for a map of the longer trace.
+MEANWHILE = 60.0
+# After each search with a time limit the trace has to grow by this factor, and by at least this
+# many steps, before the next search.
+RETRY = 1.05
+PAUSE = 2
+# A search was slow if it took this many times the time limit.
+OVERRUN = 2
+# A first estimate: mending takes this many seconds times the square of the number of steps.
+MENDING = 5e-7
 
 
 class BackgroundTask(Generic[Result]):
@@ -67,3 +103,211 @@ def _end(watch: Watch, thread: threading.Thread) -> None:
     """Interrupt the work of a thread, and wait until it has ended."""
     watch.interrupted = True
     thread.join()
+
+
+@dataclass(frozen=True, slots=True)
+class Solved:
+    """The parts of a Solution that are needed here. Unlike a Solution, it can be pickled.
+
+    Attributes:
+        steps: The number of steps of the trace that was solved.
+        status: How much is proven.
+        maps: The minimal maps, or the best map found in time.
+        bound: The proven lower bound of the cost.
+        complete: Whether `maps` are all minimal maps.
+        stopped: The limit that ended the search; None if no limit did.
+    """
+
+    steps: int
+    status: Status
+    maps: tuple[SSHMap, ...]
+    bound: Bound
+    complete: bool
+    stopped: Stop | None
+
+
+def solved(
+    trace: Trace,
+    theory: Theory,
+    limit: float | None,
+    maps: int | None,
+    speedups: Speedups,
+    watch: Watch | None = None,
+) -> Solved:
+    """Run `solve` on a trace and return the parts of its solution that are needed.
+
+    Args:
+        trace: The steps so far.
+        theory: The theory, in which no field is "auto".
+        limit: Seconds for the search; None for no limit.
+        maps: List at most this many maps; None lists all.
+        speedups: The speed-ups that are on.
+        watch: Not used. It is here because `in_process` passes a watch as the last argument.
+    """
+    found = solve(
+        trace, theory.of_steps(0, len(trace)), time_limit=limit, max_maps=maps, speedups=speedups
+    )
+    return Solved(len(trace), found.status, found.maps, found.bound, found.complete, found.stopped)
+
+
+class FaultSolver:
+    """Solves a growing trace with faults again each time that it has grown enough.
+
+    Args:
+        options: The time limit and the other options of a step.
+        searches: The number to start counting searches from.
+
+    Attributes:
+        searches: Number of searches so far, except those in the background.
+        background: The search in the background; None if none is running.
+    """
+
+    def __init__(self, options: StepOptions, searches: int = 0) -> None:
+        self.searches = searches
+        self.background: BackgroundTask[Solved] | None = None
+        self._options = options
+        self._next_search = 0  # no search before the trace has this many steps
+        # clingo cannot be stopped while it grounds a step. If the last search took far too long,
+        # the next one runs in the background.
+        self._is_slow = False
+
+    def is_due(self, trace: Trace) -> bool:
+        """Whether the trace has grown enough since the last search to be solved again."""
+        return len(trace) >= self._next_search
+
+    def make_due(self) -> None:
+        """Make the next search due at once, whatever the last one found."""
+        self._next_search = 0
+
+    def solve(self, trace: Trace, theory: Theory, has_map: bool) -> Solved | None:
+        """Solve the trace within the time limit of a step, or in the background.
+
+        Args:
+            trace: The steps so far.
+            theory: The theory, in which no field is "auto".
+            has_map: Whether some map is known. If so, and the last search was slow, the search runs
+                in the background.
+
+        Returns:
+            The result; None if the search runs in the background.
+        """
+        steps, options = len(trace), self._options
+        limit = options.time_limit
+        self._next_search = 0 if limit is None else max(steps + PAUSE, int(RETRY * steps))
+        if self._is_slow and has_map and self.begin_in_background(trace, theory):
+            return None
+        self.searches += 1
+        began = time.perf_counter()
+        found = solved(trace, theory, limit, options.max_maps, options.speedups)
+        if limit is not None and found.stopped == "time limit":
+            self._is_slow = time.perf_counter() - began > OVERRUN * limit
+        return found
+
+    def begin_in_background(self, trace: Trace, theory: Theory) -> bool:
+        """Start a search in another process, unless one is running.
+
+        Returns:
+            Whether a search is running there. False if processes cannot be used.
+        """
+        speedups = self._options.speedups
+        self.background = self.background or BackgroundTask.begun(
+            speedups, solved, trace, theory, MEANWHILE, self._options.max_maps, speedups
+        )
+        return self.background is not None
+
+    def finished(self) -> Solved | None:
+        """Take the result of the search in the background; None if it is not done.
+
+        The trace that it solved may lack the last steps.
+        """
+        if self.background and self.background.done():
+            background, self.background = self.background, None
+            return background.result()
+        return None
+
+
+class Mender:
+    """Mends maps of a growing trace.
+
+    A map is mended at once if the step has time for that, and in another process otherwise.
+
+    Args:
+        options: The time limit and the other options of a step.
+    """
+
+    def __init__(self, options: StepOptions) -> None:
+        self.mending: BackgroundTask[SSHMap] | None = None  # under way in another process
+        self.options = options
+        self._seconds = MENDING
+
+    def finished(self) -> SSHMap | None:
+        """Take the map that the other process made; None if it is not done, or found none.
+
+        The map may lack the last steps of the trace.
+        """
+        if self.mending and self.mending.done():
+            mending, self.mending = self.mending, None
+            return mending.result()
+        return None
+
+    def suits(self, trace: Trace, theory: Theory) -> bool:
+        """Whether to mend maps.
+
+        Steps need a time limit, the theory has to number the directions at each place, and the
+        trace may not be too long.
+        """
+        return (
+            self.options.time_limit is not None
+            and row("visits").holds_for(theory)
+            and len(trace) <= AT_ONCE
+        )
+
+    def mended(
+        self, trace: Trace, theory: Theory, contradicted: SSHMap, began: float
+    ) -> SSHMap | None:
+        """Mend a map at once if this step has time for it, else in another process.
+
+        Args:
+            trace: The steps so far.
+            theory: The theory, in which no field is "auto".
+            contradicted: The best map of the steps before the last. The last step contradicts all
+                known maps.
+            began: When the step began, by `time.perf_counter`.
+
+        Returns:
+            The mended map of all steps; None if none was made at once.
+        """
+        steps, now, speedups = len(trace), time.perf_counter(), self.options.speedups
+        assert self.options.time_limit is not None
+        if self._seconds * steps**2 <= self.options.time_limit - (now - began):
+            found = mended_map(trace, theory, contradicted, speedups)
+            self._seconds = (time.perf_counter() - now) / steps**2
+            return found
+        self.mending = self.mending or BackgroundTask.begun(
+            speedups, mended_map, trace, theory, contradicted, speedups
+        )
+        return None
+
+
+def mended_map(
+    trace: Trace, theory: Theory, known: SSHMap, speedups: Speedups, watch: Watch | None = None
+) -> SSHMap | None:
+    """Mend a map of the first steps of a trace that the later steps contradict.
+
+    Args:
+        trace: The whole trace.
+        theory: The theory, in which no field is "auto".
+        known: The map of the first steps.
+        speedups: The speed-ups that are on.
+        watch: Limits the work, and can interrupt it; None for no limit.
+
+    Returns:
+        A map of the whole trace, with new dstates for whatever does not fit; None if none is found.
+    """
+    from ssh_abduction.solver import FramedEngine, Task  # loads numpy
+
+    watch = watch or Watch()
+    found = FramedEngine(Task.of(Problem.of(trace, theory), watch, speedups)).map_mended_from(
+        known.dstate_at
+    )
+    return found.map if found else None

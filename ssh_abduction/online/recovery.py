@@ -26,7 +26,7 @@ the logical representation can be restored" (Kuipers & Beeson 2002). This module
   the minimum, which is impossible. If an action was never tried, the causal theory loses no minimal
   map, as a new link to a dstate that looks right costs nothing, and nothing else does. If no
   minimal map predicts the step, the trace is solved again: within the time of a step, or in another
-  process while the robot drives (`background_solve.py`).
+  process while the robot drives (`background.py`).
 * **Rivals** (`rival_maps.py`): besides the minimal maps, explanations that cost a little more,
   each with its probability (`hypotheses.py`).
 * **Where the robot is** (`standing.py`), by Markov localisation in the best map. It begins just
@@ -41,7 +41,7 @@ from __future__ import annotations
 
 import time
 
-from ssh_abduction.online.background_solve import FaultSolver
+from ssh_abduction.online.background import FaultSolver
 from ssh_abduction.online.options import StepOptions
 from ssh_abduction.online.rival_maps import RivalMaps
 from ssh_abduction.online.standing import Confidence, Standing

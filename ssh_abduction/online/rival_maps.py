@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.maps import Fault
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.online.background_solve import Solved
+from ssh_abduction.online.background import Solved
 from ssh_abduction.online.chances import Chances
 from ssh_abduction.online.hypotheses import Rival, Scale, Seen
 from ssh_abduction.solver import Bound, Judging, Status, observation

@@ -3,6 +3,10 @@
 Edges follow the course of the robot. Travels between the same two places whose courses lie close
 together are one edge. Places show their disc and their gateways. Places that the robot only passed,
 always between the same two neighbours, are drawn as dots. Each of several drives has its colour.
+
+Each drive of a joint map has a frame of its own. It is moved and turned so that the places that it
+shares with drives before it lie on each other. A drive that shares no place is put beside the
+others.
 """
 
 from __future__ import annotations
@@ -26,7 +30,6 @@ from ssh_abduction.data.odometry import between, moved
 from ssh_abduction.output.drawing import ALARM, COLOURS, escaped, page, text, titled
 from ssh_abduction.output.region_marks import band, banded
 from ssh_abduction.output.undecided import place_of_steps, undecided_places
-from ssh_abduction.robot_logs.drive_frames import laid_over
 from ssh_abduction.solver import Solution
 
 Array = NDArray[np.float64]
@@ -48,6 +51,7 @@ BROAD = 2.0
 SURE = 0.95
 # The colour of edges that belong to no meaningful path, of walls, and of the robot's way.
 EDGE, WALL, WAY = "#0072b2", "#8a8a8a", "#c9d4df"
+ASIDE = 5.0  # metres between drives that share no place
 
 
 def figure(log: RobotLog, imported: Imported, solution: Solution) -> str:
@@ -363,3 +367,103 @@ def _walls(log: RobotLog, poses: Sequence[Pose]) -> Array:
 def _pose(row: Array) -> Pose:
     x, y, heading = row
     return float(x), float(y), float(heading)
+
+
+def laid_over(poses: Sequence[Pose], imported: Imported, ssh_map: SSHMap | None) -> list[Pose]:
+    """Move the poses of each drive into the frame of the first one.
+
+    Args:
+        poses: The pose of each scan, in the frame of its drive.
+        imported: The trace, and how it was made.
+        ssh_map: The map that says which places drives share; None if there is no map.
+    """
+    drives = drives_of(imported.trace)
+    bounds = [0, *imported.starts, len(poses)]
+    own = [np.array(poses[a:b]) for a, b in pairwise(bounds)]
+    spots = _spots(poses, imported)
+    laid: dict[int, Array] = {0: own[0]}
+    while len(laid) < len(drives):
+        k, pairs = _next(drives, ssh_map, list(laid))
+        if pairs:
+            move = _fitted(spots, pairs, ssh_map)
+        else:
+            right = max(part[:, 0].max() for part in laid.values()) + ASIDE
+            lowest = min(part[:, 1].min() for part in laid.values())
+            move = (right - own[k][:, 0].min(), lowest - own[k][:, 1].min(), 0.0)
+        laid[k] = np.array([moved(move, pose) for pose in own[k].tolist()])
+        for t in range(drives[k].first, drives[k].stop):
+            spots[t] = moved(move, spots[t])
+    return [(x, y, heading) for k in range(len(drives)) for x, y, heading in laid[k].tolist()]
+
+
+def _spots(poses: Sequence[Pose], imported: Imported) -> list[Pose]:
+    """The pose of each step: the middle of its place, and the heading of the robot."""
+    spots = []
+    for step in imported.trace.steps:
+        visit = imported.visits[int(step.extra["visit"])]
+        x, y, heading = step.extra["seen"]
+        spots.append(moved(poses[visit.scan], (float(x), float(y), float(heading))))
+    return spots
+
+
+def _next(
+    drives: Sequence[Drive], ssh_map: SSHMap | None, laid: Sequence[int]
+) -> tuple[int, list[tuple[int, int]]]:
+    """Choose the drive to move next: the one that shares most places with the moved drives, `laid`.
+
+    Return its index, and pairs of a step of a moved drive and a step of this drive at one place.
+    """
+    known: dict[object, list[int]] = defaultdict(list)
+    for k in laid:
+        for t in range(drives[k].first, drives[k].stop):
+            known[_station(ssh_map, t)].append(t)
+    pairs = {
+        k: [
+            (other, t)
+            for t in range(drives[k].first, drives[k].stop)
+            for other in known.get(_station(ssh_map, t), ())
+        ]
+        for k in range(len(drives))
+        if k not in laid
+    }
+    chosen = max(pairs, key=lambda k: len({_station(ssh_map, t) for _, t in pairs[k]}))
+    return chosen, pairs[chosen]
+
+
+def _station(ssh_map: SSHMap | None, step: int) -> object:
+    """The place of a step; the step itself if it is unknown."""
+    place = None if ssh_map is None else ssh_map.place_of(step)
+    return ("step", step) if place is None else place
+
+
+def _fitted(
+    spots: Sequence[Pose], pairs: Sequence[tuple[int, int]], ssh_map: SSHMap | None
+) -> Pose:
+    """Find the motion that brings the second step of each pair to the first, by least squares.
+
+    Each pose counts as two points: itself, and a point one metre ahead. So one pair is enough.
+    """
+    here, there = [], []
+    for first, second in pairs:
+        x, y, heading = spots[first]
+        u, v, other = spots[second]
+        heading += _turned(ssh_map, first, second)
+        there += [(x, y), (x + math.cos(heading), y + math.sin(heading))]
+        here += [(u, v), (u + math.cos(other), v + math.sin(other))]
+    source, target = np.array(here), np.array(there)
+    middle, goal = source.mean(axis=0), target.mean(axis=0)
+    (a, b), (c, d) = (source - middle).T, (target - goal).T
+    turn = math.atan2(float((a * d - b * c).sum()), float((a * c + b * d).sum()))
+    cos, sin = math.cos(turn), math.sin(turn)
+    x = goal[0] - cos * middle[0] + sin * middle[1]
+    y = goal[1] - sin * middle[0] - cos * middle[1]
+    return float(x), float(y), turn
+
+
+def _turned(ssh_map: SSHMap | None, first: int, second: int) -> float:
+    """The heading at `second` minus that at `first`, radians counterclockwise; 0 without poses."""
+    assert ssh_map is not None
+    if ssh_map.fit is None or not ssh_map.fit.poses:
+        return 0.0
+    one, other = (ssh_map.fit.poses[ssh_map.dstate_at[step]] for step in (first, second))
+    return other.heading - one.heading
