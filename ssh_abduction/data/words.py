@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import MISSING, fields
 from typing import Any
 
@@ -34,3 +35,19 @@ def shortly(value: Any) -> str:
     """Return a repr of a dataclass with only those fields that differ from their defaults."""
     fields_told = ", ".join(f"{name}={text}" for name, text in that_differ(value).items())
     return f"{type(value).__name__}({fields_told})"
+
+
+def attributes_of(value: Any, *names: str) -> dict[str, Any]:
+    """Return attributes of a value by name, as plain data for JSON.
+
+    Tuples become lists, and values that have a `to_dict` become dicts.
+    """
+    return {name: _plain(getattr(value, name)) for name in names}
+
+
+def _plain(value: Any) -> Any:
+    if hasattr(value, "to_dict"):
+        return value.to_dict()
+    if isinstance(value, Mapping):
+        return {key: _plain(part) for key, part in value.items()}
+    return [_plain(part) for part in value] if isinstance(value, tuple | list) else value

@@ -39,7 +39,7 @@ from ssh_abduction.data.checks import an_instance
 from ssh_abduction.data.errors import TraceError, brief, is_finite, named
 from ssh_abduction.data.maps import SSHMap, checked_maps
 from ssh_abduction.data.trace import Trace, checked_trace
-from ssh_abduction.data.words import counted
+from ssh_abduction.data.words import attributes_of, counted
 from ssh_abduction.evaluation.named_truth import checked_map
 from ssh_abduction.evaluation.relations import Relations
 from ssh_abduction.evaluation.trajectory import checked_pose, checked_time
@@ -109,13 +109,7 @@ class MapPairs:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a dict with counts, precision and recall."""
-        return {
-            "things": self.things,
-            "joined": self.joined,
-            "right": self.right,
-            "precision": self.precision,
-            "recall": self.recall,
-        }
+        return attributes_of(self, "things", "joined", "right", "precision", "recall")
 
 
 @dataclass(frozen=True, slots=True)

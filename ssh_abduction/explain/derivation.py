@@ -8,6 +8,7 @@ from typing import Any
 
 from ssh_abduction.checker.checker import Violation
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.words import attributes_of
 from ssh_abduction.explain.no_map import Clash
 
 # If an inference has more reasons than IN_A_LINE, each gets a line of its own.
@@ -54,13 +55,8 @@ class Inference:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the line as plain data, as `explain --json` prints it."""
-        return {
-            "says": list(self.says),
-            "because": list(self.because),
-            "links": [{"axiom": link.axiom, "steps": list(link.steps)} for link in self.links],
-            "premises": list(self.premises),
-            "supposed": self.supposed,
-        }
+        own = attributes_of(self, "says", "because", "premises", "supposed")
+        return own | {"links": [{"axiom": a.axiom, "steps": list(a.steps)} for a in self.links]}
 
 
 @dataclass(frozen=True, slots=True)

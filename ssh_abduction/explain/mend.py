@@ -9,6 +9,7 @@ from typing import Any
 from ssh_abduction.data.drives import drives_of, named_steps
 from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.trace import STANDARD_ACTIONS, Action, Step, Trace, View
+from ssh_abduction.data.words import attributes_of
 from ssh_abduction.explain.axioms import Axioms
 from ssh_abduction.explain.no_map import Explanation, explain
 from ssh_abduction.explain.piece import Piece
@@ -84,13 +85,8 @@ class Mend:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the mend as plain data, as `explain --json` prints it."""
-        return {
-            "step": self.step,
-            "kind": self.kind,
-            "seen": self.seen,
-            "instead": self.instead,
-            "proven": self.proven,
-            "sentence": str(self),
+        return attributes_of(self, "step", "kind", "seen", "instead", "proven") | {
+            "sentence": str(self)
         }
 
 
@@ -133,14 +129,8 @@ class TraceExplanation:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the answer as plain data, as `explain --json` prints it."""
-        return {
-            "possible": self.possible,
-            "sentences": list(self.sentences),
-            "clash": self.clash.to_dict() if self.clash else None,
-            "mends": [mend.to_dict() for mend in self.mends],
-            "complete": self.complete,
-            **({"stopped": self.stopped} if self.stopped else {}),
-        }
+        own = attributes_of(self, "possible", "sentences", "clash", "mends", "complete")
+        return own | ({"stopped": self.stopped} if self.stopped else {})
 
 
 class TraceQuestion(Question[TraceExplanation]):

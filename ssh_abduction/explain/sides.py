@@ -25,6 +25,7 @@ from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.regions import course_named, listed, regions_at
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.data.words import attributes_of
 from ssh_abduction.explain.question import Question
 from ssh_abduction.solver import Stop, with_regions
 from ssh_abduction.theory.theory import Theory, checked_theory
@@ -86,13 +87,7 @@ class PathSide:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the side as plain data, as `explain --json` prints it."""
-        return {
-            "path": self.path,
-            "side": self.side,
-            "steps": list(self.steps),
-            "sentence": self.sentence,
-            "agree": self.agree,
-        }
+        return attributes_of(self, "path", "side", "steps", "sentence", "agree")
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,16 +134,8 @@ class PlaceExplanation:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the explanation as plain data, as `explain --json` prints it."""
-        return {
-            "place": self.place,
-            "sides": [side.to_dict() for side in self.sides],
-            "regions": list(self.regions),
-            "changes": list(self.changes),
-            "maps": self.maps,
-            "possible": self.possible,
-            "stopped": self.stopped,
-            "sentences": list(self.sentences),
-        }
+        names = ("place", "sides", "regions", "changes", "maps", "possible", "stopped", "sentences")
+        return attributes_of(self, *names)
 
 
 class PlaceQuestion(Question[PlaceExplanation]):

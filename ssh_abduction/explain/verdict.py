@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
 
+from ssh_abduction.data.words import attributes_of
 from ssh_abduction.explain.derivation import Derivation
 from ssh_abduction.explain.no_map import Explanation
 from ssh_abduction.solver import Cost, Stop
@@ -61,13 +62,8 @@ class Side:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the side as plain data, as `explain --json` prints it."""
-        return {
-            "possible": self.possible,
-            "cost": self.cost.to_dict() if self.cost else None,
-            "proven": self.proven,
-            "maps": self.maps,
-            **({"nats": round(self.nats, 6)} if self.nats is not None else {}),
-        }
+        own = attributes_of(self, "possible", "cost", "proven", "maps")
+        return own | ({} if self.nats is None else {"nats": round(self.nats, 6)})
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,12 +235,9 @@ class PairExplanation:
         return {
             "steps": [self.first, self.second],
             "verdict": self.verdict.value,
-            "sentences": list(self.sentences),
-            "same": self.same.to_dict(),
-            "different": self.different.to_dict(),
-            "listed": self.listed,
-            "derivation": self.derivation.to_dict() if self.derivation else None,
-            "clash": self.clash.to_dict() if self.clash else None,
+            **attributes_of(
+                self, "sentences", "same", "different", "listed", "derivation", "clash"
+            ),
             **({"stopped": self.stopped} if self.stopped else {}),
         }
 

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from ssh_abduction.data.errors import MapError, printable
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.words import counted
+from ssh_abduction.data.words import attributes_of, counted
 from ssh_abduction.rivals.differences import Difference, difference
 from ssh_abduction.rivals.factors import deciding, independent, options_of
 from ssh_abduction.rivals.listing import Listing, Maps
@@ -82,11 +82,7 @@ class Choice:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the choice as plain data, as `compare --json` prints it."""
-        return {
-            "questions": [question.to_dict() for question in self.questions],
-            "options": [option.to_dict() for option in self.options],
-            "differing": {sort: list(steps) for sort, steps in self.differing.items()},
-        }
+        return attributes_of(self, "questions", "options", "differing")
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,9 +125,7 @@ class Others:
     def to_dict(self) -> dict[str, Any]:
         """Return the comparison as plain data, as `compare --json` prints it."""
         return {
-            "count": self.count,
-            "sentence": self.sentence,
-            "both": [list(pair) for pair in self.both],
+            **attributes_of(self, "count", "sentence", "both"),
             "only_first": list(self.here),
             "only_other": list(self.there),
             "best": self.best.to_dict(),
@@ -242,15 +236,8 @@ class Comparison:
         data: dict[str, Any] = {
             "summary": self.sentence,
             "count": len(self.ids),
-            "steps": self.steps,
-            "minimal": self.minimal,
-            "complete": self.complete,
-            "ids": list(self.ids),
-            "shared": self.shared.to_dict(),
-            "variants": dict(self.variants),
-            "choices": [choice.to_dict() for choice in self.choices],
-            "together": {sort: list(steps) for sort, steps in self.together.items()},
-            "deciding": [question.to_dict() for question in self.deciding],
+            **attributes_of(self, "steps", "minimal", "complete", "ids", "shared"),
+            **attributes_of(self, "variants", "choices", "together", "deciding"),
             "sizes": [
                 {"dstates": dstates, "places": places, "paths": paths, "count": count}
                 for (dstates, places, paths), count in self.sizes
@@ -259,13 +246,10 @@ class Comparison:
         if self.stopped:
             data["stopped"] = self.stopped
         if self.complete is False:
-            data["listed"] = self.listed.to_dict()
-            data["unlisted"] = {sort: list(steps) for sort, steps in self.unlisted.items()}
+            data |= attributes_of(self, "listed", "unlisted")
         if self.fits:
             data["chi2"] = list(self.fits)
-        if self.others:
-            data["others"] = self.others.to_dict()
-        return data
+        return data | (attributes_of(self, "others") if self.others else {})
 
 
 def compare(maps: Maps, other: Maps | None = None) -> Comparison:

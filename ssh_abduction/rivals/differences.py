@@ -24,6 +24,7 @@ from ssh_abduction.data.checks import a_list, a_text, all_instances
 from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.errors import MapError, brief, printable
 from ssh_abduction.data.maps import Fault, SSHMap, checked_map
+from ssh_abduction.data.words import attributes_of
 from ssh_abduction.rivals.sides import Beside, only_in
 from ssh_abduction.rivals.table import NONE, Table
 from ssh_abduction.solver import Sort, stretches
@@ -68,14 +69,8 @@ class Change:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the change as plain data, as `compare --diff --json` prints it."""
-        data: dict[str, Any] = {
-            "sort": self.sort,
-            "first": [list(g) for g in self.first],
-            "other": [list(g) for g in self.other],
-        }
-        if self.first_none or self.other_none:
-            data |= {"first_none": list(self.first_none), "other_none": list(self.other_none)}
-        return data
+        more = ("first_none", "other_none") if self.first_none or self.other_none else ()
+        return attributes_of(self, "sort", "first", "other", *more)
 
 
 @dataclass(frozen=True, slots=True)

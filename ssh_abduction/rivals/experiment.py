@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ssh_abduction.data.errors import printable
+from ssh_abduction.data.words import attributes_of
 from ssh_abduction.rivals.consequences import Consequence
 from ssh_abduction.rivals.machines import Seen
 from ssh_abduction.solver import Stop, stretches
@@ -49,14 +50,7 @@ class Untried:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the action as plain data, as `next --json` prints it."""
-        expects = [expectation.to_dict() for expectation in self.expects]
-        return {
-            "way": list(self.way),
-            "action": self.action,
-            "worst": self.worst,
-            "pairs": self.pairs,
-            "expects": expects,
-        }
+        return attributes_of(self, "way", "action", "worst", "pairs", "expects")
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,13 +109,10 @@ class Plan:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the plan as plain data, as `next --json` prints it."""
-        record: dict[str, Any] = {"rivals": list(self.rivals)}
+        own = attributes_of(self, "rivals")
         if self.branches:
-            record |= {
-                "actions": list(self.actions),
-                "branches": [branch.to_dict() for branch in self.branches],
-            }
-        return record | ({"untried": self.untried.to_dict()} if self.untried else {})
+            own |= attributes_of(self, "actions", "branches")
+        return own | (attributes_of(self, "untried") if self.untried else {})
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,17 +205,12 @@ class Experiment:
     def to_dict(self) -> dict[str, Any]:
         """Return plain data, as `next --json` prints it (docs/reference/formats.md)."""
         return {
-            "count": self.count,
-            "complete": self.complete,
+            **attributes_of(self, "count", "complete"),
             "summary": self.sentence,
-            "sharing": self.sharing,
-            "alike": [list(group) for group in self.alike],
-            "actions": list(self.actions),
-            "worst": self.worst,
+            **attributes_of(self, "sharing", "alike", "actions", "worst"),
             "longest": self.plan.longest,
-            "predictions": [prediction.to_dict() for prediction in self.predictions],
-            "plan": self.plan.to_dict(),
-        } | ({"stopped": self.stopped} if self.stopped else {})
+            **attributes_of(self, "predictions", "plan", *(["stopped"] if self.stopped else [])),
+        }
 
 
 def _sentence(experiment: Experiment) -> str:

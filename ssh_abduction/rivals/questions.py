@@ -16,6 +16,7 @@ import numpy as np
 
 from ssh_abduction.data.errors import printable
 from ssh_abduction.data.maps import Fault, SSHMap
+from ssh_abduction.data.words import attributes_of
 from ssh_abduction.rivals.table import Bools, Table
 from ssh_abduction.solver import SORTS, stretches
 
@@ -80,15 +81,10 @@ class Question:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the question as plain data, as `compare --json` prints it."""
-        data: dict[str, Any] = {
-            "sort": self.sort,
-            "first": self.first,
-            "later": self.later,
-            "yes": self.yes,
+        data = attributes_of(self, "sort", "first", "later", "yes", "here", "there") | {
+            "sentence": str(self)
         }
-        data |= {"here": list(self.here), "there": list(self.there), "sentence": str(self)}
-        if self.places:
-            data["places"] = [list(places) for places in self.places]
+        data |= attributes_of(self, "places") if self.places else {}
         if self.fault:
             data["fault"] = {k: v for k, v in asdict(self.fault).items() if v is not None}
         return data

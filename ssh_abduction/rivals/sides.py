@@ -22,7 +22,7 @@ from ssh_abduction.data.drives import named_steps
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.regions import right_of
-from ssh_abduction.data.words import counted
+from ssh_abduction.data.words import attributes_of, counted
 from ssh_abduction.rivals.listing import Listing
 
 SHOWN = 2  # a sentence names at most this many sides
@@ -80,11 +80,7 @@ class SharedSides:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data, as `compare --json` prints it."""
-        return {
-            "forced": [side.to_dict() for side in self.forced],
-            "possible": [side.to_dict() for side in self.possible],
-            "proven": self.proven,
-        }
+        return attributes_of(self, "forced", "possible", "proven")
 
 
 def shared_sides(listing: Listing) -> SharedSides | None:
