@@ -9,10 +9,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, ClassVar
 
-from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.theory.evidence.protocol import Equality
+from ssh_abduction.theory.evidence.protocol import Evidence
 from ssh_abduction.theory.pairs import Pairs
 
 if TYPE_CHECKING:
@@ -22,7 +21,7 @@ _Seen = tuple[str | None, Star]  # a view (None if a dstate may have several vie
 
 
 @dataclass(frozen=True)
-class Alike:
+class Alike(Evidence):
     """Evidence from stars (openings seen), compared without rotating them.
 
     Attributes:
@@ -38,9 +37,6 @@ class Alike:
     def of(cls, theory: Theory) -> Alike:
         return cls("functional_view" in theory.hard and not theory.unknown_views)
 
-    def remembering(self, known: Alike) -> Alike:
-        return self
-
     def pairs(self, trace: Trace) -> Pairs:
         return _pairs(
             tuple(
@@ -48,12 +44,6 @@ class Alike:
                 for step in trace.steps
             )
         )
-
-    def facts(self, trace: Trace, start: int, stop: int) -> str:
-        return ""
-
-    def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
-        return None
 
 
 @lru_cache(maxsize=8)

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.theory.evidence.protocol import Equality
+from ssh_abduction.theory.evidence.protocol import Evidence
 from ssh_abduction.theory.pairs import Pairs
 
 if TYPE_CHECKING:
@@ -15,7 +14,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Asserted:
+class Asserted(Evidence):
     """Evidence from the fields `same`, `different`, `elsewhere` and `same_place` of a theory.
 
     Pairs with a step that the trace does not have yet are ignored.
@@ -30,15 +29,9 @@ class Asserted:
     def of(cls, theory: Theory) -> Asserted:
         return cls(theory.asserted, theory.same_place)
 
-    def remembering(self, known: Asserted) -> Asserted:
-        return self
-
     def pairs(self, trace: Trace) -> Pairs:
         return self.said
 
     def facts(self, trace: Trace, start: int, stop: int) -> str:
         said = [(i, t) for i, t in self.together if start <= t < stop]
         return "\n".join(f"together({i},{t})." for i, t in said)
-
-    def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
-        return None

@@ -17,10 +17,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from ssh_abduction.data.closure import Closure as Match
-from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.theory.evidence.protocol import Equality
+from ssh_abduction.theory.evidence.protocol import Evidence
 from ssh_abduction.theory.pairs import Pairs
 
 if TYPE_CHECKING:
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Closure:
+class Closure(Evidence):
     """Evidence from closures, with the fields `reject` and `returns` of a theory.
 
     Attributes:
@@ -47,17 +46,8 @@ class Closure:
     def of(cls, theory: Theory) -> Closure:
         return cls(theory.reject, theory.returns, theory.level == "topological")
 
-    def remembering(self, known: Closure) -> Closure:
-        return self
-
     def pairs(self, trace: Trace) -> Pairs:
         return Pairs.of(self._refused(trace, False), self._refused(trace, True))
-
-    def facts(self, trace: Trace, start: int, stop: int) -> str:
-        return ""
-
-    def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
-        return None
 
     def _refused(self, trace: Trace, places: bool) -> Iterator[tuple[int, int]]:
         """Yield the pairs of steps, as places or as dstates, of the closures that are rejected."""

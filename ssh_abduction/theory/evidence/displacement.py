@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.theory.evidence.protocol import Equality
+from ssh_abduction.theory.evidence.protocol import Equality, Evidence
 from ssh_abduction.theory.evidence.returns import Returns
 from ssh_abduction.theory.pairs import Pairs
 
@@ -41,7 +41,7 @@ KEPT = 8  # how many traces are remembered, with their returns
 
 
 @dataclass(frozen=True)
-class Displacement:
+class Displacement(Evidence):
     """Evidence from displacements, with the fields `reject`, `joint` and `returns` of a theory.
 
     Attributes:
@@ -84,9 +84,6 @@ class Displacement:
 
     def pairs(self, trace: Trace) -> Pairs:
         return self.returns_of(trace).pairs
-
-    def facts(self, trace: Trace, start: int, stop: int) -> str:
-        return ""
 
     def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
         if self.joint <= 1:

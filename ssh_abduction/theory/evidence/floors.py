@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, ClassVar
 from ssh_abduction.data.floors import stretches_of
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.theory.evidence.protocol import Equality
+from ssh_abduction.theory.evidence.protocol import Equality, Evidence
 from ssh_abduction.theory.pairs import Pairs
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Floors:
+class Floors(Evidence):
     """Evidence from actions that lead to other floors."""
 
     name: ClassVar[str] = "floors"
@@ -34,14 +34,8 @@ class Floors:
     def of(cls, theory: Theory) -> Floors:
         return cls()
 
-    def remembering(self, known: Floors) -> Floors:
-        return self
-
     def pairs(self, trace: Trace) -> Pairs:
         return _pairs(stretches_of(trace), _lifted(trace))
-
-    def facts(self, trace: Trace, start: int, stop: int) -> str:
-        return ""  # all axioms of floors.lp share their facts
 
     def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
         stretches = stretches_of(trace)

@@ -32,8 +32,7 @@ from ssh_abduction.data.star import Openings
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.theory.evidence.crossings import description, fewest, split
-from ssh_abduction.theory.evidence.protocol import Equality
-from ssh_abduction.theory.pairs import NO_PAIRS, Pairs
+from ssh_abduction.theory.evidence.protocol import Equality, Evidence
 from ssh_abduction.theory.planarity import Ends, can_be_drawn, has_way, is_planar
 
 if TYPE_CHECKING:
@@ -54,7 +53,7 @@ Gateway: TypeAlias = tuple[int, Arm]  # a place, and one of the arms that are th
 
 
 @dataclass(frozen=True)
-class Planar:
+class Planar(Evidence):
     """Evidence that maps can be drawn in the plane (the field `planar` of a theory).
 
     Attributes:
@@ -85,15 +84,6 @@ class Planar:
             distinct="one_dstate_per_heading" in axioms,
             crossing=theory.symmetric_sides,
         )
-
-    def remembering(self, known: Planar) -> Planar:
-        return self
-
-    def pairs(self, trace: Trace) -> Pairs:
-        return NO_PAIRS
-
-    def facts(self, trace: Trace, start: int, stop: int) -> str:
-        return ""
 
     def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
         places = [ssh_map.dstates[label].place for label in ssh_map.dstate_at]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.theory.pairs import Pairs
+from ssh_abduction.theory.pairs import NO_PAIRS, Pairs
 
 if TYPE_CHECKING:
     from ssh_abduction.theory.theory import Theory
@@ -33,7 +33,7 @@ class Equality:
 
 
 class Evidence(Protocol):
-    """A kind of evidence: what is known besides views and actions.
+    """A kind of evidence: what is known besides views and actions. By default, it says nothing.
 
     encodings/NAME.lp declares its axiom. The `if` after the axiom says for which theories it holds.
 
@@ -63,7 +63,7 @@ class Evidence(Protocol):
 
         If a map of the trace is cut to its first steps, the pairs must still hold there.
         """
-        ...
+        return NO_PAIRS
 
     def facts(self, trace: Trace, start: int, stop: int) -> str:
         """Return further facts for the encoding of this kind, as a text for clingo.
@@ -73,7 +73,7 @@ class Evidence(Protocol):
             start: The first step that the facts are about.
             stop: The step after the last one.
         """
-        ...
+        return ""
 
     def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
         """Find equalities and inequalities of steps in a map that cannot all hold in any map.
@@ -87,4 +87,4 @@ class Evidence(Protocol):
         Returns:
             A small set of such equalities and inequalities; None if there is none.
         """
-        ...
+        return None
