@@ -1,9 +1,9 @@
-"""What does it cost to add a drive to a standing map?
+"""What does it cost to add a drive to an existing map?
 
     python benchmarks/onto.py [--cells 5] [--steps 100] [--drives 20] [--seeds 3] [--looks 8]
 
 Robots walk at random through a maze, each from an unknown start. The first drive is solved alone.
-Each later one is added to the map that stands. The script prints a row for each maze: the CPU
+Each later one is added to the existing map. The script prints a row for each maze: the CPU
 seconds of the second and the last drive, their ratio, and whether the last map is the true one.
 """
 

@@ -106,7 +106,7 @@ class _Reader:
         rooms = tuple(self.room(space, f"space[{i}]", scale) for i, space in enumerate(spaces))
         numbers = {room.name: i for i, room in enumerate(rooms)}
         if len(numbers) < len(rooms):
-            raise self.wrong("space", "an id for each space that no other has", None)
+            raise self.wrong("space", "a unique id for each space", None)
         # Collect the positions of each door from both of its rooms.
         sides: dict[tuple[int, int], dict[int, list[Point]]] = {}
         for here, space in enumerate(spaces):

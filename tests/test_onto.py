@@ -25,7 +25,7 @@ from ssh_abduction.theory import Speedups
 
 
 def keeps(ssh_map: SSHMap) -> Callable[[Key], bool]:
-    """Whether a map of the brute force has the dstates and places of a standing map."""
+    """Whether a map of the brute force has the dstates and places of an existing map."""
     labels, places, _ = key(ssh_map)
 
     def allows(found: Key) -> bool:
@@ -69,7 +69,7 @@ def test_the_maps_are_the_least_of_those_that_keep_the_standing_map(data: st.Dat
     with patch.object(choosing, "FEW_STEPS", few_steps):
         if counts is None:
             with pytest.raises(
-                SolverError, match="expected a drive that agrees with the standing map"
+                SolverError, match="expected a drive that agrees with the existing map"
             ):
                 solve(new, theory, onto=standing, max_maps=None, speedups=speedups)
             return

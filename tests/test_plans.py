@@ -323,7 +323,7 @@ def test_no_axiom_forbids_the_truth_of_doors_close_together(tmp_path: Path, seed
         ),
         (
             xml().replace('<space id="b">', '<space id="a">'),
-            "space: expected an id for each space that no other has",
+            "space: expected a unique id for each space",
         ),
         ('<!DOCTYPE b [<!ENTITY e "e">]>' + xml(), "expected a plan without entities of its own"),
     ],

@@ -293,7 +293,7 @@ def test_a_removed_speedup_is_left_out_with_a_warning(capsys: pytest.CaptureFixt
 @settings(max_examples=8)
 @given(traces(max_steps=12))
 def test_steps_merged_by_evidence_make_a_map(trace: Trace) -> None:
-    """The result is the same as that of merging dstates of one step each, as long as possible."""
+    """Merging also makes a map if it begins with one dstate for each step."""
     theory = settle(trace, Theory.causal().replace(joint=1)).theory  # merging knows only pairs
     log = Log(trace, theory)
     chart = Chart.of_steps(log, len(trace))
@@ -317,7 +317,7 @@ def test_dstates_that_are_one_are_merged() -> None:
 
 
 def test_a_limit_leaves_a_map_of_merged_steps() -> None:
-    """If clingo is slow and no guess is annealed, the map is twice as good as a greedy one."""
+    """If clingo is slow and no guess is annealed, the map is smaller than a greedy one."""
     walk = maze(5, 5, steps=1600, seed=0)
     with (
         patch.multiple(name_search, PATIENCE=1, CORES=1),

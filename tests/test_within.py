@@ -209,7 +209,7 @@ def test_the_json_says_what_each_map_costs(near: dict[str, Any]) -> None:
 def test_a_file_of_near_minimal_maps_is_not_taken_at_its_word(
     near: dict[str, Any], change: dict[str, Any], fault: str | None
 ) -> None:
-    """After a change to maps, the numbers name the listed ones."""
+    """If `change` has maps, these are the numbers of the maps to list."""
     chosen = change.get("maps", range(near["count"]))
     answer = near | change | {"maps": [near["maps"][i] for i in chosen], "count": len(chosen)}
     maps = [SSHMap.from_dict(ssh_map) for ssh_map in answer["maps"]]

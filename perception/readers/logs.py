@@ -248,6 +248,8 @@ def _format(file: IO[bytes], source: str) -> str:
         return bag
     if carmen.looks_like(head):
         return "carmen"
+    if head.startswith(b'{"format": "ssh-trace"'):
+        raise LogError(f"{source}: expected a robot's log, got a trace; give it to solve")
     raise LogError(
         f"{source}: expected a robot's log, got a file that begins with "
         f"{brief(head[:40].decode('utf-8', 'replace'))}; formats: {formats}"

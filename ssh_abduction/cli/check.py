@@ -153,7 +153,7 @@ def _bound(
     if RESTS_ON - set(theory.axioms):
         raise MapError(
             "bound: expected a theory with the axioms functional_view and deterministic, which "
-            "the proof rests on"
+            "the proof rests on, got another one; leave out --bound"
         )
     if not isinstance(data, dict) or "certificate" not in data:
         raise MapError(

@@ -1,4 +1,4 @@
-"""ssh-abduction correct MAPS: say what a standing map has wrong."""
+"""ssh-abduction correct MAPS: say what an existing map has wrong."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""ssh-abduction name MAPS WHAT NAME: name a place, path or region of a standing map."""
+"""ssh-abduction name MAPS WHAT NAME: name a place, path or region of an existing map."""
 
 from __future__ import annotations
 

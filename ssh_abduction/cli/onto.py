@@ -1,4 +1,4 @@
-"""ssh-abduction solve TRACE --onto MAPS: add a drive to a standing map, which keeps its places."""
+"""ssh-abduction solve TRACE --onto MAPS: add a drive to an existing map, which keeps its places."""
 
 from __future__ import annotations
 

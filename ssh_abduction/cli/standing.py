@@ -1,4 +1,4 @@
-"""A standing map, as the verbs name, correct and solve see it, with its corrections."""
+"""An existing map, as the verbs name, correct and solve see it, with its corrections."""
 
 from __future__ import annotations
 

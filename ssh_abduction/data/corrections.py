@@ -317,7 +317,7 @@ class Corrections:
         """Return the same corrections without one sentence, of `pairs` or `gateways`.
 
         Raises:
-            MapError: The sentence is none.
+            MapError: `sentence` is of another type.
         """
         if not isinstance(sentence, Said | Passage):
             raise MapError(
@@ -388,7 +388,7 @@ def checked_corrections(value: object) -> Corrections:
 
 
 def _a_step(field: str, step: object) -> str:
-    """Return the name of a step, such as "monday:12". Raise MapError if it is none."""
+    """Return the name of a step, such as "monday:12". Raise MapError for another text."""
     text = a_text(field, step, MapError, mend="name a step, such as monday:12")
     drive, _, number = text.rpartition(":")
     if not (drive and number.isascii() and number.isdecimal() and is_writable(text)):

@@ -305,7 +305,7 @@ def direction(text: str) -> float:
     """Read a direction: ahead, right, back, left, or degrees clockwise from ahead.
 
     Raises:
-        MapError: The text is none.
+        MapError: The text is no direction.
     """
     with suppress(ValueError):
         degrees = DIRECTIONS[text] if text in DIRECTIONS else float(text)

@@ -1,11 +1,11 @@
 """Add a drive to the map of old drives, in about the time that solving the new drive takes.
 
-The map of the old drives is the *standing map*: the joint map must keep its dstates and places. The
+The map of the old drives is the *existing map*: the joint map must keep its dstates and places. The
 solver does not get the old drives. It gets a *digest*: a trace in which each link of the standing
 map occurs once. Axioms are about links and observations, so a map of the digest and the new drive
 is a map of all drives. Steps of the digest at different dstates or places are asserted to be
 different. If the best maps also have its equal steps at one dstate, they are the best of all maps
-that keep the standing map. If not, equal steps are asserted to be equal, too, if the traces are
+that keep the existing map. If not, equal steps are asserted to be equal, too, if the traces are
 short enough.
 
 >>> from ssh_abduction import Trace, solve
@@ -61,7 +61,7 @@ class Digest:
 
     Attributes:
         trace: The trace.
-        labels: For each of its steps, the dstate in the standing map.
+        labels: For each of its steps, the dstate in the existing map.
     """
 
     trace: Trace
@@ -211,7 +211,7 @@ def _trails(ssh_map: SSHMap) -> list[list[tuple[int, str | None]]]:
 
 
 def _pinned(theory: Theory, digest: Digest, ssh_map: SSHMap, old: Trace, *, joins: bool) -> Theory:
-    """Return the theory for a digest and a new drive, with assertions that keep the standing map.
+    """Return the theory for a digest and a new drive, with assertions that keep the existing map.
 
     They say that steps at different dstates or places of that map are different.
 
@@ -251,17 +251,17 @@ def _pinned(theory: Theory, digest: Digest, ssh_map: SSHMap, old: Trace, *, join
 
 
 def _keeps(found: SSHMap, digest: Digest, ssh_map: SSHMap) -> bool:
-    """Whether a map of a digest and a new drive has the dstates and places of the standing map."""
+    """Whether a map of a digest and a new drive has the dstates and places of the existing map."""
     return not any(_broken(found, digest, ssh_map))
 
 
 def _broken(
     found: SSHMap, digest: Digest, ssh_map: SSHMap
 ) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
-    """Find what a map of a digest and a new drive changes in the standing map.
+    """Find what a map of a digest and a new drive changes in the existing map.
 
     Returns:
-        Pairs of dstates of the standing map that are merged (a dstate that is split is paired with
+        Pairs of dstates of the existing map that are merged (a dstate that is split is paired with
         itself); and pairs of dstates whose places are merged, or split.
     """
     number: dict[int, int] = {}
@@ -288,7 +288,7 @@ def _with_assertions(
     """Solve again with assertions that equal steps of the digest are equal, if it is short enough.
 
     Returns:
-        The new solution, and its maps that keep the standing map; or the old solution `found` and
+        The new solution, and its maps that keep the existing map; or the old solution `found` and
         no maps.
     """
     if len(part) > READABLE:
@@ -331,8 +331,8 @@ def _settled(found: Theory, theory: Theory) -> Theory:
 def _contradiction(
     old: Trace, trace: Trace, ssh_map: SSHMap, digest: Digest, found: Solution
 ) -> SolverError:
-    """Make the error that says what contradicts the standing map, and what to do."""
-    reason, drives = "no map keeps the standing map", drives_of(old)
+    """Make the error that says what contradicts the existing map, and what to do."""
+    reason, drives = "no map keeps the existing map", drives_of(old)
     if found.maps:
         dstates, places = _broken(found.maps[0], digest, ssh_map)
         first = {s: t for t, s in reversed([*enumerate(ssh_map.dstate_at)])}
@@ -347,6 +347,6 @@ def _contradiction(
         )
     new = ", ".join(drive.name for drive in drives_of(trace))
     return SolverError(
-        f"onto: expected a drive that agrees with the standing map, got {new}: {reason}; solve all "
+        f"onto: expected a drive that agrees with the existing map, got {new}: {reason}; solve all "
         "drives together (solve --together)"
     )

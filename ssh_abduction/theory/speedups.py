@@ -428,7 +428,7 @@ TABLE = (
     Speedup(
         "digest",
         "digest",
-        "To add a drive to a standing map, give the solver each link of the map once, instead of "
+        "To add a drive to an existing map, give the solver each link of the map once, instead of "
         "all old steps.",
         lambda theory: not theory.has_faults,
         ONE_OF_EACH,
