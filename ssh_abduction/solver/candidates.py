@@ -15,13 +15,14 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.runtime.clock import each_looking, heeding
+from ssh_abduction.runtime.clock import heeding
 from ssh_abduction.runtime.logs import log_of
 from ssh_abduction.solver import choosing
 from ssh_abduction.solver.asp.facts import answer_maps
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.engines.base import Found, Task
 from ssh_abduction.solver.guesses.gated import sketch_beyond, sketches_of
+from ssh_abduction.solver.guesses.mended import first_contradiction, mended_sketch
 from ssh_abduction.solver.guesses.tree import Sketch
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
@@ -172,10 +173,7 @@ class Candidates:
             return False
         apart: int | None = None
         for sketch in sketches_of(trace.steps[0], theory):
-            if not all(
-                sketch.extend(action, step)
-                for action, step in each_looking(zip(trace.actions, trace.steps[1:], strict=True))
-            ):
+            if first_contradiction(sketch, trace) is not None:
                 continue
             ssh_map = sketch.map()
             apart = apart or len(Continuations(log.seen, log.actions).clique())
@@ -192,7 +190,10 @@ class Candidates:
         sketches = sketches_of(trace.steps[0], theory)
         if known is not None:
             sketches.insert(0, sketch_beyond(known, trace.prefix(len(known.dstate_at)), theory))
-        return [*broad, self.merge, *(partial(self._go_on_to_end, sketch) for sketch in sketches)]
+        kinds = [partial(self._go_on_to_end, sketch) for sketch in sketches]
+        if theory.misread or theory.slipped or theory.jumped:
+            kinds.append(partial(self._offer_mended))
+        return [*broad, self.merge, *kinds]
 
     def _offer_beam(self, width: int) -> None:
         """Offer the maps that a beam of hypotheses about the displacements finds."""
@@ -202,10 +203,13 @@ class Candidates:
 
     def _go_on_to_end(self, sketch: Sketch) -> None:
         """Extend a sketch to the end of the trace and offer it, unless a step contradicts it."""
-        trace, done = self._task.trace, len(sketch.labels)
-        later = each_looking(zip(trace.actions[done - 1 :], trace.steps[done:], strict=True))
-        if all(sketch.extend(action, step) for action, step in later):
+        if first_contradiction(sketch, self._task.trace) is None:
             self.offer(sketch.map())
+
+    def _offer_mended(self) -> None:
+        """Offer a sketch of a trace that is mended where a step contradicts the sketch."""
+        if ssh_map := mended_sketch(self._task.trace, self._task.theory):
+            self.offer(ssh_map)
 
     def frame(self, speedups: Speedups) -> None:
         """Offer maps in which places have frames, although the theory does not demand frames.

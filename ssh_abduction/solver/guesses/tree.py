@@ -190,6 +190,10 @@ class Sketch:
         self.labels.append(there)
         return True
 
+    def leads_to(self, action: Action) -> int | None:
+        """Return the dstate to which an action leads from the last step; None if it is unknown."""
+        return self._links.get((self.labels[-1], action.name))
+
     def map(self) -> SSHMap:
         """Return the map of all steps so far. Numbers follow the order of first visits."""
         labels = tuple(self.labels)

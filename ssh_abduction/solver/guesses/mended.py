@@ -1,0 +1,124 @@
+"""A sketch that pays for faults: where a step contradicts it, the trace is mended there.
+
+>>> from ssh_abduction import Theory, Trace
+>>> from ssh_abduction.solver.guesses.mended import mended_sketch
+>>> from ssh_abduction.theory.settle import settle
+>>> trace = Trace.from_steps("abcb", ["travel", "around", "around"])
+>>> theory = settle(trace, Theory(slipped=1.0, boundary="none")).theory
+>>> mended_sketch(trace, theory).dstate_at
+(0, 1, 2, 1)
+>>> wrong = mended_sketch(trace.with_views("abcd"), theory)
+>>> [(fault.step, fault.kind) for fault in wrong.faults]
+[(2, 'slipped')]
+
+The sketch begins anew after each fault. It seldom has the fewest faults.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from ssh_abduction.checker.checker import violations
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.trace import Action, Step, Trace
+from ssh_abduction.runtime.clock import each_looking
+from ssh_abduction.solver.guesses.gated import sketches_of
+from ssh_abduction.solver.guesses.tree import Sketch
+from ssh_abduction.solver.steps.chart import QUARTERS
+from ssh_abduction.solver.steps.faults import with_faults
+from ssh_abduction.theory.theory import Theory
+
+
+def mended_sketch(trace: Trace, theory: Theory) -> SSHMap | None:
+    """Make a map in which most steps are new dstates, with the faults that it needs.
+
+    Args:
+        trace: The trace. All its views are known.
+        theory: The theory.
+
+    Returns:
+        The map. None if a step contradicts the sketch, and the theory allows no fault that mends
+        it. The map may break axioms, so the caller has to check it.
+    """
+    mended = trace
+    while True:
+        sketch = sketches_of(mended.steps[0], theory)[-1]
+        wrong = first_contradiction(sketch, mended)
+        if wrong is not None:
+            better = _mended(trace, mended, sketch, theory)
+        else:
+            ssh_map = with_faults(sketch.map(), trace, mended, theory)
+            better = _without_jump(mended, ssh_map, trace, theory) if theory.jumped else None
+            if better is None:
+                return ssh_map
+        if better is None:
+            return None
+        mended = better
+
+
+def first_contradiction(sketch: Sketch, trace: Trace) -> int | None:
+    """Extend a sketch to the end of a trace.
+
+    Args:
+        sketch: The sketch, of some first steps.
+        trace: The trace.
+
+    Returns:
+        The first step that contradicts the sketch; None if it has grown to the end.
+    """
+    done = len(sketch.labels)
+    later = each_looking(zip(trace.actions[done - 1 :], trace.steps[done:], strict=True))
+    reaches_end = all(sketch.extend(action, step) for action, step in later)
+    return None if reaches_end else len(sketch.labels)
+
+
+def _mended(trace: Trace, mended: Trace, sketch: Sketch, theory: Theory) -> Trace | None:
+    """Mend the step that contradicts a sketch: its view and star, or else the action before it.
+
+    Args:
+        trace: The trace itself.
+        mended: The trace with the faults that were mended before.
+        sketch: The sketch of all steps before.
+        theory: The theory.
+    """
+    t, steps = len(sketch.labels), list(mended.steps)
+    action = mended.actions[t - 1]
+    right = _right(mended, sketch, theory) if theory.misread else None
+    if right is not None and steps[t] == trace.steps[t] != right:
+        steps[t] = right
+    elif theory.slipped and not action.unlinked:
+        steps[t] = replace(trace.steps[t], action=steps[t].action)
+        steps[t - 1] = replace(steps[t - 1], action=Action.that_slipped(t - 1))
+    else:
+        return None
+    return replace(mended, steps=tuple(steps))
+
+
+def _right(trace: Trace, sketch: Sketch, theory: Theory) -> Step | None:
+    """Return the step after a sketch with the view and star that do not contradict the sketch.
+
+    None if these are unknown.
+    """
+    t, action = len(sketch.labels), trace.actions[len(sketch.labels) - 1]
+    there = sketch.leads_to(action)
+    if there in sketch.labels:
+        known = trace.steps[sketch.labels.index(there)]
+        return replace(trace.steps[t], view=known.view, star=known.star)
+    if action.turn is None or theory.star not in ("pattern", "frame"):
+        return None
+    seen, by = trace.steps[t - 1].openings or (), QUARTERS[action.turn]
+    return replace(trace.steps[t], star=tuple(map(int, (*seen[by:], *seen[:by]))))
+
+
+def _without_jump(mended: Trace, ssh_map: SSHMap, trace: Trace, theory: Theory) -> Trace | None:
+    """Drop the longest displacement of the first return that a map refuses; None without one."""
+    refused = (v for v in violations(trace, ssh_map, theory) if v.axiom == "one_pose")
+    found = next(refused, None)
+    if found is None:
+        return None
+    steps = range(min(found.steps) + 1, max(found.steps) + 1)
+    moved = {t: math.hypot(*d[:2]) for t in steps if (d := mended.steps[t].displacement)}
+    if not moved:
+        return None
+    return mended.without_displacements_at([max(moved, key=moved.__getitem__)])

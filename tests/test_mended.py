@@ -1,0 +1,54 @@
+"""Maps without a search of traces with faults: the checker accepts them, also after a limit."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+
+import pytest
+from instances import maze
+
+from ssh_abduction import Theory, Trace, solve
+from ssh_abduction.checker.checker import check
+from ssh_abduction.data import Odometry
+from ssh_abduction.data.trace import Action
+from ssh_abduction.solver.guesses.mended import mended_sketch
+from ssh_abduction.theory.settle import settle
+
+NOISE = Odometry(along=0.05, across=0.02, heading=0.01)
+
+
+def flawed(kind: str, seed: int) -> tuple[Trace, Theory]:
+    """A drive through a maze with three faults of a kind, and a theory that allows them."""
+    odometry = NOISE if kind == "jumped" else None
+    trace = maze(4, 4, steps=40, seed=seed, stars=True, follow=True, odometry=odometry).trace
+    steps, chance = list(trace.steps), random.Random(seed)
+    for t in chance.sample(range(1, len(steps) - 1), 3):
+        if kind == "misread":
+            other = steps[chance.randrange(len(steps))]
+            steps[t] = replace(steps[t], view=other.view, star=other.star)
+        elif kind == "slipped":
+            steps[t] = replace(steps[t], action=Action.of(chance.choice(["travel", "around"])))
+        else:
+            x, y, turned = steps[t].displacement or (0.0, 0.0, 0.0)
+            steps[t] = replace(steps[t], displacement=(x + 9.0, y - 9.0, turned))
+    return replace(trace, steps=tuple(steps)), Theory(**{kind: 1.5})
+
+
+@pytest.mark.parametrize("kind", ["misread", "slipped", "jumped"])
+def test_a_mended_sketch_is_a_map(kind: str) -> None:
+    needed = 0
+    for seed in range(4):
+        trace, theory = flawed(kind, seed)
+        ssh_map = mended_sketch(trace, settle(trace, theory).theory)
+        assert ssh_map is not None
+        assert check(trace, ssh_map, theory) == ()
+        needed += len(ssh_map.faults)
+        short = solve(trace, theory, time_limit=0.001, max_maps=1)
+        assert short.maps
+    assert needed
+
+
+def test_a_fault_that_the_theory_does_not_allow_is_not_paid() -> None:
+    trace, theory = flawed("misread", 0)
+    assert mended_sketch(trace, settle(trace, theory.replace(misread=0)).theory) is None
