@@ -739,8 +739,9 @@ def test_what_is_no_log_is_one_clear_error(tmp_path: Path, what: str) -> None:
     with pytest.raises(LogError, match=r"a\.log: .*expected .*") as caught:
         read_log(tmp_path / "a.log")
     assert "\n" not in str(caught.value)
-    if what in ("empty", "blank", "a trace", "binary", "gzip of nothing"):
+    if what in ("empty", "blank", "binary", "gzip of nothing"):
         assert all(name in str(caught.value) for name in FORMATS)
+    assert ("got a trace; give it to solve" in str(caught.value)) == (what == "a trace")
 
 
 @pytest.mark.parametrize(

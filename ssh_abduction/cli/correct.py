@@ -7,7 +7,7 @@ import shlex
 from pathlib import Path
 
 from ssh_abduction.cli.options import Verbs, add_map, add_maps, trace_beside
-from ssh_abduction.cli.standing import Standing, sentences_of
+from ssh_abduction.cli.saved_map import SavedMap, sentences_of
 from ssh_abduction.data.corrections import PAIRS
 from ssh_abduction.data.errors import MapError, brief, named, printable
 from ssh_abduction.data.words import counted
@@ -53,22 +53,22 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    standing = Standing.load(options.maps, options.map)
-    said = standing.corrections
+    saved = SavedMap.load(options.maps, options.map)
+    said = saved.corrections
     for kind in PAIRS:
         for pair in getattr(options, kind) or ():
-            said = said.with_pair(kind, *_pair(standing, kind, pair))
+            said = said.with_pair(kind, *_pair(saved, kind, pair))
     for is_open, gateways in ((True, options.open), (False, options.closed)):
         for gateway in gateways or ():
-            said = said.with_gateway(is_open, standing.gateway(gateway))
+            said = said.with_gateway(is_open, saved.gateway(gateway))
     for what, name in options.name or ():
-        said = said.with_name(name, *standing.thing(what))
-    if said == standing.corrections:
+        said = said.with_name(name, *saved.thing(what))
+    if said == saved.corrections:
         print("\n".join(map(printable, sentences_of(said))) or "nothing was said")
         return 0
-    file = standing.save(said)
+    file = saved.save(said)
     sentences = counted(sum(1 for _ in sentences_of(said)), "sentences")
-    print(printable(f"{named(file)}: {sentences}; {_how_to_obey(standing.file)}"))
+    print(printable(f"{named(file)}: {sentences}; {_how_to_obey(saved.file)}"))
     return 0
 
 
@@ -80,9 +80,9 @@ def _how_to_obey(maps: Path) -> str:
     return f"to obey: ssh-abduction solve --theory {folder} {folder} -o {shlex.quote(str(maps))}"
 
 
-def _pair(standing: Standing, kind: str, pair: str) -> tuple[str, str]:
+def _pair(saved: SavedMap, kind: str, pair: str) -> tuple[str, str]:
     """Read a pair of steps, such as "monday:12,tuesday:3", or raise MapError."""
-    steps = [standing.step(step.strip()) for step in pair.split(",")]
+    steps = [saved.step(step.strip()) for step in pair.split(",")]
     if len(steps) != 2 or steps[0] == steps[1]:
         raise MapError(
             f"--{kind.replace('_', '-')}: expected two steps such as monday:12,tuesday:3, got "

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from ssh_abduction.cli.options import Verbs, add_map, add_maps
-from ssh_abduction.cli.standing import Standing
+from ssh_abduction.cli.saved_map import SavedMap
 from ssh_abduction.data.errors import named, printable
 
 
@@ -28,9 +28,9 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    standing = Standing.load(options.maps, options.map)
-    kind, step = standing.thing(options.what)
-    step = standing.step_of_name(kind, step)
-    file = standing.save(standing.corrections.with_name(options.name, kind, step))
+    saved = SavedMap.load(options.maps, options.map)
+    kind, step = saved.thing(options.what)
+    step = saved.step_of_name(kind, step)
+    file = saved.save(saved.corrections.with_name(options.name, kind, step))
     print(printable(f"the {kind} of {step} is {options.name!r}, in {named(file)}"))
     return 0

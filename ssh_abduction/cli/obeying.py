@@ -7,7 +7,7 @@ import sys
 from dataclasses import dataclass, replace
 
 from ssh_abduction.cli.outcome import warn
-from ssh_abduction.cli.standing import sentences_of
+from ssh_abduction.cli.saved_map import sentences_of
 from ssh_abduction.data.corrections import Corrections, Passage, Said
 from ssh_abduction.data.corrections_file import beside, load_corrections
 from ssh_abduction.data.drives import drives_of, fingerprints_of, step_of

@@ -23,14 +23,14 @@ def run(options: argparse.Namespace) -> int:
             raise AbductionError(
                 f"{flag}: expected none where a drive is added to a map; leave it out"
             )
-    standing = Solution.load(options.onto)
+    existing = Solution.load(options.onto)
     trace = together([Trace.load(path) for path in options.traces])
-    if standing.trace is not None:
-        number_steps(options, together([standing.trace, trace]))
+    if existing.trace is not None:
+        number_steps(options, together([existing.trace, trace]))
     solution = solve(
         trace,
-        theory_of(options, standing.theory.replace(returns=0)),
-        onto=standing,
+        theory_of(options, existing.theory.replace(returns=0)),
+        onto=existing,
         time_limit=options.time_limit,
         max_maps=options.maps or None,
         within=options.within,

@@ -1,7 +1,7 @@
 """Add a drive to the map of old drives, in about the time that solving the new drive takes.
 
 The map of the old drives is the *existing map*: the joint map must keep its dstates and places. The
-solver does not get the old drives. It gets a *digest*: a trace in which each link of the standing
+solver does not get the old drives. It gets a *digest*: a trace in which each link of the existing
 map occurs once. Axioms are about links and observations, so a map of the digest and the new drive
 is a map of all drives. Steps of the digest at different dstates or places are asserted to be
 different. If the best maps also have its equal steps at one dstate, they are the best of all maps
@@ -99,7 +99,7 @@ class Digest:
 
 def solve_onto(
     trace: Trace,
-    standing: Solution,
+    existing: Solution,
     theory: Theory | None,
     corrections: Corrections | None,
     solving: Solving,
@@ -108,7 +108,7 @@ def solve_onto(
 
     Args:
         trace: The new drive, or several.
-        standing: The solution of the old drives, with their trace. Its first map is the standing
+        existing: The solution of the old drives, with their trace. Its first map is the existing
             map.
         theory: The theory; None for that of the solution. Steps in it are steps of the joint trace.
         corrections: Names and corrections of a person, to be obeyed; None for none.
@@ -117,8 +117,8 @@ def solve_onto(
     Raises:
         SolverError: The solution has no map or no trace, or the new drive contradicts the map.
     """
-    old, ssh_map = _standing(standing)
-    theory = checked_theory(theory or standing.theory.replace(returns=0))
+    old, ssh_map = _existing(existing)
+    theory = checked_theory(theory or existing.theory.replace(returns=0))
     joint = together([old, trace])
     theory.check_steps(joint)
     if corrections is not None:
@@ -151,10 +151,10 @@ def solve_onto(
     return solution if corrections is None else with_names(corrections, solution, joint)
 
 
-def _standing(standing: object) -> tuple[Trace, SSHMap]:
+def _existing(existing: object) -> tuple[Trace, SSHMap]:
     """Return the trace of a solution and its first map. Raises SolverError if one is missing."""
     mend = "take what solve returned, or Solution.load"
-    solution = an_instance("onto", standing, Solution, SolverError, mend=mend)
+    solution = an_instance("onto", existing, Solution, SolverError, mend=mend)
     if not solution.maps or solution.trace is None:
         raise SolverError(
             "onto: expected a solution with a map and its trace, got one without; read a file that "

@@ -1,4 +1,4 @@
-"""An existing map, as the verbs name, correct and solve see it, with its corrections."""
+"""A saved map, as the verbs name, correct and solve see it, with its corrections."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _KINDS = {"p": "place"}
 
 
 @dataclass(frozen=True)
-class Standing:
+class SavedMap:
     """A map and the drives that it was made of.
 
     Attributes:
@@ -43,7 +43,7 @@ class Standing:
     in_quarters: bool
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], number: int | str = 1) -> Standing:
+    def load(cls, path: str | os.PathLike[str], number: int | str = 1) -> SavedMap:
         """Read a map, and the corrections beside it.
 
         Args:
