@@ -204,11 +204,17 @@ class Beam:
             yield child
 
     def _extended(self, beam: list[Hypothesis], end: int) -> list[Hypothesis]:
-        """Extend a beam to its first `end` steps. Keep the hypotheses that the checker accepts."""
+        """Extend a beam to its first `end` steps. Keep the hypotheses that the checker accepts.
+
+        If all that remain cost much more than one that it refuses, that one may have crowded out
+        others. Then check each step.
+        """
         begun = len(beam[0].labels)
         longer = self._onward(beam, end)
         valid = [found for found in longer if self._map(found, begun) is not None]
         self.refuses |= len(valid) < len(longer)
+        if valid and valid[0].nats > longer[0].nats + self._sights.dearest:
+            return self._checked(beam, end) or self._settled(valid)
         return self._settled(valid)
 
     def _settled(self, beam: list[Hypothesis]) -> list[Hypothesis]:
