@@ -37,7 +37,7 @@ from truth import (
 
 from simulator.plan_tours import tour
 from simulator.plans import Plan
-from ssh_abduction import Theory
+from ssh_abduction import SSHMap, Theory
 from ssh_abduction.data import Odometry, together
 from ssh_abduction.solver.guesses.beam import Beam
 from ssh_abduction.solver.steps.log import Log
@@ -100,9 +100,17 @@ def of_worlds(folder: Path) -> Iterator[Known]:
         yield joined(known.name, parts)
 
 
+def false_joins(found: SSHMap | None, known: Known) -> int:
+    """Count the dstates of a map that are several in truth."""
+    real: dict[int, set[object]] = {}
+    for dstate, true in zip(found.dstate_at if found else (), known.dstates, strict=False):
+        real.setdefault(dstate, set()).add(true)
+    return sum(len(names) > 1 for names in real.values())
+
+
 def report_of_beams(traces: Iterator[Known], theory: Theory, width: int) -> str:
     """Print a row for the cheapest map of the beam for each trace, and return how many are true."""
-    head = ("trace", "steps", "true dstates", "dstates", "cheapest map", "CPU s")
+    head = ("trace", "steps", "true dstates", "dstates", "false joins", "cheapest map", "CPU s")
     print(f"| {' | '.join(head)} |\n|{'---|' * len(head)}")
     right = count = 0
     for known in traces:
@@ -113,7 +121,7 @@ def report_of_beams(traces: Iterator[Known], theory: Theory, width: int) -> str:
         count, right = count + 1, right + true
         print(
             f"| {known.name} | {len(known.trace)} | {len(set(known.dstates))} "
-            f"| {len(found.dstates) if found else '–'} "
+            f"| {len(found.dstates) if found else '–'} | {false_joins(found, known)} "
             f"| {'true' if true else 'false' if found else 'none'} "
             f"| {time.process_time() - begin:.1f} |",
             flush=True,

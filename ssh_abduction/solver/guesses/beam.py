@@ -49,8 +49,9 @@ CHECKED_EVERY = 8
 # If no hypothesis is left, search again with a beam that is this many times as wide.
 WIDER = 2
 # With several drives or floors, it is open how they are joined. So keep LOST times as many
-# hypotheses, but at most ALIKE that join them in the same way.
-LOST, ALIKE = 32, 4
+# hypotheses, but at most ALIKE that join them in the same way. Check the beam at once if it has
+# more than CROWDED times as many, so that false joins do not crowd out true ones.
+LOST, ALIKE, CROWDED = 32, 4, 16
 # Of each earlier checked beam, keep this many hypotheses.
 SPARE = 2
 
@@ -163,9 +164,11 @@ class Beam:
         return float(beam[0].nats) if beam else math.inf
 
     def _onward(self, beam: list[Hypothesis], end: int) -> list[Hypothesis]:
-        """Extend a beam to its first `end` steps, without the checker."""
+        """Extend a beam to its first `end` steps, or fewer if it is crowded. Do not check it."""
         for t in range(len(beam[0].labels), end):
             beam = list(self._best(self._options_of(beam, t, joins=True), t, self._width))
+            if len(beam) > CROWDED * self._width:
+                break
         return beam
 
     def _best(
@@ -204,7 +207,7 @@ class Beam:
             yield child
 
     def _extended(self, beam: list[Hypothesis], end: int) -> list[Hypothesis]:
-        """Extend a beam to its first `end` steps. Keep the hypotheses that the checker accepts.
+        """Extend a beam as `_onward` does. Keep the hypotheses that the checker accepts.
 
         If all that remain cost much more than one that it refuses, that one may have crowded out
         others. Then check each step.
@@ -452,13 +455,9 @@ class Beam:
             there = len(places)
             places, seen = [*places, place], [*seen, {}]
             heading = [*heading, len(pose[0]) - 4]
-        number, (dstate, action) = (
-            self._sights.seen[t],
-            (moved.labels[-1], self._log.actions[t - 1]),
-        )
-        links = moved.links
+        number, links = self._sights.seen[t], moved.links
         if not _slips(moved, t):
-            links = {**links, (dstate, action): there}
+            links = {**links, (moved.labels[-1], self._log.actions[t - 1]): there}
         if number not in seen[there] or "misread" in self._fault:
             doubt = self._doubt(t) + seen[there].get(number, 0.0)
             seen = [*seen[:there], {**seen[there], number: doubt}, *seen[there + 1 :]]
