@@ -13,10 +13,11 @@ may be wrong, too. Then each step is a visit of its own, and a turn is a return,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import TypeAlias
 
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.solver.engines.refusing import minimal_part
 from ssh_abduction.solver.fit import Poses
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.evidence.displacement import jumped
@@ -115,10 +116,6 @@ class Misfit:
         Returns:
             The subset. If even the misfit of all returns is less: all returns. If the misfit
             without any return is that large: an empty list.
-
-        Reference:
-            Junker 2004, "QuickXplain: preferred explanations and relaxations for over-constrained
-            problems".
         """
         if self.of_returns(returns, wrong) < least:
             return list(returns)
@@ -126,7 +123,7 @@ class Misfit:
         def suffices(some: Sequence[Equality]) -> bool:
             return self.of_returns(some, wrong) >= least
 
-        return [] if suffices([]) else _minimal(suffices, list(returns))
+        return [] if suffices([]) else minimal_part(suffices, list(returns))
 
     def _of_groups(self, groups: _Groups) -> float:
         """Compute the misfit if steps share headings and positions, or look it up."""
@@ -139,29 +136,6 @@ class Misfit:
                 trace, [number[heading] for heading in headings], [position[h] for h in number]
             ).misfit()
         return self._known[groups]
-
-
-def _minimal(
-    suffices: Callable[[Sequence[Equality]], bool], returns: list[Equality]
-) -> list[Equality]:
-    """Find a minimal subset of returns that suffices, by QuickXplain.
-
-    Args:
-        suffices: Says whether some returns suffice. If a set does, so does each larger set.
-        returns: Returns that suffice.
-    """
-
-    def needed(kept: list[Equality], is_new: bool, rest: list[Equality]) -> list[Equality]:
-        if is_new and suffices(kept):
-            return []
-        if len(rest) == 1:
-            return rest
-        first, second = rest[: len(rest) // 2], rest[len(rest) // 2 :]
-        of_second = needed(kept + first, True, second)
-        of_first = needed(kept + of_second, bool(of_second), first)
-        return of_first + of_second
-
-    return needed([], False, returns)
 
 
 def _join(groups: list[int], first: int, second: int) -> None:

@@ -22,7 +22,7 @@ from ssh_abduction.solver.asp.facts import names_lp, path_reader, paths_lp
 from ssh_abduction.solver.engines.base import Found, Task
 from ssh_abduction.solver.engines.doubts import Settled
 from ssh_abduction.solver.engines.paths import Paths
-from ssh_abduction.solver.engines.refusing import smaller
+from ssh_abduction.solver.engines.refusing import minimal_part
 from ssh_abduction.solver.steps.chart import FramedChart
 from ssh_abduction.theory.evidence import Equality
 
@@ -237,11 +237,11 @@ class FramedPaths:
         This is for labels whose contradiction shows only after choosing which segments merge.
         """
 
-        def clashing(nodes: list[int]) -> list[int] | None:
+        def clashes(nodes: list[int]) -> bool:
             control = self.control(chart, labels, nodes=nodes)
-            return next(self._asker.answers(lambda _: None, "ignore", 1, control=control), nodes)
+            return next(self._asker.answers(lambda _: False, "ignore", 1, control=control), True)
 
-        return smaller(list(range(len(labels))), clashing)
+        return minimal_part(clashes, list(range(len(labels))))
 
     def charted(self, chart: FramedChart, before: FramedChart | None = None) -> FramedChart:
         """Return the chart with pairs of nodes added that cannot be at one place.

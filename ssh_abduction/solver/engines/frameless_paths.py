@@ -26,7 +26,7 @@ from ssh_abduction.solver.engines.doubts import Settled
 from ssh_abduction.solver.engines.homes import fewest_paths, homes_of
 from ssh_abduction.solver.engines.naming import NamedLabels
 from ssh_abduction.solver.engines.paths import PREPARING
-from ssh_abduction.solver.engines.refusing import smaller
+from ssh_abduction.solver.engines.refusing import minimal_part
 from ssh_abduction.solver.steps.chart import Link
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Equality
@@ -98,9 +98,6 @@ class _Members:
             else:
                 links.append(member)
         return cls(links, far)
-
-    def all(self) -> list[Link | _Far]:
-        return [*self.links, *self.far]
 
 
 class PlacesAndPaths:
@@ -270,7 +267,7 @@ class PlacesAndPaths:
             return
         far = self._far_away(labels)
         for members in self._turned_together(links, far) or [
-            _Members.of(smaller(_Members([*links], far).all(), self._clashing))
+            _Members.of(minimal_part(self._clash, [*links, *far]))
         ]:
             placed = {at for apart in members.far for at in apart.placed}
             self.named.program.add_links_at({step for step, _ in placed})
@@ -306,14 +303,13 @@ class PlacesAndPaths:
                 )
         return sorted(found, key=lambda members: len(members.links))[:CONTRARY]
 
-    def _clashing(self, members: list[Link | _Far]) -> list[Link | _Far] | None:
-        """Return the members themselves if no places and paths fit them, else None."""
+    def _clash(self, members: list[Link | _Far]) -> bool:
+        """Whether no places and paths fit these members."""
         some = _Members.of(members)
-        found = any(
+        return not any(
             self._has_paths(self._control_for(some.links, far=some.far, single=single))
             for single in (True, False)
         )
-        return None if found else members
 
     def _far_away(self, labels: Sequence[int]) -> list[_Far]:
         """List the constraints of evidence about dstates that are not at one place.

@@ -98,29 +98,26 @@ def all_accepted(
         forbid(reason)
 
 
-def smaller(
-    members: list[Member],
-    shrunk: Callable[[list[Member]], list[Member] | None],
-) -> list[Member]:
-    """Reduce a list of members to a small part that still has a property.
-
-    Leave out ever smaller parts: at first half of the members, at last single ones.
+def minimal_part(suffices: Callable[[list[Member]], bool], members: list[Member]) -> list[Member]:
+    """Find a part of some members that suffices, and from which no member can be left out.
 
     Args:
-        members: A list that has the property.
-        shrunk: Given a list, returns a part of it with the property (perhaps all of it); None if
-            the list lacks the property.
+        suffices: Says whether some members suffice. If they do, so do more members.
+        members: Members that suffice.
 
-    Returns:
-        The remaining members. None of them could be left out when it was tried.
+    Reference:
+        Junker 2004, "QuickXplain: preferred explanations and relaxations for over-constrained
+        problems".
     """
-    size = len(members)
-    while size := size // 2:
-        start = 0
-        while start < len(members) and len(members) > 1:
-            fewer = shrunk(members[:start] + members[start + size :])
-            if fewer is not None:
-                members = fewer
-                continue
-            start += size
-    return members
+
+    def needed(kept: list[Member], is_new: bool, rest: list[Member]) -> list[Member]:
+        if is_new and suffices(kept):
+            return []
+        if len(rest) == 1:
+            return rest
+        first, second = rest[: len(rest) // 2], rest[len(rest) // 2 :]
+        of_second = needed(kept + first, True, second)
+        of_first = needed(kept + of_second, bool(of_second), first)
+        return of_first + of_second
+
+    return needed([], False, members)
