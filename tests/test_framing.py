@@ -13,7 +13,7 @@ from strategies import theories, traces
 from ssh_abduction import Theory, check, solve
 from ssh_abduction.solver import Status, Watch, choosing
 from ssh_abduction.solver.asp.limits import StageTimeError
-from ssh_abduction.solver.engines.framing import maps_with_frames
+from ssh_abduction.solver.engines.framed import maps_with_frames
 from ssh_abduction.solver.prefixes import Prefixes
 from ssh_abduction.theory import Speedups
 from ssh_abduction.theory.settle import settle

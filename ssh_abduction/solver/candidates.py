@@ -217,7 +217,7 @@ class Candidates:
         Args:
             speedups: The speed-ups that the caller has on. With frames, more of them may apply.
         """
-        from ssh_abduction.solver.engines.framing import maps_with_frames  # loads numpy
+        from ssh_abduction.solver.engines.framed import maps_with_frames  # loads numpy
 
         watch = self._task.watch
         seconds = min(FRAMING, choosing.STEPWISE_SHARE * watch.left())

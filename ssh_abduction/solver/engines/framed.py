@@ -33,7 +33,9 @@ from collections.abc import Collection, Hashable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain, islice
 
+from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.asp.control import Asker
+from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.engines.base import Found, Task, next_charted_size
 from ssh_abduction.solver.engines.doubts import Settled
 from ssh_abduction.solver.engines.framed_paths import Fitted, FramedPaths, Naming
@@ -43,6 +45,8 @@ from ssh_abduction.solver.engines.visit_labels import VisitLabels
 from ssh_abduction.solver.guesses.merging import kept
 from ssh_abduction.solver.steps.chart import Chart, FramedChart
 from ssh_abduction.theory.evidence import Equality
+from ssh_abduction.theory.settle import Problem
+from ssh_abduction.theory.speedups import Speedups
 
 # If more pairs of visits than this may be at one place, add no axioms of single paths. They take
 # about forty rules for each pair.
@@ -258,6 +262,26 @@ class FramedEngine:
         """
         chart = Chart.framed(self._task.trace, self._task.log, size)
         return None if chart is None else self._fitting.charted(chart, before)
+
+
+def maps_with_frames(problem: Problem, watch: Watch, speedups: Speedups) -> Iterator[SSHMap]:
+    """Yield ever cheaper maps in which places have frames, for a theory with star=pattern.
+
+    With star=pattern clingo gets all axioms for each step, and only manages a few dozen steps. With
+    frames, a good map of thousands of steps takes seconds. Each map of `Theory.with_frames` is also
+    a map of the theory with star=pattern. So if the world has frames, this finds the true map or
+    one that is about as small.
+
+    Args:
+        problem: The trace, and a theory with star=pattern and all defaults filled in.
+        watch: The limits.
+        speedups: The speed-ups that are on.
+    """
+    task = Task.of(problem.changed(theory=problem.theory.with_frames()), watch, speedups)
+    engine = FramedEngine(task)
+    engine.grow(len(problem.trace))
+    for found in engine.improving_maps():
+        yield found.map.without_headings()
 
 
 def _listing(cost: tuple[int, ...]) -> str:

@@ -18,7 +18,6 @@ from ssh_abduction.solver.asp.facts import names_lp
 from ssh_abduction.solver.asp.limits import LimitError
 from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.name_program import Fitting, NameProgram
-from ssh_abduction.solver.engines.refusing import first_accepted_of
 from ssh_abduction.solver.engines.small_maps import SmallMaps
 from ssh_abduction.solver.steps.chart import Link
 
@@ -133,7 +132,11 @@ class NameSearch:
 
     def _searched(self) -> Iterator[list[int]]:
         """Do the work of `improving`. End early if a known map has the fewest dstates."""
-        found = yield from first_accepted_of(self._cheapest_answer, self._why_not, self._tell_why)
+        while (found := (yield from self._cheapest_answer())) is not None:
+            lacking = self._why_not(found)
+            if lacking is None:
+                break
+            self._tell_why(lacking)
         yield found.labels if found else self._incumbent.labels or []
 
     def _cheapest_answer(self) -> Generator[list[int], None, _Answer | None]:

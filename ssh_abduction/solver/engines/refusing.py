@@ -12,7 +12,6 @@ from typing import TypeVar
 
 Answer = TypeVar("Answer")
 Reason = TypeVar("Reason")
-Meanwhile = TypeVar("Meanwhile")
 Member = TypeVar("Member")
 
 
@@ -32,33 +31,6 @@ def first_accepted(
         The first accepted answer; None if there is no answer left.
     """
     while (answer := ask()) is not None:
-        reason = refuse(answer)
-        if reason is None:
-            return answer
-        forbid(reason)
-    return None
-
-
-def first_accepted_of(
-    ask: Callable[[], Generator[Meanwhile, None, Answer | None]],
-    refuse: Callable[[Answer], Reason | None],
-    forbid: Callable[[Reason], None],
-) -> Generator[Meanwhile, None, Answer | None]:
-    """Do the same as `first_accepted`, with an `ask` that yields intermediate results.
-
-    Args:
-        ask: Makes a generator. It yields intermediate results, and returns the next answer that
-            is not forbidden so far, or None.
-        refuse: Returns the reason to reject an answer; None if it is accepted.
-        forbid: Forbids all answers that have this reason to be rejected.
-
-    Yields:
-        The intermediate results of `ask`.
-
-    Returns:
-        The first accepted answer; None if there is no answer left.
-    """
-    while (answer := (yield from ask())) is not None:
         reason = refuse(answer)
         if reason is None:
             return answer
