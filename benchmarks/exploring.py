@@ -49,7 +49,7 @@ from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.data.trace import Action, Step
 from ssh_abduction.online.explorer import Explorer
 from ssh_abduction.rivals.flow import shortest_flow
-from ssh_abduction.rivals.stances import Move
+from ssh_abduction.rivals.stances import StanceMove
 
 ROOT = Path(__file__).parent.parent
 MOVES = {name: Action.of(name) for name in ("travel", "right", "around", "left")}
@@ -220,7 +220,7 @@ def shortest(world: World) -> int:
     ends = states_of(world)
     number = {state: n for n, state in enumerate(ends)}
     moves = [
-        Move(number[state], action, number[there], "known")
+        StanceMove(number[state], action, number[there], "known")
         for state in ends
         for action, there in ends[state].items()
     ]

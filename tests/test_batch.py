@@ -25,7 +25,7 @@ from worlds import TOURS, drive, rectangle
 from perception.readers.writers import write_carmen
 from ssh_abduction import Theory, Trace
 from ssh_abduction.cli import batch, cluster_jobs, main, mapping
-from ssh_abduction.cli.batch import Answer, Question
+from ssh_abduction.cli.batch import SolveAnswer, SolveQuestion
 from ssh_abduction.cli.cluster_jobs import Absence, answers_on_cluster
 from ssh_abduction.cli.jobs import StopFlag, answers_here
 from ssh_abduction.cli.mapping import MapAnswer, MapQuestion
@@ -43,19 +43,19 @@ ENDLESS = [
     "-n",
     "0",
 ]  # a theory in which slow.jsonl has maps without end
-QUESTION = Question(
+QUESTION = SolveQuestion(
     Theory.topological(), limit=None, maps=100, memory=None, speedups=Speedups(), json=False
 )
 
 
-class Deadly(Question):
+class Deadly(SolveQuestion):
     """Kill the process that solves a trace of this name, as the system does if memory runs out."""
 
-    def answer(self, number: int, path: str, *rest: Any) -> Answer:
+    def answer(self, number: int, path: str, *rest: Any) -> SolveAnswer:
         if "deadly" in path:
             time.sleep(0.3)  # let other traces start
             os.kill(os.getpid(), signal.SIGKILL)
-        return Question.answer(self, number, path, *rest)
+        return SolveQuestion.answer(self, number, path, *rest)
 
 
 class KilledOnce(MapQuestion):
@@ -353,14 +353,14 @@ def test_what_nobody_foresaw_is_an_answer_too(monkeypatch: pytest.MonkeyPatch) -
         raise MemoryError("no room for\nso many steps")
 
     monkeypatch.setattr(Trace, "load", load)
-    assert QUESTION.answer(3, "a\nb.jsonl") == Answer(
+    assert QUESTION.answer(3, "a\nb.jsonl") == SolveAnswer(
         3, r"'a\nb.jsonl': error: MemoryError: no room for so many steps", 1
     )
 
 
 @pytest.mark.slow
 def test_only_the_trace_whose_process_is_killed_is_lost(traces: Path, scheduler: str) -> None:
-    deadly = Deadly(*(getattr(QUESTION, name) for name in Question.__slots__))
+    deadly = Deadly(*(getattr(QUESTION, name) for name in SolveQuestion.__slots__))
     paths = [f"{name}.jsonl" for name in ("quick", "deadly", "quick")]
     stop = StopFlag()
     for answers in (
@@ -416,7 +416,9 @@ def test_where_a_worker_is_killed_all_logs_are_mapped_and_none_twice(
 
 def test_a_worker_stops_when_the_client_goes(traces: Path, scheduler_here: str) -> None:
     theory = Theory.topological().replace(boundary="none", path_order="partial", prefer=())
-    endless = Question(theory, limit=1000, maps=0, memory=None, speedups=Speedups(), json=False)
+    endless = SolveQuestion(
+        theory, limit=1000, maps=0, memory=None, speedups=Speedups(), json=False
+    )
     answers = answers_on_cluster(
         endless, ["quick.jsonl", "slow.jsonl"], scheduler_here, None, StopFlag()
     )
@@ -454,10 +456,10 @@ def test_memory_is_counted_for_each_trace(traces: Path) -> None:
 def test_ctrl_c_prints_what_waited_for_its_turn(
     traces: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def answers(*_: object) -> Iterator[Answer]:
-        yield Answer(0, "first", 0)
-        yield Answer(3, "fourth", 0)
-        yield Answer(2, "third", 20)
+    def answers(*_: object) -> Iterator[SolveAnswer]:
+        yield SolveAnswer(0, "first", 0)
+        yield SolveAnswer(3, "fourth", 0)
+        yield SolveAnswer(2, "third", 20)
         os.kill(os.getpid(), signal.SIGINT)
         time.sleep(10)
 

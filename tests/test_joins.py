@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from strategies import theories, traces
 
 from ssh_abduction import Solution, Theory, Trace, compare, solve
-from ssh_abduction.checker.joins import Join, joins_by_minimality, sentence_of
+from ssh_abduction.checker.joins import Join, joins_by_minimality, joins_in_words
 from ssh_abduction.cli import main
 from ssh_abduction.cli.mapping import MapQuestion
 from ssh_abduction.data import MapError, SSHMap
@@ -131,12 +131,12 @@ def test_an_action_that_slipped_forces_nothing() -> None:
 
 def test_sentences_name_few_joins() -> None:
     joins = [Join(i, i + 9, at_place=True) for i in range(7)]
-    assert sentence_of([], minimal=True) == ""
-    assert sentence_of(joins, minimal=True) == (
+    assert joins_in_words([], minimal=True) == ""
+    assert joins_in_words(joins, minimal=True) == (
         "minimal; nothing observed separates these places: steps 0 and 9, 1 and 10, 2 and 11, "
         "3 and 12, 4 and 13, and 2 more joins"
     )
-    assert sentence_of([*joins[:1], Join(3, 4, at_place=False)], 2) == (
+    assert joins_in_words([*joins[:1], Join(3, 4, at_place=False)], 2) == (
         "in map 1 nothing observed separates these places: steps 0 and 9; nor these dstates: "
         "steps 3 and 4"
     )

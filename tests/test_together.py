@@ -42,7 +42,7 @@ from ssh_abduction.data import (
     together,
 )
 from ssh_abduction.data.closure import Closure
-from ssh_abduction.data.drives import fingerprints_of, named_steps, sentence_of
+from ssh_abduction.data.drives import fingerprints_of, named_steps, pieces_in_words
 from ssh_abduction.explain import explain_trace
 from ssh_abduction.rivals import Listing, compare, difference, joins_of_drives
 from ssh_abduction.solver import choosing, prefixes
@@ -225,7 +225,9 @@ def test_drives_that_share_a_place_have_one_map() -> None:
     (ssh_map,) = solution.maps
     assert len(ssh_map.pieces) == 1
     assert {action for _, action, _ in ssh_map.links} == {"travel", "around"}
-    assert sentence_of(solution.drives, ssh_map) == "the map joins all 2 drives: monday, tuesday"
+    assert (
+        pieces_in_words(solution.drives, ssh_map) == "the map joins all 2 drives: monday, tuesday"
+    )
 
 
 def test_drives_that_share_nothing_are_pieces(tmp_path: Path) -> None:
@@ -233,7 +235,7 @@ def test_drives_that_share_nothing_are_pieces(tmp_path: Path) -> None:
     solution = solve([MONDAY, far, TUESDAY], Theory.causal())
     (ssh_map,) = solution.maps
     assert ssh_map.pieces == ((0, 1, 2, 3), (4, 5, 6))
-    assert "2 pieces that share no place: far alone; monday, tuesday" in sentence_of(
+    assert "2 pieces that share no place: far alone; monday, tuesday" in pieces_in_words(
         solution.drives, ssh_map
     )
     solution.save(tmp_path / "maps.json")

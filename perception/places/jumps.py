@@ -358,7 +358,7 @@ def stands_still(log: RobotLog) -> NDArray[np.bool_]:
     return np.asarray(np.abs(np.diff(poses, axis=0)).max(axis=1) < STILL)
 
 
-class Standing:
+class StandstillCheck:
     """Notices whether the robot moves while its odometer stands still.
 
     Attributes:
@@ -381,7 +381,7 @@ class Standing:
 
 def moves_unseen(log: RobotLog) -> bool:
     """Whether the robot moves while its odometer stands still, as the scans of a log show."""
-    standing = Standing()
+    standing = StandstillCheck()
     for scan in log.scans:
         standing.add(scan)
     return standing.moved

@@ -227,10 +227,10 @@ def watched(scans: Iterable[Scan], tell: Teller, source: str = "") -> Iterator[S
         return
     units = _units_of(RobotLog(tuple(first), source=source), tell)
     stretch: list[Scan] = []
-    last, begin, standing = first[-1:], 0, jumps.Standing()
+    last, begin, standing = first[-1:], 0, jumps.StandstillCheck()
     for number, scan in enumerate(map(units.converted, chain(first, coming))):
         if len(stretch) == LOOKS[-1]:
-            stretch, begin, standing = last, number - 1, jumps.Standing()
+            stretch, begin, standing = last, number - 1, jumps.StandstillCheck()
         stretch.append(without_ranges(scan))
         standing.add(scan)
         if len(stretch) in LOOKS:

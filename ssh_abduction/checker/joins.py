@@ -93,7 +93,7 @@ def joins_by_minimality(
     return _Joining(trace, ssh_map, checked_theory(theory)).joins()
 
 
-def sentence_of(joins: Sequence[Join], maps: int = 1, *, minimal: bool = False) -> str:
+def joins_in_words(joins: Sequence[Join], maps: int = 1, *, minimal: bool = False) -> str:
     """Say which joins rest on minimality alone, in words. Empty if there are none.
 
     Args:

@@ -57,7 +57,7 @@ LATE = (
 )
 
 
-class Answer(NamedTuple):
+class SolveAnswer(NamedTuple):
     """The result of one trace, as plain data.
 
     Attributes:
@@ -74,8 +74,8 @@ class Answer(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Question:
-    """The settings for solving each of many traces. It implements `jobs.Asked`.
+class SolveQuestion:
+    """The settings for solving each of many traces. It implements `jobs.FileQuestion`.
 
     Attributes:
         theory: The theory.
@@ -110,7 +110,7 @@ class Question:
         path: str,
         trace: Trace | None = None,
         given_up: Callable[[], bool] = lambda: False,
-    ) -> Answer:
+    ) -> SolveAnswer:
         """Solve one trace. If that fails, the answer says why.
 
         Args:
@@ -124,7 +124,9 @@ class Question:
         except Exception as error:  # one bad trace must not stop the others
             return self.failed(number, path, error)
 
-    def _solved(self, number: int, path: str, trace: Trace, given_up: Callable[[], bool]) -> Answer:
+    def _solved(
+        self, number: int, path: str, trace: Trace, given_up: Callable[[], bool]
+    ) -> SolveAnswer:
         """Solve one trace as `answer` does, but let errors pass."""
         self.theory.check_steps(trace)
         if self.memory is not None:
@@ -168,7 +170,7 @@ class Question:
         Otherwise return a context manager that does nothing.
         """
 
-        def last_words(why: Stop) -> tuple[Answer, int]:
+        def last_words(why: Stop) -> tuple[SolveAnswer, int]:
             solution = search.snapshot(why)
             found = [*maps] or ([(ssh_map, None) for ssh_map in solution.maps] if self.json else [])
             # Nobody reads the exit code of this process.
@@ -194,7 +196,7 @@ class Question:
         maps: Sequence[Given],
         explanation: Explanation | None,
         backbone: Backbone | None,
-    ) -> Answer:
+    ) -> SolveAnswer:
         """Make the answer for a solution: its line, exit code and warnings."""
         if self.json:
             line = json_line(
@@ -208,7 +210,7 @@ class Question:
         else:
             line = f"{named(path)}: {headline(solution, search.count, explanation)}"
         warnings = tuple(f"{named(path)}: {warning}" for warning in warnings_of(search, solution))
-        return Answer(number, line, exit_code(solution), warnings)
+        return SolveAnswer(number, line, exit_code(solution), warnings)
 
     @property
     def overdue(self) -> float | None:
@@ -220,11 +222,11 @@ class Question:
         """The seconds to wait for unfinished answers after Ctrl-C."""
         return OVERDUE
 
-    def lost(self, lost: workers.Lost, path: str) -> Answer:
+    def lost(self, lost: workers.Lost, path: str) -> SolveAnswer:
         """Make the answer for a trace whose process ended without an answer."""
         return self.failed(lost.number, path, SolverError(LATE if lost.late else KILLED))
 
-    def failed(self, number: int, path: str, error: Exception) -> Answer:
+    def failed(self, number: int, path: str, error: Exception) -> SolveAnswer:
         """Make the answer for a trace that could not be solved because of an error."""
         message = in_a_line(error)
         line = (
@@ -232,7 +234,7 @@ class Question:
             if self.json
             else f"{named(path)}: error: {message}"
         )
-        return Answer(number, line, EXIT_ERROR)
+        return SolveAnswer(number, line, EXIT_ERROR)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -248,7 +250,7 @@ def run(options: argparse.Namespace) -> int:
             "leave it out for 1"
         )
     speedups = Speedups.without(options.without_speedups)
-    question = Question(
+    question = SolveQuestion(
         theory_of(options),
         options.time_limit,
         options.maps,
@@ -266,7 +268,7 @@ def run(options: argparse.Namespace) -> int:
     return final_code(codes, len(paths), stop, "traces")
 
 
-def _printed(answers: Generator[Answer], total: int, stop: StopFlag) -> list[int]:
+def _printed(answers: Generator[SolveAnswer], total: int, stop: StopFlag) -> list[int]:
     """Print all lines in the order of the traces, and return the exit codes of the answers."""
     lines: dict[int, str] = {}  # the lines that wait for an earlier trace
     codes: list[int] = []

@@ -12,7 +12,7 @@ from concurrent.futures import CancelledError
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from ssh_abduction.cli.jobs import Asked, StopFlag
+from ssh_abduction.cli.jobs import FileQuestion, StopFlag
 from ssh_abduction.cli.outcome import warn
 from ssh_abduction.data.errors import AbductionError, SolverError, brief
 from ssh_abduction.solver import POLL, workers
@@ -30,7 +30,7 @@ LOST = (
 
 
 def answers_on_cluster(
-    question: Asked, paths: Sequence[str], address: str, jobs: int | None, stop: StopFlag
+    question: FileQuestion, paths: Sequence[str], address: str, jobs: int | None, stop: StopFlag
 ) -> Generator[Any]:
     """Yield answers from the workers of a Dask scheduler, in the order in which they are ready.
 
@@ -87,7 +87,7 @@ def answers_on_cluster(
 
 
 def _answers(
-    question: Asked,
+    question: FileQuestion,
     paths: Sequence[str],
     attempt: Callable[[list[Task], list[Task]], Iterator[Any]],
 ) -> Iterator[Any]:
@@ -155,7 +155,7 @@ class Absence:
 
 
 def _on_workers(
-    question: Asked,
+    question: FileQuestion,
     client: Client,
     most: int,
     absence: Absence,
@@ -223,7 +223,7 @@ def _on_workers(
         yield question.failed(*task, SolverError(LOST))
 
 
-def _on_worker(question: Asked, number: int, path: str, content: Any) -> Any:
+def _on_worker(question: FileQuestion, number: int, path: str, content: Any) -> Any:
     """Answer the question about one file on a Dask worker. Stop if the client disconnects."""
     from distributed import get_worker
 
@@ -245,6 +245,6 @@ def _on_worker(question: Asked, number: int, path: str, content: Any) -> Any:
 
 
 def _solved_for_cluster(
-    number: int, path: str, question: Asked, content: Any, given_up: Callable[[], bool]
+    number: int, path: str, question: FileQuestion, content: Any, given_up: Callable[[], bool]
 ) -> Any:
     return question.answer(number, path, content, given_up)

@@ -36,7 +36,7 @@ def in_a_line(error: Exception) -> str:
     return printable(" ".join(message.split()))
 
 
-class Asked(Protocol):
+class FileQuestion(Protocol):
     """A question to be answered for each of many files.
 
     Questions and answers are plain data, because they are sent to other processes and machines.
@@ -79,7 +79,7 @@ class Asked(Protocol):
 
 
 def answers_here(
-    question: Asked, paths: Sequence[str], jobs: int, stop: StopFlag
+    question: FileQuestion, paths: Sequence[str], jobs: int, stop: StopFlag
 ) -> Generator[Any]:
     """Yield answers from processes of this machine, in the order in which they are ready.
 
@@ -137,5 +137,7 @@ def final_code(codes: Sequence[int], asked: int, stop: StopFlag, files: str) -> 
     return max(codes, default=0)
 
 
-def _solved_in_worker(number: int, path: str, question: Asked, given_up: Callable[[], bool]) -> Any:
+def _solved_in_worker(
+    number: int, path: str, question: FileQuestion, given_up: Callable[[], bool]
+) -> Any:
     return question.answer(number, path, None, given_up)

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ssh_abduction.checker.joins import sentence_of
+from ssh_abduction.checker.joins import joins_in_words
 from ssh_abduction.cli import EXIT_ERROR, unwritten
 from ssh_abduction.cli.cluster_jobs import answers_on_cluster
 from ssh_abduction.cli.guard import Guard
@@ -75,7 +75,7 @@ class MapAnswer:
 
 @dataclass(frozen=True, slots=True)
 class MapQuestion:
-    """The settings for mapping each of many logs. It implements `jobs.Asked`.
+    """The settings for mapping each of many logs. It implements `jobs.FileQuestion`.
 
     Attributes:
         theory: The theory; None to choose it for each log.
@@ -277,7 +277,7 @@ class MapQuestion:
             else f"{solution.status.value}, {counted(solution.count, 'minimal maps')}"
             f"{'' if solution.complete else ' or more'}"
         )
-        if joins := sentence_of(solution.by_minimality, solution.count):
+        if joins := joins_in_words(solution.by_minimality, solution.count):
             how += f"; {joins}"
         if done.joined:
             how += f"; {done.joined}"

@@ -8,7 +8,7 @@ from ssh_abduction.cli.obeying import corrections_of
 from ssh_abduction.cli.options import number_steps, theory_of
 from ssh_abduction.cli.outcome import exit_code
 from ssh_abduction.cli.text import describe, headline
-from ssh_abduction.data.drives import sentence_of, together
+from ssh_abduction.data.drives import pieces_in_words, together
 from ssh_abduction.data.errors import AbductionError, printable
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.trace import Trace
@@ -45,6 +45,6 @@ def run(options: argparse.Namespace) -> int:
         return exit_code(solution)
     stands = ", ".join(solution.support.onto)
     print(headline(solution, len(solution.maps), None))
-    print(printable(f"the map of {stands} stands; {sentence_of(solution.drives, solution[0])}"))
+    print(printable(f"the map of {stands} stands; {pieces_in_words(solution.drives, solution[0])}"))
     print(f"\n{'map 1' if len(solution) > 1 else 'map'}\n{describe(solution[0])}")
     return exit_code(solution)

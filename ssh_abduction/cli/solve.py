@@ -37,7 +37,7 @@ from ssh_abduction.cli.outcome import (
     warnings_of,
 )
 from ssh_abduction.cli.text import by_displacements, compared, describe, describe_backbone, headline
-from ssh_abduction.data.drives import sentence_of, together
+from ssh_abduction.data.drives import pieces_in_words, together
 from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.floors import floors_in_words
@@ -360,7 +360,7 @@ def _lines(
     if (
         joined := solution.drives
         and solution.maps
-        and sentence_of(solution.drives, solution.maps[0])
+        and pieces_in_words(solution.drives, solution.maps[0])
     ):
         yield joined
     if solution.maps and (floors := floors_in_words(solution.maps[0])):

@@ -214,7 +214,7 @@ def joined_drives(drives: Sequence[Drive], ssh_map: SSHMap) -> tuple[tuple[str, 
     return tuple(tuple(names) for _, names in groups)
 
 
-def sentence_of(drives: Sequence[Drive], ssh_map: SSHMap) -> str:
+def pieces_in_words(drives: Sequence[Drive], ssh_map: SSHMap) -> str:
     """Say which drives a map joins, in words. Empty for a single drive."""
     groups = joined_drives(drives, ssh_map)
     if len(drives) < 2:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sklearn.neighbors import NearestNeighbors
 
 from perception.confidence import NOISE
-from ssh_abduction.data.drives import Drive, drives_of, joined_drives, sentence_of
+from ssh_abduction.data.drives import Drive, drives_of, joined_drives, pieces_in_words
 from ssh_abduction.data.errors import AbductionError, brief, is_whole
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
@@ -147,7 +147,7 @@ def warn_of_pieces(trace: Trace, ssh_map: SSHMap) -> None:
     drives = drives_of(trace)
     if len(joined_drives(drives, ssh_map)) > 1:
         warnings.warn(
-            f"{sentence_of(drives, ssh_map)}: a dstate that is in several pieces gets several "
+            f"{pieces_in_words(drives, ssh_map)}: a dstate that is in several pieces gets several "
             "labels; let each drive pass places of another drive",
             AmbiguousMapWarning,
             stacklevel=3,

@@ -193,8 +193,7 @@ class _Drawing:
     def layout(self) -> Layout:
         """Choose the drawing with the fewest wrong turns and bent streets out of four.
 
-        It draws straight either whole paths or only their segments, each with robust headings and
-        without.
+        Whole paths are straight, or only their segments. Headings are robust, or not.
         """
         if not self.map.places:
             return self._spread()

@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass
 from statistics import median
 from typing import Any
 
-from ssh_abduction.data.drives import sentence_of
+from ssh_abduction.data.drives import pieces_in_words
 from ssh_abduction.data.maps import SSHMap, check_of_trace
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted
@@ -159,7 +159,7 @@ def _drives(listing: Listing) -> dict[str, Any]:
     first = {drive.name: drive.first for drive in listing.drives}
     return {
         "drives": [asdict(drive) for drive in listing.drives] if len(listing.drives) > 1 else [],
-        "joined": sentence_of(listing.drives, listing.maps[0]),
+        "joined": pieces_in_words(listing.drives, listing.maps[0]),
         "between": [
             {
                 "sentence": f"{pair.first} and {pair.second}: {_shared_by(pair)}",

@@ -66,9 +66,9 @@ from ssh_abduction.rivals.machines import (
     UNKNOWN,
     Can,
     Machine,
+    MachineTable,
     Row,
     Sights,
-    Table,
     Walk,
     links_of,
     machine_of,
@@ -211,7 +211,7 @@ class Laboratory:
             found.setdefault(machine, []).append(i)
             self._reached.append(reached)
         self._groups = list(found.values())
-        self._table = Table(list(found), names)
+        self._table = MachineTable(list(found), names)
 
     @property
     def alike(self) -> tuple[tuple[int, ...], ...]:

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import coo_array
 
-from ssh_abduction.rivals.stances import Move
+from ssh_abduction.rivals.stances import StanceMove
 
 T = TypeVar("T")
 # Seconds for the search for one flow. If it takes longer, the robot goes to the nearest untried
@@ -26,7 +26,7 @@ ROUNDS = 8
 
 
 def shortest_walk(
-    moves: Sequence[Move], start: int, due: set[int], unseen: set[int]
+    moves: Sequence[StanceMove], start: int, due: set[int], unseen: set[int]
 ) -> tuple[str, ...]:
     """Find the shortest walk that makes required moves and visits required stances.
 
@@ -71,7 +71,7 @@ def shortest_walk(
 
 
 def shortest_flow(
-    moves: Sequence[Move],
+    moves: Sequence[StanceMove],
     start: int,
     due: set[int],
     unseen: set[int],
@@ -158,7 +158,7 @@ def shortest_flow(
     return [int(n) if move.source in near else 0 for move, n in zip(moves, times, strict=True)]
 
 
-def _parts_cut_off(used: Sequence[Move], start: int) -> list[set[int]]:
+def _parts_cut_off(used: Sequence[StanceMove], start: int) -> list[set[int]]:
     """Find the connected parts of a flow without the start (a stance), as sets of stances."""
     near = reached_from(used, start)
     left = [move for move in used if move.source not in near]
@@ -174,7 +174,7 @@ def _parts_cut_off(used: Sequence[Move], start: int) -> list[set[int]]:
 
 
 def nearest_of(
-    moves: Sequence[Move], start: int, due: set[int], unseen: set[int]
+    moves: Sequence[StanceMove], start: int, due: set[int], unseen: set[int]
 ) -> tuple[str, ...]:
     """Find the shortest way to make one required move or to visit one required stance.
 
@@ -200,7 +200,7 @@ def nearest_of(
     return ()
 
 
-def reached_from(moves: Iterable[Move], start: int) -> set[int]:
+def reached_from(moves: Iterable[StanceMove], start: int) -> set[int]:
     """Find all stances that moves lead to from `start`, including `start`."""
     return followed_from(((move.source, move.target) for move in moves), start)
 

@@ -16,7 +16,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
-from ssh_abduction.checker.joins import Join, sentence_of
+from ssh_abduction.checker.joins import Join, joins_in_words
 from ssh_abduction.data.checks import a_flag, a_path, a_text, an_instance
 from ssh_abduction.data.corrections_file import named_beside
 from ssh_abduction.data.drives import Drive, with_named_faults
@@ -67,7 +67,7 @@ class Listing:
         """How sure the first map is, in words; an empty text if this is unknown."""
         if self.weighed is not None:
             return self.weighed.sentence
-        return sentence_of(self.by_minimality, len(self.maps), minimal=self.minimal is not None)
+        return joins_in_words(self.by_minimality, len(self.maps), minimal=self.minimal is not None)
 
     @classmethod
     def of(cls, source: Maps) -> Listing:

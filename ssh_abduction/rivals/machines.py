@@ -295,7 +295,7 @@ def machine_of(
     return Machine(tuple(sights[s] for s in reached), tuple(ends)), tuple(reached)
 
 
-class Table:
+class MachineTable:
     """Machines as arrays, so that an action is followed in all of them at once.
 
     Attributes:
@@ -359,13 +359,13 @@ class Walk:
         limits: Limits of the search; None for none.
 
     >>> blind = Machine((0, 0), ((("a", 1),), (("a", 0),)))
-    >>> walk = Walk(Table([blind, blind], ["a"]), [0, 1], (0, 0), None)
+    >>> walk = Walk(MachineTable([blind, blind], ["a"]), [0, 1], (0, 0), None)
     >>> [layer.rows.tolist() for layer in walk.layers()], walk.way(1)
     ([[[0, 0]], [[1, 1]]], [0])
     """
 
     def __init__(
-        self, table: Table, group: Sequence[int], start: Row, limits: Limits | None
+        self, table: MachineTable, group: Sequence[int], start: Row, limits: Limits | None
     ) -> None:
         self.table, self.group, self._limits = table, np.array(group, np.int32), limits
         self._start = start

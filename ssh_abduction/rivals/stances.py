@@ -20,7 +20,7 @@ AROUND = Action.of("around")
 
 
 @dataclass(frozen=True, slots=True)
-class Move:
+class StanceMove:
     """An action that leads from one stance to another.
 
     Attributes:
@@ -97,7 +97,7 @@ class Stances:
             self._in.setdefault(room, []).append(n)
         self._back: dict[int, int] = {}  # where a travel from a stance leads if it leads back
 
-    def moves(self) -> list[Move]:
+    def moves(self) -> list[StanceMove]:
         """List all moves from all stances. The call adds stances that were never seen."""
         for source, tried in self._links.items():
             for name, target in tried.items():
@@ -107,7 +107,7 @@ class Stances:
                     and self._frames[target]
                 ):
                     self._back.setdefault(self._around(target), self._around(source))
-        found: list[Move] = []
+        found: list[StanceMove] = []
         n = 0
         while n < len(self._at):
             found += (self._move(n, action) for action in self._possible(n))
@@ -172,21 +172,21 @@ class Stances:
             )
         ]
 
-    def _move(self, n: int, action: Action) -> Move:
+    def _move(self, n: int, action: Action) -> StanceMove:
         """Make the move for an action in stance n."""
         if n < len(self._links) and action.name in self._links[n]:
-            return Move(n, action, self._links[n][action.name], "known")
+            return StanceMove(n, action, self._links[n][action.name], "known")
         frame = self._frames[n]
         if frame is not None and action.kind == "travel":
             return (
-                Move(n, action, self._back[n], "expected")
+                StanceMove(n, action, self._back[n], "expected")
                 if n in self._back
-                else Move(n, action, self._around(n), "unknown")
+                else StanceMove(n, action, self._around(n), "unknown")
             )
         degrees = _degrees(action, frame) if action.kind == "turn" else None
         if degrees is None:
-            return Move(n, action, n, "unknown")
-        return Move(
+            return StanceMove(n, action, n, "unknown")
+        return StanceMove(
             n,
             action,
             self._turned(n, degrees),

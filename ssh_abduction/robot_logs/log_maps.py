@@ -29,7 +29,7 @@ from perception.recognition import recogniser as new_recogniser
 from perception.store import written
 from ssh_abduction.data.checks import all_instances
 from ssh_abduction.data.corrections import Corrections
-from ssh_abduction.data.drives import drives_of, sentence_of
+from ssh_abduction.data.drives import drives_of, pieces_in_words
 from ssh_abduction.data.files import json_line
 from ssh_abduction.evaluation.ladder import Rung, UnderWay, ladder, rungs
 from ssh_abduction.page.html import view_page
@@ -155,7 +155,7 @@ class LogMap:
     def joined(self) -> str:
         """Which drives the first map joins, in words; empty for a single drive or without a map."""
         maps = self.solution.maps
-        return sentence_of(drives_of(self.imported.trace), maps[0]) if maps else ""
+        return pieces_in_words(drives_of(self.imported.trace), maps[0]) if maps else ""
 
     @property
     def drove(self) -> float | None:

@@ -13,9 +13,8 @@ from typing import Any
 
 from perception.places.importing import Imported
 from perception.readers.scans import RobotLog
-from ssh_abduction.checker.joins import sentence_of
-from ssh_abduction.data.drives import drives_of
-from ssh_abduction.data.drives import sentence_of as sentence_of_drives
+from ssh_abduction.checker.joins import joins_in_words
+from ssh_abduction.data.drives import drives_of, pieces_in_words
 from ssh_abduction.data.words import counted
 from ssh_abduction.evaluation.ladder import Rung
 from ssh_abduction.output.drawing import escaped
@@ -102,7 +101,7 @@ def _summary(solution: Solution, run: Mapping[str, Any]) -> str:
         proven = f"{'' if solution.complete else 'at least '}{solution.count} minimal maps"
     if solution.weighed is not None:
         proven += f"; {solution.weighed.sentence}"
-    elif joins := sentence_of(solution.by_minimality, solution.count):
+    elif joins := joins_in_words(solution.by_minimality, solution.count):
         proven += f"; {joins}"
     paths = f", {cost.paths} paths" if paths_mean_something(solution) else ""
     size = f"{cost.places} places{paths}, {cost.dstates} distinctive states"
@@ -122,7 +121,7 @@ def _drives(imported: Imported, solution: Solution, run: Mapping[str, Any]) -> I
         counts = (one["scans"], f"{one['metres']:g} m", one["visits"], one["steps"])
         rows.append((drive.name, *counts, len(at[k]), len(at[k] & others)))
     head = ("drive", "scans", "way", "visits", "steps", "places", "shared with other drives")
-    pieces = sentence_of_drives(drives, solution.maps[0])
+    pieces = pieces_in_words(drives, solution.maps[0])
     yield "<h2>Drives</h2>" + _table(head, rows) + _paragraph(f"{pieces.capitalize()}.")
     yield "<h2>Joins between drives</h2>" + _joins_of_drives(solution)
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.checker.claims import contradictions
-from ssh_abduction.checker.joins import Join, joins_by_minimality, sentence_of
+from ssh_abduction.checker.joins import Join, joins_by_minimality, joins_in_words
 from ssh_abduction.data.checks import a_whole_number, one_of
 from ssh_abduction.data.drives import Drive, drives_of, with_named_faults
 from ssh_abduction.data.errors import MapError, SolverError, brief, named
@@ -194,7 +194,7 @@ class Solution(MapSequence):
         if self.weighed is not None:
             return self.weighed.sentence
         minimal = self.status is Status.OPTIMAL
-        return sentence_of(self.by_minimality, self.count, minimal=minimal)
+        return joins_in_words(self.by_minimality, self.count, minimal=minimal)
 
     def probability(self, first: int, second: int, of: str = "dstate") -> float:
         """Return the probability that two steps are at one dstate, or at one place.

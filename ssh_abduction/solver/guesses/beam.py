@@ -38,7 +38,7 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.guesses.completing import completed
 from ssh_abduction.solver.guesses.pieces import fitted
-from ssh_abduction.solver.guesses.reckoning import Hypothesis, Reckoning, first_pose
+from ssh_abduction.solver.guesses.reckoning import Hypothesis, HypothesisPoses, first_pose
 from ssh_abduction.solver.guesses.sights import DEAREST, Sights
 from ssh_abduction.solver.steps.faults import with_changes, with_faults
 from ssh_abduction.solver.steps.log import Log
@@ -100,7 +100,7 @@ class Beam:
         self._leaves = has_places and "travel_leaves" in theory.hard
         # The prices of a dstate and of a place.
         self._prices = theory.prices[0], theory.prices[1] if has_places else 0.0
-        self._reckoning, self._frames = Reckoning(trace), frames_of(trace)
+        self._reckoning, self._frames = HypothesisPoses(trace), frames_of(trace)
         self.nats, self.refuses = math.inf, False
         self._kept: list[list[Hypothesis]] = []  # the beam after each check
         self._sights = Sights(trace, self._bare, log, misreads=theory.misread > 0)

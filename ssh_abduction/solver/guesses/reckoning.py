@@ -76,7 +76,7 @@ class Hypothesis:
     pieces: Pieces = field(default_factory=Pieces)
 
 
-class Reckoning:
+class HypothesisPoses:
     """Updates the poses of hypotheses by the displacements and closures of a trace.
 
     Attributes:

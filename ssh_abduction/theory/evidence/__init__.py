@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory.evidence.alike import Alike
 from ssh_abduction.theory.evidence.asserted import Asserted
-from ssh_abduction.theory.evidence.closure import Closure
+from ssh_abduction.theory.evidence.closure import Closures
 from ssh_abduction.theory.evidence.displacement import Displacement
 from ssh_abduction.theory.evidence.floors import Floors
 from ssh_abduction.theory.evidence.planar import Planar
@@ -32,14 +32,14 @@ from ssh_abduction.theory.pairs import NO_PAIRS, Pairs
 if TYPE_CHECKING:
     from ssh_abduction.theory.theory import Theory
 
-KINDS: tuple[type[Evidence], ...] = (Asserted, Alike, Displacement, Closure, Floors, Planar)
+KINDS: tuple[type[Evidence], ...] = (Asserted, Alike, Displacement, Closures, Floors, Planar)
 
 __all__ = [
     "KINDS",
     "NO_PAIRS",
     "Alike",
     "Asserted",
-    "Closure",
+    "Closures",
     "Displacement",
     "Equality",
     "Evidence",

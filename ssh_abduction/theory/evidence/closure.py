@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from ssh_abduction.data.closure import Closure as Match
+from ssh_abduction.data.closure import Closure
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory.evidence.protocol import Evidence
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Closure(Evidence):
+class Closures(Evidence):
     """Evidence from closures, with the fields `reject` and `returns` of a theory.
 
     Attributes:
@@ -43,7 +43,7 @@ class Closure(Evidence):
     has_places: bool
 
     @classmethod
-    def of(cls, theory: Theory) -> Closure:
+    def of(cls, theory: Theory) -> Closures:
         return cls(theory.reject, theory.returns, theory.level == "topological")
 
     def pairs(self, trace: Trace) -> Pairs:
@@ -62,7 +62,7 @@ class Closure(Evidence):
                 yield match.first, match.last
 
 
-def _square(match: Match, odometry: Odometry, places: bool) -> float:
+def _square(match: Closure, odometry: Odometry, places: bool) -> float:
     """The chi-square of a closure if its two steps have one position (`places`), or one pose."""
     import numpy as np
 
