@@ -6,7 +6,7 @@
 >>> Star.of((0, 120, 240)).openings is None
 True
 >>> [frame.bearings for frame in Star.of((1, None, 1, 0)).frames]
-[(0, 180), (0, 90, 180)]
+[(0.0, 180.0), (0.0, 90.0, 180.0)]
 
 Bearings are degrees clockwise from straight ahead, in any directions. The spread of a bearing is
 how many degrees it may be off. A gateway that is seen twice has two bearings. Corrected by the
