@@ -86,7 +86,7 @@ def opened(path: Path, format: str) -> Iterator[Files]:
                 # Other parts of the drive may lie beside the file. The user may have meant all.
                 files.notes += _beside(path)
         except OSError as error:
-            check_room(error, named(path))
+            raise_if_disk_is_full(error, named(path))
             raise LogError(
                 f"{named(path)}: expected a readable bag: {error.strerror or error}; check the path"
             ) from None
@@ -115,7 +115,7 @@ def _of_folder(path: Path, folder: Path, stack: ExitStack) -> Files:
                 )
             return files
         except Exception as error:  # Damaged bytes can raise any error in the library.
-            check_room(error, named(path))
+            raise_if_disk_is_full(error, named(path))
             if not parts:
                 raise LogError(
                     f"{named(path)}: expected a bag of ROS 2, got one that cannot be opened "
@@ -146,7 +146,7 @@ def _of_folder(path: Path, folder: Path, stack: ExitStack) -> Files:
         try:
             _open_part(part, files, folder, stack)
         except OSError as error:
-            check_room(error, named(part))
+            raise_if_disk_is_full(error, named(part))
             unread.append(
                 LogError(
                     f"{named(part)}: expected a readable bag: {error.strerror or error}; "
@@ -180,7 +180,7 @@ def _open_part(path: Path, files: Files, folder: Path, stack: ExitStack) -> None
         files.readers.append(_by_rosbags(here, files.format, stack))
         return
     except Exception as error:  # Damaged bytes can raise any error in the library.
-        check_room(error, named(path))
+        raise_if_disk_is_full(error, named(path))
         why = cause(error).replace(str(here), source)
     salvage = Salvage(here, files.format)
     if not salvage.count:
@@ -282,7 +282,7 @@ def _beside(path: Path) -> list[str]:
     return _gaps([path])
 
 
-def check_room(error: Exception, source: str) -> None:
+def raise_if_disk_is_full(error: Exception, source: str) -> None:
     """Raise LogError if an error means that a disk is full. Then the bag itself is not damaged."""
     if is_full(error):
         raise no_room(source) from None

@@ -87,7 +87,7 @@ class Bag:
                 except StopIteration:
                     break
                 except Exception as error:  # Damaged bytes can raise any error in the library.
-                    bag_files.check_room(error, self.source)
+                    bag_files.raise_if_disk_is_full(error, self.source)
                     number = sum(numbers.values()) + 1
                     where = " and ".join(sorted(topics))
                     what = (

@@ -152,7 +152,7 @@ def region_beside(m: Reading) -> Found:
 
 
 def region_between(m: Reading) -> Found:
-    """Check that the places beside all the directed paths that a place is beside are a region."""
+    """Check, for each place, the region right of all directed paths that it lies right of."""
     yield from _missing(m, m.once(_between))
 
 

@@ -110,7 +110,7 @@ class Obeying:
         return with_names(self.corrections, solution, self.trace)
 
     def blamed(self, explanation: Explanation | None) -> list[str]:
-        """List the sentences of the person that take part in why there is no map.
+        """List the sentences of the person without which the trace may have a map.
 
         Sentences are left out one by one, as long as the stretch of the explanation has no map.
         """

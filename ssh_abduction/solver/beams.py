@@ -45,7 +45,7 @@ class Beams:
     """The beams of one search, and what they say about the best map.
 
     Attributes:
-        broken: By how many nats the best map that breaks axioms costs less than the best map, as in
+        broken: How many nats the best map that breaks axioms saves, compared to the best map, as in
             `Weighed`; 0 if it does not cost less, -inf if none was sought.
     """
 

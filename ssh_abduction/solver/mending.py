@@ -299,7 +299,7 @@ class Mending:
         return list(maps), proven
 
     def _believed_again(self, ssh_map: SSHMap, mended: Trace) -> Trace:
-        """Put those missing displacements back into a mended trace that agree with a map of it."""
+        """Restore the missing displacements of a mended trace that agree with its map."""
         for t, (step, other) in enumerate(zip(self._task.trace.steps, mended.steps, strict=True)):
             if step.displacement == other.displacement:
                 continue

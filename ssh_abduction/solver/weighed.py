@@ -63,7 +63,7 @@ class Weighed:
             maps come last.
         searched: Whether a broad beam of hypotheses ended with the best map, and its misfit is not
             improbable. Such a map is seldom false, even if it is not proven to be the best.
-        broken: By how many nats the best map that breaks axioms costs less than the best map; 0 if
+        broken: How many nats the best map that breaks axioms saves, compared to the best map; 0 if
             it does not cost less, -inf if none was sought.
         excess: The misfit of the best map, divided by the misfit that the standard deviations
             predict. Costs are divided by it before they become probabilities.

@@ -358,7 +358,7 @@ class Theory:
             raise TraceError(f"{where}: {error}, or take {choice('star', 'none')}") from None
 
     def check_steps(self, trace: Trace) -> None:
-        """Check that the trace has all steps that the user asserts something about.
+        """Check that the trace has all steps of the user's assertions.
 
         Raises:
             TheoryError: A step is missing.
