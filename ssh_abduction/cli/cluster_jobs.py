@@ -12,7 +12,7 @@ from concurrent.futures import CancelledError
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from ssh_abduction.cli.jobs import FileQuestion, StopFlag
+from ssh_abduction.cli.jobs import FileQuestion, StopFlag, solved_in_worker
 from ssh_abduction.cli.outcome import warn
 from ssh_abduction.data.errors import AbductionError, SolverError, brief
 from ssh_abduction.solver import POLL, workers
@@ -239,12 +239,6 @@ def _on_worker(question: FileQuestion, number: int, path: str, content: Any) -> 
     # process, as other tasks may run in this one.
     work = [(number, path, question, content)]
     answer: Any = next(
-        workers.answers(_solved_for_cluster, work, 1, given_up, question.overdue, question.patience)
+        workers.answers(solved_in_worker, work, 1, given_up, question.overdue, question.patience)
     )
     return question.lost(answer, path) if isinstance(answer, workers.Lost) else answer
-
-
-def _solved_for_cluster(
-    number: int, path: str, question: FileQuestion, content: Any, given_up: Callable[[], bool]
-) -> Any:
-    return question.answer(number, path, content, given_up)

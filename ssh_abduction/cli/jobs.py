@@ -101,11 +101,11 @@ def answers_here(
 
     from joblib import effective_n_jobs
 
-    tasks = [(number, path, question) for number, path in enumerate(paths)]
+    tasks = [(number, path, question, None) for number, path in enumerate(paths)]
     processes = min(effective_n_jobs(jobs), len(paths))
     with on_ctrl_c(end):
         for answer in workers.answers(
-            _solved_in_worker, tasks, processes, stop.is_set, question.overdue, question.patience
+            solved_in_worker, tasks, processes, stop.is_set, question.overdue, question.patience
         ):
             if not isinstance(answer, workers.Lost):
                 yield answer
@@ -137,7 +137,8 @@ def final_code(codes: Sequence[int], asked: int, stop: StopFlag, files: str) -> 
     return max(codes, default=0)
 
 
-def _solved_in_worker(
-    number: int, path: str, question: FileQuestion, given_up: Callable[[], bool]
+def solved_in_worker(
+    number: int, path: str, question: FileQuestion, content: Any, given_up: Callable[[], bool]
 ) -> Any:
-    return question.answer(number, path, None, given_up)
+    """Answer a question about one file, with its content if it is loaded, in a process."""
+    return question.answer(number, path, content, given_up)
