@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, TypeAlias
 
@@ -42,7 +42,7 @@ from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.data.words import attributes_of, counted
 from ssh_abduction.evaluation.named_truth import checked_map
 from ssh_abduction.evaluation.relations import Relations
-from ssh_abduction.evaluation.trajectory import checked_pose, checked_time
+from ssh_abduction.evaluation.trajectory import checked_pose, checked_time, three_numbers
 
 # By default two poses within this many metres are one place.
 NEAR = 2.0
@@ -254,23 +254,10 @@ def told_poses(trace: Trace) -> list[Pose | None]:
     values = [
         step.truth.get("pose") if isinstance(step.truth, Mapping) else None for step in trace.steps
     ]
-    return [_pose(value, f"{trace.at(t)}: truth.pose") for t, value in enumerate(values)]
-
-
-def _pose(value: Any, where: str) -> Pose | None:
-    """Read a pose from JSON; None if the value is None. Raise TraceError if it is malformed."""
-    if value is None:
-        return None
-    if (
-        isinstance(value, Sequence)
-        and not isinstance(value, str)
-        and len(value) == 3
-        and all(is_finite(number) for number in value)
-    ):
-        return float(value[0]), float(value[1]), float(value[2])
-    raise TraceError(
-        f"{where}: expected [x, y, heading] in metres and radians, got {brief(value)}; mend it"
-    )
+    return [
+        None if value is None else three_numbers(value, f"{trace.at(t)}: truth.pose")
+        for t, value in enumerate(values)
+    ]
 
 
 class _Poses:

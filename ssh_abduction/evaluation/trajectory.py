@@ -248,8 +248,11 @@ def checked_pose(value: Any, where: str) -> Pose:
     Raises:
         TraceError: The value is malformed.
     """
-    if value is None:
-        return 0.0, 0.0, 0.0
+    return (0.0, 0.0, 0.0) if value is None else three_numbers(value, f"{where}: seen")
+
+
+def three_numbers(value: Any, where: str) -> Pose:
+    """Read a pose from JSON. Raise TraceError if it is malformed."""
     if (
         isinstance(value, Sequence)
         and not isinstance(value, str)
@@ -258,8 +261,7 @@ def checked_pose(value: Any, where: str) -> Pose:
     ):
         return float(value[0]), float(value[1]), float(value[2])
     raise TraceError(
-        f"{where}: seen: expected [x, y, heading] in metres and radians, got {brief(value)}; "
-        "mend it"
+        f"{where}: expected [x, y, heading] in metres and radians, got {brief(value)}; mend it"
     )
 
 
