@@ -32,8 +32,12 @@ from simulator.laser import Laser
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.evaluation.paper.experiments import VIEWS_ALONE, one_to_one, true_dstates
-from ssh_abduction.evaluation.paper.notches import notched
+from ssh_abduction.evaluation.paper.experiments import (
+    VIEWS_ALONE,
+    notched,
+    one_to_one,
+    true_dstates,
+)
 from ssh_abduction.learning.learner import (
     AmbiguousMapWarning,
     BootstrapLearner,

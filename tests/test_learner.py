@@ -44,10 +44,10 @@ from ssh_abduction.evaluation.paper.experiments import (
     Run,
     measure,
     one_to_one,
+    outcome,
     rate,
     true_dstates,
 )
-from ssh_abduction.evaluation.paper.notches import outcome
 from ssh_abduction.learning.labels import warn_of_pieces
 from ssh_abduction.learning.learner import (
     AmbiguousMapWarning,

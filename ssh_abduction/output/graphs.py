@@ -14,7 +14,7 @@ from ssh_abduction.data.errors import MapError, xml_text
 from ssh_abduction.data.maps import SSHMap, checked_map
 from ssh_abduction.data.regions import ids_at
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.output.turns import Turns, degrees_of
+from ssh_abduction.output.headings import Turns, degrees_of
 
 LEVELS = ("causal", "topological", "places")
 

@@ -17,8 +17,10 @@ import networkx as nx
 import numpy as np
 from scipy.sparse import coo_array
 
+from ssh_abduction.data.checks import an_object
+from ssh_abduction.data.errors import MapError, brief, is_finite
 from ssh_abduction.data.maps import DState, SSHMap
-from ssh_abduction.output.turns import SURE
+from ssh_abduction.data.trace import Trace
 
 # The key of a course, which is drawn with one heading: a path, a part of a path, or a dstate that
 # is along no path.
@@ -31,6 +33,12 @@ WRONG, WRONG_GUESS = math.radians(46), math.radians(61)
 SWEEPS, REWEIGHTED = 60, 15
 LEAST_MISSED = 0.02  # radians: turns with a smaller error all get the same weight
 EXACT = 1e-6  # radians: a turn with a smaller error agrees with the headings
+Turns: TypeAlias = Mapping[str, "str | float"]
+
+# Degrees clockwise that are assumed for turns of which only the side is known.
+SIDES = {"right": 90.0, "around": 180.0, "left": 270.0}
+# The weights of a turn with known degrees, and of a turn of which only the side is known.
+SURE, GUESSED = 1.0, 0.2
 
 
 class Turn(NamedTuple):
@@ -168,3 +176,41 @@ def _synchronised(graph: nx.MultiDiGraph[Any], first: Course, robust: bool) -> d
         course: round(math.remainder(angle - found[number[first]], math.tau), 9)
         for course, angle in zip(courses, found.tolist(), strict=True)
     }
+
+
+def degrees_of(turns: Trace | Turns | None) -> dict[str, tuple[float, float]]:
+    """Find by how many degrees each action turns.
+
+    Args:
+        turns: The trace that was mapped; or a dict that gives for names of actions "right", "left",
+            "around" or degrees clockwise. Actions that are themselves named right, left or around
+            need no entry.
+
+    Returns:
+        For each action's name, the degrees clockwise, and their weight: SURE if the degrees are
+        known, GUESSED if only the side is known.
+
+    Raises:
+        MapError: A value of `turns` is none of these.
+    """
+    known: dict[str, str | float] = {name: name for name in SIDES}
+    if isinstance(turns, Trace):
+        known |= {
+            action.name: (action.turn or "") if action.bearing is None else action.bearing
+            for action in turns.actions
+            if action.turn is not None
+        }
+    elif turns is not None:
+        known |= an_object("turns", turns, MapError)
+    degrees = {}
+    for name, turn in known.items():
+        if isinstance(turn, str) and turn in SIDES:
+            degrees[name] = (SIDES[turn], GUESSED)
+        elif is_finite(turn):
+            degrees[name] = (float(turn), SURE)
+        else:
+            raise MapError(
+                f'turns[{brief(name)}]: expected "right", "left", "around" or degrees clockwise, '
+                f"got {brief(turn)}; say which"
+            )
+    return degrees

@@ -25,9 +25,8 @@ from scipy.spatial.distance import pdist
 
 from ssh_abduction.data.maps import DState, MapPath, Pose, SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.output.headings import Course, headings_by, turns_between
+from ssh_abduction.output.headings import Course, Turns, degrees_of, headings_by, turns_between
 from ssh_abduction.output.streets import LOOSE, Point, StreetProgram, Streets
-from ssh_abduction.output.turns import Turns, degrees_of
 
 FARTHEST = 1e7  # metres: a robot's positions are nearer than this
 GAP = 1.5  # distance in the drawing between parts of a map that nothing connects

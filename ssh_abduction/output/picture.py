@@ -27,10 +27,10 @@ from ssh_abduction.output.drawing import (
     text,
     titled,
 )
+from ssh_abduction.output.headings import Turns, degrees_of
 from ssh_abduction.output.layout import Layout, layout, located, travelled
 from ssh_abduction.output.metric_picture import metric_svg
 from ssh_abduction.output.region_marks import place_title, region_marks
-from ssh_abduction.output.turns import Turns, degrees_of
 
 # Distances in units of the page. SPACING is between neighbouring places, DSTATE from the centre of
 # a place to the name of a dstate, LANE from the line of a path to the marks of its dstates, NAME

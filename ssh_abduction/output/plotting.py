@@ -10,8 +10,8 @@ from ssh_abduction.data.errors import MapError, brief
 from ssh_abduction.data.maps import DState, SSHMap, checked_map
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.output.drawing import ALARM, COLOURS
+from ssh_abduction.output.headings import Turns
 from ssh_abduction.output.layout import Layout, layout, travelled
-from ssh_abduction.output.turns import Turns
 
 # APART is the number of inches between neighbouring places. AHEAD and LANE are shares of the
 # distance of the two nearest places: the mark of a dstate is AHEAD of its place, and LANE beside

@@ -19,7 +19,7 @@ from simulator.world import World
 from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.files import write_file
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.evaluation.paper.notches import Outcome
+from ssh_abduction.evaluation.paper.experiments import Outcome
 from ssh_abduction.output import plot
 
 BLUE, ORANGE, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#888888"

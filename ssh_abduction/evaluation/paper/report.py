@@ -28,11 +28,12 @@ from ssh_abduction.evaluation.paper.experiments import (
     EXPERIMENTS,
     VIEWS_ALONE,
     WITH_STARS,
+    Outcome,
     Run,
     measure,
+    outcome,
     true_dstates,
 )
-from ssh_abduction.evaluation.paper.notches import Outcome, outcome
 from ssh_abduction.learning.learner import BootstrapLearner
 from ssh_abduction.output import to_svg
 from ssh_abduction.runtime import program
