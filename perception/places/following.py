@@ -271,7 +271,7 @@ def _carried(log: RobotLog, track: Track) -> list[int]:
             continue
         shares = [
             _matched(
-                *surfaces(log.scans[k]), known, _as_pose(track.poses[k]), (0.0, 0.0, 0.0), wide
+                *surfaces(log.scans[k]), known, (*track.poses[k].tolist(),), (0.0, 0.0, 0.0), wide
             )[2]
             for k in range(i, i + IN_A_ROW)
         ]
@@ -294,10 +294,6 @@ def turned_wrongly(log: RobotLog, track: Track) -> list[tuple[int, float]]:
         if abs(off) > TURNED and track.shares[i] >= POOR and i not in track.cuts:
             found.append((i, off))
     return found
-
-
-def _as_pose(row: Array) -> Pose:
-    return float(row[0]), float(row[1]), float(row[2])
 
 
 def surfaces(scan: Scan) -> tuple[Array, Array]:

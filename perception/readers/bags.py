@@ -22,7 +22,6 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -42,7 +41,7 @@ from perception.readers.bag_frames import (
 from perception.readers.bag_topics import Bag
 from perception.readers.messages import Damaged
 from perception.readers.poses import Poses, Track, clock_of, sources_of
-from perception.readers.scans import Damage, Laser, Pose, Reading, Scan
+from perception.readers.scans import Damage, Laser, Pose, Reading, Scan, laser_of
 from ssh_abduction.data.errors import brief
 from ssh_abduction.data.odometry import moved
 
@@ -335,7 +334,7 @@ def _measured(message: Any, mount: Pose, is_flipped: bool) -> tuple[NDArray[np.f
         raise Damaged(f"expected a first angle and a step in radians, got {first:g} and {step:g}")
     if is_flipped:
         first, step = -first, -step
-    return ranges, _laser(
+    return ranges, laser_of(
         first,
         step,
         len(ranges),
@@ -343,10 +342,3 @@ def _measured(message: Any, mount: Pose, is_flipped: bool) -> tuple[NDArray[np.f
         mount,
         nearest if 0 < nearest < math.inf else 0.0,
     )
-
-
-@lru_cache(maxsize=64)
-def _laser(
-    first: float, step: float, beams: int, reach: float, mount: Pose, nearest: float
-) -> Laser:
-    return Laser(first, step, beams, reach, mount, nearest)

@@ -40,7 +40,6 @@ import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import IO
 
 import numpy as np
@@ -71,7 +70,7 @@ from perception.readers.messages import (
     vertex_of,
     words,
 )
-from perception.readers.scans import Damage, Laser, Reading, Scan
+from perception.readers.scans import Damage, Laser, Reading, Scan, laser_of
 from ssh_abduction.data.files import LINE_OF_A_LOG
 from ssh_abduction.data.odometry import Pose, between, moved
 
@@ -343,23 +342,9 @@ def _measured(
     """
     beams = len(line.ranges)
     if line.shape is None:
-        laser = _conventional(beams, fov, without_codes(reach), mount)
+        # FLASER lines do not give the geometry. The first beam is on the right. If the number of
+        # beams is even, the last beam of a SICK, on the left, is missing.
+        first, step = -fov / 2, fov / max(1, beams - beams % 2)
     else:
         first, step, reach = line.shape
-        laser = _described(first, step, without_codes(reach), beams, mount)
-    return line.ranges, laser
-
-
-@lru_cache(maxsize=64)
-def _conventional(beams: int, fov: float, reach: float, mount: Pose) -> Laser:
-    """The laser of FLASER lines, which do not give its geometry. Its first beam is on the right.
-
-    If the number of beams is even, the last beam of a SICK, on the left, is missing.
-    """
-    step = fov / max(1, beams - beams % 2)
-    return Laser(-fov / 2, step, beams, reach, mount)
-
-
-@lru_cache(maxsize=64)
-def _described(first: float, step: float, reach: float, beams: int, mount: Pose) -> Laser:
-    return Laser(first, step, beams, reach, mount)
+    return line.ranges, laser_of(first, step, beams, without_codes(reach), mount)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ssh_abduction.data.odometry import Pose
 from ssh_abduction.data.words import counted
 
-__all__ = ["Damage", "Laser", "Pose", "Reading", "RobotLog", "Scan"]
+__all__ = ["Damage", "Laser", "Pose", "Reading", "RobotLog", "Scan", "laser_of"]
 
 
 @dataclass(frozen=True)
@@ -59,6 +59,10 @@ class Laser:
     def bearings(self) -> NDArray[np.float64]:
         """The bearing of each beam in the frame of the scanner: (beams,), radians."""
         return self.first + self.step * np.arange(self.beams, dtype=np.float64)
+
+
+# All scans of a log share the few lasers that it has.
+laser_of = lru_cache(maxsize=64)(Laser)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
