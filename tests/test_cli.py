@@ -544,7 +544,7 @@ def test_progress_shows_on_a_terminal(tmp_path: Path) -> None:
         assert process.wait(100) == 10
     os.close(master)
     text = shown.decode()
-    for part in ("prefix ", "of 1501 steps", "best", "dstates ≥", " s"):
+    for part in ("clingo has ", "of 1501 steps", "best", "dstates ≥", " s"):
         assert part in text
 
 

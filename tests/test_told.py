@@ -155,7 +155,9 @@ def test_lines_of_progress_come_now_and_then(
         _, told = lines(capsys, verb, tee)
         assert len(told) > len(some)
         assert all(
-            re.fullmatch(r"ssh-abduction: prefix \d+ of 12 steps; .*; \d+ maps; \d+\.\d s", line)
+            re.fullmatch(
+                r"ssh-abduction: clingo has \d+ of 12 steps; .*; \d+ maps listed; \d+\.\d s", line
+            )
             for line in told
         )
     assert lines(capsys, "solve", tee, "-q")[1] == []
@@ -176,7 +178,7 @@ def test_progress_never_comes_between_the_lines_of_an_answer_for_programs(
     done = subprocess.run(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=True
     )
-    assert ("ssh-abduction: prefix" in done.stdout) == mixed
+    assert ("ssh-abduction: clingo has" in done.stdout) == mixed
     if not mixed:
         assert json.loads(done.stdout)["count"] == 1
 

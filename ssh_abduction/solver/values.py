@@ -213,6 +213,6 @@ class Progress:
         )
         bound = ", ".join(f"{k} ≥ {v}" for k, v in self.bound.to_dict().items()) or "no bound yet"
         return (
-            f"prefix {self.prefix} of {self.steps} steps; {best}; {bound}; {self.maps} maps; "
-            f"{self.seconds:.1f} s"
+            f"clingo has {self.prefix} of {self.steps} steps; {best}; {bound}; "
+            f"{self.maps} maps listed; {self.seconds:.1f} s"
         )
