@@ -119,7 +119,7 @@ class Candidates:
         A sketch extends the best map of a prefix, or begins at the first step. The sketch with the
         most new dstates is large, but the checker accepts it most often and fastest. So it is tried
         first. Then come the others, the smallest first. With a time limit, stop at the first of
-        these that is better.
+        these that is better than the first sketch.
 
         Args:
             seconds: The time for all sketches. Each sketch may use a share of the time left.

@@ -104,8 +104,8 @@ class Search:
         self._asked_weigh = theory.weigh if theory else "auto"
         if within and self.theory.has_faults:
             raise TheoryError(
-                "within: expected 0 where faults are allowed; leave it out, or see what each "
-                "number of faults is worth (--front)"
+                f"within: expected 0 where faults are allowed, got {within}; leave it out, or see "
+                "what each number of faults is worth (--front)"
             )
         check_rules(self.theory)
         self.trace = trace

@@ -109,7 +109,7 @@ class SmallMaps:
 
 
 def mended(guess: Sequence[int], chart: Chart) -> list[int]:
-    """Correct a guess: label each node as the action to it from that dstate mostly leads.
+    """Correct a guess: give each node the label to which the last label and action mostly lead.
 
     This corrects a few wrong labels: once a label is right, all that follow become right.
 
