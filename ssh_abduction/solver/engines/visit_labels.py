@@ -25,9 +25,6 @@ clingo solves a relaxation, so its bounds hold.
 visits, such that few pairs of them may be at one place. Mostly an answer also determines the places
 of all other visits (`steps/localising.py`). If not, clingo gets further visits. Fewer visits are a
 relaxation, and an answer that locates all visits is an answer for all of them.
-
-*Cores.* Unsat cores raise the bound (`Cores`). Clasp can do this itself, but starts again with each
-call, and each answer that is not transitive needs another call.
 """
 
 from __future__ import annotations
@@ -166,7 +163,7 @@ class VisitLabels:
             self._program = VisitProgram(self._task, self._asker, chart, self._sides)
             self._nodes_at_start = len(chart.seen)
         self.program.give(chart, visits, order, fits)
-        self._raise_bound()
+        self._raise_bound(self.program.least)
         self._excluded = 0
         self.size = size
 
@@ -177,9 +174,9 @@ class VisitLabels:
         with self._asker.grounding_timed():
             self._give(self.chart, more, range(len(self.chart.seen)))
 
-    def _raise_bound(self) -> None:
-        """Take over the bound of the cores if it is higher."""
-        self.bound = max(self.bound or 0, self.program.cores.least)
+    def _raise_bound(self, bound: int) -> None:
+        """Take over a lower bound if it is higher."""
+        self.bound = max(self.bound or 0, bound)
 
     def fewest(self) -> list[int] | None:
         """Find labels of all nodes with the fewest dstates; None if no labels satisfy all rules."""
@@ -198,28 +195,21 @@ class VisitLabels:
             self._give_more(reason.missed)
 
     def _best_answer(self) -> Answer | None:
-        """Find an answer with the fewest first nodes; None if there is no answer.
-
-        Cores that clingo returns meanwhile raise the bound.
-        """
-        program = self.program
-        if not self._task.speedups.core_guided:
-            read = program.read
-            better = list(self._asker.answers(lambda model: (read(model), model.cost[0]), "opt", 0))
-            if not better:
-                return None
-            pairs, program.cores.least = better[-1]
-            self._raise_bound()
-            return Answer(pairs)
-        while True:
-            avoided = list(program.cores.avoided)
-            pairs_found, core = self._asker.verdict(program.read, avoided)
-            if core is None:
-                return Answer(pairs_found or ())
-            if not core:
-                return None
-            program.cores.relax(core)
-            self._raise_bound()
+        """Find an answer with the fewest first nodes; None if there is no answer."""
+        read = self.program.read
+        better = list(
+            self._asker.answers(
+                lambda model: (read(model), model.cost[0]),
+                "opt",
+                0,
+                on_bound=lambda costs: self._raise_bound(costs[0]),
+            )
+        )
+        if not better:
+            return None
+        pairs, fewest = better[-1]
+        self._raise_bound(fewest)
+        return Answer(pairs)
 
     def all_of(self, dstates: int) -> Generator[list[int], None, None]:
         """Yield all labels with this many dstates, each once.
@@ -231,7 +221,7 @@ class VisitLabels:
             dstates: The number of dstates, the fewest possible.
         """
         program = self.program
-        if self.fewest() is None or program.cores.least > dstates:
+        if self.fewest() is None or (self.bound or 0) > dstates:
             return
         yield from map(list, self._found)
         while True:
@@ -253,19 +243,11 @@ class VisitLabels:
         """Find labels with this many dstates that are not excluded; None if there are none."""
 
         def ask() -> Answer | None:
-            mode, assumed = self._asking_for(dstates)
-            found, _ = self._asker.verdict(self.program.read, assumed, mode=mode)
+            found, _ = self._asker.verdict(self.program.read, [], mode=f"enum,{dstates}")
             return None if found is None else Answer(found)
 
         answer = first_accepted(ask, self.program.why_not, self._tell_why)
         return None if answer is None else self.program.labels(answer.located)
-
-    def _asking_for(self, dstates: int) -> tuple[str, list[int]]:
-        """Return the opt-mode and the assumptions that allow at most this many dstates."""
-        cores = self.program.cores
-        if self._task.speedups.core_guided and cores.least == dstates:
-            return "ignore", list(cores.avoided)
-        return f"enum,{dstates}", []
 
     def take_back(self, labels: Sequence[int]) -> None:
         """Forget labels that were found, but turned out to have no map."""

@@ -6,7 +6,7 @@ them. Fewer visits are a relaxation, so a bound proven for them holds for the tr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence, Set
+from collections.abc import Collection, Iterable, Sequence, Set
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -37,71 +37,6 @@ class Sides(Protocol):
     def extend(self, batch: int) -> None:
         """Extend the axioms to the visits of a new batch."""
         ...
-
-
-class Cores:
-    """Raises a lower bound on the number of dstates, core by core (OLL).
-
-    A node is *first* if no node before it, in the order of choice, is at its dstate. So there is
-    one first node for each dstate. Clingo is initially asked for an answer without first nodes. If
-    there is none, it returns an unsat core: a set of nodes. At least one of them is first. This
-    raises the bound by one. From then on one node of the core may be first. A later core may allow
-    a second one, and so on.
-
-    Attributes:
-        least: A lower bound on the number of first nodes.
-        avoided: The atoms that are assumed to be false, by the literal of that assumption.
-
-    Reference:
-        Andres, Kaufmann, Matheis, Schaub 2012, "Unsatisfiability-based optimization in clasp".
-    """
-
-    def __init__(self, asker: Asker, add_rules: Callable[[str, str, int], None]) -> None:
-        """Begin without any core.
-
-        Args:
-            asker: Asks the control that has the atoms.
-            add_rules: Takes rules, a program part and a number. It adds the rules, and grounds
-                the part for the number.
-        """
-        self.least = 0
-        self.avoided: dict[int, clingo.Symbol] = {}
-        self._asker, self._add_rules = asker, add_rules
-        self._sizes: list[int] = []  # the number of members of each core
-
-    def avoid(self, symbol: clingo.Symbol) -> None:
-        """Assume from now on that an atom is false, if the control has this atom."""
-        if atom := self._asker.control.symbolic_atoms[symbol]:
-            self.avoided[-atom.literal] = atom.symbol
-
-    def relax(self, core: Sequence[int]) -> None:
-        """Raise the bound by one, and allow one member of a core to be true.
-
-        Args:
-            core: Literals of assumptions that cannot all hold.
-        """
-        members = [self.avoided.pop(literal) for literal in core]
-        self.least += 1
-        for member in members:
-            # If the member is a limit on an earlier core, loosen this limit by one.
-            if (over := visits_lp.read_over(member)) is not None:
-                self._limit(over[0], over[1] + 1)
-        if len(members) > 1:
-            number = len(self._sizes)
-            self._sizes.append(len(members))
-            self._add_rules(visits_lp.core_facts(number, members), "core", number)
-            self._limit(number, 2)
-
-    def _limit(self, core: int, count: int) -> None:
-        """Assume from now on that fewer than `count` members of a core are true.
-
-        Args:
-            core: The number of the core.
-            count: One more than the number of members that may be true.
-        """
-        if count <= self._sizes[core]:
-            self._asker.control.ground([("over", numbers(core, count))])
-            self.avoid(visits_lp.over(core, count))
 
 
 @dataclass
@@ -163,7 +98,7 @@ class VisitProgram:
     Attributes:
         chart: The chart of the first steps, with their visits and nodes.
         batch: The number of the last batch of visits; -1 before the first.
-        cores: The lower bound, and the assumptions that raise it.
+        least: A lower bound on the dstates: the number of nodes that are first in any case.
     """
 
     def __init__(self, task: Task, asker: Asker, chart: FramedChart, sides: Sides) -> None:
@@ -179,10 +114,10 @@ class VisitProgram:
         self.chart = chart
         self.batch = -1
         self._asker, self._trace, self._sides = asker, task.trace, sides
-        self._core_guided = task.speedups.core_guided
         self._one = pairs_in(task.log.pairs.one)
-        asker.control = new_control("visits", "", ["--heuristic=Domain"])
-        self.cores = Cores(asker, self.add_rules)
+        cores = ["--opt-strategy=usc"] if task.speedups.core_guided else []
+        asker.control = new_control("visits", "", ["--heuristic=Domain", *cores])
+        self.least = 0
         self._known = _Known()
         self._pair_of = PairOf()
         self._parts = 0
@@ -253,7 +188,10 @@ class VisitProgram:
         control.add(part, [], sides_lp.turn_facts(self.batch, chart, added, turns))
         control.ground([(part, []), ("more", numbers(self.batch))])
         control.assign_external(visits_lp.listed(self.batch), True)
-        self._avoid_first(place for place, *_ in nodes)
+        atoms = control.symbolic_atoms
+        self.least += sum(
+            atom.is_fact for place, *_ in nodes if (atom := atoms[visits_lp.first(place)])
+        )
         self._sides.extend(self.batch)
 
     def _joined(self) -> set[Pair]:
@@ -268,16 +206,6 @@ class VisitProgram:
                     earlier = (first, last, (other - slot) % 4)
                     found.add(earlier if first <= last else (last, first, (slot - other) % 4))
         return found
-
-    def _avoid_first(self, places: Iterable[int]) -> None:
-        """Assume that no node at these new positions is first. Count those first in any case."""
-        atoms = self._asker.control.symbolic_atoms
-        for place in places:
-            atom = atoms[visits_lp.first(place)]
-            if atom and (atom.is_fact or not self._core_guided):
-                self.cores.least += atom.is_fact
-            elif atom:
-                self.cores.avoided[-atom.literal] = atom.symbol
 
     def read(self, model: clingo.Model) -> list[Pair]:
         """Read the pairs of visits that are at one place in an answer."""

@@ -23,8 +23,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +39,7 @@ ENOUGH = 1e-4  # stop EM below this gain in log-likelihood per step of the trace
 PSEUDOCOUNT = 2e-3  # added to all counts, as by George et al.
 MISREAD, SLIPPED = 0.01, 0.01  # probabilities of faults in the model
 RARE = 4  # a dstate with at most this many visits may be dropped
-TRIED = 20  # try to drop at most this many dstates, and to merge this many pairs, in a round
+TRIED = 20  # try to drop at most this many dstates in a round
 # While a map is refined, a fault that is forbidden costs this many times as much as an allowed one.
 # The last pass can replace a few of them by allowed faults.
 DEARER = 4 / 3
@@ -62,48 +60,6 @@ class Machine:
 
     shows: Sequence[int]
     goes: Mapping[tuple[int, int], int]
-
-    @cached_property
-    def actions(self) -> frozenset[int]:
-        return frozenset(action for _, action in self.goes)
-
-    def folded(self, s: int, x: int) -> tuple[int, list[int]]:
-        """Try to merge two dstates, the dstates that the same action leads to from both, and so on.
-
-        Dstates with different views are not merged, but count as a contradiction. The machine stays
-        as it is.
-
-        Args:
-            s: A dstate.
-            x: Another dstate.
-
-        Returns:
-            The number of contradictions minus the number of dstates saved, and the new label of
-            each dstate. Callers try merges with the least number first.
-        """
-        root = list(range(len(self.shows)))
-        members = {dstate: [dstate] for dstate in root}
-        contradicted, merges, work = 0, 0, [(s, x)]
-        while work:
-            a, b = (root[end] for end in work.pop())
-            if a == b:
-                continue
-            if self.shows[a] != self.shows[b]:
-                contradicted += 1
-                continue
-            merges += 1
-            # Also merge the dstates that the same action leads to from both.
-            work += [
-                (self.goes[p, action], self.goes[q, action])
-                for action in self.actions
-                for p in members[a]
-                for q in members[b]
-                if (p, action) in self.goes and (q, action) in self.goes
-            ]
-            for dstate in members[b]:
-                root[dstate] = a
-            members[a] += members.pop(b)
-        return contradicted - merges, root
 
     def without(self, dropped: int) -> Machine:
         """Make a machine without one dstate and its links. Larger numbers of dstates drop by 1."""
@@ -261,8 +217,7 @@ class Explainer:
 
     def _near(self, best: Explained) -> Iterator[Explained]:
         """Yield explanations by machines in which dstates of the best one are merged or dropped."""
-        # First merge all dstates that can be one. Then drop rare dstates, one at a time. Then merge
-        # pairs of dstates with few contradictions.
+        # First merge all dstates that can be one. Then drop rare dstates, one at a time.
         machine = self.read_off(best.labels)
         labels = numbered(best.labels)
         visits = Counter(labels)
@@ -276,14 +231,6 @@ class Explainer:
             if count <= RARE and len(machine.shows) > 1:
                 self.check()
                 yield self._settled(self.completed(machine.without(s)).labels)
-        folded = (
-            machine.folded(s, x)
-            for s, x in combinations(range(len(machine.shows)), 2)
-            if machine.shows[s] == machine.shows[x]
-        )
-        for _, root in sorted(folded)[:TRIED]:
-            self.check()
-            yield self._settled([root[label] for label in labels])
 
     def _settled(self, labels: Sequence[int]) -> Explained:
         """Explain the trace by the machine of the labels, and repeat that while the cost falls."""

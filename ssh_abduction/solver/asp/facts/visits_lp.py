@@ -61,23 +61,6 @@ def first(place: int) -> Symbol:
     return Function("first", numbers(place))
 
 
-def over(core: int, count: int) -> Symbol:
-    """Return the atom that says that at least `count` members of an unsat core are true."""
-    return Function("over", numbers(core, count))
-
-
-def read_over(member: Symbol) -> tuple[int, int] | None:
-    """Read the core and the count from an atom of `over`; None for another atom."""
-    return (
-        (member.arguments[0].number, member.arguments[1].number) if member.name == "over" else None
-    )
-
-
-def core_facts(core: int, members: Iterable[Symbol]) -> str:
-    """Return the facts that name the members of an unsat core: atoms that cannot all be false."""
-    return "\n".join(f"member({core},{member})." for member in members)
-
-
 def three_facts(batch: int, threes: Iterable[tuple[int, ...]]) -> str:
     """Return the facts for triples of visits for which "is at one place" has to be transitive.
 
