@@ -2,7 +2,6 @@
 
 >>> from ssh_abduction import Theory, Trace, solve
 >>> from ssh_abduction.rivals.listing import Listing
-from ssh_abduction.solver import probability_in_words
 >>> monday = Trace.from_steps("abc", ["travel", "travel"], name="monday")
 >>> tuesday = Trace.from_steps("cd", ["travel"], name="tuesday")
 >>> solution = solve([monday, tuesday], Theory.causal())
