@@ -91,7 +91,8 @@ def junctions(patch: Patch, room: float) -> list[Junction]:
     corners = [
         (node, branches)
         for node, branches in bends(graph, distance, far)
-        if not inner[node.cell] and not any(_overlap(node, other) for other, _ in found)
+        if not inner[node.cell]
+        and all(math.dist(node.at, o.at) > max(node.radius, o.radius) for o, _ in found)
     ]
     return [
         Junction(
@@ -115,11 +116,6 @@ def _with_mouths(found: list[Fork], mouths: list[Fork], far: float) -> list[Fork
         if node.radius > far and all(math.dist(node.at, mouth.at) > far for mouth, _ in mouths)
     ]
     return mouths + amid
-
-
-def _overlap(first: Node, second: Node) -> bool:
-    """Check whether one of two nodes is in the disc of the other one."""
-    return math.dist(first.at, second.at) <= max(first.radius, second.radius)
 
 
 def open_space(distance: Array, far: float) -> Bools:

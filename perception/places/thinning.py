@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -145,19 +145,19 @@ def graph_of(lines: Bools, distance: Array) -> Graph:
     nodes: dict[int, Node] = {}
     for number, part in enumerate(_parts(forks), 1):
         known |= dict.fromkeys(part, number)
-        nodes[number] = _junction(_at(part, columns), distance)
+        cells = _at(part, columns)
+        nodes[number] = Node(cells.mean(axis=0), float(distance[cells[:, 0], cells[:, 1]].max()))
     graph = Graph(nodes, [])
     for part in _parts(lines & ~forks):
         line = _in_order(part, steps)
-        beside = [_forks_beside(known, cell, steps) for cell in (line[0], line[-1])]
+        beside = [
+            sorted({known[cell + step] for step in steps if cell + step in known})
+            for cell in (line[0], line[-1])
+        ]
         _add_line(graph, _at(line, columns), beside, distance)
     for node in [*graph.nodes]:
         graph = graph.joined_at(node)
     return graph
-
-
-def _junction(cells: NDArray[np.int64], distance: Array) -> Node:
-    return Node(cells.mean(axis=0), float(distance[cells[:, 0], cells[:, 1]].max()))
 
 
 def _at(cells: Sequence[int], columns: int) -> NDArray[np.int64]:
@@ -206,11 +206,6 @@ def _add_line(
             graph.nodes[ends[-1]] = _end(cell, distance)
     cells = np.concatenate([graph.nodes[ends[0]].at[None], line, graph.nodes[ends[1]].at[None]])
     graph.edges.append(Edge((ends[0], ends[1]), cells))
-
-
-def _forks_beside(known: Mapping[int, int], cell: int, steps: Sequence[int]) -> list[int]:
-    """List the numbers of the junctions that touch a cell, ascending."""
-    return sorted({known[cell + step] for step in steps if cell + step in known})
 
 
 def _end(cell: NDArray[np.int64], distance: Array) -> Node:

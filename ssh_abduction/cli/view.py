@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import shlex
+import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -120,7 +121,7 @@ def run(options: argparse.Namespace) -> int:
     if trace is not None and theory is not None:
         content["assuming"] = _assuming(listing, trace, theory)
     page = Page(content)
-    file = options.output or _temporary()
+    file = options.output or str(Path(tempfile.mkdtemp(prefix="ssh-abduction-")) / "maps.html")
     page.save(file)
     print(file)
     if not options.output and options.open:
@@ -258,12 +259,6 @@ def _serve(
         finally:
             end_all()
     return 0
-
-
-def _temporary() -> str:
-    import tempfile
-
-    return str(Path(tempfile.mkdtemp(prefix="ssh-abduction-")) / "maps.html")
 
 
 def _open(address: str) -> None:

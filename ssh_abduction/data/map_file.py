@@ -6,6 +6,7 @@ import json
 import os
 import sys
 from collections.abc import Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +58,8 @@ def read_json(path: str | os.PathLike[str]) -> Any:
     path = a_path("path", path, MapError)
     source = "standard input" if path == "-" else named(path)
     try:
-        text = sys.stdin.buffer.read(LARGEST + 1) if path == "-" else _start_of(path, LARGEST + 1)
+        with nullcontext(sys.stdin.buffer) if path == "-" else Path(path).open("rb") as file:
+            text = file.read(LARGEST + 1)
         if len(text) > LARGEST:
             raise MapError(
                 f"{source}: expected at most {LARGEST // 2**20} MiB, got more; "
@@ -96,11 +98,6 @@ def read_json(path: str | os.PathLike[str]) -> Any:
         raise MapError(
             f"{source}: expected JSON, got {error}; write it with solve --json"
         ) from None
-
-
-def _start_of(path: str, most: int) -> bytes:
-    with Path(path).open("rb") as file:
-        return file.read(most)
 
 
 def _broken(error: json.JSONDecodeError, text: bytes, source: str) -> MapError:

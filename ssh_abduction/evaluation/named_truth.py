@@ -224,14 +224,6 @@ class _Truth:
                         f"name another dstate, or mend the {field}"
                     )
 
-    def dstate_hops(self) -> list[int]:
-        """List the steps with a known true dstate at this step and at the next one of the drive."""
-        return [t for t in _hops(self.dstates) if not self.trace.actions[t].starts]
-
-    def place_hops(self) -> list[int]:
-        """List the steps before a travel with a known true place at this step and the next one."""
-        return [t for t in _hops(self.places) if self.trace.actions[t].kind == "travel"]
-
 
 _SORTS = ("dstate", "place", "path", "course")
 
@@ -317,10 +309,12 @@ def _evaluated(ssh_map: SSHMap, truth: _Truth) -> MapEvaluation:
     # An edge joins two places either way; a link has an action and a direction.
     place_precision, place_recall = places.pairs()
     edge_precision, edge_recall = places.edges(
-        truth.place_hops(), lambda _, here, there: frozenset((here, there))
+        [t for t in _hops(truth.places) if actions[t].kind == "travel"],
+        lambda _, here, there: frozenset((here, there)),
     )
     link_precision, link_recall = dstates.edges(
-        truth.dstate_hops(), lambda t, here, there: (here, actions[t].name, there)
+        [t for t in _hops(truth.dstates) if not actions[t].starts],
+        lambda t, here, there: (here, actions[t].name, there),
     )
     return MapEvaluation(
         dstates_right=dstates.right,

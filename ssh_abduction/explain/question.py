@@ -122,7 +122,7 @@ class Question(ABC, Generic[_Answer]):
         nats: float | None,
     ) -> tuple[str, ...]:
         """Say which gateways at some places changed between drives, and what that costs."""
-        changes = changes_at(ssh_map, places)
+        changes = [f for f in ssh_map.faults if f.kind == "changed" and f.place in places]
         if not changes or cost is None:
             return ()
         search = self._solved(self.trace, self.theory.replace(changed=0.0), 1, self._watch.left())
@@ -137,11 +137,6 @@ class Question(ABC, Generic[_Answer]):
         if search.stopped in ("interrupted", "memory limit"):
             self.stopped = search.stopped
         self._over()
-
-
-def changes_at(ssh_map: SSHMap, places: Collection[int | None]) -> tuple[Fault, ...]:
-    """Find the changes of gateways at these places of a map."""
-    return tuple(f for f in ssh_map.faults if f.kind == "changed" and f.place in places)
 
 
 def changes_in_words(

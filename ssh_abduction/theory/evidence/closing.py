@@ -36,11 +36,6 @@ class Closing:
     square_of_position: float
 
     @property
-    def square_of_heading(self) -> float:
-        """The chi-square of the heading, with one degree of freedom."""
-        return (self.turned / self.turned_sigma) ** 2
-
-    @property
     def metres(self) -> str:
         """The distance between the ends in words, such as "11.2 ± 1.4 m"."""
         return f"{self.size:.1f} ± {self.size_sigma:.1f} m"

@@ -193,7 +193,10 @@ class Loops:
 
     def _repeated(self, loops: tuple[Steps, Steps], others: tuple[Steps, Steps]) -> Array:
         """Return the covariances, between closings, from a wrong scale and a steady drift."""
-        scaled, other_scaled = (self._by_scale(*pair) for pair in (loops, others))
+        # A scale that is wrong by 1 moves the end of a loop by the whole loop.
+        scaled, other_scaled = (
+            (self.poses[j] - self.poses[i]) * (1.0, 1.0, 0.0) for i, j in (loops, others)
+        )
         bent, other_bent = (self._by_bend(*pair) for pair in (loops, others))
         by_scale: Array = self.odometry.scale**2 * scaled[:, :, None] * other_scaled[:, None, :]
         return by_scale + self.drift**2 * bent[:, :, None] * other_bent[:, None, :]
@@ -202,10 +205,6 @@ class Loops:
         closing = self.poses[j] - self.poses[i]
         closing[:, 2] = np.remainder(closing[:, 2] + math.pi, math.tau) - math.pi
         return closing
-
-    def _by_scale(self, i: Steps, j: Steps) -> Array:
-        """Return how far a scale that is wrong by 1 moves the end of each loop, m x 3."""
-        return (self.poses[j] - self.poses[i]) * (1.0, 1.0, 0.0)
 
     def _by_bend(self, i: Steps, j: Steps) -> Array:
         """Return how far a drift of 1 radian a metre moves the end of each loop, m x 3."""

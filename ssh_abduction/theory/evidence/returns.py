@@ -377,7 +377,7 @@ class Returns:
         closing = self.closing(first, last)
         far, turned = (
             closing.square_of_position > self.threshold(2, False),
-            closing.square_of_heading > self.threshold(1, False),
+            (closing.turned / closing.turned_sigma) ** 2 > self.threshold(1, False),
         )
         if turned and not far:
             return (
