@@ -115,11 +115,7 @@ class Question(ABC, Generic[_Answer]):
         return search
 
     def _changes_in_words(
-        self,
-        ssh_map: SSHMap,
-        places: Collection[int | None],
-        cost: Cost | None,
-        nats: float | None,
+        self, ssh_map: SSHMap, places: Collection[int | None], cost: Cost | None, nats: float | None
     ) -> tuple[str, ...]:
         """Say which gateways at some places changed between drives, and what that costs."""
         changes = [f for f in ssh_map.faults if f.kind == "changed" and f.place in places]

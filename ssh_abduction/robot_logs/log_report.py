@@ -130,11 +130,7 @@ def _joins_of_drives(solution: Solution) -> str:
     """Make the table of the places that two drives have in common, with their probabilities."""
     pairs = joins_of_drives(Listing.of(solution))
     rows = [
-        (
-            f"{pair.first}:{join.first}",
-            f"{pair.second}:{join.second}",
-            pair.how_sure(join),
-        )
+        (f"{pair.first}:{join.first}", f"{pair.second}:{join.second}", pair.how_sure(join))
         for pair in pairs
         for join in (*pair.forced, *pair.possible)
     ]
