@@ -193,7 +193,7 @@ def load(path: str | os.PathLike[str]) -> Stored:
     except Exception as error:  # Each part of a damaged archive fails in its own way.
         raise PerceptionError(
             f"{path}: expected a .skops file that train or save wrote, got something else "
-            f"({type(error).__name__})"
+            f"({type(error).__name__}); train it again"
         ) from error
     if (
         not isinstance(held, dict)

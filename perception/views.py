@@ -379,7 +379,7 @@ def _check_distinct(k: int, images: NDArray[np.float64], distinct: int | None = 
     if found < k:
         raise PerceptionError(
             f"k: expected at most {found}, as there are {found} different images among "
-            f"{len(images)}, got {k}"
+            f"{len(images)}, got {k}; take fewer views"
         )
 
 

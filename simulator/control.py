@@ -180,7 +180,7 @@ def travel(driver: Driver) -> None:
         if done > LONGEST_TRAVEL:
             raise SimulatorError(
                 f"{driver.world.name}: travel: expected a distinctive place within "
-                f"{LONGEST_TRAVEL:.0f} m, got none"
+                f"{LONGEST_TRAVEL:.0f} m, got none; change the route"
             )
         stride = STRIDE if to_go is None else min(STRIDE, max(0.5 * to_go, 0.01))
         driver.go(stride, _steer(seen, reach, stride))

@@ -142,7 +142,7 @@ def test_a_file_of_another_map_is_refused(folder: Path, capsys: pytest.CaptureFi
     assert main(solving(folder, "round")) == 1
     assert "it belongs to another map" in capsys.readouterr().err
     for unknown in ("sunday:1", "monday:9"):
-        with pytest.raises(MapError, match=r"sunday:1|from 0 to 3"):
+        with pytest.raises(MapError, match=r"sunday:1|expected 0 to 3"):
             solve(JOINT, corrections=said.with_name("den", "place", unknown))
 
 

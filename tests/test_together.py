@@ -350,8 +350,8 @@ def test_steps_are_named_by_their_drives(
     assert json.loads(capsys.readouterr().out)["steps"] == [1, 4]
     for name, said in (
         ("sunday:0", "expected a drive out of monday, tuesday, got 'sunday'"),
-        ("tuesday:3", "expected a number from 0 to 2"),
-        ("tuesday:x", "expected a number from 0 to 2"),
+        ("tuesday:3", "expected 0 to 2, got '3'"),
+        ("tuesday:x", "expected 0 to 2, got 'x'"),
     ):
         assert main(["explain", joint, "0", name]) == 1
         assert said in capsys.readouterr().err

@@ -69,12 +69,12 @@ def check_bound(trace: Trace, certificate: Any) -> ProvenBound:
     ):
         raise MapError(
             f"certificate: clique: expected different steps, 0 to {len(trace) - 1}, got "
-            f"{brief(steps)}"
+            f"{brief(steps)}; write it with solve --json"
         )
     if not _integers(refuted) or refuted != list(range(len(steps), len(steps) + len(refuted))):
         raise MapError(
             f"certificate: refuted: expected the numbers from {len(steps)} up without a gap, got "
-            f"{brief(refuted)}"
+            f"{brief(refuted)}; write it with solve --json"
         )
     # the word of each pair of steps for which the certificate has one
     word_of: dict[frozenset[int], list[str]] = {}
@@ -87,7 +87,8 @@ def check_bound(trace: Trace, certificate: Any) -> ProvenBound:
             or not isinstance(entry[2], list)
         ):
             raise MapError(
-                f"certificate: words: expected [step, step, [action, …]], got {brief(entry)}"
+                f"certificate: words: expected [step, step, [action, …]], got {brief(entry)}; "
+                "write it with solve --json"
             )
         word_of[frozenset(entry[:2])] = entry[2]
     pairs = list(combinations(steps, 2))

@@ -237,7 +237,7 @@ def check_number(number: int | None, maps: Sequence[object], where: str) -> None
     """
     if number is not None and not 1 <= number <= len(maps):
         raise MapError(
-            f"{where}: --map: expected 1 to {len(maps)}, got {number}"
+            f"{where}: --map: expected 1 to {len(maps)}, got {number}; show lists the maps"
             if maps
             else f"{where}: --map: expected a map, got none"
         )

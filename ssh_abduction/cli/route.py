@@ -32,7 +32,7 @@ def add_parser(verbs: Verbs) -> None:
         dest="goal",
         metavar="B",
         required=True,
-        help="goal: a dstate, place or region, named likewise",
+        help="goal: a dstate, place or region, named as for --from",
     )
     parser.add_argument(
         "--avoid",

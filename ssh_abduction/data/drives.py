@@ -178,11 +178,11 @@ def step_of(drives: Sequence[Drive], name: str) -> int:
     if drive is None:
         raise TraceError(
             f"step {brief(name)}: expected a drive out of {', '.join(by_name)}, got "
-            f"{brief(drive_name)}"
+            f"{brief(drive_name)}; name one, such as {next(iter(by_name))}:0"
         )
     steps = drive.stop - drive.first
     if not (number.isascii() and number.isdecimal()) or int(number) >= steps:
-        raise TraceError(f"step {brief(name)}: expected a number from 0 to {steps - 1}")
+        raise TraceError(f"step {brief(name)}: expected 0 to {steps - 1}, got {brief(number)}")
     return drive.first + int(number)
 
 
