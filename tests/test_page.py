@@ -635,6 +635,30 @@ def test_floors_are_named_beside_their_places(browser: Any, tmp_path: Path) -> N
     assert "floors" not in content_of(flat, trace[:2])["layouts"][0]
 
 
+def test_a_map_without_paths_has_a_street_for_each_travel(browser: Any, tmp_path: Path) -> None:
+    """Maps of logs have places, but no paths. A lift and the start of a drive are no street."""
+    monday = Trace.from_steps("abcde", ["travel", "travel", Action("up", "lift"), "travel"])
+    trace = together([replace(monday, name="monday"), Trace.from_steps("fg", ["travel"], name="b")])
+    (ssh_map, *_) = solve(trace).maps
+    bare = replace(
+        ssh_map,
+        dstates=tuple(replace(s, path=None, direction=None) for s in ssh_map.dstates),
+        paths=(),
+        regions=None,
+    )
+    content = content_of(bare, trace)
+    assert content["maps"][0]["leaps"] == [3, 5]
+    at = [node["steps"] for node in content["overview"]["nodes"]]
+    ends = {(at[a][0], at[b][0]) for a, b, _, _ in content["overview"]["streets"]}
+    assert ends == {(0, 1), (1, 2), (3, 4)}  # b drives between the places of steps 0 and 1
+    Page(content).save(tmp_path / "page.html")
+    page = Shown(browser, (tmp_path / "page.html").as_uri())
+    for figure in ("one", "overview"):
+        page.click(figure)
+        assert len(browser.find_elements("css selector", "#drawings .street:not(.lift)")) == 3
+    assert page.complaints == []
+
+
 def test_the_page_of_a_joint_map_shows_its_drives(browser: Any, tmp_path: Path) -> None:
     monday = Trace.from_steps("abc", ["travel", "travel"], name="monday")
     tuesday = Trace.from_steps("cd", ["travel"], name="<b>tuesday</b>")

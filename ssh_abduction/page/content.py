@@ -13,6 +13,7 @@ import time
 from collections import Counter
 from collections.abc import Hashable, Sequence
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from statistics import median
 from typing import Any
 
@@ -86,6 +87,8 @@ def content_of(
             "places": places.number(tuple((s.place, s.path, s.direction) for s in ssh_map.dstates)),
             "orders": orders.number(tuple((path.id, path.order) for path in ssh_map.paths)),
         }
+        if leaps := _leaps(ssh_map):
+            one["leaps"] = leaps
         if ssh_map.regions:
             one["regions"] = regions.number(
                 tuple((r.places, r.bounds, r.door) for r in ssh_map.regions)
@@ -126,6 +129,13 @@ def content_of(
         ],
         "overview": overview(maps, spots),
     }
+
+
+def _leaps(ssh_map: SSHMap) -> list[int]:
+    """List the steps to which no street leads: a drive starts, an action slipped, or a lift led."""
+    floor = [s.floor for s in ssh_map.dstates]
+    linked = {(s, x) for s, _, x in ssh_map.links if floor[s] == floor[x]}
+    return [t for t, pair in enumerate(pairwise(ssh_map.dstate_at), 1) if pair not in linked]
 
 
 def _shared(listing: Listing) -> dict[str, Any] | None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from itertools import pairwise
 from statistics import fmean
 from typing import Any, TypeAlias
 
@@ -48,14 +47,17 @@ class _Counts:
                 self.along[steps, of_path[h]] += count
         for steps in of_place.values():
             self.places[steps] += count
-        # Only streets that the robot travelled count: it went between two places along one path.
-        # The order of other places on a path is one of many possible ones.
+        # Only streets that the robot travelled count: it went between two places along one path,
+        # or in a map without paths. The order of other places on a path is one of many possible
+        # ones.
         streets: dict[Pair, int | None] = {}
-        for s, x in set(pairwise(ssh_map.dstate_at)):
+        for s, _, x in ssh_map.links:
             a, b = ssh_map.dstates[s], ssh_map.dstates[x]
-            if None in (a.place, b.place, a.path) or a.place == b.place or a.path != b.path:
+            if None in (a.place, b.place) or a.place == b.place or a.path != b.path:
                 continue
-            streets[frozenset((of_place[a.place], of_place[b.place]))] = of_path[a.path]
+            if a.floor == b.floor and a.place in of_place and b.place in of_place:
+                pair = frozenset((of_place[a.place], of_place[b.place]))
+                streets[pair] = None if a.path is None else of_path[a.path]
         if not ssh_map.places:
             streets = {
                 frozenset((of_dstate[s], of_dstate[x])): None

@@ -116,12 +116,12 @@ function mapFigure(i, rival) {
       a: ssh.places.get(from),
       b: ssh.places.get(to),
       kind: `${kindOf(key, path)}${travelled ? "" : " order"}`.trim(),
-      colour: other || data.drives.length ? null : path % COLOURS,
-      path,
+      colour: other || data.drives.length || path === null ? null : path % COLOURS,
+      path: path ?? undefined,
       called: ssh.called("path", path),
       title:
-        `${ssh.called("path", path)}, from ${ssh.called("place", from)} to ` +
-        ssh.called("place", to) +
+        `${path === null ? "way" : `${ssh.called("path", path)},`} from ` +
+        `${ssh.called("place", from)} to ${ssh.called("place", to)}` +
         (travelled ? "" : ": only the order of the path says so, nobody travelled there"),
     }));
   for (const { from, to, actions, key } of ssh.links.values())

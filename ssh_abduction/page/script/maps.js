@@ -44,15 +44,16 @@ function mapOf(i) {
           : middle(steps);
     return { id: s, view, steps, place, path, direction, at, heading: spot[2] };
   });
-  const travelled = new Map();
+  const travelled = new Map(),
+    leaps = new Set(told.leaps);
   for (let t = 1; t < labels.length; t++) {
     const [a, b] = [dstates[labels[t - 1]], dstates[labels[t]]];
     if (
       a.place !== null &&
       b.place !== null &&
       a.place !== b.place &&
-      a.path !== null &&
-      a.path === b.path
+      a.path === b.path &&
+      !leaps.has(t)
     )
       travelled.set(pairKey(a.place, b.place), {
         path: a.path,
