@@ -8,7 +8,7 @@ probable state of each step is its first label, that is, its dstate.
 A map is then read off the labels: a dstate shows the majority view of its steps, and an action
 leads where it leads most often. A Viterbi pass (Viterbi 1967) finds new labels with the cheapest
 faults for this map. These two steps are repeated while the cost falls. In between, dstates are
-merged if they can be one. A dstate is dropped if it costs more than the faults without it.
+merged if they can be one.
 
 >>> seen = [t % 4 for t in range(60)]
 >>> seen[30] = 0
@@ -38,8 +38,6 @@ ROUNDS = 100  # the most EM steps of a start
 ENOUGH = 1e-4  # stop EM below this gain in log-likelihood per step of the trace
 PSEUDOCOUNT = 2e-3  # added to all counts, as by George et al.
 MISREAD, SLIPPED = 0.01, 0.01  # probabilities of faults in the model
-RARE = 4  # a dstate with at most this many visits may be dropped
-TRIED = 20  # try to drop at most this many dstates in a round
 # While a map is refined, a fault that is forbidden costs this many times as much as an allowed one.
 # The last pass can replace a few of them by allowed faults.
 DEARER = 4 / 3
@@ -60,16 +58,6 @@ class Machine:
 
     shows: Sequence[int]
     goes: Mapping[tuple[int, int], int]
-
-    def without(self, dropped: int) -> Machine:
-        """Make a machine without one dstate and its links. Larger numbers of dstates drop by 1."""
-        number = {s: s - (s > dropped) for s in range(len(self.shows)) if s != dropped}
-        goes = {
-            (number[s], a): number[x]
-            for (s, a), x in self.goes.items()
-            if s in number and x in number
-        }
-        return Machine([view for s, view in enumerate(self.shows) if s != dropped], goes)
 
 
 @dataclass(frozen=True)
@@ -203,34 +191,24 @@ class Explainer:
         """Find a cheap explanation near these labels, by local search.
 
         Make a machine from the labels, explain the trace by it, and repeat this while the cost
-        falls. Then try machines in which dstates are merged, or a rarely visited one is dropped.
+        falls. Then merge all dstates that can be one, and begin again if that is cheaper.
 
         Args:
             labels: The dstate of each step.
         """
         best = self._settled(labels)
         while True:
-            better = next((found for found in self._near(best) if found.tenths < best.tenths), None)
-            if better is None:
+            machine, labels = self.read_off(best.labels), numbered(best.labels)
+            visits = Counter(labels)
+            links: list[Link] = [(s, action, x) for (s, action), x in machine.goes.items()]
+            counts = [visits[s] for s in range(len(machine.shows))]
+            root = thinned_map(machine.shows, links, counts, self.check)
+            if len(set(root)) == len(machine.shows):
+                return best
+            better = self._settled([root[label] for label in labels])
+            if better.tenths >= best.tenths:
                 return best
             best = better
-
-    def _near(self, best: Explained) -> Iterator[Explained]:
-        """Yield explanations by machines in which dstates of the best one are merged or dropped."""
-        # First merge all dstates that can be one. Then drop rare dstates, one at a time.
-        machine = self.read_off(best.labels)
-        labels = numbered(best.labels)
-        visits = Counter(labels)
-        links: list[Link] = [(s, action, x) for (s, action), x in machine.goes.items()]
-        root = thinned_map(
-            machine.shows, links, [visits[s] for s in range(len(machine.shows))], self.check
-        )
-        if len(set(root)) < len(machine.shows):
-            yield self._settled([root[label] for label in labels])
-        for s, count in sorted(visits.items(), key=lambda item: item[1])[:TRIED]:
-            if count <= RARE and len(machine.shows) > 1:
-                self.check()
-                yield self._settled(self.completed(machine.without(s)).labels)
 
     def _settled(self, labels: Sequence[int]) -> Explained:
         """Explain the trace by the machine of the labels, and repeat that while the cost falls."""
