@@ -148,7 +148,11 @@ class Parser(argparse.ArgumentParser):
         formatter.add_usage(self.usage, self._actions, self._mutually_exclusive_groups)
         formatter.add_text(self.description)
         for group in self._action_groups:
-            actions = [a for a in group._group_actions if not self._lists_verbs(a)]
+            actions = [
+                a
+                for a in group._group_actions
+                if not (self.groups and isinstance(a, argparse._SubParsersAction))
+            ]
             formatter.start_section(group.title)
             formatter.add_text(group.description)
             formatter.add_arguments(actions)
@@ -169,9 +173,6 @@ class Parser(argparse.ArgumentParser):
         for name, text in rows:
             formatter.add_argument(argparse.Action([], name, metavar=name, help=text))
         formatter.end_section()
-
-    def _lists_verbs(self, action: argparse.Action) -> bool:
-        return bool(self.groups) and isinstance(action, argparse._SubParsersAction)
 
     def _verb_actions(self) -> Iterable[argparse.Action]:
         for action in self._actions:
