@@ -20,7 +20,6 @@ from typing import Generic, TypeVar
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.online.options import StepOptions
 from ssh_abduction.solver import (
     AT_ONCE,
     Bound,
@@ -48,6 +47,22 @@ PAUSE = 2
 OVERRUN = 2
 # A first estimate: mending takes this many seconds times the square of the number of steps.
 MENDING = 5e-7
+
+
+@dataclass(frozen=True, slots=True)
+class StepOptions:
+    """The limits and speed-ups for solving at each step.
+
+    Attributes:
+        time_limit: Seconds for each step. A step may take a little longer. None waits for the exact
+            answer.
+        max_maps: Keep at most this many minimal maps; None keeps all.
+        speedups: The speed-ups that are on.
+    """
+
+    time_limit: float | None
+    max_maps: int | None
+    speedups: Speedups
 
 
 class BackgroundTask(Generic[Result]):

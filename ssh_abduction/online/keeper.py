@@ -17,8 +17,7 @@ from itertools import pairwise
 from ssh_abduction.checker.checker import check, unchecked
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Action, Step, Trace
-from ssh_abduction.online.background import Mender
-from ssh_abduction.online.options import StepOptions
+from ssh_abduction.online.background import Mender, StepOptions
 from ssh_abduction.online.replay import MinimalMaps
 from ssh_abduction.solver import (
     Cost,

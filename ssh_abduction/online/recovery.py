@@ -41,8 +41,7 @@ from __future__ import annotations
 
 import time
 
-from ssh_abduction.online.background import FaultSolver
-from ssh_abduction.online.options import StepOptions
+from ssh_abduction.online.background import FaultSolver, StepOptions
 from ssh_abduction.online.rival_maps import RivalMaps
 from ssh_abduction.online.standing import Confidence, Standing
 from ssh_abduction.solver import Effort, Judging, Seconds, Solution, Status, cost_as_counted
