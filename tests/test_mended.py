@@ -1,4 +1,4 @@
-"""Maps without a search of traces with faults: the checker accepts them, also after a limit."""
+"""Maps without a search of traces with faults, and clashes found where a sketch is contradicted."""
 
 from __future__ import annotations
 
@@ -11,7 +11,11 @@ from instances import maze
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data import Odometry
+from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Action
+from ssh_abduction.explain.no_map import explain
+from ssh_abduction.solver import Search, Status
+from ssh_abduction.solver.fallback import clash_in, late_clash
 from ssh_abduction.solver.guesses.mended import mended_sketch
 from ssh_abduction.theory.settle import settle
 
@@ -52,3 +56,27 @@ def test_a_mended_sketch_is_a_map(kind: str) -> None:
 def test_a_fault_that_the_theory_does_not_allow_is_not_paid() -> None:
     trace, theory = flawed("misread", 0)
     assert mended_sketch(trace, settle(trace, theory.replace(misread=0)).theory) is None
+
+
+def test_steps_that_contradict_a_sketch_are_searched_for_a_clash() -> None:
+    """Out along a corridor, and around twice: the robot faces on, but sees something else."""
+    views = [*range(12), "around", "wrong", "later"]
+    trace = Trace.from_steps(views, [*["travel"] * 11, "around", "around", "travel"])
+    search = Search(trace)
+    search._parts.candidates.sketch()
+    assert list(search._parts.candidates.contradicting) == [13]
+
+    def maps_of(trace: Trace, theory: Theory) -> tuple[tuple[SSHMap, ...], bool]:
+        solution = solve(trace, theory, max_maps=1)
+        return solution.maps, solution.status in (Status.OPTIMAL, Status.UNSATISFIABLE)
+
+    assert late_clash(search._parts, maps_of) is None  # the search was not stopped
+    search._parts.known.stopped = "time limit"
+    clash = late_clash(search._parts, maps_of)
+    assert clash == range(10, 14)
+    assert search.status is Status.UNSATISFIABLE
+    found = explain(trace, near=clash)
+    assert found is not None
+    assert (found.first, found.last) == (10, 13)
+    faulty = Theory(misread=1.0)
+    assert clash_in(trace, settle(trace, faulty).theory, [clash], maps_of) is None

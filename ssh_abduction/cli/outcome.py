@@ -6,6 +6,7 @@ import contextlib
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from itertools import zip_longest
 from typing import Any, TypeAlias
@@ -19,12 +20,15 @@ from ssh_abduction.runtime import program
 from ssh_abduction.solver import Backbone, Cost, Search, Solution, Status
 from ssh_abduction.solver import ending as written_ending
 from ssh_abduction.solver import opening as written_opening
+from ssh_abduction.solver.asp.limits import Watch
 
 # After Ctrl-C, only traces of at most this many steps get warnings. 40,000 steps would take 2 s.
 SOON = 10_000
 
 Given: TypeAlias = tuple[SSHMap, Cost | None]
 
+# It may take this many seconds of processor time to explain a clash, even if a limit is over.
+EXPLAINING = 0.5
 LEAST_LEFT = 0.2  # seconds that must be left to solve the trace with the runner-up's views
 
 EXIT_CODES = {Status.OPTIMAL: 0, Status.FEASIBLE: 10, Status.UNSATISFIABLE: 20, Status.UNKNOWN: 30}
@@ -43,8 +47,15 @@ def explained(search: Search) -> Explanation | None:
     """Explain why there is no map; None if there is a map, or no time to find out."""
     if search.status is not Status.UNSATISFIABLE or search.theory.jumped:
         return None
+    watch = Watch(EXPLAINING, clock=time.thread_time)
+    watch.use_reserve()
+    watch.start()
+
+    def over() -> bool:
+        return search.over() and not watch.allows(0)
+
     try:
-        return explain(search.trace, search.theory, search.over)
+        return explain(search.trace, search.theory, over, search.clash)
     except Interrupted:
         return None
 

@@ -87,7 +87,10 @@ class Explanation:
 
 
 def explain(
-    trace: Trace, theory: Theory | None = None, stop: Callable[[], bool] = lambda: False
+    trace: Trace,
+    theory: Theory | None = None,
+    stop: Callable[[], bool] = lambda: False,
+    near: range | None = None,
 ) -> Explanation | None:
     """Explain why a trace has no map.
 
@@ -99,6 +102,7 @@ def explain(
         trace: The trace, with views.
         theory: The theory; Theory.topological() if None.
         stop: Called now and then. If it returns True, Interrupted is raised.
+        near: Consecutive steps that are tried first; None if nothing is known.
 
     Returns:
         The explanation, or None if the trace has a map.
@@ -122,7 +126,8 @@ def explain(
         return not Axioms(Piece.of(problem, range(first, end)), stop).consistent()
 
     begins = range(0, max(len(trace) - 1, 1), STRETCH - 1)
-    stretches = ((begin, min(begin + STRETCH, len(trace))) for begin in begins)
+    stretches = [(begin, min(begin + STRETCH, len(trace))) for begin in begins]
+    stretches[:0] = [(near.start, near.stop)] if near else []
     begin, before = next((s for s in stretches if has_no_map(*s)), (0, len(trace)))
     # Drop steps from the end, then from the start.
     length = shortest(before - begin, lambda n: has_no_map(begin, begin + n))

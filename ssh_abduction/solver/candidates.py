@@ -48,7 +48,11 @@ BROAD, LONGEST = 4, 2000
 
 
 class Candidates:
-    """Makes maps of the whole trace, and keeps the best one that the checker accepts."""
+    """Makes maps of the whole trace, and keeps the best one that the checker accepts.
+
+    Attributes:
+        contradicting: The steps that contradicted a sketch, that of the surest sketch first.
+    """
 
     def __init__(
         self, task: Task, known: Known, judging: Judging, report: Callable[[], None]
@@ -61,6 +65,7 @@ class Candidates:
             report,
         )
         self._beams: dict[int, Beam] = {}  # by their widths
+        self.contradicting: dict[int, None] = {}
         # A snapshot waits for a sketch under way instead of making another one.
         self._sketching = threading.Lock()
 
@@ -203,8 +208,10 @@ class Candidates:
 
     def _go_on_to_end(self, sketch: Sketch) -> None:
         """Extend a sketch to the end of the trace and offer it, unless a step contradicts it."""
-        if first_contradiction(sketch, self._task.trace) is None:
+        if (wrong := first_contradiction(sketch, self._task.trace)) is None:
             self.offer(sketch.map())
+        else:
+            self.contradicting[wrong] = None
 
     def _offer_mended(self) -> None:
         """Offer a sketch of a trace that is mended where a step contradicts the sketch."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 
@@ -22,6 +23,9 @@ from ssh_abduction.theory.theory import Theory
 OVERTIME, OVERTIME_SHARE = 0.5, 0.05
 # After Ctrl-C, or at the memory limit, it may take this many seconds.
 INTERRUPTED = 0.6
+# If a stopped search has no map, it looks for a clash in stretches of this many steps, for at most
+# CLASHING seconds. A short stretch takes a few hundredths of a second.
+STRETCHES, CLASHING = (2, 3, 4, 6, 8, 12), 0.3
 _log = log_of(__name__)
 
 
@@ -55,27 +59,56 @@ def fall_back(parts: Parts, answer: Answer, *, may_search: bool) -> None:
         known.status = Status.FEASIBLE
 
 
-def two_steps_clash(
-    trace: Trace, theory: Theory, maps_of: Callable[[Trace, Theory], tuple[Sequence[SSHMap], bool]]
-) -> bool:
-    """Whether some pair of successive steps has no map by itself. Then the trace has no map.
+def clash_in(
+    trace: Trace,
+    theory: Theory,
+    stretches: Iterable[range],
+    maps_of: Callable[[Trace, Theory], tuple[Sequence[SSHMap], bool]],
+) -> range | None:
+    """Find a stretch of consecutive steps that has no map by itself. Then the trace has no map.
 
     Args:
         trace: The trace.
-        theory: Its theory, with all defaults filled in. If it allows faults, the result is False.
+        theory: Its theory, with all defaults filled in.
+        stretches: The stretches to try.
         maps_of: Solves a trace. Returns some maps, and whether the answer is proven.
+
+    Returns:
+        The first such stretch; None if there is none, or if the theory allows faults or has own
+        rules, which may hold for the whole trace alone.
     """
-    if theory.has_faults:
-        return False
+    if theory.has_faults or theory.rules:
+        return None
     bare = theory.replace(weigh="count", displacement="none")
-    for t, action in enumerate(each_looking(trace.actions)):
-        steps = trace.steps[t], replace(trace.steps[t + 1], action=None)
-        if not action.starts:
-            two = Trace(steps, odometry=trace.odometry)
-            maps, proven = maps_of(two, bare.of_steps(t, 2))
+    for found in each_looking(stretches):
+        *steps, last = trace.steps[found.start : found.stop]
+        if not any(step.action and step.action.starts for step in steps):
+            piece = Trace((*steps, replace(last, action=None)), odometry=trace.odometry)
+            maps, proven = maps_of(piece, bare.of_steps(found.start, len(found)))
             if proven and not maps:
-                return True
-    return False
+                return found
+    return None
+
+
+def late_clash(
+    parts: Parts, maps_of: Callable[[Trace, Theory], tuple[Sequence[SSHMap], bool]]
+) -> range | None:
+    """Look for a clash before the steps that contradicted a sketch, if a stopped search has no map.
+
+    Args:
+        parts: The parts of the search. Its `known` gets the status if there is a clash.
+        maps_of: As in `clash_in`.
+    """
+    known, task, clash = parts.known, parts.task, None
+    if known.best is not None or not known.stopped or known.status is not Status.UNKNOWN:
+        return None
+    stretches = _stretches_before(parts.candidates.contradicting, len(task.trace))
+    part = Watch().part(CLASHING, time.thread_time)
+    with suppress(LimitError, KeyboardInterrupt), heeding(part.check):
+        clash = clash_in(task.trace, task.theory, stretches, maps_of)
+    if clash is not None:
+        known.status = Status.UNSATISFIABLE
+    return clash
 
 
 def salvage(parts: Parts) -> None:
@@ -123,3 +156,14 @@ def overtime(parts: Parts) -> float:
     if parts.known.stopped != "time limit" or limit is None:
         return INTERRUPTED
     return max(parts.watch.left() + OVERTIME_SHARE * limit + OVERTIME, 0.0)
+
+
+def _stretches_before(ends: Iterable[int], steps: int) -> Iterator[range]:
+    """Yield stretches of consecutive steps that end with one of these steps, short ones first.
+
+    Args:
+        ends: The last steps.
+        steps: The number of steps of the trace. Each stretch has fewer.
+    """
+    for length in STRETCHES:
+        yield from (range(t + 1 - length, t + 1) for t in ends if length <= min(t + 1, steps - 1))

@@ -28,7 +28,15 @@ from ssh_abduction.runtime.threads import one_thread
 from ssh_abduction.solver.answer import Answer
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError, Stop, Watch, now
 from ssh_abduction.solver.asp.rules import check_rules
-from ssh_abduction.solver.fallback import OVERTIME, best_map, fall_back, overtime, two_steps_clash
+from ssh_abduction.solver.fallback import (
+    CLASHING,
+    OVERTIME,
+    best_map,
+    clash_in,
+    fall_back,
+    late_clash,
+    overtime,
+)
 from ssh_abduction.solver.map_list import Priced, by_count, listed
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.ranking import Ranking
@@ -75,6 +83,7 @@ class Search:
         trace: The trace.
         theory: The theory. Each "auto" in it is replaced by the value that is used.
         limits: The limits of the search.
+        clash: Consecutive steps that have no map by themselves; None if none are known.
     """
 
     @renamed_parameters("limit", "maps", "memory")
@@ -109,6 +118,7 @@ class Search:
             )
         check_rules(self.theory)
         self.trace = trace
+        self.clash: range | None = None
         self._begun = False
         self._reasons = _start.reasons
         self._parts = Parts(
@@ -285,6 +295,9 @@ class Search:
         finally:
             parts.end_clingo()
         fall_back(parts, self._answer, may_search=not self._stages.mends)
+        self.clash = self.clash or late_clash(
+            parts, lambda trace, theory: self._solve_mended(trace, theory, 1, CLASHING)
+        )
         if self._weighing is not None:
             # If this takes too long after a limit, the map has no cost in nats.
             ended = known.stopped in ("time limit", "interrupted")
@@ -310,9 +323,14 @@ class Search:
         def maps_of(trace: Trace, theory: Theory) -> tuple[tuple[SSHMap, ...], bool]:
             return self._solve_mended(trace, theory, 1, watch.left())
 
+        def clashes() -> bool:
+            twos = (range(t, t + 2) for t in range(len(self.trace) - 1))
+            self.clash = clash_in(self.trace, self.theory, twos, maps_of)
+            return self.clash is not None
+
         # The matrices are small: threads of BLAS would mostly wait for each other.
         with one_thread("blas"):
-            if not weighing.guess(lambda: two_steps_clash(self.trace, self.theory, maps_of)):
+            if not weighing.guess(clashes):
                 self._parts.known.status = Status.UNSATISFIABLE
                 return
         if watch.left() < math.inf:

@@ -34,7 +34,7 @@ from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.rotations import leads
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Action, Step, Trace
-from ssh_abduction.solver.guesses.tree import Contradiction, Sketch
+from ssh_abduction.solver.guesses.tree import Contradiction, Known, Sketch
 from ssh_abduction.solver.steps.log import observation
 from ssh_abduction.theory.theory import Theory
 
@@ -203,17 +203,28 @@ class GatewaySketch(Sketch):
         return next((x for x in known if self._states[x].seen == seen and self._may_show(x)), None)
 
     def _course_through(self, here: int) -> tuple[int, int] | None:
-        place = self._shown[self._states[here].place]
-        sights, turns = self._sights(place)
+        s = self._states[here]
+        if not self._homing and self._may_begin_path(s):
+            return None
+        sights, turns = self._sights(self._shown[s.place])
         read = fit(sights, turns, self._axioms, as_shown=False) or []
         own = [
             turned for sight, turned in zip(sights, read, strict=False) if sight.dstate.id == here
         ]
         for sight, turned in zip(sights, read, strict=False):
-            s = sight.dstate
-            if s.path is not None and any(are_opposite(turned, x) for x in own):
-                return s.path, -(s.direction or 1)
+            path, direction = sight.dstate.path, sight.dstate.direction
+            if path is not None and any(are_opposite(turned, x) for x in own):
+                return path, -(direction or 1)
         return None
+
+    def _may_begin_path(self, s: Known) -> bool:
+        """Whether a new path may leave a place in the heading of a dstate."""
+        self._orders.append([s.place])
+        s.path, s.direction = len(self._orders) - 1, 1
+        fitted = fit(*self._sights(self._shown[s.place]), self._axioms, as_shown=False)
+        s.path = None
+        self._orders.pop()
+        return fitted is not None
 
     def _travel(self, here: int, step: Step) -> int:
         if "gateway_end" not in self._axioms or _leads_on(self._star_seen, 0):
