@@ -222,6 +222,7 @@ def test_drives_that_share_a_place_have_one_map() -> None:
     """Tuesday adds nothing to the map of Monday. Nothing links the end of Monday to Tuesday."""
     solution = solve([MONDAY, TUESDAY])
     assert [ssh_map.dstate_at for ssh_map in solution.maps] == [(0, 1, 2, 3, 1, 2, 3)]
+    assert solve(trace for trace in (MONDAY, TUESDAY)) == solution
     (ssh_map,) = solution.maps
     assert len(ssh_map.pieces) == 1
     assert {action for _, action, _ in ssh_map.links} == {"travel", "around"}

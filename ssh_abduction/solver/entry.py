@@ -9,7 +9,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 
@@ -40,7 +40,7 @@ from ssh_abduction.theory.theory import Theory, checked_theory
 
 @renamed_parameters("limit", "maps", "memory")
 def solve(
-    trace: Trace | Sequence[Trace],
+    trace: Trace | Sequence[Trace] | Iterator[Trace],
     theory: Theory | None = None,
     *,
     time_limit: float | None = None,
@@ -89,7 +89,7 @@ def solve(
     Reference:
         Kuipers & Beeson 2002, "Bootstrap Learning for Place Recognition", step 2.
     """
-    joint = together(trace) if isinstance(trace, list | tuple) else checked_trace(trace)
+    joint = together(trace) if isinstance(trace, list | tuple | Iterator) else checked_trace(trace)
 
     def find(trace: Trace, theory: Theory) -> Solution:
         search = Search(
