@@ -171,7 +171,7 @@ def test_the_cheapest_maps_are_those_of_plain_least_squares(data: st.DataObject)
 
 
 @pytest.mark.parametrize(
-    "prices", [(-1, 8, 0), (math.nan, 8, 0), ("dear", 8, 0), (8, 8), 8, (0, 8, 0)]
+    "prices", [(-1, 8, 0), (math.nan, 8, 0), ("dear", 8, 0), ("8", 8, 0), (8, 8), 8, (0, 8, 0)]
 )
 def test_prices_are_three_numbers(prices: object) -> None:
     with pytest.raises(TheoryError, match=r"prices: expected .*, got"):

@@ -229,10 +229,10 @@ def _check_numbers(theory: Theory) -> None:
 def _check_prices(theory: Theory) -> None:
     """Convert the prices to three floats. Raises TheoryError."""
     given: Any = theory.prices
-    if isinstance(given, str):
-        given = [price.strip() for price in given.split(",")]
     try:
-        prices = tuple(float(price) for price in given if not isinstance(price, bool))
+        if isinstance(given, str):
+            given = map(float, given.split(","))
+        prices = tuple(float(price) for price in given if not isinstance(price, bool | str))
     except (TypeError, ValueError):
         prices = ()
     if len(prices) != 3 or not all(0 <= price <= DEAREST_PRICE for price in prices):
