@@ -157,6 +157,9 @@ def test_a_maze_with_wrong_displacements_has_a_map_that_costs_no_more_than_the_t
     assert solution.cost is not None
     assert solution.cost.dstates + solution.cost.faults <= true + 3 * jumps
     assert check(trace, solution.maps[0], solution.theory) == ()
+    assert solution.weighed is not None
+    assert solution.weighed.proven or not solution.weighed.searched
+    assert solution.weighed.proven or solution.weighed.confidence < 0.5
 
 
 @pytest.mark.parametrize("jumps", [(), (17,), (11, 30)])

@@ -69,10 +69,14 @@ class Beams:
     def found(self, nats: float) -> bool:
         """Whether a broad beam ended with a map of this cost, and `broken` is known.
 
+        If displacements may be wrong, this is False: after a wrong one the pose is unknown, so the
+        beam often drops the map of least cost.
+
         Args:
             nats: The cost of the best map.
         """
-        return self._best[0] <= nats + EQUAL and math.isfinite(self.broken)
+        is_sound = math.isfinite(self.broken) and not self._parts.task.theory.jumped
+        return is_sound and self._best[0] <= nats + EQUAL
 
     def search(self, clashes: Callable[[], bool]) -> bool:
         """Search by beams of growing width, as far as there is time.
