@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import io
+import math
 import random
 import sys
 from collections.abc import Callable, Sequence
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from coarse import every_second_beam, hall
+from test_distinctive import log_of
 from test_log_checks import backwards, in_degrees, of_two_clocks, with_poses
 
 from perception.errors import LogError
@@ -64,6 +66,22 @@ def test_import_of_a_pipe_shows_each_place_and_writes_the_trace_of_the_file(
     live = Trace.load(tmp_path / "live.jsonl")
     assert live.steps == done.trace.steps
     assert live.closures == done.trace.closures
+
+
+def test_a_pipe_shows_at_its_end_where_lanes_part(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # In a wide corridor, the robot comes back on another lane.
+    walls = [(0, -2, 24, -2), (0, 2, 24, 2), (0, -2, 0, 2), (24, -2, 24, 2)]
+    log, _ = log_of(walls, [(1, -1.4), (21, -1.4), (14, -1.4), (11, 1.4), (1, 1.4)])
+    write_carmen(tmp_path / "lanes.log", log.scans)
+    given(monkeypatch, (tmp_path / "lanes.log").read_bytes())
+    assert main(["import", "-", "-o", str(tmp_path / "live.jsonl")]) == 0
+    *shown, last, _ = capsys.readouterr().out.splitlines()
+    assert last == "at the end of the drive: 2 more visits where stretches of it lead apart"
+    visits = import_log(read_log(tmp_path / "lanes.log")).visits
+    assert len(visits) == len(shown) + 2
+    assert sum(math.dist(visit.middle, (12, 0.4)) < 1.0 for visit in visits) == 2
 
 
 def test_a_trace_on_standard_output_is_alone_there(

@@ -38,6 +38,7 @@ from perception.places.closures import (
 from perception.places.distinctive import WIDTH, WINDOW, find_visits
 from perception.places.following import follow, turned_wrongly
 from perception.places.live import LiveLog
+from perception.places.partings import with_partings
 from perception.places.tracing import DRIFT, to_trace
 from perception.places.track import Track
 from perception.places.visits import Visit, patches_of
@@ -148,7 +149,8 @@ def import_live(
         width: Width of the robot in metres.
         name: Name of the trace.
         tell: Takes each note on suspicious scans and odometry as soon as it is known.
-        show: Takes each visit when it is final.
+        show: Takes each visit when it is final, except those where stretches of the drive lead
+            apart (`partings`).
         source: Name of the log, for errors.
 
     Returns:
@@ -207,6 +209,7 @@ def _imported(
     with _timed(seconds, "trace"):
         closings = find_closures(track, visits, patches_of(visits), 2 * WINDOW)
         track = calibrated(track, visits, closings)
+        visits, closings = with_partings(track, visits, closings)
         trace = to_trace(log, track, visits, closings, name)
     with _timed(seconds, "views"):
         trace = with_views(trace)
@@ -226,7 +229,8 @@ def stream_visits(
     the odometry are recognised.
 
     The visits are those of `import_log` if the odometry is good. Unlike there, a jump of the
-    odometer is judged by the steps before it only.
+    odometer is judged by the steps before it only, and visits where stretches of the drive lead
+    apart are missing (`partings`).
 
     Args:
         scans: The scans with odometry, in order, for example those of `stream_log`. Damaged parts

@@ -235,8 +235,8 @@ class Stays:
         ways, numbers = list(visit.ways), []
         for side in (-1, 1):
             bearing = self._crossing(visit, side)
-            numbers.append(None if bearing is None else _taken(ways, bearing))
-        return _in_order(replace(visit, ways=tuple(ways), arrived=numbers[0], left=numbers[1]))
+            numbers.append(None if bearing is None else taken(ways, bearing))
+        return in_order(replace(visit, ways=tuple(ways), arrived=numbers[0], left=numbers[1]))
 
     def _crossing(self, visit: Visit, side: int) -> float | None:
         """The direction in radians in which the robot enters (side -1) or leaves (1) a disc.
@@ -273,11 +273,11 @@ def _are_near(first: Visit, second: Visit) -> bool:
 def joined(first: Visit, last: Visit) -> Visit:
     """Make one visit of two successive visits to the same place."""
     ways = list(first.ways)
-    left = None if last.left is None else _taken(ways, last.ways[last.left].bearing)
-    return _in_order(replace(first, end=last.end, ways=tuple(ways), left=left))
+    left = None if last.left is None else taken(ways, last.ways[last.left].bearing)
+    return in_order(replace(first, end=last.end, ways=tuple(ways), left=left))
 
 
-def _in_order(visit: Visit) -> Visit:
+def in_order(visit: Visit) -> Visit:
     """The visit with its ways in counterclockwise order."""
     order = sorted(range(len(visit.ways)), key=lambda k: visit.ways[k].bearing)
     arrived, left = (None if k is None else order.index(k) for k in (visit.arrived, visit.left))
@@ -285,7 +285,7 @@ def _in_order(visit: Visit) -> Visit:
     return replace(visit, ways=ways, arrived=arrived, left=left)
 
 
-def _taken(ways: list[Way], bearing: float) -> int:
+def taken(ways: list[Way], bearing: float) -> int:
     """Find the way out that the robot took, by its bearing in radians, as an index of `ways`.
 
     The way with nearly this bearing becomes sure. If there is none, a new way is added.

@@ -41,7 +41,8 @@ class Visit:
             log.
         left: Index in `ways` of the way by which the robot left; None at the end of the log.
         support: Share of the local maps nearby that show the place, from 0 to 1.
-        patch: Local map around the middle; None while the visit is not final.
+        patch: Local map around the middle, or around that of a visit near it; None while the visit
+            is not final.
     """
 
     scan: int

@@ -1,0 +1,246 @@
+"""Finds the places where two stretches of a drive that ran together lead apart.
+
+A robot changes its lane in a wide corridor, or leaves a hall at one side. No junction of a skeleton
+is there, but the robot decided something. The drive shows it: closures say how stretches of the
+drive lie relative to each other. Where two stretches lead apart and no place is near, there is a
+place. Each stretch that passes it has a visit.
+
+The second stretch may come long after the first one. So these visits are found when a drive ends.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.distance import cdist
+
+from perception.places.closures import Closing
+from perception.places.stays import in_order, taken
+from perception.places.track import Array, Track, points_turned
+from perception.places.visits import Visit, Way
+
+# A stretch reaches REACH metres of trajectory to both sides of a visit. Its points are PACE metres
+# apart.
+REACH, PACE = 12.0, 0.25
+# Two stretches run together if they are within BESIDE metres for TOGETHER metres. Then they lead
+# apart if each is more than APART metres from the other one within AHEAD metres.
+BESIDE, TOGETHER, APART, AHEAD = 1.0, 2.0, 2.0, 4.0
+# A parting within NEAR metres of the middle of a visit, or within BEYOND metres of its disc, is at
+# the place of the visit. Partings within ONE metres are one. Points within PASS metres of the
+# trajectory belong to one pass.
+NEAR, BEYOND, ONE, PASS = 1.5, 0.5, 2.0, 4.0
+# The radius of the disc of a parting in metres. The robot crosses its rim at RIM metres, less than
+# BOW metres of trajectory away.
+RADIUS, RIM, BOW = 1.0, 1.5, 6.0
+# Between visits at most MOST metres of trajectory apart, the track is as good as a closure. Two
+# stretches are LEAST metres of trajectory apart.
+MOST, LEAST = 32.0, 8.0
+
+# A pass of a place: the metres driven, and the middle (x, y) of the place in the frame of the track
+# there, in metres.
+_Pass = tuple[float, Array]
+
+
+def with_partings(
+    track: Track, visits: Sequence[Visit], closings: Sequence[Closing]
+) -> tuple[tuple[Visit, ...], list[Closing]]:
+    """Add a visit for each pass of a place where stretches of a drive lead apart.
+
+    Args:
+        track: Trajectory of the robot.
+        visits: The visits, in order. Each has its local map.
+        closings: The closures between them.
+
+    Returns:
+        All visits, in order, and the closures between them. An added visit has the local map of the
+        nearest other one.
+    """
+    drive = _Drive(track, visits)
+    relations = [*_closed(drive, closings), *_tracked(drive)]
+    places: list[list[_Pass]] = []
+    for one in relations:
+        for pair in drive.partings(one):
+            known = [old for place in places for old in place]
+            if any(drive.is_near(some) or _is_known(some, known) for some in pair):
+                continue
+            place = _passes(drive, pair, relations)
+            if not any(map(drive.is_near, place)):
+                places.append(place)
+    every = [*visits, *(drive.visit(*some) for place in places for some in place)]
+    order = sorted(range(len(every)), key=lambda k: every[k].scan)
+    number = {k: n for n, k in enumerate(order)}
+    return tuple(every[k] for k in order), [
+        replace(one, first=number[one.first], last=number[one.last]) for one in closings
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class _Relation:
+    """How the trajectory at a visit lies relative to the trajectory at an earlier one.
+
+    Attributes:
+        first: Metres driven up to the earlier visit.
+        last: Metres driven up to the later visit.
+        turn: Rotation from the axes there to the axes at the earlier visit, in radians.
+        here: (x, y) of a point by the earlier visit, in metres.
+        there: (x, y) of the same point by the later visit.
+    """
+
+    first: float
+    last: float
+    turn: float
+    here: Array
+    there: Array
+
+    @property
+    def reverse(self) -> _Relation:
+        return _Relation(self.last, self.first, -self.turn, self.there, self.here)
+
+    def moved(self, points: Array) -> Array:
+        """Move points, (..., 2) metres, from the later to the earlier trajectory."""
+        return self.here + points_turned(self.turn, points - self.there)
+
+
+class _Drive:
+    """A drive as points along its trajectory.
+
+    Args:
+        track: Trajectory of the robot.
+        visits: The visits, in order.
+
+    Attributes:
+        points: (n, 2) positions, PACE metres apart.
+        visits: The visits.
+        ways: (v,) metres driven up to each visit.
+    """
+
+    def __init__(self, track: Track, visits: Sequence[Visit]) -> None:
+        """Place points along the track."""
+        self._way = track.way
+        at = np.arange(0.0, self._way[-1], PACE)
+        self.points = np.stack([np.interp(at, self._way, track.poses[:, k]) for k in (0, 1)], 1)
+        self.visits = visits
+        self.ways = self._way[[visit.scan for visit in visits]]
+        self._reaches = np.array([max(NEAR, visit.radius + BEYOND) for visit in visits])
+        self._middles = np.array([visit.middle for visit in visits]).reshape(-1, 2)
+        self._cuts = [0.0, *(float(self._way[cut]) for cut in track.cuts), float(self._way[-1])]
+
+    def stretch(self, way: float, reach: float = REACH) -> range:
+        """The indices of the points around a way in metres, without a cut of the track between."""
+        k = min(max(bisect(self._cuts, way), 1), len(self._cuts) - 1)
+        begin, end = max(self._cuts[k - 1], way - reach), min(self._cuts[k], way + reach)
+        return range(math.ceil(begin / PACE), min(math.floor(end / PACE) + 1, len(self.points)))
+
+    def partings(self, one: _Relation) -> Iterator[tuple[_Pass, _Pass]]:
+        """Yield the earlier and the later pass of each parting of two stretches."""
+        ours, theirs = self.stretch(one.first), self.stretch(one.last)
+        if ours.stop > theirs.start:  # Stretches share no points.
+            middle, gap = round((one.first + one.last) / 2 / PACE), round(LEAST / 2 / PACE)
+            ours = range(ours.start, max(ours.start, middle - gap))
+            theirs = range(min(theirs.stop, middle + gap), theirs.stop)
+        if not ours or not theirs:
+            return
+        here = self.points[ours.start : ours.stop]
+        there = one.moved(self.points[theirs.start : theirs.stop])
+        for a, b in lead_apart(cdist(here, there)):
+            middle = (here[a] + there[b]) / 2
+            yield (ours[a] * PACE, middle), (theirs[b] * PACE, one.reverse.moved(middle))
+
+    def is_near(self, some: _Pass) -> bool:
+        """Whether a visit is so near a pass that it is to the same place."""
+        soon = np.abs(self.ways - some[0]) <= PASS
+        return bool((soon & (np.hypot(*(self._middles - some[1]).T) <= self._reaches)).any())
+
+    def visit(self, way: float, middle: Array) -> Visit:
+        """Make the visit of a pass."""
+        scan = int(np.abs(self._way - way).argmin())
+        part, here = self.stretch(way, BOW), round(way / PACE)
+        ways: list[Way] = []
+        sides = (range(here - 1, part.start - 1, -1), range(here, part.stop))
+        arrived, left = (self._crossed(side, middle, ways) for side in sides)
+        far = np.hypot(*(self._middles - middle).T) + np.abs(self.ways - way)
+        patch = self.visits[int(far.argmin())].patch
+        return in_order(
+            Visit(scan, middle, scan, scan, RADIUS, tuple(ways), arrived, left, patch=patch)
+        )
+
+    def _crossed(self, side: range, middle: Array, ways: list[Way]) -> int | None:
+        """The index in `ways` of the way by which points leave a disc; None if they stay in it."""
+        for k in side:
+            x, y = self.points[k] - middle
+            if math.hypot(x, y) >= RIM:
+                return taken(ways, math.atan2(y, x))
+        return None
+
+
+def _closed(drive: _Drive, closings: Sequence[Closing]) -> Iterator[_Relation]:
+    """Yield how trajectories lie relative to each other by closures."""
+    for one in closings:
+        first, last = drive.visits[one.first], drive.visits[one.last]
+        first_way, last_way = float(drive.ways[one.first]), float(drive.ways[one.last])
+        here = first.middle + one.match.shift
+        yield _Relation(first_way, last_way, one.match.turn, here, last.middle)
+
+
+def _tracked(drive: _Drive) -> Iterator[_Relation]:
+    """Yield how trajectories lie relative to each other by the track, for visits soon after."""
+    for way in drive.ways.tolist():
+        first, last = np.searchsorted(drive.ways, (way, way + MOST))
+        for other in drive.ways[first:last].tolist():
+            yield _Relation(way, other, 0.0, np.zeros(2), np.zeros(2))
+
+
+def _passes(
+    drive: _Drive, pair: tuple[_Pass, _Pass], relations: Sequence[_Relation]
+) -> list[_Pass]:
+    """List all passes of a parting: those of the two stretches, and of others by relations."""
+    place = list(pair)
+    for way, middle in place:  # The list grows.
+        for one in (some for relation in relations for some in (relation, relation.reverse)):
+            if abs(one.last - way) > REACH:
+                continue
+            here, part = one.moved(middle), drive.stretch(one.first)
+            far = np.hypot(*(drive.points[part.start : part.stop] - here).T)
+            if len(far) and far.min() <= BESIDE:
+                there = part[int(far.argmin())] * PACE
+                if all(abs(there - known) > PASS for known, _ in place):
+                    place.append((there, here))
+    return place
+
+
+def _is_known(some: _Pass, known: Sequence[_Pass]) -> bool:
+    """Whether a pass is one of those that are known."""
+    return any(abs(some[0] - way) <= PASS and math.dist(some[1], at) <= ONE for way, at in known)
+
+
+def lead_apart(far: Array) -> Iterator[tuple[int, int]]:
+    """Find the points after which two stretches that ran together lead apart.
+
+    Args:
+        far: (n, m) distance of each point of one stretch from each of the other one, in metres.
+
+    Yields:
+        The index of the point in each stretch.
+    """
+    yield from _ahead(far)
+    yield from sorted((len(far) - 1 - a, b) for a, b in _ahead(far[::-1]))
+
+
+def _ahead(far: Array) -> Iterator[tuple[int, int]]:
+    """Find what `lead_apart` does, along the direction of the first stretch."""
+    back, ahead = round(TOGETHER / PACE), round(AHEAD / PACE)
+    ours, theirs = far.min(axis=1), far.min(axis=0)
+    ends = np.flatnonzero((ours[:-1] <= BESIDE) & (ours[1:] > BESIDE))
+    for a in ends[ends >= back].tolist():
+        if ours[a - back : a].max() > BESIDE or ours[a + 1 : a + 1 + ahead].max() <= APART:
+            continue
+        # The other stretch is driven in the same or in the opposite direction.
+        before, b = (int(k) for k in far[[a - back, a]].argmin(axis=1))
+        onward = theirs[b + 1 : b + 1 + ahead] if b > before else theirs[max(b - ahead, 0) : b]
+        # It runs along, too, and does not turn around.
+        if abs(b - before) >= back // 2 and len(onward) and onward.max() > APART:
+            yield a, b

@@ -1,0 +1,145 @@
+"""Where stretches of a drive that ran together lead apart, each pass has a visit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from scipy.spatial.distance import cdist
+
+from perception.places.closures import Closing
+from perception.places.matching import Match
+from perception.places.partings import PACE, lead_apart, with_partings
+from perception.places.track import Array, Track, points_moved
+from perception.places.visits import Visit
+
+Points = Sequence[tuple[float, float]]
+
+STRAIGHT = [(0, 0), (20, 0)]
+LANE = [(0, 0), (10, 0), (13, 3), (20, 3)]
+
+
+def walked(corners: Points, pace: float = PACE) -> Array:
+    """Points along a polygonal chain: (n, 2) metres."""
+    ends = np.array(corners, float)
+    far = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(ends, axis=0).T))])
+    at = np.arange(0.0, far[-1] + pace / 2, pace)
+    return np.stack([np.interp(at, far, ends[:, k]) for k in (0, 1)], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "where"),
+    [
+        (STRAIGHT, LANE, [(11, 0)]),
+        (STRAIGHT, LANE[::-1], [(11, 0)]),
+        (STRAIGHT[::-1], LANE, [(11, 0)]),
+        (STRAIGHT, [(0, 3), (7, 3), (10, 0), (20, 0)], [(9, 0)]),
+        (STRAIGHT, [(0, 3), (4, 3), (7, 0), (13, 0), (16, 3), (20, 3)], [(6, 0), (14, 0)]),
+        (STRAIGHT, STRAIGHT, []),
+        (STRAIGHT, [(0, 0.8), (20, 0.8)], []),
+        (STRAIGHT, [(0, 3), (20, 3)], []),
+        (STRAIGHT, [(10, -8), (10, 8)], []),  # a crossing
+        (STRAIGHT, [(0, 0), (10, 0), (0, 0)], []),  # the robot turned around
+        (STRAIGHT, [(0, 0), (10, 0)], []),  # the log ended
+        (STRAIGHT, [(0, 0), (8, 0), (10, 1.5), (12, 0), (20, 0)], []),  # around somebody
+    ],
+)
+def test_stretches_lead_apart_where_both_go_on(first: Points, last: Points, where: Points) -> None:
+    ours, theirs = walked(first), walked(last)
+    found = [(ours[a] + theirs[b]) / 2 for a, b in lead_apart(cdist(ours, theirs))]
+    assert len(found) >= len(where)
+    assert all(min(math.dist(p, q) for q in where) < 0.8 for p in found)
+    assert all(min(math.dist(p, q) for p in found) < 0.8 for q in where)
+
+
+def drive(
+    passes: Sequence[Points], pose: tuple[float, float, float], others: Points = ()
+) -> tuple[Track, list[Visit], list[Closing]]:
+    """A drive with several passes. Each later one is moved by a pose, as if the track had drifted.
+
+    Each pass has a visit 2 m after its beginning, and visits at other points of the first pass.
+    Closures relate the first pass to each other one.
+
+    Args:
+        passes: The corners of each pass in metres.
+        pose: How the track of a later pass is off: x and y in metres, and radians.
+        others: (x, y) of further visits on the first pass.
+    """
+    parts = [walked(corners, 0.2) for corners in passes]
+    moved = [parts[0], *(points_moved(pose, part) for part in parts[1:])]
+    gap = [(1000.0, 0.0)]  # between passes, the robot drives far
+    points = np.concatenate([part for one in moved for part in (one, gap)][:-1])
+    begins = np.cumsum([0, *(len(part) + 1 for part in parts[:-1])])
+    track = Track(np.column_stack([points, np.zeros(len(points))]), np.zeros((len(points), 3, 3)))
+    scans = [int(begin) + 10 for begin in begins]
+    closings = [
+        Closing(0, len(others) + k, Match(0.9, -pose[2], turned, 0.9, 0.1))
+        for k, turned in enumerate([np.zeros(2)] * (len(passes) - 1), 1)
+    ]
+    more = [int(np.hypot(*(parts[0] - other).T).argmin()) for other in others]
+    visits = [Visit(scan, points[scan], scan, scan) for scan in (scans[0], *more, *scans[1:])]
+    return track, visits, closings
+
+
+def added(visits: Sequence[Visit], every: Sequence[Visit]) -> list[Visit]:
+    return [visit for visit in every if visit not in visits]
+
+
+@pytest.mark.parametrize("pose", [(0.0, 0.0, 0.0), (5.0, -3.0, 0.4), (0.0, 50.0, -2.0)])
+@pytest.mark.parametrize(("first", "last"), [(STRAIGHT, LANE), (LANE, STRAIGHT)])
+def test_each_pass_of_a_parting_has_a_visit(
+    first: Points, last: Points, pose: tuple[float, float, float]
+) -> None:
+    # The third pass does not leave the first one, but it passes, too.
+    track, visits, closings = drive([first, last, first], pose)
+    every, closed = with_partings(track, visits, closings)
+    new = added(visits, every)
+    assert [visit.scan for visit in every] == sorted(visit.scan for visit in every)
+    assert len(new) == 3
+    middles = [new[0].middle, *points_moved(pose, new[:1][0].middle[None])] * 2
+    for visit, middle in zip(new, [*middles[:2], middles[1]], strict=True):
+        assert math.dist(visit.middle, middle) < 1e-6
+    assert math.dist(new[0].middle, (11, 0)) < 1.0
+    for visit in new:
+        here = track.poses[visit.scan, :2]
+        assert math.dist(here, visit.middle) <= 1.0
+        assert visit.arrived is not None
+        assert visit.left is not None
+    # Ways that part have other directions, and the ways of equal passes are equal.
+    bearings = [visit.ways[visit.left].bearing for visit in new]  # type: ignore[index]
+    assert abs(bearings[1] - pose[2] - bearings[0]) % math.tau > math.radians(20)
+    assert math.remainder(bearings[2] - pose[2] - bearings[0], math.tau) == pytest.approx(
+        0, abs=0.2
+    )
+    # Closures are between the same visits as before.
+    assert [(every[one.first], every[one.last]) for one in closed] == [
+        (visits[one.first], visits[one.last]) for one in closings
+    ]
+
+
+def test_a_place_nearby_is_the_place_of_a_parting() -> None:
+    for other, count in (((11.0, 0.0), 0), ((9.0, 0.0), 2)):
+        track, visits, closings = drive([STRAIGHT, LANE], (0.0, 50.0, 0.0), [other])
+        assert len(added(visits, with_partings(track, visits, closings)[0])) == count
+
+
+def test_only_closures_and_short_ways_relate_stretches() -> None:
+    track, visits, closings = drive([STRAIGHT, LANE], (0.0, 0.0, 0.0))
+    assert with_partings(track, visits, [])[0] == tuple(visits)
+    assert len(with_partings(track, visits, closings)[0]) == 4
+    # The robot comes back on another lane after 10 m.
+    corners = [(0, 0), (20, 0), (20, 3), (13, 3), (10, 0), (0, 0)]
+    points = walked(corners, 0.2)
+    track = Track(np.column_stack([points, np.zeros(len(points))]), np.zeros((len(points), 3, 3)))
+    visits = [Visit(scan, points[scan], scan, scan) for scan in (30, 190)]
+    every, _ = with_partings(track, visits, [])
+    assert len(every) == 4
+    assert all(math.dist(visit.middle, (11, 0.5)) < 1.0 for visit in added(visits, every))
+
+
+def test_no_stretch_crosses_a_cut_of_the_track() -> None:
+    track, visits, closings = drive([STRAIGHT, LANE], (0.0, 0.0, 0.0))
+    cut = Track(track.poses, track.covariances, cuts=(30,))
+    assert with_partings(cut, visits, closings)[0] == tuple(visits)
