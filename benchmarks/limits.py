@@ -1,6 +1,7 @@
 """Do limits of time and memory hold? The worst overshoot on traces with flaws.
 
     python benchmarks/limits.py --cases 40 --seed 0 [--python]
+    python benchmarks/limits.py --logs TRACE ... --seconds 0.5 2 --rows FILE
 
 With flaws, most places look new. The package promises three things: at most 1.2 times the time
 limit plus 1 s, including the start; at most 1.2 times the memory limit plus 200 MiB; and valid JSON
@@ -8,14 +9,20 @@ as output. Each case runs in its own process. By default, the process is the com
 a guard that ends it in time whatever clingo does. With --python, it is `solve` of the Python
 interface, which has no guard. The same seed gives the same cases. Their times depend on the load of
 the machine.
+
+With --logs, traces that `import` made of logs are solved by the theory of `map` in this process.
+The libraries are loaded before. The limit and the times are CPU seconds, so other work on the
+machine matters little. Rows that are in the file of --rows are not measured again.
 """
 
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import os
 import random
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -23,11 +30,16 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
+from typing import Any
 
 from instances import maze, moore, rectangle
 
-from ssh_abduction import Trace
+from ssh_abduction import Trace, solve
+from ssh_abduction.robot_logs.log_maps import BARE, MAPS
+from ssh_abduction.solver import search
+from ssh_abduction.solver.asp import limits
 
 TIME, MEMORY = (
     (1.2, 1.0),
@@ -270,6 +282,79 @@ def table(outcomes: Sequence[Outcome]) -> str:
     return "\n".join(rows)
 
 
+def cpu_seconds() -> float:
+    """The CPU seconds of this process and of its children that ended."""
+    return sum(os.times()[:4])
+
+
+def of_logs(paths: Sequence[Path], seconds: Sequence[float], rows: Path) -> list[dict[str, Any]]:
+    """Solve traces of logs with limits in CPU seconds. Return a row for each trace and limit.
+
+    Args:
+        paths: Files of the traces.
+        seconds: Limits, each for all traces.
+        rows: File of the rows, one JSON object a line. Each new row is appended.
+    """
+    limits.now = search.now = time.process_time  # type: ignore[attr-defined]
+    solve(Trace.load(paths[0]), BARE, time_limit=1, max_maps=MAPS)  # loads the libraries
+    found = [json.loads(line) for line in rows.read_text().splitlines()] if rows.exists() else []
+    measured = {(row["trace"], row["limit"]) for row in found}
+    for limit, path in product(seconds, paths):
+        if (path.stem, limit) in measured:
+            continue
+        row = {"trace": path.stem, "limit": limit, **_solved(Trace.load(path), limit)}
+        found.append(row)
+        with rows.open("a") as file:
+            print(json.dumps(row), file=file)
+        print(*row.values(), file=sys.stderr, flush=True)
+    return found
+
+
+def _solved(trace: Trace, limit: float) -> dict[str, Any]:
+    """Solve a trace, and tell what was found and what it took. The peak memory starts anew."""
+    gc.collect()
+    Path("/proc/self/clear_refs").write_text("5")
+    began = cpu_seconds()
+    solution = solve(trace, BARE, time_limit=limit, max_maps=MAPS)
+    taken = cpu_seconds() - began
+    fit = solution.maps[0].fit if solution.maps else None
+    rivals = solution.weighed.rivals if solution.weighed else ()
+    return {
+        "steps": len(trace),
+        "status": solution.status.value,
+        "map": bool(solution.maps),
+        "nats": round(rivals[0].nats, 1) if rivals else None,
+        "poses": bool(fit and fit.poses),
+        "seconds": round(taken, 2),
+        "mebibytes": round(_peak(os.getpid())),
+    }
+
+
+def table_of_logs(rows: Sequence[dict[str, Any]]) -> str:
+    """Make a table in Markdown, with a row for each limit."""
+    lines = [
+        "| limit, CPU s | promised | traces | with a map, cost and poses | proven | median CPU s "
+        "| most CPU s | over | most MiB |",
+        f"|{'--:|' * 9}",
+    ]
+    for limit in sorted({row["limit"] for row in rows}):
+        of_limit = [row for row in rows if row["limit"] == limit]
+        taken, promised = [row["seconds"] for row in of_limit], TIME[0] * limit + TIME[1]
+        cells = [
+            f"{limit:g}",
+            f"{promised:.1f}",
+            len(of_limit),
+            sum(row["map"] and row["poses"] and row["nats"] is not None for row in of_limit),
+            sum(row["status"] == "optimal" for row in of_limit),
+            f"{statistics.median(taken):.2f}",
+            f"{max(taken):.2f}",
+            sum(one > promised for one in taken),
+            max(row["mebibytes"] for row in of_limit),
+        ]
+        lines.append(f"| {' | '.join(map(str, cells))} |")
+    return "\n".join(lines)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cases", type=int, default=40)
@@ -278,7 +363,13 @@ def main() -> None:
     parser.add_argument(
         "--python", action="store_true", help="use the Python interface, not the command line"
     )
+    parser.add_argument("--logs", type=Path, nargs="+", metavar="TRACE", help="traces of logs")
+    parser.add_argument("--seconds", type=float, nargs="+", default=[0.5], help="limits of --logs")
+    parser.add_argument("--rows", type=Path, default=Path("limits.jsonl"), help="rows of --logs")
     options = parser.parse_args()
+    if options.logs:
+        print(table_of_logs(of_logs(options.logs, options.seconds, options.rows)))
+        return
     outcomes = []
     with tempfile.TemporaryDirectory() as folder:
         for case in cases(options.cases, options.seed, options.longest):
