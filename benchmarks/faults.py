@@ -56,7 +56,7 @@ COLUMNS = (
     "among the cheapest",
     "proven",
     "faults found",
-    "in vain",
+    "false",
     "labels right",
     "CPU s, median",
     "worst",

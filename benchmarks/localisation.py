@@ -177,7 +177,7 @@ def part_kidnapped(seeds: range) -> None:
     """Print the table of kidnapped robots."""
     print(
         "| map | dstates | wrong views | located after | noticed after | found after | "
-        "found | right | of those located, wrong | collapsed in vain |"
+        "found | right | of those located, wrong | false alarms |"
     )
     print("|---|---|---|---|---|---|---|---|---|---|")
     for name, make in FAMILIES.items():

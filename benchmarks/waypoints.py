@@ -87,7 +87,7 @@ def _spaced(last: int, metres: float) -> Array:
 
 
 def _every(contour: Array, metres: float) -> Array:
-    """The points of a contour that are so many metres apart."""
+    """The points of a contour at regular distances in metres."""
     far = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(contour, axis=0).T))]) * CELL
     return contour[np.searchsorted(far, np.arange(0, far[-1] + 1e-9, metres))]
 

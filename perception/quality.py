@@ -457,7 +457,7 @@ def _rounding(beams: int, dtype: type[np.floating[Any]], reach: float) -> float:
 
 
 def _numbered(labels: ArrayLike, count: int | None = None) -> Integers:
-    """Replace the labels by numbers 0, 1, …, or raise if they are no row (of `count`)."""
+    """Number the labels 0, 1, …; raise unless they are a row, of `count` labels if given."""
     of = np.asarray(labels)
     if of.ndim != 1 or not len(of) or (count is not None and len(of) != count):
         raise PerceptionError(

@@ -153,7 +153,7 @@ def cloned(name: str, estimator: Any, *methods: str) -> Any:
     if isinstance(estimator, type) or not all(hasattr(estimator, method) for method in wanted):
         raise PerceptionError(
             f"{name}: expected an estimator with {', '.join(wanted)}, got {brief(estimator)}; "
-            "make one of scikit-learn's"
+            "give an estimator of scikit-learn"
         )
     return clone(estimator)
 

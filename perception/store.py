@@ -156,7 +156,8 @@ def written(model: Any, name: str = "recogniser") -> bytes:
     # Reject now what `load` would reject later.
     if foreign := _foreign(data=data):
         raise PerceptionError(
-            f"{name}: expected a model of types that can be read back, got {', '.join(foreign)}"
+            f"{name}: expected a model of types that can be read back, got {', '.join(foreign)}; "
+            "use an estimator of scikit-learn"
         )
     return data
 

@@ -90,7 +90,7 @@ class Log:
     begun: bool = False
 
     def displacement(self) -> Displacement | None:
-        """Return the displacement from the last step by odometry; None for the first on a floor.
+        """Return the displacement from the last step by odometry; None at a floor's first step.
 
         Returns:
             Metres ahead, metres to the left, and radians turned, rounded.

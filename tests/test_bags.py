@@ -184,7 +184,7 @@ def test_parts_without_metadata_that_can_be_used_are_one_drive(
     assert len(log) == len(SCANS)
     assert all(map(agree, log.scans, SCANS))
     assert "3 parts are read as one drive, from drive_0" in notes(log)
-    assert "these parts are not there: 2, 3, 4, 5, 6, …" in notes(log)
+    assert "These parts are not there: 2, 3, 4, 5, 6, …" in notes(log)
     assert ("metadata.yaml cannot be used" in notes(log)) == (metadata is not None)
 
 
@@ -197,7 +197,7 @@ def test_one_part_that_is_named_alone_is_said_to_be_one(tmp_path: Path) -> None:
         "drive_10.db3: name the folder" in notes(log)
     )
     (tmp_path / "drive" / "drive_1.db3").rename(tmp_path / "drive_1.db3")
-    assert "these parts are not there: 0" in notes(read_log(tmp_path / "drive_1.db3"))
+    assert "These parts are not there: 0" in notes(read_log(tmp_path / "drive_1.db3"))
 
 
 def test_a_part_that_is_damaged_or_packed_costs_no_other(tmp_path: Path) -> None:

@@ -325,7 +325,7 @@ def test_poses_and_times_that_cannot_be_used() -> None:
         evaluate_visits([ssh_map], seen, relations=relations)
     with pytest.raises(
         TraceError,
-        match=r"^trace: time: expected steps at times that are related, from 1 to 2 s, got none",
+        match=r"^trace: time: expected steps between 1 and 2 s, as the relations have, got none",
     ):
         evaluate_visits([ssh_map], posed([None] * 2, ["travel"], [7, 8]), relations=relations)
 

@@ -249,7 +249,7 @@ def _gaps(parts: list[Path]) -> list[str]:
     listed = ", ".join(map(str, missing[:5])) + (", …" if len(missing) > 5 else "")
     return [
         (
-            f"{named(parts[-1].name)} is one part of a drive, of which these parts are not there: "
+            f"{named(parts[-1].name)} is one part of a drive. These parts are not there: "
             f"{listed}. Their scans are missing."
         )
     ]

@@ -163,8 +163,8 @@ def live_log(
     head = carmen.head_of(text, SURVEYED)
     if not carmen.looks_like(head) or carmen.VERTEX.search(head):
         raise LogError(
-            f"{named(source)}: expected lines of CARMEN, got another log; save it to a file, and "
-            "read that"
+            f"{named(source)}: expected lines of CARMEN, got another log; save the log to a "
+            "file, and read the file"
         )
     file = cast(IO[bytes], Piped(head, text))
     reading = carmen.read(file, named(source), "carmen", surveyed=io.BytesIO(head))

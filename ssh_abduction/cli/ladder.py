@@ -44,7 +44,9 @@ def add_parser(verbs: Verbs) -> None:
         metavar="N",
         help="list at most N maps on each rung; 0 for all (default: 100)",
     )
-    parser.add_argument("--time-limit", type=float, metavar="SECONDS", help="seconds for each rung")
+    parser.add_argument(
+        "--time-limit", type=float, metavar="S", help="limit in seconds for each rung"
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object per rung")
     add_theory(parser)
     parser.set_defaults(run=run)

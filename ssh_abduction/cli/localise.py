@@ -58,7 +58,8 @@ def add_parser(verbs: Verbs) -> None:
         "--trace",
         type=trace_in,
         metavar="TRACE",
-        help="the trace that was mapped, to estimate probabilities by counting its steps",
+        help="the trace that was mapped; from its steps localise estimates how reliable views "
+        "and links are",
     )
     parser.add_argument(
         "--recogniser",

@@ -51,7 +51,7 @@ class SavedMap:
             number: The number of the map, from 1, or its id.
 
         Raises:
-            MapError: A file cannot be read; the maps do not say of which drives they are; or the
+            MapError: A file cannot be read; the maps do not name their drives; or the
                 corrections are of another map.
         """
         file = Path(maps_in(str(path)))

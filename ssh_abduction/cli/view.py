@@ -164,7 +164,7 @@ def _run(options: argparse.Namespace, trace: Trace | None, data: Any) -> Run | N
     followed = Trace.load(options.followed) if options.followed is not None else trace
     if followed is None:
         raise AbductionError(
-            "--belief: expected the run that it is of, got none; name it with --run, or give the "
+            "--belief: expected the trace of the run, got none; name it with --run, or give the "
             "trace that was mapped"
         )
     if options.belief is None:

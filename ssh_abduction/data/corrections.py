@@ -131,7 +131,7 @@ class Corrections:
 
     @classmethod
     def for_drives(cls, trace: Trace) -> Corrections:
-        """Return corrections for the drives of a trace that say nothing yet."""
+        """Return empty corrections for the drives of a trace."""
         return cls(fingerprints_of(checked_trace(trace)))
 
     def with_name(self, name: str, kind: str, step: str) -> Corrections:
@@ -163,7 +163,7 @@ class Corrections:
         one_of("kind", kind, PAIRS, MapError)
         said = Said(kind, (_a_step("first", first), _a_step("second", second)))
         if said.steps[0] == said.steps[1]:
-            raise MapError(f"second: expected another step than {first}, got it again; name two")
+            raise MapError(f"second: expected a step other than {first}, got it again; name two")
         return self if said in self.pairs else replace(self, pairs=(*self.pairs, said))
 
     def with_gateway(self, is_open: bool, seen: Iterable[tuple[str, float]]) -> Corrections:

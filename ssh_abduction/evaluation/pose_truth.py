@@ -309,9 +309,9 @@ class _Related:
         if not self.known.any():
             began, ended = relations.times[0], relations.times[-1]
             raise TraceError(
-                f"{named(trace.source or 'trace')}: time: expected steps at times that are "
-                f"related, from {began:g} to {ended:g} s, got none; "
-                "import the trace from the log that the relations are of"
+                f"{named(trace.source or 'trace')}: time: expected steps between {began:g} and "
+                f"{ended:g} s, as the relations have, got none; import the trace from the log of "
+                "the relations"
             )
 
     def seen_from(self, step: int) -> tuple[Array, Array, Array]:

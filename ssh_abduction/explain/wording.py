@@ -166,7 +166,7 @@ class Words:
 
 
 def that_path(sentence: str) -> str:
-    """Replace repeated mentions of a path by `that path`, unless another path was mentioned."""
+    """Replace later mentions of a path by `that path`, until another path is mentioned."""
     seen = set[str]()
 
     def name(match: re.Match[str]) -> str:

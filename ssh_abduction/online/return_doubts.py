@@ -41,7 +41,7 @@ class ReturnDoubts:
         self._least: dict[Doubt, int] = {}  # lower bound of the dstates of a map without the return
 
     def in_doubt(self, ssh_map: SSHMap, trace: Trace) -> Iterator[Doubt]:
-        """Yield the returns of a map that are in doubt. The latest come first.
+        """Yield the doubtful returns of a map, the latest first.
 
         Args:
             ssh_map: A minimal map.

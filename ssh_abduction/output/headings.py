@@ -27,7 +27,7 @@ from ssh_abduction.data.trace import Trace
 Course: TypeAlias = tuple[int, ...]
 
 # Radians. If a drawing is off by more than this, a turn may go to the wrong side. The first is for
-# turns by known degrees, the second for turns of which only the side is known.
+# turns by known degrees, the second for turns to a known side.
 WRONG, WRONG_GUESS = math.radians(46), math.radians(61)
 # Number of averaging sweeps for each set of weights, and number of times that weights are updated.
 SWEEPS, REWEIGHTED = 60, 15
@@ -35,9 +35,9 @@ LEAST_MISSED = 0.02  # radians: turns with a smaller error all get the same weig
 EXACT = 1e-6  # radians: a turn with a smaller error agrees with the headings
 Turns: TypeAlias = Mapping[str, "str | float"]
 
-# Degrees clockwise that are assumed for turns of which only the side is known.
+# Degrees clockwise that are assumed for turns to a known side.
 SIDES = {"right": 90.0, "around": 180.0, "left": 270.0}
-# The weights of a turn with known degrees, and of a turn of which only the side is known.
+# The weights of a turn by known degrees, and of a turn to a known side.
 SURE, GUESSED = 1.0, 0.2
 
 

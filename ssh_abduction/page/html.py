@@ -103,8 +103,8 @@ def view_page(
         a_function("beliefs", beliefs, MapError, what="a function of a map")
     if (run is None) != (beliefs is None):
         raise MapError(
-            "beliefs: expected a run that they are of, and beliefs for a run, "
-            "got one of the two; give both, or none"
+            "beliefs: expected both a run and its beliefs, or neither, got one of the two; give "
+            "the other one"
         )
     localised = None if run is None or beliefs is None else Run(run, beliefs)
     return Page(content_of(source, trace, localised))

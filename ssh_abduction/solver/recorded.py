@@ -289,7 +289,7 @@ def levels_in(read: FieldReader, record: Mapping[str, Any], maps: int) -> tuple[
     )
     counts = [level.count for level in found]
     if sum(counts) != maps:
-        raise read.wrong("levels", f"{maps} maps in all, as so many are listed", counts)
+        raise read.wrong("levels", f"{maps} maps in all, the number of listed maps", counts)
     return found
 
 

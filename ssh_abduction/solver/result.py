@@ -471,7 +471,7 @@ def _check_steps(
         if steps != len(trace):
             raise MapError(
                 f"{where}: steps: expected those of a trace of {len(trace)} steps, got {steps}; "
-                "it is of another trace"
+                "give the trace of these maps"
             )
 
 

@@ -33,7 +33,7 @@ _BEGIN = b"\0ssh-abduction answers\n"  # whatever Python prints before this is n
 
 
 class Lost(NamedTuple):
-    """Takes the place of an answer if the process of a task ended, or was killed as it was late.
+    """Stands for a missing answer, as the process of a task ended or was killed for being late.
 
     `number` is the number of the task. `late` says whether it took too long.
     """

@@ -44,7 +44,7 @@ class Fitting(Protocol):
     """Axioms beyond the causal theory that labels have to satisfy (`engines/frameless.py`)."""
 
     def fits(self, labels: Sequence[int]) -> bool:
-        """Whether some map has these labels and satisfies the further axioms."""
+        """Whether some map with these labels satisfies these axioms."""
         ...
 
     def forbid(self, labels: Sequence[int]) -> None:

@@ -278,7 +278,7 @@ class VisitProgram:
     def standing(self, labels: Sequence[int]) -> dict[int, tuple[int, int]]:
         """For each dstate, return the visit and slot (direction) of some node there.
 
-        Dstates of which clingo has no node are left out.
+        Dstates without a node in clingo are left out.
 
         Args:
             labels: The dstate of each node.

@@ -4,8 +4,8 @@ A star is the gateways that are seen at a step. For some directions it may be un
 is a gateway. A *frame* is a star after this is decided. The gateways of a frame are numbered
 clockwise; these numbers are its *slots*. All frames at a place have the same number N of slots.
 Slot K of a frame is slot (K+C) mod N of an earlier frame, for some *shift* C. A gateway is seen at
-some bearing, give or take a spread in degrees. So the shift limits by which rotations the robot can
-have turned between the two frames. A set of rotations has whole degrees clockwise. Its ends are
+some bearing, which may be off by a spread in degrees. So each shift allows only some rotations of
+the robot between the two frames. A set of rotations has whole degrees clockwise. Its ends are
 rounded outwards. If it is empty, the two frames are not seen at one place with this shift.
 
 >>> from ssh_abduction.data.star import Star
@@ -232,7 +232,7 @@ def _looks(first: Frame, then: Frame, shift: int, towards: int) -> bool:
 
 
 def _near(degrees: float, spread: float) -> bool:
-    """Whether an angle may be 0, give or take a spread."""
+    """Whether an angle is within a spread of 0."""
     return abs((degrees + 180) % 360 - 180) <= spread + ROUNDING
 
 

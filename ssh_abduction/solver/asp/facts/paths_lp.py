@@ -203,9 +203,9 @@ class Segments:
 
 
 def tight_facts(homes: Mapping[int, Iterable[int]]) -> str:
-    """Return the facts for paths_frameless.lp that say which fixed places each place may be.
+    """Return the facts for paths_frameless.lp that list the fixed places that a place may equal.
 
-    Fixed places are pairwise different, and with these facts there are no other places.
+    Fixed places are pairwise different. The facts exclude all other places.
     """
     return "tight.\n" + "\n".join(
         f"fixed({place},{home})." for place, found in homes.items() for home in found
