@@ -17,10 +17,9 @@ from ssh_abduction.explain.axioms import Interrupted
 from ssh_abduction.explain.no_map import Explanation, explain
 from ssh_abduction.learning.runner_up import second_map
 from ssh_abduction.runtime import program
-from ssh_abduction.solver import Backbone, Cost, Search, Solution, Status
+from ssh_abduction.solver import Backbone, Cost, Search, Solution, Status, Watch
 from ssh_abduction.solver import ending as written_ending
 from ssh_abduction.solver import opening as written_opening
-from ssh_abduction.solver.asp.limits import Watch
 
 # After Ctrl-C, only traces of at most this many steps get warnings. 40,000 steps would take 2 s.
 SOON = 10_000
