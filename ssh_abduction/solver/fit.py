@@ -118,12 +118,12 @@ class Poses:
         return float((self._residuals(self._best()) ** 2).sum())
 
     def settled(
-        self, start: Array, fixed: Sequence[int], wanted: Sequence[int]
+        self, start: Array | None, fixed: Sequence[int], wanted: Sequence[int]
     ) -> tuple[float, Array, Array]:
         """Find the unknowns with the least chi-square, and their covariance.
 
         Args:
-            start: Unknowns to begin with.
+            start: Unknowns to begin with; None to compute some.
             fixed: The indices of unknowns whose values are known.
             wanted: The indices of the unknowns whose covariance is wanted.
 

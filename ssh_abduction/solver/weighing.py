@@ -15,6 +15,8 @@ may be wrong, a misfit excludes only maps that believe the displacements that ca
 *Rivals.* A map is too expensive if it costs at least `WITHIN` nats more than the best one. So all
 cheaper maps are found, each with a probability proportional to exp(-cost). *Places* are not
 minimised first. Evidence gives their lower bound: steps that are pairwise at different places.
+
+If the robot may be off the poses of its dstates, as in logs, `scatter.py` gives a better bound.
 """
 
 from __future__ import annotations
@@ -52,6 +54,7 @@ from ssh_abduction.solver.map_list import Priced
 from ssh_abduction.solver.misfit import Misfit
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.prefixes import Prefixes
+from ssh_abduction.solver.scatter import is_for, least_cost
 from ssh_abduction.solver.values import Cost, Status
 from ssh_abduction.solver.weighed import EQUAL, Rival, Weighed
 from ssh_abduction.theory.evidence import Equality
@@ -155,6 +158,9 @@ class Weighing:
         self._least = {"places": least_places(parts.task.problem)}
         may_be_wrong = range(1, len(parts.task.trace)) if parts.task.theory.jumped else ()
         self._base = self._misfit.of_returns([], may_be_wrong) / 2  # of every map
+        if self.candidates and is_for(parts.task.problem):
+            most = self.candidates[0].nats
+            self.bound = least_cost(parts.task.problem, self._misfit.visit, most)
         task = replace(parts.task, speedups=replace(parts.task.speedups, prefixes=False))
         judging, engine = _Judging(task.problem, self), _engine(task, parts)
         engine.grow(len(task.trace))

@@ -1,0 +1,281 @@
+"""A lower bound on the cost of all maps of a log, whose robot is off the poses of its dstates.
+
+A visit lies some decimetres beside its place. Each map pays for this scatter, and for bending the
+track so that visits come nearer to each other.
+
+If the track could not bend, a map would be a clustering of known poses: dstates and places are
+facilities with prices (`facilities.py`). The price of a place and PLACES of the error of position
+are in one problem, whose points are the visits. The price of a dstate and the rest of the error are
+in another problem, whose points are the steps. The sum of both is a lower bound.
+
+The track can bend. Let z be its most important errors as independent standard normal variables, so
+that bending costs |z|^2 / 2. For each c > 0 and all vectors, |a + b|^2 >= c / (1 + c) |a|^2 - c
+|b|^2. So if all variances are multiplied by 1 + 1 / c, the bound holds with a loss of at most
+c |b|^2 / 2 for each point. Here b is how far z moves the point against the other points of its
+cluster. Points that are too far apart to share a facility lose at most
+their share, and only if z brings them nearer by that much. Each loss is at most a quadratic form of
+z. The numbers c are so small that the sum of all these forms is at most |z|^2 / 2. So the bound
+holds for each z, and there is no loss.
+
+The poses are linearised at the best track without returns. Axioms and views can only raise the
+cost, except that steps with different views are never one dstate.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ssh_abduction.data.drives import drives_of
+from ssh_abduction.data.odometry import Odometry
+from ssh_abduction.runtime.clock import look_at_clock
+from ssh_abduction.solver.equations import spreads_of
+from ssh_abduction.solver.facilities import Array, Facilities
+from ssh_abduction.solver.fit import Poses
+from ssh_abduction.theory.settle import Problem
+
+# The share of the error of position that is counted in the problem of places.
+PLACES = 0.3
+# The number of errors of the track that are treated one by one. The rest adds to the scatter.
+MODES = 25
+# Points that are too far apart to share a facility, by this many standard deviations, are far. If
+# the losses of far points leave less than LEFT of what bending costs, fewer points count as far.
+GAPS, LEFT = (4.0, 8.0, 16.0), 0.4
+# Shares are first computed with variances multiplied by FIRST. Later, no share may be more than
+# GROWTH times the first one plus SLACK.
+FIRST, GROWTH, SLACK = 1.3, 1.15, 0.2
+# The bound alone does not prove a map to be the best one, as poses are linearised.
+UNPROVEN = 0.01
+# Points whose own loss exceeds LOOSE, and LOOSER times the median, are left out. At most LARGEST
+# far points are treated one by one for each point.
+LOOSE, LOOSER, LARGEST = 0.25, 3.0, 40
+
+
+def is_for(problem: Problem) -> bool:
+    """Say whether the bound holds for a trace and its theory, and is more than nothing."""
+    trace, theory = problem.trace, problem.theory
+    is_known = all(step.displacement is not None for step in trace.steps[1:])
+    one = len(drives_of(trace)) == 1 and is_known and len(trace) > 2
+    return one and bool(spreads_of(trace).any()) and not theory.has_faults
+
+
+def least_cost(problem: Problem, visit: Sequence[int], most: float) -> float:
+    """Compute a lower bound on the cost of every map.
+
+    Args:
+        problem: The trace and its theory, for which `is_for` is true.
+        visit: For each step, the first step of its visit.
+        most: The cost of some map, in nats.
+
+    Returns:
+        The bound in nats, a little less than `most` at most; 0 if there is none.
+    """
+    track, within = _Track.of(problem), math.sqrt(2 * most)
+    parts = _parts(problem, track, np.array(visit))
+    firsts = [part.stretched(np.full(len(part.points), FIRST)).first_shares() for part in parts]
+    for gap in GAPS:
+        losses = [_Losses.of(*both, gap, within) for both in zip(parts, firsts, strict=True)]
+        left = 1.0 - _largest(sum(found.far.sum(0) for found in losses))
+        if left >= LEFT:
+            break
+    else:
+        return 0.0
+    bending = _largest(sum(found.scaled().sum(0) for found in losses))
+    shares = [found.shares(left / bending) for found in losses]
+    return min(track.nats + sum(float(found.sum()) for found in shares), most - UNPROVEN)
+
+
+@dataclass(frozen=True, eq=False)
+class _Track:
+    """The best track without returns, linearised.
+
+    Attributes:
+        nats: What its misfit to the displacements and closures costs.
+        poses: x, y and heading of each step, in metres and radians, (n, 3).
+        moves: How far each of the most important errors of the track moves each pose, (n, 3, k).
+        scatter: The variances of the pose of each step about its dstate, with all other errors of
+            the track, (n, 3).
+    """
+
+    nats: float
+    poses: Array
+    moves: Array
+    scatter: Array
+
+    @classmethod
+    def of(cls, problem: Problem) -> _Track:
+        """Fit the track of a trace with one drive."""
+        trace, n = problem.trace, len(problem.trace)
+        odometry = replace(trace.odometry or Odometry(), offset=0.0, facing=0.0)
+        at_steps = Poses(replace(trace, odometry=odometry), range(n), range(n))
+        squares, unknown, covariance = at_steps.settled(None, (0, 1, 2 * n), range(3 * n))
+        poses = np.stack([unknown[: 2 * n : 2], unknown[1 : 2 * n : 2], unknown[2 * n : 3 * n]], 1)
+        turned = _without_rigid_motions(poses)
+        scatter = spreads_of(trace)
+        order = np.column_stack(
+            [2 * np.arange(n), 2 * np.arange(n) + 1, 2 * n + np.arange(n)]
+        ).ravel()
+        deviation = np.sqrt(scatter).ravel()
+        relative = (turned @ covariance @ turned.T)[np.ix_(order, order)]
+        values, vectors = np.linalg.eigh(relative / np.outer(deviation, deviation))
+        values, vectors = values[::-1].clip(0.0), vectors[:, ::-1]
+        moves = vectors[:, :MODES] * np.sqrt(values[:MODES]) * deviation[:, None]
+        others = float(values[MODES]) if len(values) > MODES else 0.0
+        return cls(squares / 2, poses, moves.reshape(n, 3, -1), scatter * (1 + others))
+
+
+def _without_rigid_motions(poses: Array) -> Array:
+    """Return the matrix that removes translations and rotations of all poses from their errors."""
+    n, middle = len(poses), poses.mean(0)
+    motions = np.zeros((3 * n, 3))
+    motions[: 2 * n : 2, 0] = motions[1 : 2 * n : 2, 1] = motions[2 * n :, 2] = 1
+    motions[: 2 * n : 2, 2] = middle[1] - poses[:, 1]
+    motions[1 : 2 * n : 2, 2] = poses[:, 0] - middle[0]
+    fitted = np.zeros((3, 3 * n))
+    fitted[:, : 2 * n] = np.linalg.pinv(motions[: 2 * n])
+    matrix: Array = np.identity(3 * n) - motions @ fitted
+    return matrix
+
+
+def _parts(problem: Problem, track: _Track, visit: NDArray[np.int_]) -> list[_Part]:
+    """Return the problems of dstates and of places."""
+    theory = problem.theory
+    dstate, place, _ = theory.prices
+    has_places = theory.level != "causal" and place > 0
+    views = [step.view for step in problem.trace]
+    tell = "functional_view" in theory.hard and None not in views
+    number = {view: i for i, view in enumerate(dict.fromkeys(views))}
+    kinds = np.array([number[view] if tell else 0 for view in views])
+    weights = np.array([1 - PLACES * has_places] * 2 + [1.0])
+    parts = [_Part(track.poses, track.scatter / weights, kinds, dstate, track.moves)]
+    if has_places:
+        first, at, steps = np.unique(visit, return_inverse=True, return_counts=True)
+        mean = np.zeros((len(first), len(at)))
+        mean[at, np.arange(len(at))] = 1 / steps[at]
+        moves = np.einsum("vt,tak->vak", mean, track.moves[:, :2])
+        scatter = track.scatter[first, :2] / steps[:, None] / PLACES
+        alike = np.zeros(len(first), dtype=int)
+        parts.append(_Part(mean @ track.poses[:, :2], scatter, alike, place, moves))
+    return parts
+
+
+@dataclass(frozen=True, eq=False)
+class _Part(Facilities):
+    """Points that share facilities, and how errors of the track move them.
+
+    Attributes:
+        moves: How far each error of the track moves each point, (n, d, k).
+    """
+
+    moves: Array
+
+    def only(self, chosen: NDArray[np.bool_]) -> _Part:
+        """Return some of the points."""
+        return replace(
+            self,
+            points=self.points[chosen],
+            variances=self.variances[chosen],
+            kinds=self.kinds[chosen],
+            moves=self.moves[chosen],
+        )
+
+    def stretched(self, factors: Array) -> _Part:
+        """Multiply the variances of each point."""
+        return replace(self, variances=self.variances * factors[:, None])
+
+    def first_shares(self) -> Array:
+        """Compute approximate shares, none above the price."""
+        return self.shares(np.full(len(self.points), self.price), checked=False)
+
+
+@dataclass(frozen=True, eq=False)
+class _Losses:
+    """What points of a part may lose if the track bends, as quadratic forms of its errors z.
+
+    Attributes:
+        part: The points.
+        most: No share of a point may be more than this, (n,).
+        gap: Points that are too far apart by this many standard deviations count as far.
+        within: Bending by more than this is too expensive.
+        near: Twice what each point loses against points that it may share a facility with, if c is
+            1, (n, k, k).
+        far: Twice what each point loses against the other points, (n, k, k).
+    """
+
+    part: _Part
+    most: Array
+    gap: float
+    within: float
+    near: Array
+    far: Array
+
+    @classmethod
+    def of(cls, part: _Part, first: Array, gap: float, within: float) -> _Losses:
+        """Bound the losses, given approximate shares. Leave out points that lose too much."""
+        most = np.minimum(part.price, GROWTH * first + SLACK)
+        losses = cls._of_all(part, most, gap, within)
+        sizes = _each_largest(losses.near + losses.far)
+        kept = sizes <= max(LOOSE, LOOSER * float(np.median(sizes)))
+        return losses if kept.all() else cls._of_all(part.only(kept), most[kept], gap, within)
+
+    @classmethod
+    def _of_all(cls, part: _Part, most: Array, gap: float, within: float) -> _Losses:
+        unit = np.sqrt(part.variances.max(0))
+        reach = np.sqrt(2 * most)
+        away = np.linalg.norm(part.offsets(part.points) / unit, axis=-1) - reach - reach[:, None]
+        near, far = [], []
+        for i, apart in enumerate(away):
+            look_at_clock()
+            moved = part.moves[i] - part.moves
+            is_near = (part.kinds == part.kinds[i]) & (apart < gap)
+            near.append(_dominating(moved[is_near] / np.sqrt(2 * part.variances[i])[:, None]))
+            is_far = (part.kinds == part.kinds[i]) & (apart >= gap)
+            gaps, moved = apart[is_far], moved[is_far] / unit[:, None]
+            is_cheap = gaps < within * np.linalg.norm(moved, 2, axis=(1, 2))
+            factors = np.sqrt(2 * most[i]) / gaps[is_cheap]
+            far.append(_dominating(moved[is_cheap] * factors[:, None, None]))
+        return cls(part, most, gap, within, np.array(near), np.array(far))
+
+    def _weights(self) -> Array:
+        """Return the numbers c of the points, up to a factor."""
+        sizes = _each_largest(self.near)
+        weights = 1 / np.sqrt(sizes + sizes.max(initial=0.0) / 100 + 1e-6)
+        scaled: Array = weights / _largest(np.einsum("n,nij->ij", weights, self.near))
+        return scaled
+
+    def scaled(self) -> Array:
+        """Return the losses against near points for the numbers c, (n, k, k)."""
+        losses: Array = self._weights()[:, None, None] * self.near
+        return losses
+
+    def shares(self, factor: float) -> Array:
+        """Compute the shares if the numbers c are multiplied by a factor."""
+        c = factor * self._weights()
+        return self.part.stretched(1 + 1 / c).shares(self.most)
+
+
+def _dominating(moves: Array) -> Array:
+    """Find a quadratic form that is at least |a z|^2 for each of m matrices a, (m, d, k)."""
+    form = np.zeros((moves.shape[2], moves.shape[2]))
+    sizes = (moves**2).sum((1, 2))
+    order = np.argsort(-sizes)
+    for a in moves[order[:LARGEST]]:
+        values, vectors = np.linalg.eigh(a.T @ a - form)
+        form += (vectors * values.clip(0.0)) @ vectors.T
+    if len(order) > LARGEST:
+        form += sizes[order[LARGEST]] * np.identity(len(form))
+    return form
+
+
+def _largest(form: Array) -> float:
+    """Return the largest eigenvalue of a quadratic form, at least a tiny number."""
+    return max(float(np.linalg.eigvalsh(form)[-1]), 1e-9)
+
+
+def _each_largest(forms: Array) -> Array:
+    """Return the largest eigenvalue of each of n quadratic forms, (n,)."""
+    return np.array([_largest(form) for form in forms])

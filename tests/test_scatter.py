@@ -1,0 +1,133 @@
+"""Lower bounds on clusterings (solver/facilities.py) and on costs of logs (solver/scatter.py)."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ssh_abduction import Theory, Trace, solve
+from ssh_abduction.data.odometry import Odometry
+from ssh_abduction.solver.facilities import Facilities
+from ssh_abduction.solver.misfit import Misfit
+from ssh_abduction.solver.scatter import is_for, least_cost
+from ssh_abduction.theory.settle import Problem, settle
+
+PRICE = 8.0
+OFF = Odometry(0.05, 0.02, 0.005, 0.02, 0.1, 0.02, 0.01, 0.001, offset=0.2, facing=0.1)
+QUARTER = math.pi / 2
+
+
+def partitions(items: Sequence[int]) -> Iterator[list[list[int]]]:
+    """Yield all ways to divide items into sets."""
+    if not items:
+        yield []
+        return
+    for rest in partitions(items[1:]):
+        yield [[items[0]], *rest]
+        for k in range(len(rest)):
+            yield [*rest[:k], [items[0], *rest[k]], *rest[k + 1 :]]
+
+
+def least_by_trying(facilities: Facilities) -> float:
+    """Compute the least cost of all clusterings. Headings are near 0."""
+    points, weights = facilities.points, 1 / facilities.variances
+
+    def cost(cluster: list[int]) -> float:
+        w, p = weights[cluster], points[cluster]
+        mean = (w * p).sum(0) / w.sum(0)
+        return facilities.price + float((w * (p - mean) ** 2).sum()) / 2
+
+    return min(
+        sum(map(cost, parts))
+        for parts in partitions(range(len(points)))
+        if all(len(set(facilities.kinds[part])) == 1 for part in parts)
+    )
+
+
+@settings(max_examples=40)
+@given(st.integers(1, 6), st.sampled_from([2, 3]), st.integers(0, 10**6))
+def test_shares_are_a_lower_bound_of_all_clusterings(n: int, size: int, seed: int) -> None:
+    draw = np.random.default_rng(seed)
+    points = draw.uniform(0, 2.5, (n, size)) * [1, 1, 0.3][:size]
+    variances = draw.uniform(0.05, 0.15, (n, size)) * [1, 1, 0.1][:size]
+    facilities = Facilities(points, variances, draw.integers(0, 2, n), PRICE)
+    shares = facilities.shares(np.full(n, PRICE))
+    least = least_by_trying(facilities)
+    assert 0.8 * least <= shares.sum() <= least + 1e-6
+
+
+def test_shares_of_clusters_that_are_far_apart_are_the_cost_of_these() -> None:
+    points = np.array([[0.0, 0, 3.1], [0.2, 0, -3.1], [9, 9, 0], [9, 9, 0.1], [9, 9, 2]])
+    facilities = Facilities(points, np.full((5, 3), 0.04), np.zeros(5, dtype=int), PRICE)
+    shares = facilities.shares(np.full(5, PRICE))
+    turned = 2 * math.pi - 6.2
+    costs = [(0.2**2 + turned**2) / 4 / 0.04, 0.1**2 / 4 / 0.04, 0]
+    assert shares.sum() == pytest.approx(3 * PRICE + sum(costs), rel=0.02)
+    assert shares.sum() <= 3 * PRICE + sum(costs)
+
+
+def off_its_places(seed: int) -> Trace:
+    """A random walk among crossings of streets. The robot is some decimetres off the crossings."""
+    draw = random.Random(seed)
+    steps = draw.randint(3, 6)
+    views = "".join(draw.choice("ab") for _ in range(steps))
+    turns = [draw.random() < 0.5 for _ in range(steps - 1)]
+    moves = [
+        (0.0, 0.0, QUARTER + draw.gauss(0, 0.05))
+        if turn
+        else (draw.choice([1, 2, 3]) + draw.gauss(0, 0.2), draw.gauss(0, 0.2), draw.gauss(0, 0.05))
+        for turn in turns
+    ]
+    actions = ["left" if turn else "travel" for turn in turns]
+    return replace(Trace.from_steps(views, actions, displacements=moves), odometry=OFF)
+
+
+def bound_of(problem: Problem, most: float) -> float:
+    return least_cost(problem, Misfit(problem).visit, most)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_no_map_costs_less_than_the_bound(seed: int) -> None:
+    trace = off_its_places(seed)
+    theory = Theory.causal() if seed % 3 == 0 else Theory.topological().replace(boundary="none")
+    theory = theory.replace(weigh="cost", prices=((8, 8, 0), (3, 5, 0))[seed % 2])
+    solution = solve(trace, theory)
+    assert solution.status.value == "optimal"
+    assert solution.weighed is not None
+    problem = settle(trace, theory)
+    assert is_for(problem)
+    least = solution.weighed.nats
+    assert 0 < bound_of(problem, 2 * least) <= least + 1e-6
+
+
+def rounds(count: int) -> Trace:
+    """A robot that drives around a square with sides of 4 m, and turns left at each corner."""
+    draw = random.Random(7)
+    moves = [(4 + draw.gauss(0, 0.1), draw.gauss(0, 0.1), 0.0), (0.0, 0.0, QUARTER)] * (4 * count)
+    views, actions = "a" * (8 * count + 1), ["travel", "left"] * (4 * count)
+    return replace(Trace.from_steps(views, actions, displacements=moves), odometry=OFF)
+
+
+def test_the_bound_is_near_the_least_cost_if_places_are_far_apart() -> None:
+    trace = rounds(1)
+    theory = Theory.topological().replace(boundary="none", star="none", weigh="cost")
+    solution = solve(trace, theory)
+    assert solution.status.value == "optimal"
+    assert solution.weighed is not None
+    least = solution.weighed.nats
+    assert 0.6 * least <= bound_of(settle(trace, theory), least) < least
+
+
+def test_traces_and_theories_that_the_bound_is_not_for() -> None:
+    trace = rounds(1)
+    assert is_for(settle(trace))
+    assert not is_for(settle(trace, Theory(misread=2.0)))
+    assert not is_for(settle(replace(trace, odometry=replace(OFF, offset=0.0, facing=0.0))))
+    assert not is_for(settle(trace.without_displacements_at((2,))))
