@@ -15,7 +15,7 @@ from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import each_heeding, heeding, look_at_clock
-from ssh_abduction.solver import Status, candidates, fallback
+from ssh_abduction.solver import Status, candidates, fallback, ranking
 from ssh_abduction.solver.fit import fit
 from ssh_abduction.solver.guesses.tree import Sketch
 from ssh_abduction.solver.judging import Judging
@@ -124,6 +124,14 @@ def test_there_is_a_map_when_the_time_is_over(steps: int, wrong: int, stars: boo
         solution = solve(trace, time_limit=1e-6)
     assert (solution.status, solution.stopped) == (Status.FEASIBLE, "time limit")
     assert check(trace, solution.maps[0], solution.theory) == ()
+
+
+@pytest.mark.parametrize(("left", "fits"), [(0.5, [True, False]), (-101.0, [False, False])])
+def test_only_the_first_map_has_poses_when_the_time_is_over(left: float, fits: list[bool]) -> None:
+    """Its fit may end some time beyond the limit, and no later."""
+    with patch.object(ranking, "LATEST", 100.0):
+        found = ranking.Ranking(DRIVEN).ranked(iter([MAP, MAP]), lambda: True, lambda: left)
+        assert [bool(ssh_map.fit) for ssh_map in found] == fits
 
 
 def test_a_sketch_that_the_checker_refuses_is_not_the_last_one() -> None:

@@ -31,8 +31,7 @@ TOO_SMALL, TOO_LARGE = 1.5, 2.0
 STANDING = 2.0
 NEVER_LESS = 0.01  # the least factor to name, as it would be 0 if displacements agree exactly
 
-OVERTIME = 0.3  # seconds beyond the limit for the fit of the first map
-LATEST = 0.6  # no fit ends later than this many seconds beyond the limit
+LATEST = 0.6  # the fit of the first map ends at most this many seconds beyond the limit
 
 _Key: TypeAlias = tuple[tuple[int, ...], tuple[int | None, ...], tuple[int, ...]]
 
@@ -64,18 +63,17 @@ class Ranking:
         Args:
             maps: The maps as they are found. Only the first RANKED of them are sorted.
             over: Returns whether a limit is reached. From then on, maps get no fit and keep their
-                order. Only the fit of the first map may take OVERTIME seconds more.
-            left: Returns the seconds left until the limit, less than 0 beyond it. The fit of the
-                first map ends LATEST seconds beyond it.
+                order. Only the fit of the first map may end LATEST seconds beyond the limit.
+            left: Returns the seconds left until the limit, less than 0 beyond it.
         """
-        overtime = Watch(OVERTIME)
+        overtime: Watch | None = None
 
         def look(first: bool) -> None:
+            nonlocal overtime
             if over():
-                if not first or left() < -LATEST:
+                if not first:
                     raise LimitError("time limit")
-                if not overtime.running:
-                    overtime.start()
+                overtime = overtime or Watch().part(min(left(), 0.0) + LATEST)
                 overtime.check()
 
         def fitted(ssh_map: SSHMap, first: bool = False) -> SSHMap:
