@@ -624,3 +624,54 @@ def test_a_closed_standard_error_is_no_error(
     out = capsys.readouterr().out
     assert out.startswith("optimal: 8 dstates")
     assert "nosuch" not in out
+
+
+def test_an_answer_without_a_map_keeps_the_maps_of_a_file(
+    room: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clash = Trace.from_steps("xyabcd", ["right", "travel", "travel", "around", "around"])
+    wrong, maps = saved(clash, tmp_path), tmp_path / "maps.json"
+    assert main(["solve", wrong, "-o", str(maps)]) == 20
+    assert json.loads(maps.read_text())["maps"] == []
+    assert main(["solve", room, "-o", str(maps)]) == 0
+    good = maps.read_text()
+    capsys.readouterr()
+    for words in ([], ["--json"]):
+        assert main(["solve", wrong, "-o", str(maps), *words]) == 20
+        assert "maps.json: keeps the maps that it had" in capsys.readouterr().err
+        assert maps.read_text() == good
+
+
+def test_an_error_is_json_too(
+    room: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for words in (["solve", "nosuch"], ["check", "nosuch", room], ["solve", room, "-n", "-1"]):
+        assert main([*words, "--json"]) == 1
+        out, err = capsys.readouterr()
+        data = json.loads(out)
+        assert list(data) == ["status", "error"]
+        assert (data["status"], err) == ("error", f"ssh-abduction: {data['error']}\n")
+    assert main(["solve", room, "--json", "-o", str(tmp_path / "nosuch" / "maps.json")]) == 1
+    assert json.loads(capsys.readouterr().out)["status"] == "optimal"  # no error follows it
+
+
+def test_check_prints_violations_as_json(
+    solved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["check", str(solved), ACES, "--bound", "--json"]
+    assert main(words) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert (data["holds"], data["maps"], data["violations"]) == (True, 4, [])
+    assert data["sentences"][-1] == "the maps have 19: no map has fewer"
+    broken = json.loads(solved.read_text())
+    ends = broken["maps"][1]["paths"][0]["order"]
+    ends.reverse()
+    solved.write_text(json.dumps(broken))
+    assert main(words[:3]) == 20
+    lines = capsys.readouterr().out.splitlines()
+    assert main([*words[:3], "--json"]) == 20
+    data = json.loads(capsys.readouterr().out)
+    assert (data["holds"], {v["map"] for v in data["violations"]}) == (False, {2})
+    first = data["violations"][0]
+    assert first["axiom"] in lines[0]
+    assert first["message"] in lines[0]

@@ -19,7 +19,7 @@ from in_processes import sleep, stay, vanish
 from limits import Case, cases, outcome
 from worlds import rectangle
 
-from ssh_abduction import Theory, Trace, solve
+from ssh_abduction import Solution, Theory, Trace, solve
 from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.explain.axioms import Axioms, Interrupted
 from ssh_abduction.explain.piece import Piece
@@ -166,7 +166,7 @@ def test_who_is_ended_prints_what_is_known(noisy: Path) -> None:
     ) as process:
         assert process.stderr
         assert any(
-            "progress: prefix" in line for line in process.stderr
+            "progress: clingo" in line for line in process.stderr
         )  # the search is under way, and will not end by itself
         process.send_signal(signal.SIGTERM)
         out, _ = process.communicate(timeout=SOON)
@@ -427,3 +427,23 @@ def test_a_busy_machine_has_a_map_when_the_limit_is_long_over(
         solution = solve(trace, theory, time_limit=0.1, max_maps=1)
         assert solution.stopped == "time limit"
         assert len(solution.maps) == 1
+
+
+@pytest.mark.parametrize("words", [[], ["--json"]])
+def test_who_is_ended_writes_the_best_map(words: list[str], room: str, tmp_path: Path) -> None:
+    program = """
+import sys, time
+from ssh_abduction.cli import guard, main
+from ssh_abduction.solver import Search
+guard.LATE = (1.0, 0.0)
+Search.__iter__ = lambda search: iter(lambda: time.sleep(100), 0)
+main(sys.argv[1:])
+"""
+    maps = str(tmp_path / "maps.json")
+    command = [sys.executable, "-c", program, "solve", room, "--time-limit", "0.3", "-o", maps]
+    done = subprocess.run([*command, *words], capture_output=True, timeout=SOON, check=False)
+    assert (done.returncode, done.stderr) == (10, b"")
+    solution = Solution.load(maps)
+    assert (solution.stopped, len(solution)) == ("time limit", 1)
+    if words:
+        assert json.loads(done.stdout)["cost"] == solution.to_dict()["cost"]

@@ -56,6 +56,7 @@ from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.parsing import Parser
 from ssh_abduction.cli.verbosity import add_verbosity, telling
 from ssh_abduction.data.errors import AbductionError, named, printable
+from ssh_abduction.data.files import json_line
 from ssh_abduction.runtime import program
 
 EXIT_ERROR = 1
@@ -184,19 +185,23 @@ def _main(arguments: Sequence[str] | None) -> int:
                 warn([printable(str(warning.message)) for warning in caught])
         sys.stdout.flush()
     except AbductionError as error:
-        print(f"ssh-abduction: {error}", file=sys.stderr)
-        return EXIT_ERROR
+        return _failed(options, str(error))
     except BrokenPipeError:
         # The reader has closed the pipe. Text in Python's buffer must not raise again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:
-        print(
-            "ssh-abduction: "
-            f"{unwritten(error, getattr(options, 'output', None) or 'standard output')}",
-            file=sys.stderr,
-        )
+        _failed(options, unwritten(error, getattr(options, "output", None) or "standard output"))
         with contextlib.suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_ERROR
     return code
+
+
+def _failed(options: argparse.Namespace, message: str) -> int:
+    """Print an error on stderr and, with --json, as JSON on stdout. Returns the exit code."""
+    print(f"ssh-abduction: {message}", file=sys.stderr)
+    if getattr(options, "json", False):
+        with contextlib.suppress(OSError, ValueError):
+            print(json_line({"status": "error", "error": message}), flush=True)
+    return EXIT_ERROR

@@ -8,13 +8,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from ssh_abduction.checker.checker import check, unchecked
+from ssh_abduction.checker.checker import Violation, check, unchecked
 from ssh_abduction.checker.claims import false_claims
 from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.cli.obeying import as_corrected
 from ssh_abduction.cli.options import Verbs, add_maps, add_theory, add_trace, theory_of, trace_of
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import MapError, brief, is_finite, printable
+from ssh_abduction.data.files import json_line
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.maps import SSHMap, maps_of
 from ssh_abduction.data.trace import Trace
@@ -40,11 +41,13 @@ def add_parser(verbs: Verbs) -> None:
         action="store_true",
         help="also check the proof in the file that no map has fewer dstates",
     )
+    parser.add_argument("--json", action="store_true", help="print JSON")
     add_theory(parser, default="the theory of the maps, or topological")
     parser.set_defaults(run=run)
     parser.epilog = (
         "Without --theory, the theory is that of the file of maps. The other options change "
-        "single fields of it. Corrections in corrections.yaml beside the maps are obeyed."
+        "single fields of it. Corrections in corrections.yaml beside the maps are obeyed. "
+        "docs/reference/formats.md describes the JSON."
     )
 
 
@@ -68,30 +71,31 @@ def run(options: argparse.Namespace) -> int:
     # The regions of a map follow from the theory that made it.
     unjudged = other and any(ssh_map.regions is not None for ssh_map in maps)
     maps = [replace(ssh_map, regions=None) for ssh_map in maps] if unjudged else maps
-    broken = 0
-    for i, ssh_map in enumerate(maps):
-        violations = check(trace, ssh_map, resolved)
-        broken += bool(violations)
-        for v in violations[:SHOWN]:
-            steps = (
-                f"{'step' if len(v.steps) == 1 else 'steps'} {', '.join(map(str, v.steps))}: "
-                if v.steps
-                else ""
-            )
-            print(f"map {i + 1}: {v.axiom}: {steps}{printable(v.message)}")
-        if more := violations[SHOWN:]:
-            print(f"map {i + 1}: and {counted(len(more), 'more violations')}")
+    violations = [check(trace, ssh_map, resolved) for ssh_map in maps]
     not_checked = unchecked(resolved)
-    checked = sum(name not in not_checked for name in resolved.axioms)
-    print(f"{len(maps) - broken} of {len(maps)} maps satisfy the {checked} axioms")
-    if not_checked:
-        print(f"not checked, as they are a user's own: {printable(', '.join(not_checked))}")
+    said: list[str] = []  # sentences about what is checked besides the axioms
     if unjudged:
-        print("regions are not checked: the file is of another theory")
+        said.append("regions are not checked: the file is of another theory")
+    holds = not any(violations)
     if resolved.weigh == "cost" and isinstance(data, dict) and data.get("weighed"):
-        broken += not _costs_hold(trace, data, maps, resolved, str(options.maps))
-    if not options.bound:
-        return EXIT_VIOLATED if broken else 0
+        holds &= _costs_hold(trace, data, maps, resolved, str(options.maps), said)
+    if options.bound:
+        _refuse_bound(resolved, solved)
+        broken, doubt = not holds, None
+        if broken:
+            doubt = "some maps break axioms"
+        elif solved is None:
+            doubt = "the file names no theory"
+        elif other:
+            doubt = "the file is of another theory"
+        holds &= _bound(trace, data, theory, maps, doubt, made_by, broken, said)
+    checked = sum(name not in not_checked for name in resolved.axioms)
+    _print(options.json, violations, checked, not_checked, [*map(printable, said)], holds)
+    return 0 if holds else EXIT_VIOLATED
+
+
+def _refuse_bound(resolved: Theory, solved: Theory | None) -> None:
+    """Raise MapError if the proof of a bound does not hold for a theory."""
     if resolved.has_faults or (solved is not None and solved.has_faults):
         raise MapError(
             "bound: expected a theory without faults (misread, slipped), as a clique of steps "
@@ -102,15 +106,61 @@ def run(options: argparse.Namespace) -> int:
             "bound: expected a trace whose views are all known, as a step whose view is unknown "
             "may be any dstate; leave out --bound"
         )
-    doubt = None
-    if broken:
-        doubt = "some maps break axioms"
-    elif solved is None:
-        doubt = "the file names no theory"
-    elif other:
-        doubt = "the file is of another theory"
-    proven = _bound(trace, data, theory, maps, doubt, made_by, bool(broken))
-    return EXIT_VIOLATED if broken or not proven else 0
+
+
+def _print(
+    as_json: bool,
+    violations: Sequence[Sequence[Violation]],
+    checked: int,
+    not_checked: Sequence[str],
+    said: Sequence[str],
+    holds: bool,
+) -> None:
+    """Print what was found.
+
+    Args:
+        as_json: Whether to print JSON.
+        violations: The violations of each map.
+        checked: The number of axioms that were checked.
+        not_checked: The names of the user's own axioms, which cannot be checked.
+        said: Sentences about what was checked besides the axioms.
+        holds: Whether all maps and claims hold.
+    """
+    if as_json:
+        found = [
+            {"map": i, "axiom": v.axiom, "steps": list(v.steps), "message": v.message}
+            for i, some in enumerate(violations, 1)
+            for v in some
+        ]
+        print(
+            json_line(
+                {
+                    "holds": holds,
+                    "maps": len(violations),
+                    "axioms": checked,
+                    "violations": found,
+                    "not_checked": list(not_checked),
+                    "sentences": list(said),
+                }
+            )
+        )
+        return
+    for i, some in enumerate(violations, 1):
+        for v in some[:SHOWN]:
+            steps = (
+                f"{'step' if len(v.steps) == 1 else 'steps'} {', '.join(map(str, v.steps))}: "
+                if v.steps
+                else ""
+            )
+            print(f"map {i}: {v.axiom}: {steps}{printable(v.message)}")
+        if more := some[SHOWN:]:
+            print(f"map {i}: and {counted(len(more), 'more violations')}")
+    sound = sum(not some for some in violations)
+    print(f"{sound} of {len(violations)} maps satisfy the {checked} axioms")
+    if not_checked:
+        print(f"not checked, as they are a user's own: {printable(', '.join(not_checked))}")
+    for sentence in said:
+        print(sentence)
 
 
 def _axioms_of(theory: Theory) -> Theory:
@@ -119,19 +169,23 @@ def _axioms_of(theory: Theory) -> Theory:
 
 
 def _costs_hold(
-    trace: Trace, data: Mapping[str, Any], maps: Sequence[SSHMap], theory: Theory, where: str
+    trace: Trace,
+    data: Mapping[str, Any],
+    maps: Sequence[SSHMap],
+    theory: Theory,
+    where: str,
+    said: list[str],
 ) -> bool:
-    """Compute the costs of maps in nats anew, print what is false, and return whether all hold."""
+    """Compute the costs of maps in nats anew, append to `said` what is false; whether all hold."""
     from ssh_abduction.checker.misfit import LONGEST, false_costs  # loads numpy
 
     Solution.from_dict(data, where, trace)  # the fields that claim costs have the right form
     false = list(false_costs(trace, data, maps, theory))
-    for claim in false:
-        print(printable(claim))
+    said += false
     if len(trace) > LONGEST:
-        print(f"costs in nats are not checked, as the trace has more than {LONGEST} steps")
+        said.append(f"costs in nats are not checked, as the trace has more than {LONGEST} steps")
     elif not false:
-        print("the costs in nats are right: they were computed anew")
+        said.append("the costs in nats are right: they were computed anew")
     return not false
 
 
@@ -143,8 +197,9 @@ def _bound(
     doubt: str | None,
     solved: Theory,
     broken: bool,
+    said: list[str],
 ) -> bool:
-    """Check the lower bound and the other claims in a file of maps, and print the result.
+    """Check the lower bound and the other claims in a file of maps, and append to `said`.
 
     `doubt` says why clingo's proofs may not hold for this trace and theory. Returns whether all
     claims hold.
@@ -160,27 +215,25 @@ def _bound(
             "certificate: expected one beside the maps, got none; use what solve --json printed"
         )
     bound = check_bound(trace, data["certificate"])
-    for fault in bound.faults:
-        print(f"bound: {printable(fault)}")
+    said += [f"bound: {fault}" for fault in bound.faults]
     false = [
         *false_claims(data, maps, len(trace), solved, bound.dstates + len(bound.refuted)),
         *_false_of_maps(data, maps, trace),
     ]
     if not false and not broken and "theory" in data:
         false += _false_of_all(data, trace)
-    for claim in false:
-        print(printable(claim))
+    said += false
     if bound.faults:
         return False
     pairs = bound.dstates * (bound.dstates - 1) // 2
     states = counted(bound.dstates, "dstates")
-    print(
+    said.append(
         f"at least {states}: no two of {counted(bound.dstates, 'steps')} can be one dstate "
         f"({counted(pairs, 'pairs')} checked)"
     )
     total = bound.dstates + (0 if doubt else len(bound.refuted))
     if bound.refuted and doubt:
-        print(
+        said.append(
             f"clingo's verdict on {counted(bound.refuted[0], 'dstates')} and more is left out: "
             f"{doubt}"
         )
@@ -190,7 +243,7 @@ def _bound(
             if len(bound.refuted) > 1
             else str(bound.refuted[0])
         )
-        print(
+        said.append(
             f"at least {counted(total, 'dstates')}, if clingo is right that there is no map of "
             f"{sizes}"
         )
@@ -200,7 +253,7 @@ def _bound(
             if fewest < total
             else f"{fewest - total} more than proven"
         )
-        print(
+        said.append(
             f"the maps have {fewest}" + (": no map has fewer" if fewest == total else f", {beyond}")
         )
     return not false and (fewest is None or fewest >= total)

@@ -9,10 +9,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from itertools import zip_longest
+from pathlib import Path
 from typing import Any, TypeAlias
 from weakref import WeakKeyDictionary
 
-from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.errors import MapError, named
+from ssh_abduction.data.map_file import read_json
+from ssh_abduction.data.maps import SSHMap, maps_of
 from ssh_abduction.explain.axioms import Interrupted
 from ssh_abduction.explain.no_map import Explanation, explain
 from ssh_abduction.learning.runner_up import second_map
@@ -133,6 +136,35 @@ def warn(warnings: Sequence[str]) -> None:
     """Print warnings on stderr."""
     for warning in warnings:
         print(f"ssh-abduction: warning: {warning}", file=sys.stderr)
+
+
+def save(solution: Solution, file: str | None) -> None:
+    """Write a solution to a file, if one is named.
+
+    A solution without a map does not replace a file of maps. A warning says so.
+
+    Args:
+        solution: The solution.
+        file: The file; None for none.
+
+    Raises:
+        MapError: The file cannot be written.
+    """
+    if file is not None and solution.cost is None and _has_maps(file):
+        warn(
+            [
+                f"{named(file)}: keeps the maps that it had, as this search found none; delete it "
+                "first to write the new answer, or name another file"
+            ]
+        )
+    elif file is not None:
+        solution.save(file)
+
+
+def _has_maps(file: str) -> bool:
+    with contextlib.suppress(MapError):
+        return Path(file).is_file() and bool(maps_of(read_json(Path(file).absolute()), file))
+    return False
 
 
 @contextlib.contextmanager

@@ -33,6 +33,7 @@ from ssh_abduction.cli.outcome import (
     given_by,
     on_ctrl_c,
     opening,
+    save,
     warn,
     warnings_of,
 )
@@ -216,16 +217,30 @@ def run(options: argparse.Namespace) -> int:
             # Ctrl-C must not cut the output, as half of it would be useless.
             until_printed.enter_context(on_ctrl_c(search.interrupt))
             printed = (_Json if options.json else _Text)(search, obeying)
+
+            def last_words(why: Stop) -> tuple[tuple[str, Solution], int]:
+                solution = obeying.with_names(search.snapshot(why))
+                warn(warnings_of(search, solution))
+                return (printed.last_words(solution), solution), exit_code(solution)
+
+            def print_last(last: tuple[str, Solution]) -> None:
+                print(last[0], end="", flush=True)
+                save(last[1], options.output)
+
             guard = Guard(
-                search.interrupt, printed.last_words, options.time_limit, options.memory_limit
+                search.interrupt,
+                last_words,
+                options.time_limit,
+                options.memory_limit,
+                print_last=print_last,
             )
             until_printed.enter_context(guard)
             explanation = printed.searched(guard.say)
         solution = obeying.with_names(search.solution(tuple(printed.kept)))
         guard.say(partial(printed.end, solution, explanation))
         warn(warnings_of(search, solution))
-        if options.output is not None:
-            solution.save(options.output)
+        options.json = False  # the JSON is complete: a later error must not follow it
+        save(solution, options.output)
     return exit_code(solution)
 
 
@@ -262,16 +277,12 @@ class _Text:
         lines = _lines(self._search, solution, explanation, self._search.backbone)
         return _text(chain(lines, self._obeying.blamed(explanation)))
 
-    def last_words(self, why: Stop) -> tuple[str, int]:
-        """The text and exit code of a process that must end although its search does not stop."""
-        solution = self._search.snapshot(why)
+    def last_words(self, solution: Solution) -> str:
+        """The text of a process that must end although its search does not stop."""
         kept = (
             tuple(self.kept) if solution.status is Status.OPTIMAL and self.kept else solution.maps
         )
-        warn(warnings_of(self._search, solution))
-        return _text(_lines(self._search, replace(solution, maps=kept), None, None)), exit_code(
-            solution
-        )
+        return _text(_lines(self._search, replace(solution, maps=kept), None, None))
 
 
 class _Json:
@@ -298,7 +309,6 @@ class _Json:
 
         Return why there is no map, or None.
         """
-        say(self._opening)
         for ssh_map in self._search:
             given = given_by(self._search, self._obeying.named(ssh_map))
             if self._maps:
@@ -313,7 +323,7 @@ class _Json:
     def end(self, solution: Solution, explanation: Explanation | None) -> str:
         """Make the rest of the JSON: the maps in memory, and the fields after the maps."""
         maps = "".join(map(self._line, all_given(solution)))
-        return maps + self._end(solution, explanation, self._search.backbone)
+        return self._opening() + maps + self._end(solution, explanation, self._search.backbone)
 
     def _end(
         self, solution: Solution, explanation: Explanation | None, backbone: Backbone | None
@@ -323,24 +333,25 @@ class _Json:
             end["corrections"] = blamed
         return f"\n],{json_line(end)[1:]}\n"
 
-    def last_words(self, why: Stop) -> tuple[str, int]:
-        """The rest of the JSON, and the exit code, if the process must end before its search."""
-        solution = self._search.snapshot(why)
-        warn(warnings_of(self._search, solution))
-        words = ("" if self._begun else self._opening()) + self._let_go()
+    def last_words(self, solution: Solution) -> str:
+        """The rest of the JSON, if the process must end before its search."""
+        words = self._let_go()
         if not self._maps and solution.maps:
             words += self._line((solution.maps[0], None))
         # The backbone is left out: another thread may be changing it.
-        return words + self._end(solution, None, None), exit_code(solution)
+        return words + self._end(solution, None, None)
 
     def _opening(self) -> str:
+        """Begin the JSON; "" if it is begun already."""
+        if self._begun:
+            return ""
         self._begun = True
         return json_line(opening(self._search))[:-1] + ', "maps": ['
 
     def _let_go(self) -> str:
         """Write the maps in memory in the order in which they were found, and forget them."""
         held, self._held = self._held, []
-        return "".join(map(self._line, held))
+        return self._opening() + "".join(map(self._line, held))
 
     def _line(self, given: Given) -> str:
         self._maps += 1
