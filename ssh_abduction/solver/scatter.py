@@ -3,22 +3,21 @@
 A visit lies some decimetres beside its place. Each map pays for this scatter, and for bending the
 track so that visits come nearer to each other.
 
-If the track could not bend, a map would be a clustering of known poses: dstates and places are
-facilities with prices (`facilities.py`). The price of a place and PLACES of the error of position
-are in one problem, whose points are the visits. The price of a dstate and the rest of the error are
-in another problem, whose points are the steps. The sum of both is a lower bound.
+*A track that cannot bend.* Then a map is a clustering of known poses, and dstates and places are
+facilities with prices (`facilities.py`). One problem has the price of a place and PLACES of the
+error of position. Its points are the visits. Another problem has the price of a dstate and the rest
+of the error. Its points are the steps. The sum of their bounds is a bound of the cost.
 
-The track can bend. Let z be its most important errors as independent standard normal variables, so
-that bending costs |z|^2 / 2. For each c > 0 and all vectors, |a + b|^2 >= c / (1 + c) |a|^2 - c
-|b|^2. So if all variances are multiplied by 1 + 1 / c, the bound holds with a loss of at most
-c |b|^2 / 2 for each point. Here b is how far z moves the point against the other points of its
-cluster. Points that are too far apart to share a facility lose at most
-their share, and only if z brings them nearer by that much. Each loss is at most a quadratic form of
-z. The numbers c are so small that the sum of all these forms is at most |z|^2 / 2. So the bound
-holds for each z, and there is no loss.
+*A track that bends.* Let z be the most important errors of the track, as independent standard
+normal variables. Bending costs |z|^2 / 2. It moves each point by some b against the other points of
+its cluster. For each c > 0, |a + b|^2 >= c / (1 + c) |a|^2 - c |b|^2. So multiply the variances of
+each point by 1 + 1 / c. Then its bound still holds, but for a loss of at most c |b|^2 / 2. Far
+points are too far apart to share a facility. A point that z brings to far ones loses at most its
+share. All these losses are at most quadratic forms of z. The numbers c are so small that the sum of
+the forms is at most |z|^2 / 2. So bending costs more than it saves.
 
-The poses are linearised at the best track without returns. Axioms and views can only raise the
-cost, except that steps with different views are never one dstate.
+The poses are linearised at the best track without returns. All other axioms can only raise the
+cost. One of them is used: steps with different views are different dstates.
 """
 
 from __future__ import annotations
@@ -116,9 +115,8 @@ class _Track:
         poses = np.stack([unknown[: 2 * n : 2], unknown[1 : 2 * n : 2], unknown[2 * n : 3 * n]], 1)
         turned = _without_rigid_motions(poses)
         scatter = spreads_of(trace)
-        order = np.column_stack(
-            [2 * np.arange(n), 2 * np.arange(n) + 1, 2 * n + np.arange(n)]
-        ).ravel()
+        steps = np.arange(n)
+        order = np.column_stack([2 * steps, 2 * steps + 1, 2 * n + steps]).ravel()
         deviation = np.sqrt(scatter).ravel()
         relative = (turned @ covariance @ turned.T)[np.ix_(order, order)]
         values, vectors = np.linalg.eigh(relative / np.outer(deviation, deviation))
@@ -224,6 +222,7 @@ class _Losses:
 
     @classmethod
     def _of_all(cls, part: _Part, most: Array, gap: float, within: float) -> _Losses:
+        """Bound the losses of all points."""
         unit = np.sqrt(part.variances.max(0))
         reach = np.sqrt(2 * most)
         away = np.linalg.norm(part.offsets(part.points) / unit, axis=-1) - reach - reach[:, None]
