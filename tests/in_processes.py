@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from ssh_abduction.solver.asp import workers
 from ssh_abduction.solver.asp.limits import Watch
 
 
@@ -59,3 +60,10 @@ def stay(_: int, path: str, __: Callable[[], bool]) -> None:
     """Write the id of this process, and ignore all signals."""
     Path(path).write_text(str(os.getpid()))
     time.sleep(1000)
+
+
+def answer_and_end(number: int, seconds: float, _: Callable[[], bool]) -> None:
+    """Answer, and end this process some seconds later, as a guard does at a limit."""
+    workers.reply(number)
+    time.sleep(seconds)
+    os._exit(1)

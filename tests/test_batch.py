@@ -15,6 +15,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -199,6 +200,15 @@ def test_json_lines_are_the_single_objects(
     assert main(["check", "maps.json", "quick.jsonl"]) == 0  # a line is what the other verbs read
 
 
+@pytest.mark.usefixtures("without_processes")
+def test_a_warning_names_its_trace_once(traces: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    steps = [*rectangle(40).steps[:-1], replace(rectangle(40).steps[-1], view="v2")]
+    replace(rectangle(40), steps=tuple(steps)).save("noisy.jsonl")
+    main(["solve", "noisy.jsonl", "quick.jsonl", "--time-limit", "1e-9"])
+    (warning,) = capsys.readouterr().err.splitlines()
+    assert warning.startswith("ssh-abduction: warning: noisy.jsonl:42: view 'v2' looks like noise")
+
+
 def test_everywhere_the_same(
     traces: Path, scheduler_here: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -227,7 +237,7 @@ def test_everywhere_the_same(
 def test_the_worst_exit_code(
     paths: str, code: int, traces: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    limit = ["--time-limit", "1e-9"] if code == 30 else []
+    limit = ["--time-limit=1e-9", "--set=without_speedups=greedy"] if code == 30 else []
     assert main(["solve", *(f"{name}.jsonl" for name in paths.split()), *limit]) == code
     assert (capsys.readouterr().err == "") == (code != 1)
 

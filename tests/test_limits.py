@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from in_processes import sleep, stay, vanish
+from in_processes import answer_and_end, sleep, stay, vanish
 from limits import Case, cases, outcome
 from worlds import rectangle
 
@@ -261,6 +261,12 @@ def test_an_explanation_can_be_stopped_while_it_grounds() -> None:
 def test_answers_of_workers() -> None:
     tasks = [(number, 0.0) for number in range(5)]
     assert sorted(workers.answers(sleep, tasks, 2, lambda: False, None, 1.0)) == [0, 1, 2, 3, 4]
+
+
+def test_a_worker_that_ends_behind_its_answer_gets_no_other_task() -> None:
+    """The next task was lost, and its trace was said to be killed for lack of memory."""
+    tasks = [(number, 0.5) for number in range(3)]
+    assert list(workers.answers(answer_and_end, tasks, 1, bool, None, 1.0)) == [0, 1, 2]
 
 
 def test_a_worker_that_vanishes_or_is_late_loses_its_task_alone(

@@ -49,11 +49,12 @@ KILLED = (
     "--memory-limit, or solve fewer traces at a time"
 )
 # A process is lost if it has no answer after GUARDED times its time limit plus OVERDUE seconds, or
-# OVERDUE seconds after Ctrl-C. This is a last resort, as its own guard should end it earlier.
-GUARDED, OVERDUE = 1.2, 3.0
+# PATIENCE seconds after Ctrl-C. This is a last resort, as its own guard should end it earlier. On a
+# busy machine that takes it several seconds.
+GUARDED, OVERDUE, PATIENCE = 1.2, 10.0, 3.0
 LATE = (
-    "process: expected an answer in time, got none, as happens when memory is swapped; set "
-    "--memory-limit, or solve fewer traces at a time"
+    "process: expected an answer soon after --time-limit, got none, as happens when the machine is "
+    "busy or memory is swapped; solve fewer traces at a time (--jobs), or set --memory-limit"
 )
 
 
@@ -171,10 +172,14 @@ class SolveQuestion:
         """
 
         def last_words(why: Stop) -> tuple[SolveAnswer, int]:
-            solution = search.snapshot(why)
-            found = [*maps] or ([(ssh_map, None) for ssh_map in solution.maps] if self.json else [])
             # Nobody reads the exit code of this process.
-            return self._answer(number, path, search, solution, found, None, None), EXIT_ERROR
+            try:
+                solution = search.snapshot(why)
+                given = [(ssh_map, None) for ssh_map in solution.maps] if self.json else []
+                found = [*maps] or given
+                return self._answer(number, path, search, solution, found, None, None), EXIT_ERROR
+            except Exception as error:  # without an answer, the process would seem to be killed
+                return self.failed(number, path, error), EXIT_ERROR
 
         if not workers.serves():
             return contextlib.nullcontext()
@@ -209,7 +214,10 @@ class SolveQuestion:
             )
         else:
             line = f"{named(path)}: {headline(solution, search.count, explanation)}"
-        warnings = tuple(f"{named(path)}: {warning}" for warning in warnings_of(search, solution))
+        warnings = tuple(
+            warning if warning.startswith(f"{named(path)}:") else f"{named(path)}: {warning}"
+            for warning in warnings_of(search, solution)
+        )
         return SolveAnswer(number, line, exit_code(solution), warnings)
 
     @property
@@ -220,7 +228,7 @@ class SolveQuestion:
     @property
     def patience(self) -> float:
         """The seconds to wait for unfinished answers after Ctrl-C."""
-        return OVERDUE
+        return PATIENCE
 
     def lost(self, lost: workers.Lost, path: str) -> SolveAnswer:
         """Make the answer for a trace whose process ended without an answer."""

@@ -95,7 +95,10 @@ class Worker:
                 self._begun = line.endswith(_BEGIN)
                 if not line:
                     return self._lost(number)
-            return pickle.load(output)
+            answer, ends = pickle.load(output)
+            if ends:  # it must not get another task while it ends
+                self._process.wait()
+            return answer
         except (EOFError, pickle.UnpicklingError):
             return self._lost(number)
         finally:
@@ -257,12 +260,16 @@ _outputs: list[BinaryIO] = []  # the stream for answers, in a worker process
 
 
 def reply(answer: object) -> None:
-    """Send the answer of the current task to the parent process.
+    """Send the answer of the current task to the parent process. Then end this process.
 
-    `serve` does this for each task. A task that calls it directly has to end the process
-    afterwards.
+    A task calls it if it cannot return. The parent process waits for the end.
     """
-    pickle.dump(answer, _outputs[0])
+    _send(answer, ends=True)
+
+
+def _send(answer: object, *, ends: bool) -> None:
+    """Send an answer to the parent process, and whether this process ends behind it."""
+    pickle.dump((answer, ends), _outputs[0])
     _outputs[0].flush()
 
 
@@ -285,4 +292,4 @@ def serve() -> None:
     pieces = _Work(tempfile.tempdir)
     while True:
         work, arguments = pieces.next()
-        reply(work(*arguments, pieces.is_given_up))
+        _send(work(*arguments, pieces.is_given_up), ends=False)
