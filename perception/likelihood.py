@@ -196,7 +196,7 @@ class ImageLikelihood:
         return known, self._log_density(np.sum((features - self.centre) ** 2, axis=1), self.spread)
 
     def _log_density(self, squares: NDArray[np.float64], mean: float) -> NDArray[np.float64]:
-        """Log density of an isotropic Gaussian, by squared distances and their mean."""
+        """Log density of an isotropic Gaussian, at squared distances. `mean` is its variance."""
         return np.asarray(
             -0.5 * self.dimensions * (np.log(2 * np.pi * mean / self.dimensions) + squares / mean)
         )

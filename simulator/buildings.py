@@ -157,7 +157,7 @@ def _span(flat: Opening, walls: Array) -> tuple[float, float]:
 
 
 def _across(flat: Opening, wall: Array, along: float) -> float:
-    """Measure how many metres to the left of a door's middle a wall lies, `along` from it."""
+    """Measure how far left of a door's middle a wall is, `along` metres ahead. In metres."""
     ends = flat.frame(wall.reshape(2, 2))
     return float(np.interp(along, *ends[np.argsort(ends[:, 0])].T))
 

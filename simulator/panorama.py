@@ -336,7 +336,7 @@ def _beginnings(segments: Array) -> Array:
 
 
 def _albedo(textures: Array, along: Array, height: Array) -> Array:
-    """The share of light that points of walls reflect, (r, c, 3), by the wall of each column."""
+    """The share of light that walls reflect at each pixel, (r, c, 3). A column has one wall."""
     base, stripe, skirting, stripes, waves = np.split(textures, [3, 6, 9, 13], axis=1)
     period, share, phase, board = stripes.T
     striped = ((along / period + phase) % 1 < share)[None, :, None] & (height < 0.75 * CEILING)[

@@ -178,7 +178,7 @@ def _place(world: World, pose: Array) -> str | None:
 
 
 def _stops(driver: Driver, world: World, tours: int) -> Iterator[tuple[int, str]]:
-    """Drive to the places of all tours. Before each, yield its number over all tours, and name."""
+    """Drive to each stop of all tours. First yield its number, counted over tours, and name."""
     for tour in range(tours):
         if tour:
             driver.world = world.arranged(driver.rng)

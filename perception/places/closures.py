@@ -141,7 +141,7 @@ class _Gate:
 
 
 class _Gates:
-    """Makes the gate of any two visits that are `apart` metres of driving, in order."""
+    """Makes the gates of pairs of visits that are at least `apart` metres of driving apart."""
 
     def __init__(self, track: Track, visits: Sequence[Visit], apart: float) -> None:
         """Compute the middles for each drift."""
@@ -179,7 +179,7 @@ class _Gates:
 
 
 class _Corrected:
-    """The positions of visits by the track, if each closure corrects the poses after it."""
+    """The positions of visits by the track. Each closure corrects the later ones."""
 
     def __init__(self, visits: Sequence[Visit]) -> None:
         """Start without any correction."""

@@ -230,7 +230,7 @@ class _Detector:
 
 @dataclass(frozen=True, eq=False)
 class _Sighting:
-    """A junction in the local map of a milestone, a number from 0, after `way` metres."""
+    """A junction in the local map of a numbered milestone, after `way` metres."""
 
     milestone: int
     way: float
@@ -239,7 +239,7 @@ class _Sighting:
 
 @dataclass(eq=False)
 class _Chain:
-    """Sightings of one junction at successive milestones, with a number in order of beginning."""
+    """Sightings of one junction at successive milestones. Chains are numbered by their start."""
 
     number: int
     sightings: list[_Sighting]

@@ -116,7 +116,7 @@ def _named(names: Sequence[str | None], notes: Sequence[Sequence[str]]) -> tuple
 
 
 def _joint_track(tracks: Sequence[Track], begins: Sequence[int]) -> tuple[Track, list[Array]]:
-    """Join tracks to one that is broken where a drive starts. Each is shifted, (2,) metres."""
+    """Join tracks to one, broken where a drive starts. Also return their shifts, (2,) metres."""
     poses = [tracks[0].poses]
     shifts = [np.zeros(2)]
     for track in tracks[1:]:

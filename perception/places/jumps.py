@@ -292,7 +292,7 @@ def unknown_steps(log: RobotLog) -> Unknown:
 
 
 def _targets(steps: NDArray[np.bool_]) -> frozenset[int]:
-    """The indices of the scans that steps, (n - 1,), lead to."""
+    """The indices of the scans that the marked steps, (n - 1,), lead to."""
     return frozenset((np.flatnonzero(steps) + 1).tolist())
 
 

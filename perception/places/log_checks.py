@@ -307,7 +307,7 @@ def _contradictions(log: RobotLog, track: Track) -> list[int]:
 
 
 def _intruding(log: RobotLog, track: Track, one: int, other: int) -> tuple[int, int]:
-    """Count the points of a scan in the free space of another, and those it should have seen."""
+    """Count the points of scan `one` in the free space of `other`, and those in its view."""
     pose = moved(_pose(track, one), log.scans[one].laser.mount)
     scan, laser = log.scans[other], log.scans[other].laser
     x, y, heading = between(moved(_pose(track, other), laser.mount), pose)
@@ -326,7 +326,7 @@ def _intruding(log: RobotLog, track: Track, one: int, other: int) -> tuple[int, 
 
 
 def _neighbours(ranges: Array, beam: Array, best: Callable[..., Array]) -> Array:
-    """Take the `best` (np.min or np.max) range of each beam, (k,), and its two neighbours, (k,)."""
+    """The `best` (np.min or np.max) range of each beam and its two neighbours, (k,)."""
     return best([ranges[beam - 1], ranges[beam], ranges[beam + 1]], axis=0)
 
 

@@ -119,7 +119,7 @@ class _Drive:
     """
 
     def __init__(self, track: Track, visits: Sequence[Visit]) -> None:
-        """Place points along the track."""
+        """Take points along the trajectory."""
         self._way = track.way
         at = np.arange(0.0, self._way[-1], PACE)
         self.points = np.stack([np.interp(at, self._way, track.poses[:, k]) for k in (0, 1)], 1)
@@ -130,7 +130,7 @@ class _Drive:
         self._cuts = [0.0, *(float(self._way[cut]) for cut in track.cuts), float(self._way[-1])]
 
     def stretch(self, way: float, reach: float = REACH) -> range:
-        """The indices of the points around a way in metres, without a cut of the track between."""
+        """The indices of the points within `reach` metres of driving, up to cuts of the track."""
         k = min(max(bisect(self._cuts, way), 1), len(self._cuts) - 1)
         begin, end = max(self._cuts[k - 1], way - reach), min(self._cuts[k], way + reach)
         return range(math.ceil(begin / PACE), min(math.floor(end / PACE) + 1, len(self.points)))
@@ -151,7 +151,7 @@ class _Drive:
             yield (ours[a] * PACE, middle), (theirs[b] * PACE, one.reverse.moved(middle))
 
     def is_near(self, some: _Pass) -> bool:
-        """Whether a visit is so near a pass that it is to the same place."""
+        """Whether some visit is near enough to a pass to be to the same place."""
         soon = np.abs(self.ways - some[0]) <= PASS
         return bool((soon & (np.hypot(*(self._middles - some[1]).T) <= self._reaches)).any())
 
@@ -187,7 +187,7 @@ def _closed(drive: _Drive, closings: Sequence[Closing]) -> Iterator[_Relation]:
 
 
 def _tracked(drive: _Drive) -> Iterator[_Relation]:
-    """Yield how trajectories lie relative to each other by the track, for visits soon after."""
+    """Yield how trajectories lie relative to each other by the track, for successive visits."""
     for way in drive.ways.tolist():
         first, last = np.searchsorted(drive.ways, (way, way + MOST))
         for other in drive.ways[first:last].tolist():
@@ -197,7 +197,7 @@ def _tracked(drive: _Drive) -> Iterator[_Relation]:
 def _passes(
     drive: _Drive, pair: tuple[_Pass, _Pass], relations: Sequence[_Relation]
 ) -> list[_Pass]:
-    """List all passes of a parting: those of the two stretches, and of others by relations."""
+    """List all passes of a parting: two of the pair, and those that relations find elsewhere."""
     place = list(pair)
     for way, middle in place:  # The list grows.
         for one in (some for relation in relations for some in (relation, relation.reverse)):
@@ -231,7 +231,7 @@ def lead_apart(far: Array) -> Iterator[tuple[int, int]]:
 
 
 def _ahead(far: Array) -> Iterator[tuple[int, int]]:
-    """Find what `lead_apart` does, along the direction of the first stretch."""
+    """Find where stretches lead apart, as `lead_apart` does, in the first stretch's direction."""
     back, ahead = round(TOGETHER / PACE), round(AHEAD / PACE)
     ours, theirs = far.min(axis=1), far.min(axis=0)
     ends = np.flatnonzero((ours[:-1] <= BESIDE) & (ours[1:] > BESIDE))

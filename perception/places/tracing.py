@@ -210,7 +210,7 @@ def _covariance(track: Track, begin: int, end: int, first: Pose, last: Pose) -> 
 
 
 def _with_turns(steps: list[Step], visits: Sequence[Visit]) -> list[Step]:
-    """Add the turns between two steps of a visit, to steps with the actions of travels."""
+    """Give each step without an action the turn to the next step of its visit."""
     done = list(steps)
     for i, step in enumerate(steps[:-1]):
         if step.action is None:

@@ -206,7 +206,7 @@ def _by_rosbags(path: Path, format: str, stack: ExitStack) -> Any:
 
 
 def _copied(file: IO[bytes], here: Path, source: str) -> list[str]:
-    """Unpack a file to the path `here`, as far as it is intact, with a note if it is not."""
+    """Unpack the intact part of a file to the path `here`, with a note if it is damaged."""
     with here.open("wb") as copy:
         try:
             copied(unpacked(file, source), copy, source)
@@ -228,7 +228,7 @@ def _format(path: Path) -> str | None:
 
 
 def _drive(part: Path) -> str:
-    """The name of the drive of a part: its file's, without the number and the ending of packing."""
+    """The name of a part's file without its number and, if it is packed, without that suffix."""
     stem, ending = NAMES.sub("", part.name), NAMES.search(part.name)
     found = PART.match(stem)
     return f"{found['drive'] if found else stem}.{ending[1] if ending else ''}"

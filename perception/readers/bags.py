@@ -222,7 +222,7 @@ def _odometer(
 
 
 def _odometer_of_transforms(bag: Bag, frames: Frames, frame: str) -> tuple[Track, str, str]:
-    """Take what `_odometer` returns from the transforms from `odom` to the robot."""
+    """Read what `_odometer` returns, but from transforms from `odom` to the robot."""
     chain = [(child, parent_of(frames, child)) for child in ancestors(frames, frame)]
     moving = [(child, one) for child, one in chain if one.track is not None]
     found = next(
@@ -279,7 +279,7 @@ class _ScanPoses:
     by_stamp: bool
 
     def at(self, time: float) -> tuple[Pose, Pose | None]:
-        """The poses by odometer and corrected (if any) at a time in seconds, or Damaged."""
+        """The odometer's and the corrected pose (if any) at a time in seconds. Raises Damaged."""
         if not self.odometry.covers(time):
             begin, end = self.odometry.times[[0, -1]]
             raise Damaged(

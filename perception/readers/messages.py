@@ -127,7 +127,7 @@ def scan_line(tokens: list[bytes]) -> ScanLine | None:
 
 
 def _ranges(tokens: list[bytes], at: int) -> tuple[NDArray[np.float64], int]:
-    """Parse ranges behind their number, at index `at`: metres, (n,), and the index behind them."""
+    """Parse a count at index `at` and its ranges: metres, (n,), and the index after them."""
     count = _whole(tokens[at] if at < len(tokens) else b"", "beams")
     if count == 0:
         raise Damaged("expected at least one beam, got none")

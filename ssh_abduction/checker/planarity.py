@@ -298,7 +298,7 @@ def _is_turned(faced: Mapping[int, int], turn: tuple[int, int, int]) -> bool:
 
 
 def _goes_round(order: Sequence[Arm], sequence: Sequence[Arm]) -> bool:
-    """Tell whether the gateways of `told` that `order` has are distinct and clockwise in it."""
+    """Whether gateways of a sequence are distinct, and those in `order` are clockwise in it."""
     there = [order.index(gateway) for gateway in sequence if gateway in order]
     return (
         len(set(sequence)) == len(sequence)

@@ -152,7 +152,7 @@ def region_beside(m: Reading) -> Found:
 
 
 def region_between(m: Reading) -> Found:
-    """Check, for each place, the region right of all directed paths that it lies right of."""
+    """Check each place's region: all places right of every directed path it lies right of."""
     yield from _missing(m, m.once(_between))
 
 

@@ -94,7 +94,7 @@ def helps() -> dict[str, str]:
 
 
 def add_limits(parser: argparse.ArgumentParser, printed: str) -> None:
-    """Add the limits of a search, after which the verb prints `printed`."""
+    """Add the options that limit a search. `printed` says what the verb prints at a limit."""
     parser.add_argument(
         "--time-limit", type=float, metavar="S", help=f"stop after S seconds and print {printed}"
     )

@@ -120,7 +120,7 @@ _second_opinions: WeakKeyDictionary[Search, list[str]] = WeakKeyDictionary()
 
 
 def _second_opinion(search: Search, solution: Solution) -> list[str]:
-    """Warn if the second best number of views (the runner-up) gives another map, in time."""
+    """Warn if the second best number of views gives another map. Needs time that is left."""
     if search not in _second_opinions:
         limit = search.limits.time_limit
         left = None if limit is None else limit - solution.seconds.total

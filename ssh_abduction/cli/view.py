@@ -175,7 +175,7 @@ def _run(options: argparse.Namespace, trace: Trace | None, data: Any) -> Run | N
 
 
 def _with_beliefs(followed: Trace, file: str, data: Any) -> Run:
-    """Make a run with beliefs from a file, as `localise --json` writes it, or raise MapError."""
+    """Make a run with the beliefs of a file that `localise --json` wrote. Raises MapError."""
     from ssh_abduction.data.map_file import read_json
     from ssh_abduction.data.maps import maps_of
     from ssh_abduction.page.replays import Run

@@ -366,7 +366,7 @@ def _is_seen(entry: Entry) -> bool:
 
 
 def _entry(value: Any, count: int, four: bool, where: str) -> Entry:
-    """Check and return one of `count` entries of a star; `four` for four of 0, 1 or None."""
+    """Check and return one of `count` entries of a star; 0, 1 or None is allowed if `four`."""
     if isinstance(value, Gateway):
         value = {name: getattr(value, name) for name in _FIELDS}
     if isinstance(value, Mapping):

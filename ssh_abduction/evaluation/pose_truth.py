@@ -372,7 +372,7 @@ def _verdicts(
 
 
 def _pairs(verdicts: Verdicts, visit: Steps) -> Pairs:
-    """Count the pairs of different visits by verdict, (n, n), with the visit of each row, (n,)."""
+    """Count pairs of visits by verdict. `verdicts` is (n, n), `visit` is that of each row."""
     counts = Counter(verdicts[visit[:, None] < visit].tolist())
     return Pairs(counts[APART] + counts[RETURN], counts[RETURN], counts[STAYED], counts[UNKNOWN])
 
@@ -396,7 +396,7 @@ def _evaluated(ssh_map: SSHMap, visit: Steps, places: Verdicts, dstates: Verdict
 
 
 def _joined(one: NDArray[np.bool_], verdicts: Verdicts, things: int) -> MapPairs:
-    """Count the judged pairs, (n, n), that a map has at `one` place or dstate out of `things`."""
+    """Count the judged pairs. `one`, (n, n), is true for pairs that the map joins."""
     right = int((one & (verdicts == RETURN)).sum())
     return MapPairs(
         things,

@@ -171,7 +171,7 @@ class Relations:
         return found
 
     def _composed(self, node: int, before: Sequence[int], poses: dict[int, Pose]) -> Pose:
-        """Compose the pose at a node along the shortest way, from the node `before` each node."""
+        """Compose a node's pose along the shortest way. `before` is each node's predecessor."""
         way = []
         while node not in poses:
             way.append(node)

@@ -117,7 +117,7 @@ class Question(ABC, Generic[_Answer]):
     def _changes_in_words(
         self, ssh_map: SSHMap, places: Collection[int | None], cost: Cost | None, nats: float | None
     ) -> tuple[str, ...]:
-        """Say which gateways at some places changed between drives, and what that costs."""
+        """Say which gateways at some places changed between drives, and what the changes cost."""
         changes = [f for f in ssh_map.faults if f.kind == "changed" and f.place in places]
         if not changes or cost is None:
             return ()

@@ -247,7 +247,7 @@ class MoveGraph:
         return move + (self._travel_cost if travels else 0.0)
 
     def _only_action(self, *, onward: bool) -> str | None:
-        """The only action that leads onward along a path, or turns around; None if not one."""
+        """The action that leads onward along a path (or turns around); None unless exactly one."""
         dstates, names = self.map.dstates, set()
         for source, action, target in self.map.links:
             s, x = dstates[source], dstates[target]

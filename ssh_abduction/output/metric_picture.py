@@ -158,7 +158,7 @@ class _Picture:
         return titled(title, circle)
 
     def ellipse(self, spot: Point, spread: tuple[float, float, float]) -> list[str]:
-        """Draw two standard deviations of a covariance (xx, xy, yy) in m², if of a fit size."""
+        """Draw the ellipse of a covariance (xx, xy, yy) in m²; nothing if too small or large."""
         (major, minor), angle = axes(spread)
         rx, ry = DEVIATIONS * major * self.scale, DEVIATIONS * minor * self.scale
         if rx < 0.5 or rx > WIDEST:

@@ -325,7 +325,7 @@ def _corners(found: Layout, ssh_map: SSHMap, unit: float) -> list[list[float]]:
 
 
 def _lifts(found: Layout, ssh_map: SSHMap, unit: float) -> list[list[Any]]:
-    """For each lift between two places: x and y of both ends, and the actions in words."""
+    """List each lift between two places: x and y of both ends, and the names of its actions."""
     floor = [s.floor for s in ssh_map.dstates]
     actions: dict[tuple[int, int], set[str]] = {}
     for source, action, target in ssh_map.links:

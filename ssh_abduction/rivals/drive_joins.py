@@ -71,7 +71,7 @@ class DrivePair:
     of_maps: int | None
 
     def how_sure(self, join: DriveJoin) -> str:
-        """Say in how many maps these drives have a join, or how probable it is."""
+        """Say in how many maps two drives have a join, or how probable the join is."""
         if join in self.forced:
             return "all maps" if self.proven else "all maps that were found"
         if self.of_maps is None:
@@ -126,7 +126,7 @@ def joins_of_drives(listing: Listing) -> tuple[DrivePair, ...]:
 
 
 def _placings(listing: Listing) -> tuple[list[_Placing], list[float], bool]:
-    """The place of each step in each map, the weights of the maps, and whether these are all."""
+    """The place of each step in each map, the maps' weights, and whether no map is missing."""
     weighed = listing.weighed
     if weighed is not None:
         at: list[_Placing] = [rival.places or rival.dstates for rival in weighed.rivals]

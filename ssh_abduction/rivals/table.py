@@ -121,7 +121,7 @@ class Table:
         )
 
     def _shared(self, ones: Ints) -> Shared:
-        """Find what the maps share of one sort."""
+        """Find which pairs of steps all maps, or only some maps, join in one sort."""
         _, column = np.unique(ones, axis=1, return_inverse=True)
         number: dict[Hashable, int] = {}
         named = (ones != NONE).all(axis=0).tolist()

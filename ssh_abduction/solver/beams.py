@@ -37,7 +37,7 @@ class _Time:
     seconds: float
 
     def end(self, share: float) -> float:
-        """Return the seconds on the clock when a share of the time is over."""
+        """Return the time on the clock, in seconds, at which a share of the time is used up."""
         return self.begun + share * self.seconds
 
 
@@ -101,7 +101,7 @@ class Beams:
         return may_have_map
 
     def _search_widths(self, time: _Time, clashes: Callable[[], bool]) -> bool:
-        """Search by beams of all WIDTHS for which there is time. Return as `search`."""
+        """Search by the beams of WIDTHS for which there is time. Returns the same as `search`."""
         parts, watch = self._parts, self._parts.watch
         # With several drives or floors, a broad beam keeps as many hypotheses as a wider one.
         several = parts.task.theory.several_drives or parts.task.theory.lifts
@@ -130,7 +130,7 @@ class Beams:
         return bool(self._took) and now + width * self._took[0] < time.end(WIDTHS[width])
 
     def _search_wider(self, time: _Time) -> None:
-        """Search by a beam of WIDER hypotheses if the widest beam ended, and there is time."""
+        """Search by a beam of WIDER hypotheses if there is time and the widest beam ended."""
         parts, watch = self._parts, self._parts.watch
         end = time.begun + min(QUICK * time.seconds, MOST_SECONDS)
         if self._ended < max(WIDTHS) or watch.elapsed() + LONGER * self._took[-1] > end:
@@ -142,7 +142,7 @@ class Beams:
             parts.report()
 
     def _search_without_axioms(self, time: _Time) -> None:
-        """Set `broken` by a beam as wide as the last one that ended, if that is still open."""
+        """Find how many nats broken axioms save, if unknown, by the widest beam that ended."""
         self._parts.watch.end_stage_after(time.end(BREAKING))
         is_open = self._best[1] < math.inf and math.isinf(self.broken)
         with suppress(StageTimeError):

@@ -214,7 +214,7 @@ class Candidates:
             self.contradicting[wrong] = None
 
     def _offer_mended(self) -> None:
-        """Offer a sketch of a trace that is mended where a step contradicts the sketch."""
+        """Offer a sketch of the trace, mended where a step contradicts the sketch."""
         if ssh_map := mended_sketch(self._task.trace, self._task.theory):
             self.offer(ssh_map)
 

@@ -277,7 +277,7 @@ class Poses:
         return sigmas
 
     def _differences(self, first: NDArray[np.int_], second: NDArray[np.int_], size: int) -> Any:
-        """Make the matrix that maps a vector to differences of its entries: second minus first."""
+        """Make the matrix that maps a vector x to the differences x[second] - x[first]."""
         rows = np.arange(len(first))
         ones = np.ones(len(first))
         entries = (

@@ -195,7 +195,7 @@ def _leaves_room(
 def _parts_of_rest(
     drawn: Mapping[Place, Ends], orders: Mapping[Place, Sequence[Ends]], place_of: Sequence[Place]
 ) -> dict[Place, Place]:
-    """The connected parts of the places that are not drawn: from each place to one of its part."""
+    """Map each place that is not drawn to one place of its connected part."""
     part: dict[Place, Place] = {}
     for first in orders:
         queue = [] if first in drawn or first in part else [first]

@@ -185,7 +185,7 @@ def _has_bare_places(theory: Theory) -> bool:
 
 
 def _kept_by(*names: str, and_also: Iterable[str] = ()) -> Callable[[], frozenset[str]]:
-    """Make a function that returns the axioms that fast encodings, and Python around them, keep."""
+    """Make a function that returns the axioms kept by fast encodings and by Python code."""
     return lambda: encodings.keeps(*names) | frozenset(and_also)
 
 

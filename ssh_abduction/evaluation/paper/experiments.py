@@ -397,7 +397,7 @@ def notched(depth: float) -> World:
 def _driven(
     notch: float, seed: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[Any]]:
-    """Drive all tours. Return each pose's mean at its dstate and its offset, (n, 3), and dstate."""
+    """Drive all tours. Return mean pose at its dstate, offset, both (n, 3), and dstate by step."""
     trace = simulate(notched(notch), EXPERIMENTS["notched-rectangle"].tours, seed)
     truth = true_dstates(trace)
     poses = np.array([step.truth["pose"] for step in trace.steps])

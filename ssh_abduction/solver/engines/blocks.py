@@ -154,7 +154,7 @@ class Blocks:
         return end > low and not self._takes_fault(begin, end, most)
 
     def _takes_fault(self, begin: int, end: int, most: int) -> bool:
-        """Whether a clique shows that a block needs a fault: it has more than `most` steps."""
+        """Whether a block needs a fault: more than `most` steps are pairwise different."""
         self.watch.check()
         return (
             end - begin > most

@@ -207,7 +207,7 @@ class FramedEngine:
         return self._all_with_paths(cost[0])
 
     def _all_with_paths(self, dstates: int, besides: Sequence[int] = ()) -> Iterator[Naming]:
-        """Yield all labels with this many dstates that paths fit, each once."""
+        """Yield each labelling with this many dstates for which paths exist."""
         known: set[Hashable] = {tuple(besides)}
         fitted: dict[tuple[int, ...], Fitted] = {}
 

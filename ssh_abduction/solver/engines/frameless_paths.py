@@ -304,7 +304,7 @@ class PlacesAndPaths:
         return sorted(found, key=lambda members: len(members.links))[:CONTRARY]
 
     def _clash(self, members: list[Link | _Far]) -> bool:
-        """Whether no places and paths fit these members."""
+        """Whether no places and paths exist for these members."""
         some = _Members.of(members)
         return not any(
             self._has_paths(self._control_for(some.links, far=some.far, single=single))

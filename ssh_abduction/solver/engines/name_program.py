@@ -290,7 +290,7 @@ class NameProgram:
         return {view: list(some) for view, some in found.items()}
 
     def literals_of(self, labels: Sequence[int]) -> list[int]:
-        """Return the literals that give the nodes the labels of a map, up to their numbers."""
+        """Return the literals that give nodes a map's labels. Label numbers may differ."""
         name_of = {labels[node]: name for name, node in enumerate(self.pinned.clique)}
         for view, some in self._labels_by_view(labels).items():
             name_of |= dict(zip(some, self._known.spare[view], strict=False))
@@ -302,7 +302,7 @@ class NameProgram:
         ]
 
     def no_rests(self) -> list[int]:
-        """Return the literals that no node has a rest as its name."""
+        """Return the literals that forbid every node to have a rest as its name."""
         atom = self._asker.control.symbolic_atoms[self.resting(True)[0]]
         return [-atom.literal] if atom else []
 

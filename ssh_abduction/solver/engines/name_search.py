@@ -39,7 +39,7 @@ class Incumbent:
     """
 
     def __init__(self) -> None:
-        """Begin without labels and without a bound."""
+        """Begin with no labels and no bound."""
         self.bound: int | None = None
         self.labels: list[int] | None = None
 

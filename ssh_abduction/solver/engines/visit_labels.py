@@ -195,7 +195,7 @@ class VisitLabels:
             self._give_more(reason.missed)
 
     def _best_answer(self) -> Answer | None:
-        """Find an answer with the fewest first nodes; None if there is no answer."""
+        """Find an answer with the fewest first nodes of dstates; None if there is no answer."""
         read = self.program.read
         better = list(
             self._asker.answers(

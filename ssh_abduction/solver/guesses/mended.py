@@ -112,7 +112,7 @@ def _right(trace: Trace, sketch: Sketch, theory: Theory) -> Step | None:
 
 
 def _without_jump(mended: Trace, ssh_map: SSHMap, trace: Trace, theory: Theory) -> Trace | None:
-    """Drop the longest displacement of the first return that a map refuses; None without one."""
+    """Drop the longest displacement in the first loop that a map contradicts, if any."""
     refused = (v for v in violations(trace, ssh_map, theory) if v.axiom == "one_pose")
     found = next(refused, None)
     if found is None:

@@ -93,7 +93,7 @@ class Continuations:
         self._shared = 2 * (here - self._sorted[:-1]) + (shown[here] == shown[there])
 
     def apart_from(self, step: int) -> Matrix:
-        """Find the steps that are apart from one step: a flag for each step, a row of `apart`."""
+        """Flag the steps that are apart from one step. This is a row of `apart`."""
         place, steps = self._place[step], len(self._place)
         shared = np.empty(steps, dtype=int)
         shared[:place] = np.minimum.accumulate(self._shared[:place][::-1])[::-1]

@@ -220,7 +220,7 @@ def _way(frame: Frame) -> tuple[int, int] | None:
 
 
 def _looks(first: Frame, then: Frame, shift: int, towards: int) -> bool:
-    """Whether bearings allow a rotation by exactly 0, or 180, degrees. See `rotations`."""
+    """Whether bearings allow a rotation by exactly `towards` (0 or 180) degrees."""
     n = first.slots
     return all(
         _near(
@@ -246,7 +246,7 @@ def _is_sure(found: int) -> bool:
 
 @lru_cache(maxsize=2**14)
 def _about(degrees: float, spread: float) -> int:
-    """Return the set of rotations that differ from `degrees` by at most `spread`, rounded up."""
+    """Return the rotations within `spread` of `degrees`, as a set. It is rounded outwards."""
     least, most = floor(degrees - spread + ROUNDING), ceil(degrees + spread - ROUNDING)
     return _of(r % 360 for r in range(least, most + 1))
 

@@ -143,7 +143,7 @@ class Returns:
         )
 
     def _pairs_of(self, tested: _Tested, since: int = 0) -> Pairs:
-        """The pairs of steps that are different, as displacements reject a return."""
+        """The pairs of steps that are different because displacements reject their return."""
         far = self._refused_among(*tested[True], True)
         known = self._pairs or NO_PAIRS
         elsewhere = Pairs.joined([known, Pairs.of(elsewhere=far)]).elsewhere
@@ -185,7 +185,7 @@ class Returns:
         return float(2 * gammainccinv(freedom / 2, share / max(tests, 1)))
 
     def _refused_among(self, first: Steps, last: Steps, places: bool) -> list[tuple[int, int]]:
-        """The returns, to `places` or dstates, that close badly for every drift of heading."""
+        """The returns to `places` (or to dstates) whose loops do not close for any drift."""
         import numpy as np
 
         from ssh_abduction.theory.evidence.loops import chi_squares

@@ -135,7 +135,7 @@ class Together:
         return worst
 
     def _overlapping(self, later: Steps, new: Mask) -> Sequence[Steps]:
-        """The rows that may share displacements with `later` rows, in parts that fit in memory."""
+        """List rows that may share displacements with `later` rows, in parts that fit in memory."""
         stop = int(later[-1]) + 1
         begin = int(np.searchsorted(self.rows[:stop, 1], self.rows[later, 0].min(), side="right"))
         earlier = np.arange(begin, stop)
@@ -184,7 +184,7 @@ class Together:
         return safe
 
     def _least_excess(self, end: int, later: Steps, earlier: Steps) -> Array:
-        """Return `_excess` of each pair, for the drift with the least."""
+        """Return the least `_excess` of each pair over all drifts."""
         excess = np.full(len(later), np.inf)
         others = (number for number in range(len(self._reckoning.bends)) if number != self._number)
         for number in (self._number, *others):
