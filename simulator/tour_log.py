@@ -20,7 +20,7 @@ from ssh_abduction.data.odometry import Odometry as Noise
 Array = NDArray[np.float64]
 
 
-def noise_of(log: Log, world: World, body: Body, tolerance: Tolerance | None) -> Noise:
+def noise_of(log: OdometryLog, world: World, body: Body, tolerance: Tolerance | None) -> Noise:
     """Make the noise model that a trace states for its displacements.
 
     If streets meet at any angles, and images are at dstates, each displacement has a covariance of
@@ -76,7 +76,7 @@ class Eye:
 
 
 @dataclass
-class Log:
+class OdometryLog:
     """Collects the odometry between the logged steps.
 
     Attributes:

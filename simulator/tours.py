@@ -20,8 +20,8 @@ from simulator.laser import Laser
 from simulator.odometer import Odometer
 from simulator.panorama import Camera
 from simulator.robot import Body, Robot
-from simulator.tour_log import Eye, Log, covariance_of, noise_of
-from simulator.watch import Watch
+from simulator.tour_log import Eye, OdometryLog, covariance_of, noise_of
+from simulator.watch import DriveWatch
 from simulator.world import World
 from ssh_abduction.data.checks import a_flag, a_number, a_whole_number, an_instance
 from ssh_abduction.data.trace import Action, Step, Trace
@@ -102,7 +102,7 @@ def simulate(
         )
     driver = _driver(world, tours, seed, laser, body, tolerance)
     body, tolerance = driver.robot.body, driver.tolerance
-    log = Log(driver.robot)
+    log = OdometryLog(driver.robot)
     # The camera has its own noise, so that it does not change the drive.
     eye = Eye(
         camera, len(world.segments), np.random.default_rng([seed, 1]), tours * len(world.route)
@@ -257,7 +257,7 @@ def _driver(
 
 
 def _at_dstates(
-    driver: Driver, log: Log, world: World, tours: int, stars: bool, eye: Eye
+    driver: Driver, log: OdometryLog, world: World, tours: int, stars: bool, eye: Eye
 ) -> Iterator[Step]:
     """Drive all tours, and make a step at each dstate."""
     is_square = world.angles == "right"
@@ -289,7 +289,7 @@ def _at_dstates(
 
 
 def _evenly(
-    driver: Driver, log: Log, world: World, tours: int, every: float, eye: Eye
+    driver: Driver, log: OdometryLog, world: World, tours: int, every: float, eye: Eye
 ) -> list[Step]:
     """Drive all tours, and make a step every `every` metres of odometry.
 
@@ -331,7 +331,7 @@ def _legs(
 ) -> Iterator[tuple[int, str]]:
     """Drive all tours. Before each action, yield its number over all tours, and its name."""
     pilot = pilot or (Pilot(driver) if world.angles == "any" else Corridors(driver))
-    watch = Watch(world, driver, tours)
+    watch = DriveWatch(world, driver, tours)
     with watch.start():
         pilot.begin()
     for tour in range(tours):

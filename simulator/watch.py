@@ -33,7 +33,7 @@ NOISY, BLURRED = 0.1, 0.03
 
 
 @dataclass
-class Watch:
+class DriveWatch:
     """Checks the drive of a robot. Its methods are used as `with` blocks around motions.
 
     Attributes:

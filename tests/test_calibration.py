@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from perception.places.closures import Closing
+from perception.places.closures import VisitMatch
 from perception.places.importing import calibrated, factor_of
 from perception.places.matching import Match
 from perception.places.track import Array, Track, points_turned
@@ -31,7 +31,7 @@ def poses_of(errors: Array, drift: float) -> Array:
 
 def driven(
     factor: float, seed: int, drift: float = 0.0, wrong: int = 0
-) -> tuple[Track, list[Visit], list[Closing]]:
+) -> tuple[Track, list[Visit], list[VisitMatch]]:
     """A track whose errors have `factor` times the stated covariances, and its closures."""
     chance, count = np.random.default_rng(seed), LAPS * 4 * SIDE
     true = poses_of(np.zeros((count, 3)), 0.0)
@@ -51,7 +51,7 @@ def driven(
             shift = points_turned(poses[a, 2] - true[a, 2], true[b : b + 1, :2] - true[a, :2])[0]
             shift = shift + chance.normal(size=2) * 0.05 + (3.0 if len(closings) < wrong else 0.0)
             turn += chance.normal() * math.radians(0.5)
-            closings.append(Closing(first, last, Match(0.9, turn, shift, 0.9, 0.2)))
+            closings.append(VisitMatch(first, last, Match(0.9, turn, shift, 0.9, 0.2)))
     return Track(poses, covariances), visits, closings
 
 

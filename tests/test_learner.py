@@ -41,7 +41,7 @@ from ssh_abduction.evaluation.paper.claim_table import claims, summary
 from ssh_abduction.evaluation.paper.experiments import (
     EXPERIMENTS,
     FoundMaps,
-    Run,
+    SeedRun,
     measure,
     one_to_one,
     outcome,
@@ -74,7 +74,7 @@ def learnt(run: Trace) -> BootstrapLearner:
 
 
 @pytest.fixture(scope="module")
-def measured() -> Run:
+def measured() -> SeedRun:
     """The measurements of `reproduce` with seed 500 and, to be fast, few circuits."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(EXPERIMENTS, "notched-rectangle", FEW_CIRCUITS)
@@ -758,7 +758,7 @@ def test_reproduce_writes_the_page_and_all_that_made_it(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
-    measured: Run,
+    measured: SeedRun,
 ) -> None:
     """A fast version with few circuits; `reproduce` measures the claims over 20 seeds."""
     monkeypatch.setitem(EXPERIMENTS, "notched-rectangle", FEW_CIRCUITS)
@@ -824,7 +824,7 @@ def test_reproduce_writes_the_page_and_all_that_made_it(
     assert json.loads(capsys.readouterr().out)["claims"] == claimed
 
 
-def test_a_summary_counts_the_seeds_in_which_a_claim_holds(measured: Run) -> None:
+def test_a_summary_counts_the_seeds_in_which_a_claim_holds(measured: SeedRun) -> None:
     good = measured
     bad = replace(
         good,

@@ -11,7 +11,7 @@ import pytest
 from test_distinctive import log_of
 
 from perception.places import closures, matching
-from perception.places.closures import Closing, find_closures, relative, uncertainty
+from perception.places.closures import VisitMatch, find_closures, relative, uncertainty
 from perception.places.distinctive import WINDOW, find_visits
 from perception.places.following import _matched
 from perception.places.local_map import CELL, PackedPatch, Patch
@@ -152,7 +152,7 @@ def test_a_trace_has_the_closures_of_its_visits() -> None:
 
 def test_a_pose_is_relative_to_the_heading_of_the_earlier_step() -> None:
     shift = Match(1.0, 0.1, np.array([1.0, 0.0]), 1.0, 0.1)
-    x, y, turn = relative(Closing(0, 1, shift), math.pi / 2, math.pi)
+    x, y, turn = relative(VisitMatch(0, 1, shift), math.pi / 2, math.pi)
     assert (x, y) == pytest.approx((0.0, -1.0))
     assert turn == pytest.approx(math.pi / 2 + 0.1)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from perception.places.closures import Closing
+from perception.places.closures import VisitMatch
 from perception.places.matching import Match
 from perception.places.partings import PACE, lead_apart, with_partings
 from perception.places.track import Array, Track, points_moved
@@ -56,7 +56,7 @@ def test_stretches_lead_apart_where_both_go_on(first: Points, last: Points, wher
 
 def drive(
     passes: Sequence[Points], pose: tuple[float, float, float], others: Points = ()
-) -> tuple[Track, list[Visit], list[Closing]]:
+) -> tuple[Track, list[Visit], list[VisitMatch]]:
     """A drive with several passes. Each later one is moved by a pose, as if the track had drifted.
 
     Each pass has a visit 2 m after its beginning, and visits at other points of the first pass.
@@ -75,7 +75,7 @@ def drive(
     track = Track(np.column_stack([points, np.zeros(len(points))]), np.zeros((len(points), 3, 3)))
     scans = [int(begin) + 10 for begin in begins]
     closings = [
-        Closing(0, len(others) + k, Match(0.9, -pose[2], turned, 0.9, 0.1))
+        VisitMatch(0, len(others) + k, Match(0.9, -pose[2], turned, 0.9, 0.1))
         for k, turned in enumerate([np.zeros(2)] * (len(passes) - 1), 1)
     ]
     more = [int(np.hypot(*(parts[0] - other).T).argmin()) for other in others]

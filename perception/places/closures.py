@@ -41,7 +41,7 @@ MATCHES, SCENES = 32, 128
 
 
 @dataclass(frozen=True, eq=False)
-class Closing:
+class VisitMatch:
     """A reliable match of two visits.
 
     Attributes:
@@ -57,7 +57,7 @@ class Closing:
 
 def find_closures(
     track: Track, visits: Sequence[Visit], patches: Sequence[PackedPatch], apart: float
-) -> list[Closing]:
+) -> list[VisitMatch]:
     """Find the closures between the visits of a log.
 
     Each visit is matched with at most MATCHES earlier ones, so the time grows with the number of
@@ -77,7 +77,7 @@ def find_closures(
         return Scene.of(patches[visit], visits[visit].middle)
 
     gates, corrected = _Gates(track, visits, apart), _Corrected(visits)
-    found: list[Closing] = []
+    found: list[VisitMatch] = []
     for last in range(len(visits)):
         corrected.predict(last)
         earlier = gates.earlier(last)
@@ -92,7 +92,7 @@ def find_closures(
 
 def _closings(
     scene: Callable[[int], Scene], asked: Sequence[tuple[int, _Gate]], last: int
-) -> Iterator[Closing]:
+) -> Iterator[VisitMatch]:
     """Match a visit with earlier ones, and yield the closures."""
     if not asked:
         return
@@ -103,7 +103,7 @@ def _closings(
     for (first, gate), some in zip(asked, turns, strict=True):
         found = match(scene(first), turned.part(some.start - begin, some.stop - begin))
         if found is not None and is_reliable(found) and gate.allows(found):
-            yield Closing(first, last, found)
+            yield VisitMatch(first, last, found)
 
 
 def is_reliable(found: Match) -> bool:
@@ -194,7 +194,7 @@ class _Corrected:
             onward = points_turned(turn, self._middles[visit] - self._middles[visit - 1])
             self._places[visit], self._turns[visit] = self._places[visit - 1] + onward, turn
 
-    def correct(self, closing: Closing) -> None:
+    def correct(self, closing: VisitMatch) -> None:
         """Place the later visit of a closure by the earlier one."""
         turn = self._turns[closing.first]
         onward = points_turned(turn, closing.match.shift)
@@ -264,7 +264,7 @@ def uncertainty(track: Track, first: int, last: int, end: Array) -> Array:
     return np.asarray(arm @ (track.spreads[last] - track.spreads[first]) @ arm.T)
 
 
-def relative(closing: Closing, first: float, last: float) -> tuple[float, float, float]:
+def relative(closing: VisitMatch, first: float, last: float) -> tuple[float, float, float]:
     """Compute the pose at a later step relative to an earlier one from a closure.
 
     Args:

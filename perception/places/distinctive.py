@@ -21,7 +21,7 @@ from itertools import count
 import numpy as np
 
 from perception.places.following import Followed
-from perception.places.local_map import Beams, LocalMaps
+from perception.places.local_map import BeamCells, LocalMaps
 from perception.places.recent import Recent
 from perception.places.skeleton import Junction, junctions
 from perception.places.stays import AROUND, RIM, SAME, SHARE, SMALL, Stays
@@ -98,7 +98,7 @@ class _Detector:
         """Start before the first scan."""
         self._room = width / 2
         self._recent = Recent()
-        beams = Beams(self._recent, WINDOW)
+        beams = BeamCells(self._recent, WINDOW)
         self._maps = LocalMaps(self._recent, beams, WINDOW)
         self._stays = Stays(self._recent, LocalMaps(self._recent, beams, WINDOW), HALF)
         self._milestones: list[int] = []  # scans; those after the first _seen have no local map yet

@@ -28,7 +28,7 @@ from perception.places.closures import (
     DRIFTS,
     GATE,
     INFLATED,
-    Closing,
+    VisitMatch,
     errors_of,
     find_closures,
     seen_from,
@@ -327,7 +327,7 @@ def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
     seconds[stage] = round(time.process_time() - begin, 3)
 
 
-def calibrated(track: Track, visits: Sequence[Visit], closings: Sequence[Closing]) -> Track:
+def calibrated(track: Track, visits: Sequence[Visit], closings: Sequence[VisitMatch]) -> Track:
     """Return a track with covariances that agree with the closures.
 
     Args:
@@ -338,7 +338,7 @@ def calibrated(track: Track, visits: Sequence[Visit], closings: Sequence[Closing
     return replace(track, covariances=track.covariances * factor_of(track, visits, closings))
 
 
-def factor_of(track: Track, visits: Sequence[Visit], closings: Sequence[Closing]) -> float:
+def factor_of(track: Track, visits: Sequence[Visit], closings: Sequence[VisitMatch]) -> float:
     """Estimate the factor that corrects the covariances of a track; 1 if there is no closure."""
     if not closings:
         return 1.0

@@ -20,7 +20,7 @@ from itertools import accumulate, chain, combinations
 
 import numpy as np
 
-from perception.places.closures import KEPT, TURN, Closing, is_reliable
+from perception.places.closures import KEPT, TURN, VisitMatch, is_reliable
 from perception.places.importing import Imported, with_views
 from perception.places.matching import Scene, Turned, match
 from perception.places.tracing import closure_of
@@ -91,7 +91,7 @@ def join_logs(logs: Sequence[RobotLog], parts: Sequence[Imported]) -> tuple[Robo
     )
 
 
-def _closings(parts: Sequence[Imported], counts: Sequence[int]) -> Iterator[Closing]:
+def _closings(parts: Sequence[Imported], counts: Sequence[int]) -> Iterator[VisitMatch]:
     """Yield the closures between drives, with visits numbered over all drives."""
     scenes = [scenes_of(part) for part in parts]
     for a, b in combinations(range(len(parts)), 2):
@@ -162,7 +162,7 @@ def scenes_of(part: Imported) -> list[Scene]:
 
 def closures_between(
     first: Imported, last: Imported, ours: Sequence[Scene], theirs: Sequence[Scene]
-) -> list[Closing]:
+) -> list[VisitMatch]:
     """Find the closures between two drives.
 
     Args:
@@ -175,15 +175,15 @@ def closures_between(
         Closures from visits of the earlier drive to visits of the later one. Empty if too few
         matches agree.
     """
-    found: list[Closing] = []
+    found: list[VisitMatch] = []
     for j, scene in enumerate(theirs):
         turned = Turned.of(scene, TURNS)
         for i, other in enumerate(ours):
             matched = match(other, turned)
             if matched is not None and is_reliable(matched):
-                found.append(Closing(i, j, matched))
+                found.append(VisitMatch(i, j, matched))
     agreed = _largest(found, _relations(found, first, last))
-    kept: list[Closing] = []
+    kept: list[VisitMatch] = []
     for j in range(len(theirs)):
         here = [closing for closing in agreed if closing.last == j]
         kept += sorted(here, key=lambda closing: -closing.match.score)[:KEPT]
@@ -211,7 +211,7 @@ class _Relations:
         return np.asarray((far < NEAR + DRIFT * np.hypot(*onward.T)) & (twist < TWIST))
 
 
-def _relations(found: Sequence[Closing], first: Imported, last: Imported) -> _Relations:
+def _relations(found: Sequence[VisitMatch], first: Imported, last: Imported) -> _Relations:
     """Collect what matches between the visits of two drives say about their frames."""
     here = [first.visits[one.first].middle + one.match.shift for one in found]
     there = [last.visits[one.last].middle for one in found]
@@ -222,7 +222,7 @@ def _relations(found: Sequence[Closing], first: Imported, last: Imported) -> _Re
     )
 
 
-def _largest(found: Sequence[Closing], relations: _Relations) -> list[Closing]:
+def _largest(found: Sequence[VisitMatch], relations: _Relations) -> list[VisitMatch]:
     """Find the relation of the frames on which most matches agree, and list these matches.
 
     The list is empty if too few visits agree, or if another relation has more than half as many.

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.readers.poses import Track as Odometry
+from perception.readers.poses import RecordedTrack as Odometry
 from perception.readers.poses import sources_of
 from perception.readers.scans import Pose, RobotLog, Scan
 from ssh_abduction.data.odometry import between

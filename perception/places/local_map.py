@@ -92,7 +92,7 @@ class PackedPatch:
         return np.asarray(bits.view(np.bool_).reshape(self.shape))
 
 
-class Beams:
+class BeamCells:
     """The cells that the beams of each recent scan passed and met, found once for each scan.
 
     Args:
@@ -163,7 +163,7 @@ class LocalMaps:
         reach: Metres of trajectory. The window of a scan reaches this far before and after it.
     """
 
-    def __init__(self, recent: Recent, beams: Beams, reach: float) -> None:
+    def __init__(self, recent: Recent, beams: BeamCells, reach: float) -> None:
         """Start with an empty window."""
         self._recent, self._beams, self._reach = recent, beams, reach
         self._side = beams.side

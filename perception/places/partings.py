@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from perception.places.closures import Closing
+from perception.places.closures import VisitMatch
 from perception.places.stays import in_order, taken
 from perception.places.track import Array, Track, points_turned
 from perception.places.visits import Visit, Way
@@ -46,8 +46,8 @@ _Pass = tuple[float, Array]
 
 
 def with_partings(
-    track: Track, visits: Sequence[Visit], closings: Sequence[Closing]
-) -> tuple[tuple[Visit, ...], list[Closing]]:
+    track: Track, visits: Sequence[Visit], closings: Sequence[VisitMatch]
+) -> tuple[tuple[Visit, ...], list[VisitMatch]]:
     """Add a visit for each pass of a place where stretches of a drive lead apart.
 
     Args:
@@ -177,7 +177,7 @@ class _Drive:
         return None
 
 
-def _closed(drive: _Drive, closings: Sequence[Closing]) -> Iterator[_Relation]:
+def _closed(drive: _Drive, closings: Sequence[VisitMatch]) -> Iterator[_Relation]:
     """Yield how trajectories lie relative to each other by closures."""
     for one in closings:
         first, last = drive.visits[one.first], drive.visits[one.last]

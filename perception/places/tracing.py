@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from perception.places.closures import NOISE, Closing, relative, uncertainty
+from perception.places.closures import NOISE, VisitMatch, relative, uncertainty
 from perception.places.local_map import CELL, PackedPatch
 from perception.places.track import Array, Track, wrapped
 from perception.places.visits import Visit, apart, patches_of
@@ -45,7 +45,7 @@ def to_trace(
     log: RobotLog,
     track: Track,
     visits: Sequence[Visit],
-    closings: Sequence[Closing] = (),
+    closings: Sequence[VisitMatch] = (),
     name: str | None = None,
 ) -> Trace:
     """Make the trace of a log, without views.
@@ -86,7 +86,7 @@ def to_trace(
     )
 
 
-def closure_of(found: Closing, arrivals: Sequence[tuple[int, float]]) -> Closure:
+def closure_of(found: VisitMatch, arrivals: Sequence[tuple[int, float]]) -> Closure:
     """Make a closure between the first steps of two visits.
 
     Args:

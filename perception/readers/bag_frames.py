@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from perception.readers.bag_topics import NANO, TRANSFORMS, Bag
 from perception.readers.messages import Damaged
-from perception.readers.poses import Track
+from perception.readers.poses import RecordedTrack
 from perception.readers.scans import Damage, Pose
 from ssh_abduction.data.odometry import between
 
@@ -37,7 +37,7 @@ class Frame:
     translation: NDArray[np.float64]
     rotation: NDArray[np.float64]
     first: Pose
-    track: Track | None
+    track: RecordedTrack | None
     count: int = 0
     off: tuple[float, float] = (0.0, 0.0)
 
@@ -101,7 +101,7 @@ def _record(frames: Frames, child: str, parent: str, transform: Any, is_static: 
     parents = frames.setdefault(child, {})
     edge = parents.get(parent)
     if edge is None or (edge.track is None) != is_static:
-        edge = Frame(parent, np.zeros(3), np.eye(3), flat, None if is_static else Track())
+        edge = Frame(parent, np.zeros(3), np.eye(3), flat, None if is_static else RecordedTrack())
     parents.pop(parent, None)
     parents[parent] = edge  # The parent in the last message comes last.
     edge.translation = np.array([move.x, move.y, move.z])

@@ -40,8 +40,8 @@ from perception.readers.bag_frames import (
 )
 from perception.readers.bag_topics import Bag
 from perception.readers.messages import Damaged
-from perception.readers.poses import Poses, Track, clock_of, sources_of
-from perception.readers.scans import Damage, Laser, Pose, Reading, Scan, laser_of
+from perception.readers.poses import RecordedTrack, TimedPoses, clock_of, sources_of
+from perception.readers.scans import Damage, Laser, Pose, Scan, SurveyedLog, laser_of
 from ssh_abduction.data.errors import brief
 from ssh_abduction.data.odometry import moved
 
@@ -49,7 +49,7 @@ SCANS = ("sensor_msgs/msg/LaserScan", "sensor_msgs/msg/MultiEchoLaserScan")
 ODOMETRY = ("nav_msgs/msg/Odometry",)
 
 
-def read(bag: Bag, scan_topics: Sequence[str], odom_topic: str | None) -> Reading:
+def read(bag: Bag, scan_topics: Sequence[str], odom_topic: str | None) -> SurveyedLog:
     """Survey a bag, so that its scans can be read.
 
     Args:
@@ -109,12 +109,12 @@ def read(bag: Bag, scan_topics: Sequence[str], odom_topic: str | None) -> Readin
     if above:
         notes.append(f"Corrected poses are those of the transforms above {odom}.")
     where = _ScanPoses(
-        Poses.of(odometer, by_stamp),
-        [Poses.of(track, by_stamp) for track in above],
+        TimedPoses.of(odometer, by_stamp),
+        [TimedPoses.of(track, by_stamp) for track in above],
         mounts,
         by_stamp,
     )
-    return Reading(bag.format, tuple(notes), _scans(bag, set(scans), where, damaged), assumed)
+    return SurveyedLog(bag.format, tuple(notes), _scans(bag, set(scans), where, damaged), assumed)
 
 
 def _scan_topics(bag: Bag, named: Sequence[str]) -> list[str]:
@@ -177,13 +177,13 @@ def _survey(bag: Bag, topics: Sequence[str]) -> tuple[dict[str, NDArray[np.float
 
 def _odometer(
     bag: Bag, topic: str, damaged: list[Damage], notes: list[str]
-) -> tuple[Track, str, str]:
+) -> tuple[RecordedTrack, str, str]:
     """Read the poses of the odometer, the name of their frame, and that of the frame of the robot.
 
     `damaged` receives the messages that cannot be read, `notes` a note if several programs publish
     the topic. Raises LogError if no message can be read.
     """
-    tracks: dict[tuple[str, str, str], Track] = {}
+    tracks: dict[tuple[str, str, str], RecordedTrack] = {}
     for connection, number, recorded, message in bag.messages({topic}):
         if isinstance(message, Damage):
             damaged.append(message)
@@ -199,7 +199,7 @@ def _odometer(
             frame_name(message.child_frame_id),
             getattr(connection.ext, "callerid", "") or "",
         )
-        tracks.setdefault(source, Track()).add(stamp_of(message.header), recorded, flat)
+        tracks.setdefault(source, RecordedTrack()).add(stamp_of(message.header), recorded, flat)
     if not tracks:
         raise LogError(f"{bag.source}: expected odometry in {topic}, got none that can be read")
     # Several programs may publish one topic: take the longest track, preferably from a frame odom.
@@ -221,7 +221,7 @@ def _odometer(
     return tracks[best], best[0], best[1]
 
 
-def _odometer_of_transforms(bag: Bag, frames: Frames, frame: str) -> tuple[Track, str, str]:
+def _odometer_of_transforms(bag: Bag, frames: Frames, frame: str) -> tuple[RecordedTrack, str, str]:
     """Read what `_odometer` returns, but from transforms from `odom` to the robot."""
     chain = [(child, parent_of(frames, child)) for child in ancestors(frames, frame)]
     moving = [(child, one) for child, one in chain if one.track is not None]
@@ -238,19 +238,19 @@ def _odometer_of_transforms(bag: Bag, frames: Frames, frame: str) -> tuple[Track
     return edge.track, edge.parent, base
 
 
-def _of_one_source(track: Track, called: str, notes: list[str]) -> Track:
+def _of_one_source(track: RecordedTrack, called: str, notes: list[str]) -> RecordedTrack:
     """Keep the poses of the largest source if those of several alternate, and note it."""
     sources = sources_of(track)
     if len(sources) == 1:
         return track
     # For the note, measure how far the poses of the two largest sources differ.
     table = track.table()
-    first, second = (Track() for _ in range(2))
+    first, second = (RecordedTrack() for _ in range(2))
     for number in sources[0]:
         first.numbers.extend(table[number])
     for number in sources[1]:
         second.numbers.extend(table[number])
-    here, there = Poses.of(first, False), Poses.of(second, False)
+    here, there = TimedPoses.of(first, False), TimedPoses.of(second, False)
     apart = max(math.dist(here.at(time)[:2], there.at(time)[:2]) for time in there.times)
     notes.append(
         f"Several sources publish {called}, whose poses alternate, up to {apart:.1f} m apart: "
@@ -273,8 +273,8 @@ class _ScanPoses:
         by_stamp: Whether times are those of headers, instead of those of recording.
     """
 
-    odometry: Poses
-    corrections: list[Poses]
+    odometry: TimedPoses
+    corrections: list[TimedPoses]
     mounts: dict[str, tuple[Pose, bool]]
     by_stamp: bool
 

@@ -47,7 +47,7 @@ from numpy.typing import NDArray
 
 from perception.errors import LogError
 from perception.readers.carmen_survey import (
-    Found,
+    Findings,
     Meaning,
     meaning_of,
     mount_of,
@@ -70,7 +70,7 @@ from perception.readers.messages import (
     vertex_of,
     words,
 )
-from perception.readers.scans import Damage, Laser, Reading, Scan, laser_of
+from perception.readers.scans import Damage, Laser, Scan, SurveyedLog, laser_of
 from ssh_abduction.data.files import LINE_OF_A_LOG
 from ssh_abduction.data.odometry import Pose, between, moved
 
@@ -111,7 +111,7 @@ def head_of(file: IO[bytes], scans: int) -> bytes:
 
 def read(
     file: IO[bytes], source: str, format: str | None, surveyed: IO[bytes] | None = None
-) -> Reading:
+) -> SurveyedLog:
     """Survey a log in lines, so that its scans can be read.
 
     Args:
@@ -171,7 +171,7 @@ def read(
             "taken to cover 180 degrees. If they cover more or less, say so: --set fov=DEGREES."
         )
     items = _scans(file, source, _Odometer(found, meaning, is_corrected), kind, mount, reach)
-    return Reading("g2o" if found.graph.vertices else "carmen", tuple(notes), items, assumed)
+    return SurveyedLog("g2o" if found.graph.vertices else "carmen", tuple(notes), items, assumed)
 
 
 def _scans(
@@ -232,7 +232,7 @@ class _Odometer:
         news: A corrected pose that waits for the next scan, which gives its odometry.
     """
 
-    found: Found
+    found: Findings
     meaning: Meaning
     is_corrected: bool
     chain: Pose = (0.0, 0.0, 0.0)

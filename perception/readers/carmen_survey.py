@@ -72,7 +72,7 @@ class Chain:
 
 
 @dataclass
-class Graph:
+class PoseGraph:
     """A pose graph: vertices with poses, and edges with motions.
 
     Add all vertices and edges before using the methods, which cache their results.
@@ -213,7 +213,7 @@ class Survey:
 
 
 @dataclass(slots=True)
-class Found:
+class Findings:
     """Findings of the first pass.
 
     Attributes:
@@ -227,11 +227,13 @@ class Found:
     kinds: dict[str, Survey] = field(default_factory=dict)
     parameters: dict[str, float] = field(default_factory=dict)
     tags: Counter[str] = field(default_factory=Counter)
-    graph: Graph = field(default_factory=Graph)
+    graph: PoseGraph = field(default_factory=PoseGraph)
     damage: str = ""
 
 
-def meaning_of(found: Found, survey: Survey, kind: str, source: str, notes: list[str]) -> Meaning:
+def meaning_of(
+    found: Findings, survey: Survey, kind: str, source: str, notes: list[str]
+) -> Meaning:
     """Find out what the poses of the scans mean.
 
     Args:
@@ -283,7 +285,7 @@ def meaning_of(found: Found, survey: Survey, kind: str, source: str, notes: list
 
 
 def _meaning_beside_graph(
-    graph: Graph, survey: Survey, kind: str, source: str, notes: list[str]
+    graph: PoseGraph, survey: Survey, kind: str, source: str, notes: list[str]
 ) -> Meaning:
     """Find out what the poses of the scans mean if the log has vertices.
 
@@ -321,7 +323,7 @@ def _listed(numbers: list[int] | tuple[int, ...]) -> str:
     )
 
 
-def mount_of(found: Found, survey: Survey, meaning: Meaning, kind: str) -> Pose:
+def mount_of(found: Findings, survey: Survey, meaning: Meaning, kind: str) -> Pose:
     """Find the pose of the laser in the frame of the robot.
 
     It is the difference of the two poses of a scan, or else is given by PARAM lines.
@@ -341,7 +343,7 @@ def mount_of(found: Found, survey: Survey, meaning: Meaning, kind: str) -> Pose:
     return parameters.get("offset", 0.0), parameters.get("side", 0.0), parameters.get("angle", 0.0)
 
 
-def reach_of(found: Found, survey: Survey, kind: str, assumed: dict[str, str]) -> float:
+def reach_of(found: Findings, survey: Survey, kind: str, assumed: dict[str, str]) -> float:
     """Find the range in metres from which nothing came back.
 
     Args:
@@ -367,7 +369,7 @@ def reach_of(found: Found, survey: Survey, kind: str, assumed: dict[str, str]) -
     return reach
 
 
-def survey_of(file: IO[bytes], source: str, with_graph: bool) -> Found:
+def survey_of(file: IO[bytes], source: str, with_graph: bool) -> Findings:
     """Read a log, and count the evidence for the meaning of its poses and ranges.
 
     Args:
@@ -375,7 +377,7 @@ def survey_of(file: IO[bytes], source: str, with_graph: bool) -> Found:
         source: Name of the log, for errors.
         with_graph: Whether to read vertices and edges.
     """
-    found = Found()
+    found = Findings()
     odometer: tuple[Pose, float | None] | None = None  # Pose and time of the last ODOM line.
     since: dict[str, int] = {}  # Number of ODOM lines since the last scan of each kind.
     # A scan that waits for the next ODOM line, with the ODOM line before it.

@@ -14,7 +14,7 @@ from perception.errors import LogError
 from perception.readers import bag_files, bag_topics, bags, carmen
 from perception.readers.echoes import LaserOptions, interpret_log, interpret_scan, interpreter_of
 from perception.readers.lines import LONGEST_LINE, Piped, lines, opened, piped
-from perception.readers.scans import Damage, Reading, RobotLog, Scan
+from perception.readers.scans import Damage, RobotLog, Scan, SurveyedLog
 from ssh_abduction.data.checks import a_list, a_path, a_text
 from ssh_abduction.data.errors import brief, named
 from ssh_abduction.data.odometry import Pose
@@ -176,7 +176,7 @@ def live_log(
         yield interpret(item) if isinstance(item, Scan) else item
 
 
-def _assumed(reading: Reading, options: LaserOptions) -> list[str]:
+def _assumed(reading: SurveyedLog, options: LaserOptions) -> list[str]:
     """Notes on what the reader assumed. If the user gave a setting, nothing was assumed for it."""
     return [note for option, note in reading.assumed.items() if getattr(options, option) is None]
 
@@ -187,7 +187,7 @@ def _reading(
     format: str | None,
     scan_topic: str | Sequence[str] | None,
     odom_topic: str | None,
-) -> Iterator[Reading]:
+) -> Iterator[SurveyedLog]:
     """Open and survey a log of any format. Raises LogError."""
     path = a_path("path", path, LogError)
     given = [scan_topic] if isinstance(scan_topic, str) else scan_topic or ()

@@ -34,7 +34,7 @@ SOURCES = 4
 
 
 @dataclass
-class Track:
+class RecordedTrack:
     """Poses over time, in the order of their messages.
 
     Attributes:
@@ -53,7 +53,7 @@ class Track:
 
 
 @dataclass(frozen=True)
-class Poses:
+class TimedPoses:
     """Poses sorted by time.
 
     Attributes:
@@ -65,7 +65,7 @@ class Poses:
     poses: Array
 
     @classmethod
-    def of(cls, track: Track, by_stamp: bool) -> Poses:
+    def of(cls, track: RecordedTrack, by_stamp: bool) -> TimedPoses:
         """Sort the poses of a track: by the stamps in headers, or by the times of recording."""
         table = track.table()
         times = table[:, 0 if by_stamp else 1]
@@ -203,7 +203,7 @@ def _ahead(times: Array, begin: float, every: float) -> tuple[Array, Array]:
     )
 
 
-def sources_of(track: Track) -> list[NDArray[np.intp]]:
+def sources_of(track: RecordedTrack) -> list[NDArray[np.intp]]:
     """Separate the poses of sources that alternate, such as two programs with the same transform.
 
     Each pose is given to the source whose last pose is nearest. If no source is near, the pose

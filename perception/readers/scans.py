@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ssh_abduction.data.odometry import Pose
 from ssh_abduction.data.words import counted
 
-__all__ = ["Damage", "Laser", "Pose", "Reading", "RobotLog", "Scan", "laser_of"]
+__all__ = ["Damage", "Laser", "Pose", "RobotLog", "Scan", "SurveyedLog", "laser_of"]
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ class RobotLog:
 
 
 @dataclass(frozen=True, eq=False)
-class Reading:
+class SurveyedLog:
     """A log that was surveyed. Its scans can be read once.
 
     Attributes:

@@ -48,7 +48,7 @@ MARGIN = 1e-3
 
 
 @dataclass(frozen=True)
-class Closing:
+class LoopGap:
     """The error with which a loop closes by dead reckoning.
 
     Attributes:
@@ -82,7 +82,7 @@ class Refused:
     """
 
     returns: tuple[Return, ...]
-    closings: tuple[Closing, ...]
+    closings: tuple[LoopGap, ...]
     square: float
     most: float
 
@@ -141,7 +141,7 @@ def _refused(trace: Trace, ssh_map: SSHMap, theory: Theory, drifts: Drifts) -> I
         )
 
 
-def _closing(trace: Trace, first: int, last: int) -> Closing:
+def _closing(trace: Trace, first: int, last: int) -> LoopGap:
     """Compute the closing error of the loop from step `first` to step `last`.
 
     The poses assume no drift of the heading. A possible drift adds to the standard deviations.
@@ -151,7 +151,7 @@ def _closing(trace: Trace, first: int, last: int) -> Closing:
     off, covariance = filtered.closing(first, last), filtered.covariance(first, last)
     size = float(np.hypot(*off[:2]))
     ahead = off[:2] / size if size else np.array([1.0, 0.0])
-    return Closing(
+    return LoopGap(
         way=math.fsum(
             math.hypot(*step.displacement[:2])
             for step in trace.steps[first + 1 : last + 1]

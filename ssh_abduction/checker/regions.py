@@ -11,7 +11,7 @@ from typing import TypeAlias
 
 from ssh_abduction.checker.moves import Course, along, course_of, opposite
 from ssh_abduction.checker.reading import Check, Found, Reading
-from ssh_abduction.checker.sides import Branch, right_of
+from ssh_abduction.checker.sides import RightBranch, right_of
 from ssh_abduction.data.regions import Region, listed
 
 _Places: TypeAlias = frozenset[int]
@@ -19,7 +19,7 @@ _Places: TypeAlias = frozenset[int]
 _Node: TypeAlias = tuple[str, int] | tuple[str, int, int | None]
 
 
-def known_sides(m: Reading) -> Mapping[Course, Mapping[int, Branch]]:
+def known_sides(m: Reading) -> Mapping[Course, Mapping[int, RightBranch]]:
     """Find the places known to lie right of each course, each with the branch that leads to it.
 
     Here the order of places comes from travels alone. If a map lists places in an order that

@@ -18,7 +18,7 @@ from ssh_abduction.checker.reading import Check, Found, Reading
 
 
 @dataclass(frozen=True)
-class Branch:
+class RightBranch:
     """A course (path and direction) that leaves to the right of another course at a place.
 
     Attributes:
@@ -52,7 +52,7 @@ class Conflict:
     """
 
     axiom: str
-    branches: tuple[Branch, ...]
+    branches: tuple[RightBranch, ...]
     steps: tuple[int, ...]
     message: str
 
@@ -65,33 +65,35 @@ class Conflict:
 
 # For each course, the places to its right, each with the branch that leads to it. Places to the
 # left of a course are to the right of the opposite course.
-_Right = Mapping[Course, Mapping[int, Branch]]
+_Right = Mapping[Course, Mapping[int, RightBranch]]
 
 
-def branches_of(m: Reading) -> list[Branch]:
+def branches_of(m: Reading) -> list[RightBranch]:
     """List the branches that turns show, then those that the axiom symmetric_sides adds."""
     if "branch_side" not in m.axioms:
         return []
-    found: dict[tuple[int, Course, Course], Branch] = {}
+    found: dict[tuple[int, Course, Course], RightBranch] = {}
     for move in m.turns:
         p, here, there = move.source.place, course_of(move.source), course_of(move.target)
         if p is None or not here or not there or here[0] == there[0]:
             continue
         if move.action.turn in ("right", "left"):
             course = here if move.action.turn == "right" else opposite(here)
-            found.setdefault((p, course, there), Branch(p, course, there, move, mirrored=False))
+            found.setdefault(
+                (p, course, there), RightBranch(p, course, there, move, mirrored=False)
+            )
     if "symmetric_sides" in m.axioms:
         for b in list(found.values()):
             back, away = opposite(b.course), opposite(b.branch)
             for course, branch in ((back, away), (b.branch, back), (away, b.course)):
-                mirrored = Branch(b.place, course, branch, b.turn, mirrored=True)
+                mirrored = RightBranch(b.place, course, branch, b.turn, mirrored=True)
                 found.setdefault((b.place, course, branch), mirrored)
     return list(found.values())
 
 
 def right_of(
     m: Reading, after: Callable[[int, Course], Iterable[int]]
-) -> dict[Course, dict[int, Branch]]:
+) -> dict[Course, dict[int, RightBranch]]:
     """Find the places to the right of each course, each with the branch that leads to it.
 
     Args:
@@ -101,7 +103,7 @@ def right_of(
     excused = {frozenset(pair) for pair in m.map.excused if is_pair(pair)}
     if m.theory.boundary != "defeasible":
         excused = set()
-    found: dict[Course, dict[int, Branch]] = defaultdict(dict)
+    found: dict[Course, dict[int, RightBranch]] = defaultdict(dict)
     for b in branches_of(m) if "side_of_branch" in m.axioms else ():
         if frozenset((b.course[0], b.branch[0])) not in excused:
             for q in after(b.place, b.branch):

@@ -380,7 +380,7 @@ def _changes(closed: Mapping[int, frozenset[int]]) -> float:
 
 
 @dataclass(frozen=True)
-class Change:
+class GatewayChange:
     """A gateway that is open on one drive and closed on the drive that came there before or after.
 
     Attributes:
@@ -398,7 +398,7 @@ class Change:
     is_open: bool
 
 
-def changes_in(trace: Trace, ssh_map: SSHMap, axioms: Collection[str]) -> Iterator[Change]:
+def changes_in(trace: Trace, ssh_map: SSHMap, axioms: Collection[str]) -> Iterator[GatewayChange]:
     """Yield the gateways of a map that change between drives, as `changes_of`.
 
     Args:
@@ -410,7 +410,9 @@ def changes_in(trace: Trace, ssh_map: SSHMap, axioms: Collection[str]) -> Iterat
     yield from changes_of(*sights_of(trace, ssh_map, onward, changes=True), axioms)
 
 
-def changes_of(sights: Sequence[Sight], turns: Turns, axioms: Collection[str]) -> Iterator[Change]:
+def changes_of(
+    sights: Sequence[Sight], turns: Turns, axioms: Collection[str]
+) -> Iterator[GatewayChange]:
     """Yield the gateways that change between drives, by a fit to the headings of the dstates.
 
     Args:
@@ -432,7 +434,7 @@ def changes_of(sights: Sequence[Sight], turns: Turns, axioms: Collection[str]) -
             was, now = (_closed(fitted[first_of[drive]]) for drive in (a, b))
             for slot in sorted(was ^ now):
                 step = seen[first_of[b]].step
-                yield Change(place, bearing[slot], step, (a, b), slot in was)
+                yield GatewayChange(place, bearing[slot], step, (a, b), slot in was)
 
 
 def _allowed(

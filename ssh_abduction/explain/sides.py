@@ -19,7 +19,7 @@ from typing import Any, TypeAlias
 from ssh_abduction.checker.moves import Course
 from ssh_abduction.checker.reading import Reading
 from ssh_abduction.checker.regions import known_sides
-from ssh_abduction.checker.sides import Branch
+from ssh_abduction.checker.sides import RightBranch
 from ssh_abduction.data.checks import a_whole_number
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.maps import SSHMap
@@ -231,7 +231,7 @@ def _path_side(readings: list[Reading], place: int, path: int) -> PathSide:
     return PathSide(path, side, branch.turn.steps if branch else (), sentence, agree)
 
 
-def _side_of(m: Reading, place: int, course: Course) -> tuple[_Side, Branch | None]:
+def _side_of(m: Reading, place: int, course: Course) -> tuple[_Side, RightBranch | None]:
     """Find the side of a course on which a place lies, and the branch that shows it.
 
     Both are None if the side is unknown. The branch is None if the place is on the path.
@@ -245,7 +245,7 @@ def _side_of(m: Reading, place: int, course: Course) -> tuple[_Side, Branch | No
     return None, None
 
 
-def _sentence(place: int, path: int, side: _Side, branch: Branch | None) -> str:
+def _sentence(place: int, path: int, side: _Side, branch: RightBranch | None) -> str:
     """Say on which side of a path in direction +1 a place lies, and why."""
     name = course_named((path, 1))
     if side == "on":

@@ -28,7 +28,7 @@ LEAST_SHARE = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class StepEffect:
     """The effect of one more step on the rivals.
 
     Attributes:
@@ -108,7 +108,7 @@ class RivalMaps:
         """Whether a rival has the cost that was last proven minimal."""
         return rival.cost == self._least
 
-    def follow(self, problem: Problem) -> Change:
+    def follow(self, problem: Problem) -> StepEffect:
         """Extend the rivals by the last step.
 
         Args:
@@ -118,7 +118,7 @@ class RivalMaps:
         t = len(trace) - 1
         self._views.add(trace.steps[t].view)
         if self.is_impossible and self._replays:
-            return Change()
+            return StepEffect()
         done = trace.steps[t - 1].action
         assert done
         seen = observation(trace.steps[t], self._theory)
@@ -128,15 +128,15 @@ class RivalMaps:
         self.rivals = self._gone_on(self.rivals, t)
         if not self._replays:  # a minimal map of fewer steps says nothing about more steps
             self.rivals, self.is_proven, self.is_complete = [], False, False
-            return Change()
+            return StepEffect()
         lost_proof = False
         if self.is_proven and self.is_complete and has_unknown and not self._lists_links:
             self.is_complete, lost_proof = False, True
         if self.is_proven and not self.minimal:
             self.is_proven, self.is_complete, lost_proof = False, False, True
         if lead and contradicted is not None and all(r.cost > lead.cost for r in self.rivals):
-            return Change(lost_proof, self._sentence(t, lead, contradicted, seen))
-        return Change(lost_proof)
+            return StepEffect(lost_proof, self._sentence(t, lead, contradicted, seen))
+        return StepEffect(lost_proof)
 
     def absorb(self, found: Solved) -> None:
         """Use a result of the solver: add its maps to the rivals, and record what is proven.

@@ -67,8 +67,8 @@ from ssh_abduction.rivals.machines import (
     Can,
     Machine,
     MachineTable,
+    Observations,
     Row,
-    Sights,
     Walk,
     links_of,
     machine_of,
@@ -177,7 +177,7 @@ class Laboratory:
     ) -> None:
         settled = theory if theory is None or trace is None else settle(trace, theory).theory
         self._can, self._watch = can, watch
-        self._sights = Sights(rivals, trace, theory)
+        self._sights = Observations(rivals, trace, theory)
         self._links = [
             _to_known_views(links_of(ssh_map, i), ssh_map) for i, ssh_map in enumerate(rivals)
         ]

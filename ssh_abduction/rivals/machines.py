@@ -91,7 +91,7 @@ def _star_text(star: Sequence[Any]) -> str:
     return f"({len(star)} gateways)"
 
 
-class Sights:
+class Observations:
     """The observations at the dstates of rival maps, numbered.
 
     Two dstates have the same number if and only if the robot cannot distinguish them by what it
@@ -228,7 +228,7 @@ class Machine:
     States are the dstates that links reach, numbered breadth first. The current dstate is 0.
 
     Attributes:
-        sights: For each state, the number that `Sights` gives to what is seen there.
+        sights: For each state, the number that `Observations` gives to what is seen there.
         ends: For each state, pairs of an action and the state that it leads to.
     """
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ssh_abduction.evaluation.paper.experiments import EXPERIMENTS, FoundMaps, Run
+from ssh_abduction.evaluation.paper.experiments import EXPERIMENTS, FoundMaps, SeedRun
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,8 @@ class Claim:
 
     text: str
     paper: str
-    here: Callable[[Run], str]
-    holds: Callable[[Run], bool]
+    here: Callable[[SeedRun], str]
+    holds: Callable[[SeedRun], bool]
     ours: bool = False
 
 
@@ -158,12 +158,12 @@ def claims(name: str) -> list[Claim]:
     ]
 
 
-def _quality(run: Run) -> float:
+def _quality(run: SeedRun) -> float:
     """Return M at the chosen number of views."""
     return run.clustering.quality[run.clustering.k]
 
 
-def _uncertainty(run: Run) -> float:
+def _uncertainty(run: SeedRun) -> float:
     """Return U at the chosen number of views."""
     return run.clustering.uncertainty[run.clustering.k]
 
@@ -177,7 +177,7 @@ def _triple(found: FoundMaps) -> str:
     return f"{cost['dstates']}, {cost['places']}, {cost['paths']}{several}"
 
 
-def _trend(run: Run) -> float:
+def _trend(run: SeedRun) -> float:
     """How much the largest offset grows over the whole run, as a share of its mean.
 
     The growth is that of a straight line through the offsets of the tours.
@@ -187,7 +187,7 @@ def _trend(run: Run) -> float:
     return float(slope * len(largest) / largest.mean())
 
 
-def summary(name: str, runs: Sequence[Run]) -> list[dict[str, Any]]:
+def summary(name: str, runs: Sequence[SeedRun]) -> list[dict[str, Any]]:
     """Make a table of the claims about an experiment.
 
     Args:

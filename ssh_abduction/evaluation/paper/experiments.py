@@ -147,7 +147,7 @@ class Contrast:
 
 
 @dataclass(frozen=True)
-class Run:
+class SeedRun:
     """The results of an experiment for one seed.
 
     Attributes:
@@ -177,7 +177,7 @@ class Run:
     spread: list[list[float]]
 
 
-def measure(name: str, seed: int) -> Run:
+def measure(name: str, seed: int) -> SeedRun:
     """Run an experiment from simulation to recognition rates.
 
     Args:
@@ -205,7 +205,7 @@ def measure(name: str, seed: int) -> Run:
     }
     shares = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
     sizes = sorted({max(2, round(len(trace) * share)) for share in shares})
-    return Run(
+    return SeedRun(
         seed=seed,
         images=len(trace),
         clustering=_clustering(learner, truth),
@@ -314,7 +314,7 @@ def _step(trace: Trace) -> float:
 
 
 def _spread(trace: Trace, truth: NDArray[Any], tours: int) -> list[list[float]]:
-    """Compute `Run.spread`: the largest offset of a pose from the mean of its dstate, by tour."""
+    """Compute `SeedRun.spread`: the largest offset of a pose from its dstate's mean, by tour."""
     poses = np.array([step.truth["pose"] for step in trace.steps])
     off = np.zeros_like(poses)
     for name in set(truth):

@@ -29,7 +29,7 @@ from ssh_abduction.evaluation.paper.experiments import (
     VIEWS_ALONE,
     WITH_STARS,
     Outcome,
-    Run,
+    SeedRun,
     measure,
     outcome,
     true_dstates,
@@ -79,7 +79,7 @@ def reproduce(
         raise AbductionError("seeds: expected at least one, got none; write 0-19")
     figures.require_matplotlib()  # now, and not after hours of work
     folder.mkdir(parents=True, exist_ok=True)
-    runs: list[Run] = []
+    runs: list[SeedRun] = []
     for run in _each(measure, [(name, seed) for seed in seeds], jobs):
         runs.append(run)
         on_done(f"seed {run.seed}")
@@ -153,7 +153,7 @@ def steps(name: str, seeds: Sequence[int], outcomes: bool) -> int:
     return len(seeds) + 1 + (len(NOTCHES) * len(SCALES) if has_outcomes else 0)
 
 
-def _draw(name: str, run: Run, folder: Path, on_done: Callable[[str], None]) -> None:
+def _draw(name: str, run: SeedRun, folder: Path, on_done: Callable[[str], None]) -> None:
     """Draw the figures of one run, and write its trace."""
     e = EXPERIMENTS[name]
     world = World.named(e.world)
@@ -277,7 +277,7 @@ FIGURES = {
 }
 
 
-def _page(name: str, runs: Sequence[Run], table: Sequence[dict[str, Any]], folder: Path) -> str:
+def _page(name: str, runs: Sequence[SeedRun], table: Sequence[dict[str, Any]], folder: Path) -> str:
     """Write the HTML page, with the figures that are already in the folder."""
     rows = "\n".join(
         f"<tr class='{'ours' if row['ours'] else 'paper'}'><td>{escape(claimed(row))}</td>"

@@ -28,7 +28,7 @@ from ssh_abduction.solver.asp.limits import StageTimeError
 from ssh_abduction.solver.engines.base import Found, Task
 from ssh_abduction.solver.engines.blocks import Blocks
 from ssh_abduction.solver.engines.faulty_control import LONG, FaultyAnswer, FaultyControl
-from ssh_abduction.solver.guesses.robust import Explained, Explainer, Machine, robust_maps
+from ssh_abduction.solver.guesses.robust import Explained, Explainer, PartialMachine, robust_maps
 from ssh_abduction.theory.evidence import Equality
 
 FEW = 80  # make no guess for a trace of at most this many steps, as clingo is fast
@@ -232,7 +232,7 @@ class FaultyEngine:
         if bound and self._most_faults is None:
             self.bound = max(self.bound or 0, bound[0])
 
-    def _machine(self, answer: FaultyAnswer) -> tuple[dict[int, int], Machine]:
+    def _machine(self, answer: FaultyAnswer) -> tuple[dict[int, int], PartialMachine]:
         """Make a machine, which is dstates and links, from an answer.
 
         Returns:
@@ -248,7 +248,7 @@ class FaultyEngine:
             for t in answer.where
             if t + 1 in answer.where and t not in answer.slips
         }
-        return number, Machine([view_of[name] for name in number], goes)
+        return number, PartialMachine([view_of[name] for name in number], goes)
 
     def _followed(self, answer: FaultyAnswer) -> tuple[list[int] | None, int]:
         """Follow the links of an answer through the steps that clingo was not given.

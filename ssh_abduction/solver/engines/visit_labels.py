@@ -37,9 +37,9 @@ from ssh_abduction.solver.asp.facts import visits_lp
 from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.refusing import first_accepted
 from ssh_abduction.solver.engines.visit_program import (
-    Answer,
     Refusal,
     Sides,
+    VisitAnswer,
     VisitProgram,
     fits_in_time,
 )
@@ -194,7 +194,7 @@ class VisitLabels:
         else:
             self._give_more(reason.missed)
 
-    def _best_answer(self) -> Answer | None:
+    def _best_answer(self) -> VisitAnswer | None:
         """Find an answer with the fewest first nodes of dstates; None if there is no answer."""
         read = self.program.read
         better = list(
@@ -209,7 +209,7 @@ class VisitLabels:
             return None
         pairs, fewest = better[-1]
         self._raise_bound(fewest)
-        return Answer(pairs)
+        return VisitAnswer(pairs)
 
     def all_of(self, dstates: int) -> Generator[list[int], None, None]:
         """Yield all labels with this many dstates, each once.
@@ -242,9 +242,9 @@ class VisitLabels:
     def _other(self, dstates: int) -> tuple[int, ...] | None:
         """Find labels with this many dstates that are not excluded; None if there are none."""
 
-        def ask() -> Answer | None:
+        def ask() -> VisitAnswer | None:
             found, _ = self._asker.verdict(self.program.read, [], mode=f"enum,{dstates}")
-            return None if found is None else Answer(found)
+            return None if found is None else VisitAnswer(found)
 
         answer = first_accepted(ask, self.program.why_not, self._tell_why)
         return None if answer is None else self.program.labels(answer.located)

@@ -40,7 +40,7 @@ class Sides(Protocol):
 
 
 @dataclass
-class Answer:
+class VisitAnswer:
     """An answer of clingo.
 
     Attributes:
@@ -267,7 +267,7 @@ class VisitProgram:
             numbered(faced(everywhere.states[visit], slot) for visit, slot in self.chart.facing)
         )
 
-    def why_not(self, answer: Answer) -> Refusal | None:
+    def why_not(self, answer: VisitAnswer) -> Refusal | None:
         """Return the reason to reject an answer; None if it is accepted."""
         threes = self.intransitive(answer.pairs)
         if not threes:

@@ -34,7 +34,7 @@ from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.rotations import leads
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Action, Step, Trace
-from ssh_abduction.solver.guesses.tree import Contradiction, Known, Sketch
+from ssh_abduction.solver.guesses.tree import Contradiction, KnownDState, Sketch
 from ssh_abduction.solver.steps.log import observation
 from ssh_abduction.theory.theory import Theory
 
@@ -217,7 +217,7 @@ class GatewaySketch(Sketch):
                 return path, -(direction or 1)
         return None
 
-    def _may_begin_path(self, s: Known) -> bool:
+    def _may_begin_path(self, s: KnownDState) -> bool:
         """Whether a new path may leave a place in the heading of a dstate."""
         self._orders.append([s.place])
         s.path, s.direction = len(self._orders) - 1, 1

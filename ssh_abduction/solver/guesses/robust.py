@@ -48,7 +48,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Machine:
+class PartialMachine:
     """Dstates with their views, and links. An action at a dstate need not have a link.
 
     Attributes:
@@ -73,7 +73,7 @@ class Explained:
         tenths: The cost of dstates and faults, in tenths of dstates.
     """
 
-    machine: Machine
+    machine: PartialMachine
     labels: Sequence[int]
     misread: Sequence[int]
     slips: Sequence[int]
@@ -102,7 +102,7 @@ class Explainer:
     price: Mapping[str, Sequence[int]]
     check: Callable[[], None] = field(default=lambda: None)
 
-    def explained(self, machine: Machine) -> Explained:
+    def explained(self, machine: PartialMachine) -> Explained:
         """Find the labels with the cheapest faults for a machine, by a Viterbi pass.
 
         An action without a link may lead to any dstate.
@@ -148,7 +148,7 @@ class Explainer:
         labels.reverse()
         return self._explained(machine, labels)
 
-    def completed(self, machine: Machine) -> Explained:
+    def completed(self, machine: PartialMachine) -> Explained:
         """Add links to a machine until no step of the trace lacks one, and explain the trace by it.
 
         An action without a link gets one to the dstate that follows most often in the labels.
@@ -161,11 +161,11 @@ class Explainer:
                     explained.labels[t + 1]
                 ] += 1
             led = {key: counts.most_common(1)[0][0] for key, counts in votes.items()}
-            machine = Machine(machine.shows, {**machine.goes, **led})
+            machine = PartialMachine(machine.shows, {**machine.goes, **led})
             explained = self.explained(machine)
         return explained
 
-    def read_off(self, labels: Sequence[int]) -> Machine:
+    def read_off(self, labels: Sequence[int]) -> PartialMachine:
         """Make a machine from labels.
 
         A dstate gets the view that is most expensive to treat as misread. An action leads where it
@@ -182,7 +182,7 @@ class Explainer:
             views[label][self.seen[t]] += trust[t] if trust else 1
         for t, action in enumerate(self.actions):
             ends.setdefault((labels[t], action), Counter())[labels[t + 1]] += 1
-        return Machine(
+        return PartialMachine(
             [found.most_common(1)[0][0] for found in views],
             {key: found.most_common(1)[0][0] for key, found in ends.items()},
         )
@@ -217,7 +217,7 @@ class Explainer:
             best = better
         return best
 
-    def _explained(self, machine: Machine, labels: Sequence[int]) -> Explained:
+    def _explained(self, machine: PartialMachine, labels: Sequence[int]) -> Explained:
         """Make the explanation that given labels are: find their faults, and add up the cost.
 
         Args:

@@ -52,7 +52,7 @@ class Contradiction(Exception):  # noqa: N818 - not an error
 
 
 @dataclass(slots=True)
-class Known:
+class KnownDState:
     """A dstate of a sketch, as far as it is known.
 
     Attributes:
@@ -98,7 +98,7 @@ class Sketch:
         self._theory = theory
         self._homing = homing or theory.next_place
         self._framed = framed or theory.star == "frame"
-        self._states: list[Known] = []
+        self._states: list[KnownDState] = []
         self._links: dict[tuple[int, str], int] = {}
         self._stars: list[object] = []  # for each place, its star (the openings seen there)
         self._orders: list[list[int]] = []  # for each path, its places in the order of direction 1
@@ -151,7 +151,9 @@ class Sketch:
             place, heading, direction = s.place or 0, s.heading or 0, s.direction or 1
             assert s.view is not None
             sketch._states.append(
-                Known(s.view, observation(seen[s.id], theory), place, heading, s.path, direction)
+                KnownDState(
+                    s.view, observation(seen[s.id], theory), place, heading, s.path, direction
+                )
             )
             stars.setdefault(place, sketch._star(seen[s.id], heading))
             if s.path is not None:
@@ -350,7 +352,7 @@ class Sketch:
         assert step.view is not None
         if self._star(step, heading) != self._stars[place]:
             raise Contradiction
-        self._states.append(Known(step.view, observation(step, self._theory), place, heading))
+        self._states.append(KnownDState(step.view, observation(step, self._theory), place, heading))
         if self._framed:
             self._facing[place, heading] = len(self._states) - 1
         return len(self._states) - 1
