@@ -134,6 +134,6 @@ def _affordable(file: BinaryIO) -> None:
         if unpacked > LARGEST:
             raise PerceptionError(
                 f"images: expected at most {LARGEST} bytes once unpacked, got {unpacked}; "
-                "write fewer images a file"
+                "write fewer images to each file"
             )
     file.seek(0)

@@ -57,10 +57,10 @@ def tour(
 
     In each room, the robot turns to the door that it has passed least often, and travels through
     it. Ties are broken at random. It goes back through the same door only in a dead end. A view is
-    the number of doors and their rough directions, so many rooms look alike. A star is the bearings
-    of all doors. A turn has a side and a number: "left to gateway 2" ends at the second gateway on
-    the left. A turn to the door by which the robot came, or to the door opposite the one that it
-    faces, is "around".
+    the number of doors and their rough directions. Many rooms have the same view. A star is the
+    bearings of all doors. A turn has a side and a number: "left to gateway 2" ends at the second
+    gateway on the left. A turn to the door by which the robot came, or to the door opposite the one
+    that it faces, is "around".
 
     Args:
         plan: The plan.

@@ -87,7 +87,7 @@ def test_a_name_is_moved_and_a_gateway_changes_its_mind() -> None:
     said = Corrections(MARKS).with_name("hall", "place", "monday:1")
     assert [n.name for n in said.with_name("kitchen", "place", "monday:1").names] == ["kitchen"]
     with pytest.raises(
-        MapError, match=r"another name than 'hall', which names\[0\] has at monday:1"
+        MapError, match=r"another name than 'hall', as names\[0\] at monday:1 has it"
     ):
         said.with_name("hall", "place", "monday:3")
     assert len(said.with_name("hall", "path", "monday:3").names) == 2

@@ -544,11 +544,11 @@ def test_a_bag_says_what_its_odometry_is_worth(tmp_path: Path) -> None:
     [
         (
             ["school.xml"],
-            "school.xml: expected --format carmen or --format bag beside a floor plan",
+            "school.xml: expected --format carmen or --format bag with a floor plan",
         ),
         (
             ["school.xml", "--format", "carmen", "--set", "reach=1"],
-            "--reach: expected none beside a floor plan",
+            "--reach: expected none with a floor plan",
         ),
         (
             ["triangle", "--format", "carmen", "--set", "stars=false"],

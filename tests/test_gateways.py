@@ -150,7 +150,7 @@ def test_a_malformed_star_is_an_error(star: Any, message: str) -> None:
         ),
         (
             {"bearing": 60, "kind": "travel"},
-            "action.bearing: expected degrees clockwise, for a turn",
+            "action.bearing: expected degrees clockwise, and only for a turn",
         ),
         ({"bearing": "x"}, "action.bearing: expected degrees clockwise"),
     ],

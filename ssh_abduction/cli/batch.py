@@ -102,7 +102,7 @@ class SolveQuestion:
         return self.limit is not None or self.memory is not None
 
     def load(self, path: str) -> Trace:
-        """Load a trace, to send it to a worker without this disk."""
+        """Load a trace here, because a worker may not be able to read the file."""
         return Trace.load(path)
 
     def answer(

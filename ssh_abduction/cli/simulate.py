@@ -155,8 +155,8 @@ def run(options: argparse.Namespace) -> int:
         return _write_log(options, _drive(options))
     if options.world.endswith(".xml"):
         raise AbductionError(
-            f"{named(options.world)}: expected --format carmen or --format bag beside a floor "
-            "plan, as it has no route of actions; add that"
+            f"{named(options.world)}: expected --format carmen or --format bag with a floor "
+            "plan, as it has no route of actions; add one of them"
         )
     noise = Body.odometry if options.odometry_noise is None else options.odometry_noise
     body = Body(odometry=noise, scale=options.scale_error, bend=math.radians(options.bend_error))
@@ -211,7 +211,7 @@ def _drive(options: argparse.Namespace) -> Drive:
     for name in ("start", "route", "reach"):
         if getattr(options, name) is not None:
             raise AbductionError(
-                f"--{name}: expected none beside a floor plan, whose rounds are drawn by --seed; "
+                f"--{name}: expected none with a floor plan, whose rounds are drawn by --seed; "
                 "leave it out"
             )
     return record_plan(
@@ -289,7 +289,7 @@ def _camera(options: argparse.Namespace) -> Camera | None:
         begin, end = (float(hour) for hour in options.hours.split(","))
     except ValueError:
         raise AbductionError(
-            "hours: expected two hours with a comma between them, as 7,19, got "
+            "hours: expected two hours with a comma between them, such as 7,19, got "
             f"{options.hours!r}; write two"
         ) from None
     return Camera(paint=paint, hours=(begin, end))

@@ -85,7 +85,7 @@ class Action:
         """Return the direction of a turn by `bearing` degrees, or raise TraceError."""
         if self.kind != "turn" or not is_finite(self.bearing):
             raise TraceError(
-                f"action.bearing: expected degrees clockwise, for a turn, "
+                "action.bearing: expected degrees clockwise, and only for a turn, "
                 f"got {brief(self.bearing)}; leave it out elsewhere"
             )
         assert self.bearing is not None

@@ -349,8 +349,8 @@ class Corrections:
             ):
                 if key in first:
                     raise MapError(
-                        f"{where}: names[{i}]: expected {what}, which names[{first[key]}] has at "
-                        f"{self.names[first[key]].step}, got {naming}; rename one of them"
+                        f"{where}: names[{i}]: expected {what}, as names[{first[key]}] at "
+                        f"{self.names[first[key]].step} has it, got {naming}; rename one of them"
                     )
                 first[key] = i
 

@@ -129,7 +129,7 @@ class Frame:
 
     @property
     def with_closed(self) -> tuple[Frame, ...]:
-        """This frame, and all with up to MOST_CLOSED closed gateways between the others."""
+        """This frame, and the frames that add up to MOST_CLOSED closed gateways to it."""
         return _with_closed(self)
 
 

@@ -70,8 +70,8 @@ class Pairs:
     Attributes:
         judged: The number of pairs for which the truth is known: one place (or dstate), or not.
         returns: The number of judged pairs that are truly at one place (or dstate).
-        stayed: The number of pairs left out because they are near each other, but the robot was not
-            farther away in between.
+        stayed: The number of pairs left out because they are near each other and the robot did not
+            leave in between.
         unknown: The number of pairs left out because their distance is not known well enough.
     """
 

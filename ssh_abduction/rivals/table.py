@@ -93,13 +93,12 @@ class Table:
     def questions(self, sort: Sort) -> Iterator[tuple[int, int, Bools]]:
         """Yield questions that distinguish maps: are two classes one?
 
-        It is enough to pair each class with the first class of its group in each map: two maps in
-        which every class has the same first class group all classes in the same way.
+        Each class is paired only with the first class of its group in each map. Two maps that agree
+        on these pairs group all classes in the same way.
 
         Yields:
             Two classes, the earlier first, and for each map whether the two are one in it. If both
-            are the same class: for each map, whether the class is at a place, or along a path, at
-            all.
+            are the same class: for each map, whether the class has a place, or a path.
         """
         ones = self.ones[sort]
         for c in np.flatnonzero((ones != ones[0]).any(axis=0)).tolist():

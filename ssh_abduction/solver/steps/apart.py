@@ -47,9 +47,8 @@ class Continuations:
     """Compares the continuations of steps: the views and actions of the trace from each step on.
 
     The steps are sorted by their continuations, as in a suffix array (Manber, Myers 1993). For n
-    steps this takes time proportional to n log² n. Take two steps and all steps between them in the
-    sorted order. The shortest prefix that two neighbours of these share is the prefix that the two
-    steps share.
+    steps this takes time proportional to n log² n. The prefix that two
+    steps share is the shortest one that neighbours share between them in this order.
     """
 
     def __init__(
