@@ -349,3 +349,14 @@ def test_nonsense_in_the_shell_is_refused(
         main(["import", "drive.log", *words])
     assert end.value.code == 2
     assert "expected" in (said := capsys.readouterr().err) or "invalid choice" in said
+
+
+@pytest.mark.parametrize("measured", [0, 4])
+def test_scans_that_measure_nothing_have_no_beams_beside(
+    coarse: tuple[Scan, ...], measured: int
+) -> None:
+    unseen = [replace(scan, ranges=np.full_like(scan.ranges, np.nan)) for scan in coarse[measured:]]
+    _, notes = interpret_log([*coarse[:measured], *unseen], LaserOptions())
+    (note,) = (note for note in notes if "of the beams are NaN" in note)
+    assert " 0 m" not in note
+    assert ("no beam measured anything" in note) == (measured == 0)

@@ -18,6 +18,7 @@ from perception.places.importing import import_log, tracked
 from perception.readers.scans import RobotLog, Scan
 from simulator.tours import record
 from simulator.world import World
+from ssh_abduction.cli.mapping import MapQuestion
 from ssh_abduction.cli.simulate import scans_of
 from ssh_abduction.data.odometry import between, moved
 
@@ -153,7 +154,7 @@ def test_a_log_whose_scans_do_not_match_is_refused(
     scans: tuple[Scan, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log = RobotLog(scans[::20], source="drive")
-    with pytest.raises(LogError, match=r"% do not\. The usual step between two scans is"):
+    with pytest.raises(LogError, match="% do not; take all scans of the drive"):
         import_log(log)
     # The laser of a robot whose beams are mirrored sees what the odometry contradicts.
     monkeypatch.setattr(log_checks, "SPARSE", 1e9)
@@ -161,3 +162,27 @@ def test_a_log_whose_scans_do_not_match_is_refused(
     assert "contradicts the odometry in" in notes_of(mirrored)
     drives = [RobotLog(tuple(some), source="drive") for some in (scans, mirrored)]
     assert [tracked(drive)[1].is_reliable for drive in drives] == [True, False]
+
+
+def test_scans_of_few_beams_are_said_to_have_too_few(
+    scans: Scans, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(log_checks, "HOPELESS", -1.0)
+    few = every_second_beam(every_second_beam(tuple(scans[:60])))
+    assert few[0].laser.beams < log_checks.FEW_BEAMS < scans[0].laser.beams
+    for some, advised in ((few, True), (scans[:60], False)):
+        with pytest.raises(LogError, match="got 60 of which") as refused:
+            import_log(RobotLog(tuple(some), source="drive"))
+        assert ("record at least 30 beams a scan" in str(refused.value)) == advised
+        assert "; " in str(refused.value)  # there is advice
+
+
+def test_an_error_does_not_repeat_the_notes(scans: Scans, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(log_checks, "HOPELESS", -1.0)
+    log, told = RobotLog(tuple(backwards(scans[:120])), source="drive"), list[str]()
+    with pytest.raises(LogError) as refused:
+        import_log(log, tell=told.append)
+    assert told == refused.value.__notes__ != []
+    assert told[0] not in str(refused.value)
+    answer = MapQuestion(None, {}, {}, 0.5, None, 1, ladder=False).failed(0, "drive", refused.value)
+    assert answer.warnings == tuple(told)

@@ -172,22 +172,25 @@ def import_live(
 
 
 def _refuse_bad(log: RobotLog, track: Track, notes: Sequence[str]) -> None:
-    """Raise a LogError if the track shows no drive. It repeats the notes, which may say why."""
+    """Raise a LogError if the track shows no drive. The notes, which may say why, go with it."""
     if len(track.breaks) > MOST_BREAKS * len(log):
-        raise LogError(
+        raise _noted(
             f"{named(log.source)}: expected a log of one drive, got {len(log)} scans of which "
             f"{len(track.breaks)} show nothing that the previous scan shows; sort it by "
-            f"time, or cut it into drives{_besides(notes)}"
+            "time, or cut it into drives",
+            notes,
         )
     if (failing := log_checks.share_failing(track)) > log_checks.HOPELESS:
-        raise LogError(
+        raise _noted(
             f"{named(log.source)}: expected scans that show what the scans before them showed, got "
-            f"{len(log)} of which {100 * failing:.0f} % do not{_besides(notes)}"
+            f"{len(log)} of which {100 * failing:.0f} % do not; {log_checks.advice(log)}",
+            notes,
         )
     if track.way[-1] < 1.0:
-        raise LogError(
+        raise _noted(
             f"{named(log.source)}: expected a robot that drives, got a drive of "
-            f"{track.way[-1]:.1f} m; take a longer log{_besides(notes)}"
+            f"{track.way[-1]:.1f} m; take a longer log",
+            notes,
         )
 
 
@@ -202,9 +205,10 @@ def _imported(
 ) -> Imported:
     """Make the trace of the visits, and gather the result of an import. Raises LogError."""
     if not visits:
-        raise LogError(
+        raise _noted(
             f"{named(log.source)}: expected a way past junctions or turning points, got "
-            f"{track.way[-1]:.0f} m without any; take a longer log{_besides(notes)}"
+            f"{track.way[-1]:.0f} m without any; take a longer log",
+            notes,
         )
     with _timed(seconds, "trace"):
         closings = find_closures(track, visits, patches_of(visits), 2 * WINDOW)
@@ -288,9 +292,12 @@ def tracked(
     return log, track, tuple(notes)
 
 
-def _besides(notes: Sequence[str]) -> str:
-    """Join notes to the end of an error message; an empty text if there are none."""
-    return f". {' '.join(notes)}" if notes else ""
+def _noted(message: str, notes: Sequence[str]) -> LogError:
+    """Make an error with notes. They are no part of its text, as they were told already."""
+    error = LogError(message)
+    for note in notes:
+        error.add_note(note)
+    return error
 
 
 def with_views(trace: Trace) -> Trace:

@@ -362,6 +362,8 @@ def reach_of(found: Findings, survey: Survey, kind: str, assumed: dict[str, str]
     reach = without_codes(
         survey.most if survey.repeated > 2 or survey.most > SICK_REACH else math.ceil(survey.most)
     )
+    if reach <= 0:  # no beam measured anything, which another note says
+        return math.inf
     assumed["no_return"] = (
         "The log does not say how far the laser reaches. By its largest range, "
         f"{survey.most:g} m, which occurs {survey.repeated} times, it is {reach:g} m."

@@ -360,21 +360,26 @@ def _without_measurement(scans: Sequence[Scan], reach: float) -> tuple[frozenset
     for kind, count in counts.items():
         if count < WORTH_A_NOTE * beams:
             continue
+        if not len(everything):
+            notes.append(
+                f"{_percent(count / beams)} of the beams are {kind}, and no beam measured "
+                "anything. Look at the laser and its driver."
+            )
+            continue
         typical = float(np.median(np.concatenate(beside[kind]))) if beside[kind] else 0.0
-        is_free = (
-            bool(len(everything))
-            and math.isfinite(reach)
-            and float((everything < typical).mean()) >= LONG
-        )
+        is_free = math.isfinite(reach) and float((everything < typical).mean()) >= LONG
         free |= {kind} if is_free else set()
         taken, other = (
             ("nothing came back", "unknown") if is_free else ("nothing is known there", "free")
         )
+        sides = (
+            f"The beams beside them are {typical:.2g} m long, where {usual:.2g} m is usual"
+            if typical
+            else "Most of their scans measured nothing at all"
+        )
         notes.append(
-            f"{_percent(count / beams)} of the beams are {kind}. The beams beside them are "
-            f"{typical:.2g} m long, where "
-            f"{usual:.2g} m is usual. So they are taken to mean that {taken}. If that is wrong, "
-            f"say --set zero_is={other}."
+            f"{_percent(count / beams)} of the beams are {kind}. {sides}. So they are taken "
+            f"to mean that {taken}. If that is wrong, say --set zero_is={other}."
         )
     return frozenset(free), notes
 

@@ -323,6 +323,7 @@ class MapQuestion:
             number,
             message if message.startswith(named(path)) else f"{named(path)}: error: {message}",
             EXIT_ERROR,
+            tuple(getattr(error, "__notes__", ())),  # the warnings that may say why
         )
 
 
