@@ -96,7 +96,7 @@ class Driver:
         return np.median(scans, axis=0) if images > 1 else scans[0]
 
     def see(self, images: int = 1) -> Sight:
-        """Find the walls in the median of this many scans."""
+        """Find the walls in the median of `images` scans."""
         return sight(self.look(images), self.world.reach, self.laser.reach)
 
     def ride(self, name: str) -> None:

@@ -33,7 +33,7 @@ def add_parser(verbs: Verbs) -> None:
         "Check maps against a trace and the axioms, without clingo. Reports each axiom that a "
         "map breaks, and at which steps."
     )
-    parser = verbs.add_parser("check", help="do these maps satisfy the axioms?", description=text)
+    parser = verbs.add_parser("check", help="judge maps by the axioms", description=text)
     add_maps(parser)
     add_trace(parser)
     parser.add_argument(

@@ -26,7 +26,7 @@ def add_parser(verbs: Verbs) -> None:
         "differ, and which questions about steps decide between them."
     )
     parser = verbs.add_parser(
-        "compare", help="what do rival maps share, and where do they differ?", description=text
+        "compare", help="show what rival maps share, and where they differ", description=text
     )
     parser.add_argument("maps", help=MAPS_SAID)
     parser.add_argument(

@@ -51,7 +51,7 @@ def add_parser(verbs: Verbs) -> None:
         "Compare maps with the truth in the trace. Reports which map is true, and how far the "
         "others are from it."
     )
-    parser = verbs.add_parser("evaluate", help="how right are these maps?", description=text)
+    parser = verbs.add_parser("evaluate", help="compare maps with the truth", description=text)
     add_maps(parser)
     add_trace(parser, "trace file (JSON Lines) with truth")
     parser.add_setting(

@@ -60,7 +60,7 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser = verbs.add_parser(
         "explain",
-        help="why are two steps one dstate, or not? why is there no map?",
+        help="say why two steps are one dstate or two, or why there is no map",
         description=text,
     )
     parser.add_argument(

@@ -31,7 +31,7 @@ def add_parser(verbs: Verbs) -> None:
         "and the size of the minimal maps; and, if the trace has truth, which map is true."
     )
     parser = verbs.add_parser(
-        "ladder", help="what is each kind of evidence worth?", description=text
+        "ladder", help="show how much each kind of evidence helps", description=text
     )
     parser.add_argument(
         "trace", type=trace_in, help="trace file (JSON Lines), or - for standard input"

@@ -39,9 +39,7 @@ def add_parser(verbs: Verbs) -> None:
         "localisation computes a belief over dstates after each step. The robot may start "
         "anywhere, be kidnapped, or leave the map."
     )
-    parser = verbs.add_parser(
-        "localise", help="where in a known map is the robot?", description=text
-    )
+    parser = verbs.add_parser("localise", help="follow a robot in a known map", description=text)
     add_maps(parser)
     parser.add_argument(
         "other",

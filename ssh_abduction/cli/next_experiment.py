@@ -47,7 +47,7 @@ def add_parser(verbs: Verbs) -> None:
         "most of them, and the way to it."
     )
     parser = verbs.add_parser(
-        "next", help="what should the robot do to distinguish these maps?", description=text
+        "next", help="find the actions after which rival maps disagree", description=text
     )
     add_maps(parser)
     add_trace(parser)

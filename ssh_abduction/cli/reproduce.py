@@ -21,9 +21,7 @@ def add_parser(verbs: Verbs) -> None:
         "Reproduce an experiment of Kuipers & Beeson (2002): simulate, cluster, abduce, learn. "
         "Writes figures, data and a page into a folder."
     )
-    parser = verbs.add_parser(
-        "reproduce", help="the paper's experiments, end to end", description=text
-    )
+    parser = verbs.add_parser("reproduce", help="run the paper's experiments", description=text)
     parser.add_argument(
         "experiment", choices=("notched-rectangle", "taylor-hall"), help="the experiment"
     )

@@ -16,7 +16,9 @@ def add_parser(verbs: Verbs) -> None:
         "another, and the views to expect on the way. If the map lists regions, say first which "
         "regions the route leaves and enters, and which paths it passes."
     )
-    parser = verbs.add_parser("route", help="which actions lead there?", description=text)
+    parser = verbs.add_parser(
+        "route", help="find the actions that lead to a place", description=text
+    )
     add_maps(parser)
     parser.add_argument(
         "--from",

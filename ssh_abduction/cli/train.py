@@ -49,7 +49,7 @@ def add_parser(verbs: Verbs) -> None:
     )
     curve = verbs.add_parser(
         "learning-curve",
-        help="how well a recogniser does with few and many images",
+        help="measure a recogniser with few and with many images",
         description=text,
     )
     curve.add_setting(

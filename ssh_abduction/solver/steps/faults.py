@@ -135,7 +135,7 @@ def _in_order(fault: Fault) -> tuple[int, int]:
 
 
 def with_compass(ssh_map: SSHMap) -> SSHMap:
-    """Add to each "changed" fault of a map with poses which way its gateway is; y is north.
+    """Add the direction of its gateway to each "changed" fault, if the map has poses. North is y.
 
     A map of several pieces, which have no common frame, is returned as it is.
     """
