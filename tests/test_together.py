@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import pickle
 from collections.abc import Hashable, Sequence
 from dataclasses import replace
@@ -48,6 +49,7 @@ from ssh_abduction.rivals import Listing, compare, difference, joins_of_drives
 from ssh_abduction.solver import choosing, prefixes
 from ssh_abduction.solver.fit import Poses
 from ssh_abduction.solver.guesses.beam import Beam
+from ssh_abduction.solver.guesses.pieces import Pieces, headings
 from ssh_abduction.solver.misfit import Misfit
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import settle
@@ -379,6 +381,17 @@ def test_a_narrow_beam_finds_a_joint_map_as_cheap_as_the_true_one(known: truth.K
         nats(m.dstate_at, [m.dstates[label].place for label in m.dstate_at]) for m in beam.maps()
     ]
     assert min(found) <= nats(known.dstates, known.places) + 1e-6
+
+
+def test_a_drive_that_meets_others_at_one_place_may_face_four_ways() -> None:
+    (known,) = of_mazes(3, 2, [0], truth.Noise(Odometry(**truth.NOISE)), drives=1)
+    problem = settle(known.trace, Theory())
+    first = Beam(problem, Log(problem.trace, problem.theory, problem.pairs), 1)._first()
+    pieces = Pieces(here=5, of_heading=(0, 5), hinges={5: first.position[0]})
+    found = replace(first, heading=first.heading * 2, pieces=pieces)
+    one, other = zip(*headings(found), strict=True)
+    assert len({*one}) == 1
+    assert other == pytest.approx([other[0] + k * math.pi / 2 for k in range(4)])
 
 
 @pytest.mark.parametrize("known", MAZES, ids=[known.name for known in MAZES])

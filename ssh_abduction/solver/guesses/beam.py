@@ -29,6 +29,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 
 from ssh_abduction.checker.checker import violations
 from ssh_abduction.data.action import Action
@@ -37,12 +38,13 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.guesses.completing import completed
-from ssh_abduction.solver.guesses.pieces import fitted
+from ssh_abduction.solver.guesses.pieces import fitted, headings
 from ssh_abduction.solver.guesses.reckoning import Hypothesis, HypothesisPoses, first_pose
 from ssh_abduction.solver.guesses.sights import DEAREST, Sights
 from ssh_abduction.solver.steps.faults import with_changes, with_faults
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import Problem
+from ssh_abduction.theory.theory import Theory
 
 # The checker checks the beam after each CHECKED_EVERY steps.
 CHECKED_EVERY = 8
@@ -282,21 +284,23 @@ class Beam:
         look_at_clock()
         steps = len(found.labels)
         trace, theory = self._mended(found), self._bare.of_steps(0, steps)
-        facing: list[float] = found.mean[found.heading].tolist()
-        ssh_map = completed(trace, theory, found.labels, found.places, facing)
-        if ssh_map is not None:
-            ssh_map = with_changes(ssh_map, trace, theory)
-        if (
-            ssh_map is None
-            or next(violations(trace, ssh_map, theory), None) is not None
-            or any(e.refuse(trace, ssh_map, since) for e in self._problem.evidence)
-        ):
+        ssh_map = next(self._completed(found, trace, theory), None)
+        if ssh_map is None or any(e.refuse(trace, ssh_map, since) for e in self._problem.evidence):
             return None
         if not self._fault:
             return ssh_map
         whole, theory = self._trace.prefix(steps), self._problem.theory.of_steps(0, steps)
         ssh_map = with_faults(ssh_map, whole, trace, theory)
         return None if next(violations(whole, ssh_map, theory), None) else ssh_map
+
+    def _completed(self, found: Hypothesis, trace: Trace, theory: Theory) -> Iterator[SSHMap]:
+        """Yield the maps of a hypothesis that satisfy the axioms, one for each way it may face."""
+        ways = headings(found)
+        for facing in ways if theory.star == "frame" else islice(ways, 1):
+            ssh_map = completed(trace, theory, found.labels, found.places, facing)
+            changed = None if ssh_map is None else with_changes(ssh_map, trace, theory)
+            if changed is not None and next(violations(trace, changed, theory), None) is None:
+                yield changed
 
     def _believed(self, found: Hypothesis) -> Trace:
         """Return the trace of a hypothesis, without the displacements that it treats as wrong."""

@@ -13,8 +13,9 @@ are joined, the means of one are turned until they agree with the other.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import islice, product
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 # The direction from one position to another is too uncertain to use if they are closer than this
 # many metres.
 NEAR = 1.0
+# Try at most this many ways to turn the pieces with hinges: all ways for two pieces.
+TURNS = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +105,19 @@ def fitted(found: Hypothesis, place: int, dstate: int | None = None) -> Hypothes
         angle = math.atan2(*ways[1][::-1]) - math.atan2(*ways[0][::-1])
     turned = _turned(found, float(angle), n if hinge is None else hinge)
     return replace(turned, pieces=joined.merged(other))
+
+
+def headings(found: Hypothesis) -> Iterator[list[float]]:
+    """Yield the headings of the dstates in radians, for each way to turn the pieces with hinges.
+
+    At a place with four slots, frames differ by quarter turns. Where only a place joins a piece to
+    others, each quarter turn is possible.
+    """
+    pieces, facing = found.pieces, found.mean[found.heading]
+    for quarters in islice(product(range(4), repeat=len(pieces.hinges)), TURNS):
+        turn = dict(zip(pieces.hinges, quarters, strict=True))
+        turns = [turn.get(piece, 0) * math.pi / 2 for piece in pieces.of_heading]
+        yield (facing + turns).tolist()
 
 
 def closed(found: Hypothesis, dstate: int, turn: float) -> Hypothesis:
