@@ -383,6 +383,15 @@ def test_a_narrow_beam_finds_a_joint_map_as_cheap_as_the_true_one(known: truth.K
     assert min(found) <= nats(known.dstates, known.places) + 1e-6
 
 
+@pytest.mark.parametrize(("seed", "steps"), [(405, 20), (400, 30)])
+def test_a_false_join_that_is_cheap_at_first_leaves_the_true_one(seed: int, steps: int) -> None:
+    """A true join may cost more than false ones for some steps."""
+    (known,) = of_mazes(3, steps, [seed], truth.Noise(Odometry(**truth.NOISE)))
+    problem = settle(known.trace, Theory())
+    beam = Beam(problem, Log(problem.trace, problem.theory, problem.pairs), 1)
+    assert truth.is_true(next(beam.maps()), known)
+
+
 def test_a_drive_that_meets_others_at_one_place_may_face_four_ways() -> None:
     (known,) = of_mazes(3, 2, [0], truth.Noise(Odometry(**truth.NOISE)), drives=1)
     problem = settle(known.trace, Theory())

@@ -56,6 +56,9 @@ WIDER = 2
 LOST, ALIKE, CROWDED = 32, 4, 16
 # Of each earlier checked beam, keep this many hypotheses.
 SPARE = 2
+# With several drives or floors, keep hypotheses that cost up to this many nats more than the best.
+# A false join to a place that looks alike saves some dstates until the drive leads on.
+UNSURE = 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,7 +182,7 @@ class Beam:
         """Yield the hypotheses to keep: the first `width` that the options make.
 
         With several drives or floors, keep at most ALIKE hypotheses that join them in the same way,
-        and LOST times as many in all. Drop those that cost `Sights.dearest` more than the best.
+        and LOST times as many in all. Drop those that cost UNSURE more than the best.
         These two limits do not apply to a hypothesis whose present piece is not joined yet
         (`Pieces.is_loose`), as it costs more until it is joined.
 
@@ -205,7 +208,7 @@ class Beam:
                 continue
             count[pieces.joins] += 1
             if self._frames and not pieces.is_loose:
-                dearest = min(dearest, option.nats + self._sights.dearest)
+                dearest = min(dearest, option.nats + max(UNSURE, self._sights.dearest))
             yield child
 
     def _extended(self, beam: list[Hypothesis], end: int) -> list[Hypothesis]:
