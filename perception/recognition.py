@@ -254,7 +254,7 @@ def _deal(
     returned, too.
     """
     if folds < 2:
-        raise PerceptionError(f"folds: expected at least 2, got {folds}")
+        raise PerceptionError(f"folds: expected at least 2, got {folds}; take 2 or more")
     classes, of, counts = np.unique(labels, return_inverse=True, return_counts=True)
     shuffled = check_random_state(random_state).permutation(len(labels))
     cards = shuffled[np.argsort(of[shuffled], kind="stable")]
@@ -263,6 +263,7 @@ def _deal(
         raise PerceptionError(
             f"folds: expected at most {len(cards)}, the images of places seen more than once, "
             f"got {folds}"
+            "; take fewer"
         )
     fold = np.full(len(labels), -1, np.intp)
     fold[cards] = np.arange(len(cards)) % folds

@@ -305,6 +305,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
             if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
                 raise PerceptionError(
                     f"{name}: expected a whole number of at least {least}, got {value!r}"
+                    "; take a larger one"
                 )
         if self.n_init > MOST_STARTS:
             raise PerceptionError(
@@ -325,14 +326,16 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
                 mend="give a seed, a RandomState or None",
             )
         if not isinstance(self.by, str) or self.by not in ("M", "trimmed"):
-            raise PerceptionError(f'by: expected "M" or "trimmed", got {self.by!r}')
+            raise PerceptionError(
+                f'by: expected "M" or "trimmed", got {self.by!r}; write one of them'
+            )
         if self.isolated is not None and not (is_finite(self.isolated) and self.isolated > 1):
             raise PerceptionError(
                 f"isolated: expected a number of more than 1, or None, got {self.isolated!r}"
             )
         if self.k is None and self.k_max is not None and self.k_max < self.k_min:
             raise PerceptionError(
-                f"k_max: expected at least k_min = {self.k_min}, got {self.k_max}"
+                f"k_max: expected at least k_min = {self.k_min}, got {self.k_max}; raise it"
             )
         if self.clusterer is not None and not (
             hasattr(self.clusterer, "fit") and hasattr(self.clusterer, "get_params")

@@ -285,7 +285,7 @@ def record_plan(
         SimulatorError: No two rooms are connected, or a number is out of range.
     """
     if tours < 1:
-        raise SimulatorError(f"tours: expected 1 or more, got {tours}")
+        raise SimulatorError(f"tours: expected 1 or more, got {tours}; take 1 or more")
     if not is_finite(metres) or metres <= 0:
         raise SimulatorError(
             f"metres: expected a length above 0, got {brief(metres)}; 200 is usual"

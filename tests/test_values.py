@@ -162,7 +162,8 @@ def test_a_solution_is_a_sequence_of_its_maps() -> None:
     assert list(reversed(aces.solution())) == list(aces.solution().maps[::-1])  # type: ignore[call-overload]
     assert aces.solution()[2] in aces.solution()
     with pytest.raises(
-        RangeError, match=r"^maps: expected 0 to 3, or -4 to -1 from the end, got 4$"
+        RangeError,
+        match=r"^maps: expected 0 to 3, or -4 to -1 from the end, got 4; take one of them$",
     ):
         aces.solution()[4]
     none = solve(IMPOSSIBLE)

@@ -69,11 +69,17 @@ class LiveLog:
     ) -> None:
         """Start before the first scan."""
         if not (is_finite(width) and width > 0):
-            raise LogError(f"width: expected a positive number of metres, got {brief(width)}")
+            raise LogError(
+                f"width: expected a positive number of metres, got {brief(width)}"
+                "; give the width of the robot"
+            )
         if not isinstance(items, Iterable) or isinstance(items, str | bytes):
             raise LogError(f"scans: expected scans, got {brief(items)}; pass those of stream_log")
         if not callable(tell):
-            raise LogError(f"tell: expected a function that takes a text, got {brief(tell)}")
+            raise LogError(
+                f"tell: expected a function that takes a text, got {brief(tell)}"
+                "; give one, such as print"
+            )
         self._items, self._width, self._source = items, width, source
         self._tell = Teller(tell)
         self._damaged: list[Damage] = []
@@ -127,7 +133,10 @@ class LiveLog:
             elif isinstance(item, Damage):
                 self._damaged.append(item)
             else:
-                raise LogError(f"scans: expected scans, got {brief(item)} as item {number}")
+                raise LogError(
+                    f"scans: expected scans, got {brief(item)} as item {number}"
+                    "; take those of stream_log"
+                )
 
     def _keep(self, one: Followed) -> None:
         """Keep a scan with its pose, and its ranges only if a check needs them."""

@@ -171,6 +171,7 @@ def _survey(bag: Bag, topics: Sequence[str]) -> tuple[dict[str, NDArray[np.float
     if not frames:
         raise LogError(
             f"{bag.source}: expected scans in {' and '.join(topics)}, got none that can be read"
+            "; record them again, or name another topic (--set scan_topic)"
         )
     return {topic: np.array(both) for topic, both in times.items()}, frames
 
@@ -201,7 +202,10 @@ def _odometer(
         )
         tracks.setdefault(source, RecordedTrack()).add(stamp_of(message.header), recorded, flat)
     if not tracks:
-        raise LogError(f"{bag.source}: expected odometry in {topic}, got none that can be read")
+        raise LogError(
+            f"{bag.source}: expected odometry in {topic}, got none that can be read"
+            "; record it again, or name another topic (--set odom_topic)"
+        )
     # Several programs may publish one topic: take the longest track, preferably from a frame odom.
     best = max(tracks, key=lambda source: (len(tracks[source].numbers), "odom" in source[0]))
     if len(tracks) > 1:

@@ -51,7 +51,7 @@ def opened(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
     except OSError as error:
         raise _unreadable(path, error) from None
     except ValueError as error:  # A null character in the path.
-        raise LogError(f"{named(path)}: expected the path of a log: {error}") from None
+        raise LogError(f"{named(path)}: expected the path of a log: {error}; name a file") from None
     try:
         with file:
             if file.seekable():

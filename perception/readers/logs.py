@@ -199,7 +199,10 @@ def _reading(
     if odom_topic is not None:
         a_text("odom_topic", odom_topic, LogError, mend=mend)
     if format is not None and format not in FORMATS:
-        raise LogError(f"format: expected one of {', '.join(FORMATS)}, got {brief(format)}")
+        raise LogError(
+            f"format: expected one of {', '.join(FORMATS)}, got {brief(format)}"
+            "; leave it out to recognise it"
+        )
     if _is_folder(path):
         if format in LINES:
             raise LogError(

@@ -142,7 +142,7 @@ def _numbered(scans: Iterable[Scan]) -> tuple[list[Scan], list[float]]:
     """List the scans, and the time of each in seconds. Raises LogError if there are no scans."""
     listed = list(scans)
     if not listed:
-        raise LogError("scans: expected at least one to write, got none")
+        raise LogError("scans: expected at least one to write, got none; record some first")
     return listed, [float(i) if scan.time is None else scan.time for i, scan in enumerate(listed)]
 
 

@@ -121,7 +121,9 @@ def metres(text: str) -> float:
     except ValueError:
         value = float("nan")
     if not 0.1 <= value <= 50:
-        raise argparse.ArgumentTypeError(f"expected metres, from 0.1 to 50, got {text!r}")
+        raise argparse.ArgumentTypeError(
+            f"expected metres, from 0.1 to 50, got {text!r}; give the width of the robot"
+        )
     return value
 
 
@@ -151,7 +153,9 @@ def _laser_value(field: str, text: str) -> Any:
     try:
         numbers = tuple(map(float, text.split(",")))
     except ValueError:
-        raise argparse.ArgumentTypeError(f"expected numbers, got {text!r}") from None
+        raise argparse.ArgumentTypeError(
+            f"expected numbers, got {text!r}; separate them by commas"
+        ) from None
     value = numbers if field == "mount" or len(numbers) != 1 else numbers[0]
     given: dict[str, Any] = {field: value}
     try:

@@ -338,6 +338,7 @@ def run(options: argparse.Namespace) -> int:
     if options.maps < 0:
         raise AbductionError(
             f"--maps: expected how many minimal maps to list, 0 for all, got {options.maps}"
+            "; leave it out for 300"
         )
     check_limit("--time-limit", "seconds", options.time_limit)
     check_folder(Path(options.output))

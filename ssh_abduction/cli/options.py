@@ -201,7 +201,9 @@ def output(text: str) -> str:
 def seed(text: str) -> int:
     """Convert text to a seed of random numbers. Raise ArgumentTypeError for anything else."""
     if not text.isdecimal() or int(text) >= 2**32:
-        raise argparse.ArgumentTypeError(f"expected a number from 0 to {2**32 - 1}, got {text!r}")
+        raise argparse.ArgumentTypeError(
+            f"expected a number from 0 to {2**32 - 1}, got {text!r}; take a smaller one"
+        )
     return int(text)
 
 
@@ -210,6 +212,7 @@ def picture_file(text: str) -> str:
     if Path(text).suffix.lower() not in (".png", ".pdf", ".svg"):
         raise argparse.ArgumentTypeError(
             f"expected a name that ends in .png, .pdf or .svg, got {text!r}"
+            "; add one of these endings"
         )
     return text
 

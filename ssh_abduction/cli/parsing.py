@@ -67,13 +67,15 @@ class Setting:
             return self.type(text)
         except ValueError:
             expected = {int: "a whole number", float: "a number"}.get(self.type, "another value")  # type: ignore[call-overload]
-            raise argparse.ArgumentTypeError(f"expected {expected}, got {text!r}") from None
+            raise argparse.ArgumentTypeError(
+                f"expected {expected}, got {text!r}; write one"
+            ) from None
 
 
 def true_or_false(text: str) -> bool:
     """Convert "true" or "false" to a bool. Raise ArgumentTypeError for anything else."""
     if text not in ("true", "false"):
-        raise argparse.ArgumentTypeError(f"expected true or false, got {text!r}")
+        raise argparse.ArgumentTypeError(f"expected true or false, got {text!r}; write one of them")
     return text == "true"
 
 

@@ -150,6 +150,7 @@ class SavedMap:
             raise MapError(
                 f"gateway: expected a place and a direction such as 'p4 north' or "
                 f"'monday:12 left', got {brief(text)}"
+                "; write both"
             )
         label = self.map.dstate_at[step_of(self.drives, step)]
         if way not in COMPASS:

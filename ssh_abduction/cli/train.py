@@ -115,7 +115,7 @@ def pair(text: str) -> tuple[int, int]:
     first, comma, second = text.partition(",")
     if not (comma and first.strip().isdecimal() and second.strip().isdecimal()):
         raise argparse.ArgumentTypeError(
-            f"expected two dstates with a comma between them, such as 0,4, got {text!r}"
+            f"expected two dstates with a comma between them, such as 0,4, got {text!r}; write two"
         )
     return int(first), int(second)
 

@@ -182,7 +182,10 @@ def step_of(drives: Sequence[Drive], name: str) -> int:
         )
     steps = drive.stop - drive.first
     if not (number.isascii() and number.isdecimal()) or int(number) >= steps:
-        raise TraceError(f"step {brief(name)}: expected 0 to {steps - 1}, got {brief(number)}")
+        raise TraceError(
+            f"step {brief(name)}: expected 0 to {steps - 1}, got {brief(number)}"
+            "; take a step of this drive"
+        )
     return drive.first + int(number)
 
 
@@ -314,7 +317,9 @@ def _names(traces: Sequence[Trace], names: Iterable[str] | None) -> list[str]:
         ]
         count = sum(len(drives_of(trace)) for trace in traces)
         if len(found) != count:
-            raise TraceError(f"names: expected {count}, one a drive, got {len(found)}")
+            raise TraceError(
+                f"names: expected {count}, one a drive, got {len(found)}; name each drive"
+            )
     twice = next((name for name, count in Counter(found).items() if count > 1 or not name), None)
     if twice is not None:
         raise TraceError(

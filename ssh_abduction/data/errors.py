@@ -87,7 +87,7 @@ def checked_index(index: object, count: int, what: str) -> int:
         TypeError: If the index is not a whole number.
     """
     if not is_whole(index):
-        raise TypeError(f"{what}: expected a whole number or a slice, got {brief(index)}")
+        raise TypeError(f"{what}: expected a whole number or a slice, got {brief(index)}; give one")
     found = int(index)
     if not -count <= found < count:
         there = (
@@ -95,7 +95,7 @@ def checked_index(index: object, count: int, what: str) -> int:
             if count
             else "none, as there are none"
         )
-        raise RangeError(f"{what}: expected {there}, got {brief(found)}")
+        raise RangeError(f"{what}: expected {there}, got {brief(found)}; take one of them")
     return found % count
 
 

@@ -362,7 +362,8 @@ class Trace:
         sure = [None] * len(seen) if confidences is None else listed(confidences, "confidences")
         for name, values in (("views", seen), ("confidences", sure)):
             if len(values) != len(self):
-                raise TraceError(f"{name}: expected {len(self)}, one a step, got {len(values)}")
+                told = f"expected one a step, {len(self)}, got {len(values)}; add or leave out some"
+                raise TraceError(f"{name}: {told}")
         checked = [
             (
                 view_or_unknown(view, f"views[{i}]"),
@@ -413,7 +414,7 @@ class Trace:
                 f"check the path"
             ) from None
         except ValueError as error:  # a null character in the path
-            raise TraceError(f"{source}: expected the path of a trace file: {error}") from None
+            raise TraceError(f"{source}: expected a trace file: {error}; name one") from None
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the trace into a file. The file appears whole or not at all.

@@ -412,7 +412,7 @@ def _imported(
         raise LogError("log: expected at least one log, got none; read one with read_log")
     names = [f"drive {i + 1}" for i in range(len(logs))] if name is None else list(name)
     if len(names) != len(logs):
-        raise LogError(f"name: expected {len(logs)}, one a drive, got {len(names)}")
+        raise LogError(f"name: expected {len(logs)}, one a drive, got {len(names)}; name each log")
 
     def telling(drive: str) -> Callable[[str], None]:
         return lambda note: tell(f"{drive}: {note}")

@@ -138,7 +138,10 @@ def fault_front(
             "--set without and --set prefer"
         )
     if not is_whole(most) or not 0 <= most <= 1000:
-        raise TheoryError(f"front: expected a number of faults from 0 to 1000, got {brief(most)}")
+        raise TheoryError(
+            f"front: expected a number of faults from 0 to 1000, got {brief(most)}"
+            "; take one in this range"
+        )
     theory.check_steps(checked_trace(trace))
     problem = settle(trace, theory if theory.has_faults else theory.replace(**KINDS))
     watch = Watch(time_limit)

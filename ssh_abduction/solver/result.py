@@ -445,6 +445,7 @@ def _checked_record(read: FieldReader, data: Any) -> Mapping[str, Any]:
         raise MapError(
             f"{where}: status: expected a solution, got the error that solve ended with: "
             f"{brief(record.get('error'))}"
+            "; mend that, and solve again"
         )
     check_format(record, SOLUTION_FORMAT, where)
     for name in ("maps", "theory", "steps", "status", "complete"):

@@ -106,6 +106,7 @@ class Search:
         if on_progress is not None and not callable(on_progress):
             raise SolverError(
                 f"on_progress: expected a function of one Progress, got {brief(on_progress)}"
+                "; give one, or None"
             )
         before = _start.after.task.problem if _start.after else None
         problem = settle(trace, theory, before)

@@ -93,11 +93,13 @@ def normalise(theory: Theory) -> None:
         if not isinstance(getattr(theory, name), str) or getattr(theory, name) not in values:
             raise TheoryError(
                 f"{name}: expected one of {', '.join(values)}, got {brief(getattr(theory, name))}"
+                "; take one of them"
             )
     for field in fields(theory):
         if isinstance(field.default, bool) and not isinstance(getattr(theory, field.name), bool):
             raise TheoryError(
                 f"{field.name}: expected true or false, got {brief(getattr(theory, field.name))}"
+                "; write one of them"
             )
     _check_numbers(theory)
     _check_prices(theory)
@@ -209,6 +211,7 @@ def _check_numbers(theory: Theory) -> None:
             raise TheoryError(
                 f"{name}: expected a number of dstates from 0.1 to {DEAREST:g}, or 0 for no "
                 f"such faults, got {brief(price)}"
+                "; take one in this range"
             )
         object.__setattr__(theory, name, round(float(price), 1))
     if not is_finite(theory.reject) or not 0 < theory.reject < 1:
@@ -221,6 +224,7 @@ def _check_numbers(theory: Theory) -> None:
         if not is_whole(value) or not least <= value <= most:
             raise TheoryError(
                 f"{name}: expected a whole number from {least} to {most}, got {brief(value)}"
+                "; take one in this range"
             )
         object.__setattr__(theory, name, int(value))
     object.__setattr__(theory, "reject", float(theory.reject))
@@ -266,7 +270,7 @@ def _set_names(theory: Theory, field: str, allowed: Iterable[str]) -> None:
     """Convert a field to a tuple of different names out of those allowed. Raises TheoryError."""
     value = getattr(theory, field)
     if not isinstance(value, str | list | tuple):
-        raise TheoryError(f"{field}: expected a list of names, got {brief(value)}")
+        raise TheoryError(f"{field}: expected a list of names, got {brief(value)}; write a list")
     names = (
         tuple(name.strip() for name in value.split(",")) if isinstance(value, str) else tuple(value)
     )
@@ -275,9 +279,12 @@ def _set_names(theory: Theory, field: str, allowed: Iterable[str]) -> None:
         if name not in known:
             raise TheoryError(
                 f"{field}: expected names out of {', '.join(known)}, got {brief(name)}"
+                "; take some of these"
             )
         if name in names[:i]:
-            raise TheoryError(f"{field}: expected each name once, got {brief(name)} twice")
+            raise TheoryError(
+                f"{field}: expected each name once, got {brief(name)} twice; leave one out"
+            )
     object.__setattr__(theory, field, names)
 
 

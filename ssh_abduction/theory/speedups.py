@@ -54,6 +54,7 @@ class Speedups:
             if not isinstance(getattr(self, name), bool):
                 raise SolverError(
                     f"speedups: {name}: expected true or false, got {brief(getattr(self, name))}"
+                    "; take one of them"
                 )
 
     def __repr__(self) -> str:
@@ -73,6 +74,7 @@ class Speedups:
         if not isinstance(names, Iterable):
             raise SolverError(
                 f"speedups: expected names out of {', '.join(SPEEDUPS)}, got {brief(names)}"
+                "; take some of these"
             )
         off = [name for name in (names.split(",") if isinstance(names, str) else names) if name]
         for name in off:
@@ -82,6 +84,7 @@ class Speedups:
             elif name not in SPEEDUPS:
                 raise SolverError(
                     f"speedups: expected names out of {', '.join(SPEEDUPS)}, got {brief(name)}"
+                    "; take some of these"
                 )
         return cls(**dict.fromkeys((name for name in off if name not in REMOVED), False))
 

@@ -178,6 +178,7 @@ class Theory:
             raise TheoryError(
                 f"theory: expected fields out of {', '.join(f.name for f in fields(self))}, got "
                 f"{brief(min(unknown))}"
+                "; take some of these"
             )
         return replace(self, **choices)
 
@@ -371,6 +372,7 @@ class Theory:
                     raise TheoryError(
                         f"{name} ({flag}): expected steps from 0 to {len(trace) - 1}, got "
                         f"{pair[0]},{pair[1]}"
+                        "; take two steps of the trace"
                     )
 
     def of_steps(self, first: int, length: int) -> Theory:
@@ -415,7 +417,9 @@ class Theory:
             TheoryError: A field is wrong.
         """
         if not isinstance(data, Mapping):
-            raise TheoryError(f"theory: expected an object, got {brief(data)}")
+            raise TheoryError(
+                f"theory: expected an object, got {brief(data)}; take one that to_dict made"
+            )
         preset = cls.causal() if data.get("level") == "causal" else cls()
         return preset.replace(
             **{str(k): tuple(v) if isinstance(v, list) else v for k, v in data.items()}
@@ -438,6 +442,7 @@ class Theory:
         if not isinstance(preset, str) or preset not in PRESETS:
             raise TheoryError(
                 f"{named(path)}: preset: expected one of {', '.join(PRESETS)}, got {brief(preset)}"
+                "; take one of them"
             )
         if isinstance(rules := data.get("rules"), list):
             beside = Path(path).parent
