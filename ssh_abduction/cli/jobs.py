@@ -59,7 +59,7 @@ class FileQuestion(Protocol):
         """The seconds to wait for unfinished answers after Ctrl-C."""
 
     def load(self, path: str) -> Any:
-        """Read a file, to send its content to a worker without this disk."""
+        """Read a file here, because a worker may not be able to read it."""
 
     def answer(self, number: int, path: str, content: Any, given_up: Callable[[], bool]) -> Any:
         """Answer the question for one file.

@@ -123,7 +123,7 @@ class MapQuestion:
         }
 
     def load(self, path: str) -> bytes | None:
-        """Read a log, to send it to a worker without this disk; None if the log is a folder."""
+        """Read a log, as a worker may not be able to read the file; None if it is a folder."""
         file = Path(path)
         return file.read_bytes() if file.is_file() else None
 

@@ -65,9 +65,9 @@ class Front:
     def knee(self) -> int | None:
         """The number of faults at which the number of dstates stops falling fast.
 
-        A fall is by how many dstates a point is below the point with one fault less. At the knee, a
-        fall exceeds the next fall by most. Only proven points count. None if no fall exceeds the
-        next one.
+        The fall to a point is how many dstates it saves over the point with one fault less. The
+        knee is the point whose fall exceeds the next fall by most. Only proven points count. None
+        if no fall exceeds the next one.
         """
         counts = self._proven
         bends = {

@@ -46,7 +46,7 @@ def check_limit(name: str, unit: str, limit: object) -> None:
     ):
         raise SolverError(
             f"{name}: expected a number of {unit} above 0, got {brief(limit)}; "
-            "leave it out for none"
+            "leave it out for no limit"
         )
 
 

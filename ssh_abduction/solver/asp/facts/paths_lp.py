@@ -100,7 +100,7 @@ def read_contrary(model: Model) -> tuple[list[int], list[int]]:
 
     Returns:
         A dstate of each segment that shows it, the shortest segment first; and the dstates at which
-        two paths cross that seem to meet again.
+        two paths cross, if the paths seem to meet again.
     """
     atoms = list(map(read_atom, model.symbols(shown=True)))
     contrary = sorted((args[1], args[0]) for name, args in atoms if name == "contrary")
