@@ -186,3 +186,10 @@ def test_an_error_does_not_repeat_the_notes(scans: Scans, monkeypatch: pytest.Mo
     assert told[0] not in str(refused.value)
     answer = MapQuestion(None, {}, {}, 0.5, None, 1, ladder=False).failed(0, "drive", refused.value)
     assert answer.warnings == tuple(told)
+
+
+@pytest.mark.parametrize("missing", [0, 70])
+def test_missing_scans_are_said_though_the_odometry_goes_on(scans: Scans, missing: int) -> None:
+    notes = notes_of([*scans[:100], *scans[100 + missing : 200 + missing]])
+    assert ("The odometry alone connects the parts" in notes) == (missing > 0)
+    assert ("before scan 100 " in notes) == (missing > 0)

@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 # A step between two scans is impossible if it is longer than both FAR metres and UNUSUAL times the
 # usual step. It is doubtful if it is longer than half of that.
 FAR, UNUSUAL = 1.5, 3.5
+# A scan matches nothing if less than this share of its points lies on walls seen before. Behind a
+# step of more than FAR metres, ten good logs have 0.32 or more.
+UNMATCHED = 0.1
 # After a pause of PAUSE times the usual interval, the robot may have driven on at up to FASTER
 # times its usual speed.
 PAUSE, FASTER = 3.0, 2.0
@@ -178,6 +181,15 @@ def describe_cuts(log: RobotLog, track: Track, turned: list[tuple[int, float]]) 
             "carried "
             "there. The rest is mapped as a separate drive."
         )
+    if gaps := _gaps(log, track):
+        first = gaps[0]
+        step = math.dist(log.scans[first - 1].odometry[:2], log.scans[first].odometry[:2])
+        notes.append(
+            f"The scans show nothing of what was seen before, {_times(len(gaps))}, while the "
+            f"odometry goes on: by {step:.1f} m before scan {first} ({_where(log, first)}). The "
+            "odometry alone connects the parts. If scans are missing there, or the robot was "
+            "carried, cut the log there, and map each part."
+        )
     if turned:
         first, angle = turned[0]
         notes.append(
@@ -187,6 +199,16 @@ def describe_cuts(log: RobotLog, track: Track, turned: list[tuple[int, float]]) 
             "part."
         )
     return notes
+
+
+def _gaps(log: RobotLog, track: Track) -> list[int]:
+    """Find the scans behind a long step that match nothing, though the odometry is trusted."""
+    far = _far(log, 1) if len(log) > 1 else np.zeros(0)
+    return [
+        i
+        for i in (np.flatnonzero(far > FAR) + 1).tolist()
+        if track.shares[i] < UNMATCHED and i not in track.cuts and i not in track.breaks
+    ]
 
 
 def _times(count: int) -> str:
