@@ -31,8 +31,6 @@ TOO_SMALL, TOO_LARGE = 1.5, 2.0
 STANDING = 2.0
 NEVER_LESS = 0.01  # the least factor to name, as it would be 0 if displacements agree exactly
 
-LATEST = 0.6  # the fit of the first map ends at most this many seconds beyond the limit
-
 _Key: TypeAlias = tuple[tuple[int, ...], tuple[int | None, ...], tuple[int, ...]]
 
 
@@ -56,25 +54,25 @@ class Ranking:
         return with_compass(replace(ssh_map, fit=self._known[key]))
 
     def ranked(
-        self, maps: Iterator[SSHMap], over: Callable[[], bool], left: Callable[[], float]
+        self, maps: Iterator[SSHMap], over: Callable[[], bool], overtime: Callable[[], float]
     ) -> Iterator[SSHMap]:
         """Yield the same maps with their fit, the one with the least chi-square first.
 
         Args:
             maps: The maps as they are found. Only the first RANKED of them are sorted.
             over: Returns whether a limit is reached. From then on, maps get no fit and keep their
-                order. Only the fit of the first map may end LATEST seconds beyond the limit.
-            left: Returns the seconds left until the limit, less than 0 beyond it.
+                order. Only the fit of the first map may take longer.
+            overtime: Returns how many seconds the fit of the first map may take from then on.
         """
-        overtime: Watch | None = None
+        late: Watch | None = None
 
         def look(first: bool) -> None:
-            nonlocal overtime
+            nonlocal late
             if over():
                 if not first:
                     raise LimitError("time limit")
-                overtime = overtime or Watch().part(min(left(), 0.0) + LATEST)
-                overtime.check()
+                late = late or Watch().part(overtime())
+                late.check()
 
         def fitted(ssh_map: SSHMap, first: bool = False) -> SSHMap:
             try:

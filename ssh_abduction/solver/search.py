@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import replace
+from functools import partial
 from itertools import groupby
 from typing import TYPE_CHECKING, get_args
 
@@ -248,10 +249,10 @@ class Search:
 
     def _given(self, ranking: Ranking | None) -> Iterator[SSHMap]:
         """Yield the maps. `ranking` sorts maps of one cost; None keeps their order."""
-        drives, left = drives_of(self.trace), self._parts.watch.left
+        drives, late = drives_of(self.trace), partial(overtime, self._parts)
         for cost, level in groupby(self._found(), key=lambda priced: priced[1]):
             maps = (ssh_map for ssh_map, _ in level)
-            for ssh_map in ranking.ranked(maps, self.over, left) if ranking else maps:
+            for ssh_map in ranking.ranked(maps, self.over, late) if ranking else maps:
                 complete = _with_names(ssh_map, self.trace, drives)
                 self._answer.take_down(complete, cost)
                 yield complete
