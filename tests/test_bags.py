@@ -566,4 +566,4 @@ def test_import_takes_several_topics(tmp_path: Path, capsys: pytest.CaptureFixtu
         )
         == 1
     )
-    assert "put the scans into the order of the drive" in capsys.readouterr().err
+    assert "record at least 30 beams a scan" in capsys.readouterr().err

@@ -341,7 +341,7 @@ def test_the_shell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["explain", str(impossible), "0", "2"]) == 20
     assert main(["explain", str(rectangle), "0"]) == 1
     assert main(["explain", str(rectangle), "0", "12"]) == 1
-    assert "from 0 to 11" in capsys.readouterr().err
+    assert "expected 0 to 11" in capsys.readouterr().err
     assert main(["explain", str(rectangle)]) == 0
 
 

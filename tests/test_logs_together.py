@@ -30,7 +30,7 @@ from ssh_abduction.data.odometry import between, moved
 from ssh_abduction.evaluation import evaluate_visits
 from ssh_abduction.robot_logs import log_report
 from ssh_abduction.robot_logs.log_maps import map_log
-from ssh_abduction.robot_logs.log_picture import BESIDE, colour_of, laid_over
+from ssh_abduction.robot_logs.log_picture import ASIDE, colour_of, laid_over
 from ssh_abduction.solver import Solution, solve
 from ssh_abduction.theory.theory import Theory
 
@@ -221,7 +221,7 @@ def test_drives_are_laid_over_each_other(
         )
     beside = laid_over(track, imported, None)
     left, right = np.array(beside[:start]), np.array(beside[start:])
-    assert right[:, 0].min() == pytest.approx(left[:, 0].max() + BESIDE)
+    assert right[:, 0].min() == pytest.approx(left[:, 0].max() + ASIDE)
 
 
 def test_logs_that_do_not_go_together_are_refused(

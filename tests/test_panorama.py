@@ -292,7 +292,7 @@ def test_panoramas_in_the_shell(
         ("--set textures=unique", "textures: expected --set images=panoramas beside it"),
         (
             "--set images=panoramas --set hours=noon",
-            "hours: expected two hours with a comma between them, as 7,19, got 'noon'",
+            "hours: expected two hours with a comma between them, such as 7,19, got 'noon'",
         ),
         (
             "--set images=panoramas --set hours=7,nan",

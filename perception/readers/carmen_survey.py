@@ -82,7 +82,7 @@ class PoseGraph:
         edges: Dict from the numbers of two vertices to the motion from the first to the second.
 
     Example:
-        >>> graph = Graph()
+        >>> graph = PoseGraph()
         >>> graph.vertices += [(0, (0.0, 0.0, 0.0)), (1, (1.1, 0.0, 0.0)), (2, (2.2, 0.0, 0.0))]
         >>> graph.edges |= {(0, 1): (1.0, 0.0, 0.0), (1, 2): (1.0, 0.0, 0.0)}
         >>> graph.chain.poses

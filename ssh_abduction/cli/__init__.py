@@ -24,6 +24,7 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.metadata import version
 from types import ModuleType
+from typing import Any
 
 from ssh_abduction.cli import (
     check,
@@ -169,6 +170,7 @@ def _main(arguments: Sequence[str] | None) -> int:
     if isinstance(sys.stdout, io.TextIOWrapper) and for_programs:
         # Only surrogates cannot be encoded. JSON writes them as escapes.
         sys.stdout.reconfigure(encoding="utf-8", errors="backslashreplace")
+    output = _Output(sys.stdout)
     try:
         if sys.stdout is None:
             raise AbductionError(
@@ -179,29 +181,53 @@ def _main(arguments: Sequence[str] | None) -> int:
             warnings.filterwarnings("default", category=DeprecationWarning, module="ssh_abduction")
             try:
                 warn(options.notes)
-                with Guard(lambda: None, lambda _: ("", program.interrupted_code()), None, None):
+                guard = Guard(lambda: None, lambda _: ("", program.interrupted_code()), None, None)
+                with contextlib.redirect_stdout(output), guard:
                     code = int(options.run(options))
             finally:
                 warn([printable(str(warning.message)) for warning in caught])
         sys.stdout.flush()
     except AbductionError as error:
-        return _failed(options, str(error))
+        return _failed(options, str(error), output)
     except BrokenPipeError:
         # The reader has closed the pipe. Text in Python's buffer must not raise again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:
-        _failed(options, unwritten(error, getattr(options, "output", None) or "standard output"))
+        file = getattr(options, "output", None) or "standard output"
+        _failed(options, unwritten(error, file), output)
         with contextlib.suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_ERROR
     return code
 
 
-def _failed(options: argparse.Namespace, message: str) -> int:
-    """Print an error on stderr and, with --json, as JSON on stdout. Returns the exit code."""
+class _Output:
+    """Standard output, which also knows whether anything was printed.
+
+    Attributes:
+        is_used: Whether anything was printed.
+    """
+
+    def __init__(self, stream: Any) -> None:
+        self._stream, self.is_used = stream, False
+
+    def write(self, text: str) -> int:
+        self.is_used = True
+        return int(self._stream.write(text))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+def _failed(options: argparse.Namespace, message: str, output: _Output) -> int:
+    """Print an error on stderr. With --json, print it as JSON if stdout is empty.
+
+    Returns:
+        The exit code.
+    """
     print(f"ssh-abduction: {message}", file=sys.stderr)
-    if getattr(options, "json", False):
+    if getattr(options, "json", False) and not output.is_used:
         with contextlib.suppress(OSError, ValueError):
             print(json_line({"status": "error", "error": message}), flush=True)
     return EXIT_ERROR
