@@ -176,7 +176,8 @@ class Weighed:
         if self.broken > SAID:
             text += f"; a map that breaks axioms costs {self.broken:.1f} nats less"
         elif self.searched and not self.proven:
-            text += ", without a proof"
+            least = math.floor(100 * self.bound / self.nats)
+            text += f", without a proof, but each map costs at least {least} % as much"
         if not self.joins:
             return f"{text}; the best map joins no two visits"
         first, second, probability = self.joins[0]
