@@ -890,7 +890,7 @@ def _goes_to_next(travels: list[tuple[int, int, int, int]], order: Order) -> boo
 def _branches(
     places: tuple[int, ...], courses: Courses, links: frozenset[Link], on: Axioms
 ) -> set[Branch]:
-    """B1: which paths leave to the right of which."""
+    """B1: each branch of a path to the right or left of another path."""
     if "branch_side" not in on:
         return set()
     found: set[Branch] = set()

@@ -171,7 +171,7 @@ def test_scans_of_few_beams_are_said_to_have_too_few(
     few = every_second_beam(every_second_beam(tuple(scans[:60])))
     assert few[0].laser.beams < log_checks.FEW_BEAMS < scans[0].laser.beams
     for some, advised in ((few, True), (scans[:60], False)):
-        with pytest.raises(LogError, match="got 60 of which") as refused:
+        with pytest.raises(LogError, match="got 60, and") as refused:
             import_log(RobotLog(tuple(some), source="drive"))
         assert ("record at least 30 beams a scan" in str(refused.value)) == advised
         assert "; " in str(refused.value)  # there is advice

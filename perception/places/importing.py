@@ -183,7 +183,7 @@ def _refuse_bad(log: RobotLog, track: Track, notes: Sequence[str]) -> None:
     if (failing := log_checks.share_failing(track)) > log_checks.HOPELESS:
         raise _noted(
             f"{named(log.source)}: expected scans that show what the scans before them showed, got "
-            f"{len(log)} of which {100 * failing:.0f} % do not; {log_checks.advice(log)}",
+            f"{len(log)}, and {100 * failing:.0f} % of them do not; {log_checks.advice(log)}",
             notes,
         )
     if track.way[-1] < 1.0:

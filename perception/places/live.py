@@ -37,7 +37,7 @@ COMPARED = 400
 # The checks at the end need the ranges of the scans before and after a poor match. They are kept
 # for at most this many poor matches.
 MOST_POOR = 200
-# The first notes on cuts of the track are told at once, this many. The others come at the end.
+# The first SAID notes on cuts of the track are given at once. The others come at the end.
 SAID = 3
 # Units are recognised when the robot has moved in MOVES steps and by LEAST_WAY metres, or when MOST
 # scans wait.

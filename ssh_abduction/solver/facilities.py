@@ -17,7 +17,6 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linprog
 from scipy.sparse import csr_array
 
 from ssh_abduction.runtime.clock import look_at_clock
@@ -187,6 +186,8 @@ class _Program:
 
     def solved(self) -> Array:
         """Find the shares with the greatest sum."""
+        from scipy.optimize import linprog  # slow to load, and only logs need it
+
         rows = np.repeat(np.arange(len(self._clusters)), [len(c) for c in self._clusters])
         columns = np.concatenate([np.array(cluster) for cluster in self._clusters])
         shape = len(self._clusters), len(self._bounds)

@@ -25,6 +25,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,7 +76,7 @@ def least_cost(problem: Problem, visit: Sequence[int], most: float) -> float:
     """
     track, within = _Track.of(problem), math.sqrt(2 * most)
     parts = _parts(problem, track, np.array(visit))
-    firsts = [part.stretched(np.full(len(part.points), FIRST)).first_shares() for part in parts]
+    firsts = [part.first_shares() for part in parts]
     for gap in GAPS:
         losses = [_Losses.of(*both, gap, within) for both in zip(parts, firsts, strict=True)]
         left = 1.0 - _largest(sum(found.far.sum(0) for found in losses))
@@ -186,8 +187,10 @@ class _Part(Facilities):
         return replace(self, variances=self.variances * factors[:, None])
 
     def first_shares(self) -> Array:
-        """Compute approximate shares, none above the price."""
-        return self.shares(np.full(len(self.points), self.price), checked=False)
+        """Compute approximate shares with greater variances, none above the price."""
+        n = len(self.points)
+        part = self.stretched(np.full(n, FIRST))
+        return part.shares(np.full(n, self.price), checked=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,8 +200,6 @@ class _Losses:
     Attributes:
         part: The points.
         most: No share of a point may be more than this, (n,).
-        gap: Points that are too far apart by this many standard deviations count as far.
-        within: Bending by more than this is too expensive.
         near: Twice what each point loses against points that it may share a facility with, if c is
             1, (n, k, k).
         far: Twice what each point loses against the other points, (n, k, k).
@@ -206,14 +207,19 @@ class _Losses:
 
     part: _Part
     most: Array
-    gap: float
-    within: float
     near: Array
     far: Array
 
     @classmethod
     def of(cls, part: _Part, first: Array, gap: float, within: float) -> _Losses:
-        """Bound the losses, given approximate shares. Leave out points that lose too much."""
+        """Bound the losses. Leave out points that lose too much.
+
+        Args:
+            part: The points.
+            first: Their approximate shares, (n,).
+            gap: Points that are too far apart by this many standard deviations count as far.
+            within: Bending by more than this is too expensive.
+        """
         most = np.minimum(part.price, GROWTH * first + SLACK)
         losses = cls._of_all(part, most, gap, within)
         sizes = _each_largest(losses.near + losses.far)
@@ -237,10 +243,11 @@ class _Losses:
             is_cheap = gaps < within * np.linalg.norm(moved, 2, axis=(1, 2))
             factors = np.sqrt(2 * most[i]) / gaps[is_cheap]
             far.append(_dominating(moved[is_cheap] * factors[:, None, None]))
-        return cls(part, most, gap, within, np.array(near), np.array(far))
+        return cls(part, most, np.array(near), np.array(far))
 
+    @cached_property
     def _weights(self) -> Array:
-        """Return the numbers c of the points, up to a factor."""
+        """The numbers c of the points, up to a factor, (n,)."""
         sizes = _each_largest(self.near)
         weights = 1 / np.sqrt(sizes + sizes.max(initial=0.0) / 100 + 1e-6)
         scaled: Array = weights / _largest(np.einsum("n,nij->ij", weights, self.near))
@@ -248,12 +255,12 @@ class _Losses:
 
     def scaled(self) -> Array:
         """Return the losses against near points for the numbers c, (n, k, k)."""
-        losses: Array = self._weights()[:, None, None] * self.near
+        losses: Array = self._weights[:, None, None] * self.near
         return losses
 
     def shares(self, factor: float) -> Array:
         """Compute the shares if the numbers c are multiplied by a factor."""
-        c = factor * self._weights()
+        c = factor * self._weights
         return self.part.stretched(1 + 1 / c).shares(self.most)
 
 
