@@ -42,7 +42,7 @@ from ssh_abduction.data import Step
 from ssh_abduction.data.maps import DState
 from ssh_abduction.evaluation.paper.figures import draw_beliefs
 from ssh_abduction.online import Belief
-from ssh_abduction.online.belief import Verdict
+from ssh_abduction.online.belief import BeliefVerdict
 
 FAMILIES: dict[str, Callable[[int], Walk]] = {
     "machines of 20 states, 6 views": lambda seed: moore(20, 6, steps=1000, seed=seed),
@@ -166,7 +166,7 @@ def share(part: float, whole: float) -> str:
 
 
 def located(belief: Belief, at: int | None) -> bool:
-    return belief.verdict is Verdict.LOCATED and belief.dstate == at
+    return belief.verdict is BeliefVerdict.LOCATED and belief.dstate == at
 
 
 def first(condition: Sequence[bool]) -> int | None:
@@ -200,9 +200,9 @@ def part_kidnapped(seeds: range) -> None:
                     found.append(again)
                 right += sum(b.dstate == x for b, x in zip(beliefs, drive.at, strict=True))
                 steps += len(beliefs)
-                sure += sum(b.verdict is Verdict.LOCATED for b in beliefs)
+                sure += sum(b.verdict is BeliefVerdict.LOCATED for b in beliefs)
                 wrong += sum(
-                    b.verdict is Verdict.LOCATED and b.dstate != x
+                    b.verdict is BeliefVerdict.LOCATED and b.dstate != x
                     for b, x in zip(beliefs, drive.at, strict=True)
                 )
                 vain += sum(
@@ -233,7 +233,7 @@ def part_nowhere(seeds: range) -> None:
             for seed, (ssh_map, other) in zip(seeds, maps, strict=True):
                 drive = elsewhere(ssh_map, other, seed, new)
                 beliefs = list(Localiser(ssh_map).beliefs(drive.trace))
-                nowhere = [b.verdict is Verdict.NOWHERE for b in beliefs]
+                nowhere = [b.verdict is BeliefVerdict.NOWHERE for b in beliefs]
                 # Collect the steps outside the map until the localiser notices it, and the steps
                 # after that until the robot is located.
                 if (when := first(nowhere[LEFT:BACK])) is not None:

@@ -27,7 +27,7 @@ from perception.readers.scans import RobotLog
 from perception.recognition import recogniser
 from ssh_abduction import Localiser
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.online.belief import Verdict
+from ssh_abduction.online.belief import BeliefVerdict
 from ssh_abduction.robot_logs.log_maps import FLOOR, LogMap, map_log
 
 # A dstate is within NEAR metres and TURNED radians of an image that shows it.
@@ -73,7 +73,7 @@ def localised(done: LogMap, asked: Trace) -> dict[str, int]:
     localiser = Localiser(ssh_map, done.recogniser(), trace=trace)
     counts = dict.fromkeys(("steps", "located", "located and right"), 0)
     for belief, pose in zip(localiser.beliefs(asked), others, strict=True):
-        located = belief.verdict is Verdict.LOCATED
+        located = belief.verdict is BeliefVerdict.LOCATED
         counts["steps"] += 1
         counts["located"] += located
         counts["located and right"] += located and bool(

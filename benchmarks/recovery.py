@@ -45,7 +45,7 @@ from fault_cases import (
 from instances import Walk
 
 from ssh_abduction import OnlineMapper, SSHMap, Theory, Trace
-from ssh_abduction.online.hypotheses import Rival
+from ssh_abduction.online.hypotheses import ExtendedMap
 from ssh_abduction.solver import Cost
 from ssh_abduction.solver.asp.facts import answer_maps
 
@@ -222,8 +222,8 @@ def is_right(case: Case, theory: Theory, ssh_map: SSHMap) -> bool:
     """Check whether a map of the first steps makes the same predictions as the true map."""
     truth = true_map(case, theory, len(ssh_map.labels))
     return (
-        Rival.of(ssh_map, case.walk.trace, theory).future()
-        == Rival.of(truth, case.walk.trace, theory).future()
+        ExtendedMap.of(ssh_map, case.walk.trace, theory).future()
+        == ExtendedMap.of(truth, case.walk.trace, theory).future()
     )
 
 

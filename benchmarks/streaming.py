@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.places.importing import import_live
-from perception.readers.scans import Laser, Scan
+from perception.readers.scans import LaserScanner, Scan
 from simulator.laser import BEARINGS, meetings
 from simulator.odometer import Odometer
 
@@ -91,7 +91,7 @@ class Drive:
 
     def scans(self) -> Iterator[Scan]:
         """Yield the scans."""
-        laser = Laser(float(BEARINGS[0]), math.radians(1), len(BEARINGS), REACH)
+        laser = LaserScanner(float(BEARINGS[0]), math.radians(1), len(BEARINGS), REACH)
         for begin in range(0, len(self._poses), BATCH):
             start = process_time()
             ranges = self._ranges(self._poses[begin : begin + BATCH])

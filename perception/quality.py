@@ -313,7 +313,7 @@ class _Cells:
 
     def shortest_leaving(self, components: Integers) -> tuple[Floats, Integers]:
         """The squared length, (c,), and images, (c, 2), of each component's shortest edge."""
-        search = _Search(self.images, components[self.order])
+        search = _ShortestEdges(self.images, components[self.order])
         pairs = np.argsort(self.bounds, kind="stable")
         # The products are small: threads would wait for each other longer than they work.
         with one_thread("blas"):
@@ -332,7 +332,7 @@ class _Cells:
                 pairs = pairs[BATCH:]
         return search.best, self.order[search.ends]
 
-    def _compare(self, a: int, b: int, search: _Search) -> float:
+    def _compare(self, a: int, b: int, search: _ShortestEdges) -> float:
         """Compare all images of two cells, a and b; return the new bound for these cells."""
         rows, columns = self.slices[a], self.slices[b]
         squares = self.images[rows] @ self.images[columns].T
@@ -348,7 +348,7 @@ class _Cells:
         return float(squares.min())
 
 
-class _Search:
+class _ShortestEdges:
     """The shortest edge found so far from each component to another one."""
 
     def __init__(self, images: Floats, components: Integers) -> None:

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from simulator.drive import Recorder
 from simulator.errors import SimulatorError
 from simulator.laser import Laser
-from simulator.robot import Robot
-from simulator.sight import Sight, sight
+from simulator.robot import SimulatedRobot
+from simulator.sight import WallPositions, sight
 from simulator.world import World
 
 Array = NDArray[np.float64]
@@ -76,7 +76,7 @@ class Driver:
     """
 
     world: World
-    robot: Robot
+    robot: SimulatedRobot
     laser: Laser
     rng: np.random.Generator
     tolerance: Tolerance = Tolerance()
@@ -95,7 +95,7 @@ class Driver:
         scans = self.laser.scan(self.world, np.repeat([self.robot.pose], images, axis=0), self.rng)
         return np.median(scans, axis=0) if images > 1 else scans[0]
 
-    def see(self, images: int = 1) -> Sight:
+    def see(self, images: int = 1) -> WallPositions:
         """Find the walls in the median of `images` scans."""
         return sight(self.look(images), self.world.reach, self.laser.reach)
 
@@ -188,7 +188,7 @@ def travel(driver: Driver) -> None:
             driver.on_travel(driver)
 
 
-def _steer(seen: Sight, reach: float, stride: float) -> float:
+def _steer(seen: WallPositions, reach: float, stride: float) -> float:
     """Compute the turn during the next stride, in radians, that leads to the line and along it."""
     offset = seen.offset(reach)
     wanted = 0.0 if offset is None else -math.atan(1.5 * float(np.clip(offset, -0.5, 0.5)))

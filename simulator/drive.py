@@ -33,7 +33,7 @@ TINY = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class Drive:
+class RecordedDrive:
     """A completed drive.
 
     Attributes:
@@ -65,7 +65,7 @@ class Drive:
 
     def judged(
         self, places: Mapping[str, Sequence[float]], scans: Sequence[str | None], **more: object
-    ) -> Drive:
+    ) -> RecordedDrive:
         """Copy the drive, with the truth by which its maps are evaluated.
 
         Args:
@@ -168,7 +168,7 @@ class Recorder:
             self.scans[-1][1].append(len(self.poses) - 1)
             self._way = self._turned = 0.0
 
-    def drive(self, name: str, laser: Laser, odometer: Odometer, seed: int) -> Drive:
+    def drive(self, name: str, laser: Laser, odometer: Odometer, seed: int) -> RecordedDrive:
         """Make the drive from the recorded poses. A last scan is taken at its end.
 
         Scans and odometry have random generators of their own, so their noise does not change the
@@ -189,7 +189,7 @@ class Recorder:
         ranges = np.vstack(
             [laser.scan(world, poses[part], sight) for world, part in self.scans if part]
         )
-        return Drive(
+        return RecordedDrive(
             name=name,
             ranges=np.where(ranges < laser.reach, ranges, np.inf),
             odometry=odometer.reading(poses, wheels)[numbers],

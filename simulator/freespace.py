@@ -120,8 +120,8 @@ class FreeSpace:
         )
         return found
 
-    def part(self, points: Array, closed: Mask | None = None) -> Part:
-        """Make a `Part`: a rectangle of the grid around some points.
+    def part(self, points: Array, closed: Mask | None = None) -> FreeRectangle:
+        """Make a `FreeRectangle`: a rectangle of the grid around some points.
 
         Args:
             points: (n, 2) metres.
@@ -133,7 +133,7 @@ class FreeSpace:
             self.occupied[window] if closed is None else self.occupied[window] | closed[window]
         )
         corner = self.corner[0] + CELL * int(columns[0]), self.corner[1] + CELL * int(rows[0])
-        return Part(corner, _clearance(occupied), self.least)
+        return FreeRectangle(corner, _clearance(occupied), self.least)
 
     def way(self, start: Point, goal: Point, closed: Mask | None = None) -> Array | None:
         """Find the best route between two points, within the part of the grid around both.
@@ -144,13 +144,13 @@ class FreeSpace:
             closed: (rows, columns) mask of further cells that count as occupied.
 
         Returns:
-            (n, 2) metres; None if there is no route. `Part.way` says which route is best.
+            (n, 2) metres; None if there is no route. `FreeRectangle.way` says which route is best.
         """
         return self.part(np.array([start, goal]), closed).way(start, goal)
 
 
 @dataclass(frozen=True)
-class Part:
+class FreeRectangle:
     """A rectangular part of free space.
 
     Attributes:

@@ -129,7 +129,7 @@ def read_map_file(path: Path) -> MapFile:
             f"{named(path)}: expected the YAML file of an occupancy map, got none: {reason}; "
             "check the path"
         ) from None
-    return _Reader(fields, path).map_file()
+    return _MapFileReader(fields, path).map_file()
 
 
 def _fields(data: bytes) -> dict[str, str | list[str]]:
@@ -175,7 +175,7 @@ def _fields(data: bytes) -> dict[str, str | list[str]]:
     return found
 
 
-class _Reader:
+class _MapFileReader:
     """Checks the fields of a map file. Errors name the field that is wrong."""
 
     def __init__(self, fields: Mapping[str, str | list[str]], path: Path) -> None:

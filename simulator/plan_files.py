@@ -88,10 +88,10 @@ def read_plan(path: str | os.PathLike[str]) -> tuple[str, tuple[Room, ...], tupl
             f"({brief(str(error))}); mend it"
         ) from None
     name = printable(Path(path).stem.removesuffix("_updated"))
-    return name, *_Reader(named(path)).plan(building)
+    return name, *_PlanReader(named(path)).plan(building)
 
 
-class _Reader:
+class _PlanReader:
     """Reads the XML of a plan. All methods but `wrong` raise SimulatorError for wrong parts."""
 
     def __init__(self, where: str) -> None:

@@ -23,7 +23,7 @@ from simulator.errors import SimulatorError
 from simulator.plan_files import Door, Room, read_plan
 from ssh_abduction.data.checks import a_number, a_text, all_instances
 
-__all__ = ["APART", "STRAIGHT", "Door", "Gateway", "Plan", "Room"]
+__all__ = ["APART", "STRAIGHT", "Door", "Plan", "Room", "RoomGateway"]
 
 Leg = tuple[int, int]  # A room that the robot leaves, and the door that it goes through.
 # Two doors of a room are opposite if the path through its middle bends by at most this many
@@ -34,7 +34,7 @@ APART = 3.0
 
 
 @dataclass(frozen=True)
-class Gateway:
+class RoomGateway:
     """A door as seen from the middle of a room.
 
     Attributes:
@@ -87,14 +87,14 @@ class Plan:
         return cls(*read_plan(path))
 
     @cached_property
-    def gateways(self) -> tuple[tuple[Gateway, ...], ...]:
+    def gateways(self) -> tuple[tuple[RoomGateway, ...], ...]:
         """The gateways of each room, clockwise from north."""
-        seen: list[list[Gateway]] = [[] for _ in self.rooms]
+        seen: list[list[RoomGateway]] = [[] for _ in self.rooms]
         for number, door in enumerate(self.doors):
             for here, there in (door.rooms, door.rooms[::-1]):
                 x, y = self.rooms[here].centre
                 bearing = math.degrees(math.atan2(door.position[0] - x, door.position[1] - y)) % 360
-                seen[here].append(Gateway(number, there, bearing))
+                seen[here].append(RoomGateway(number, there, bearing))
         return tuple(_with_opposites(sorted(found, key=lambda g: g.bearing)) for found in seen)
 
     @property
@@ -200,7 +200,7 @@ def _apart(one: float, other: float) -> float:
     return abs(math.remainder(one - other, 360))
 
 
-def _with_opposites(found: Sequence[Gateway]) -> tuple[Gateway, ...]:
+def _with_opposites(found: Sequence[RoomGateway]) -> tuple[RoomGateway, ...]:
     """Set `opposite` for two gateways of a room if each is the best opposite of the other.
 
     They may differ from exactly opposite by at most STRAIGHT degrees. Two doors to one other room
@@ -223,5 +223,5 @@ def _with_opposites(found: Sequence[Gateway]) -> tuple[Gateway, ...]:
     return tuple(replace(gateway, opposite=pairs.get(k)) for k, gateway in enumerate(found))
 
 
-def _bend(found: Sequence[Gateway], one: int, other: int) -> float:
+def _bend(found: Sequence[RoomGateway], one: int, other: int) -> float:
     return _apart(found[one].bearing, found[other].bearing + 180)

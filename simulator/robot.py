@@ -73,7 +73,7 @@ class Report:
     covariance: NDArray[np.float64]
 
 
-class Robot:
+class SimulatedRobot:
     """A robot with its true pose, which only the simulator knows, and its odometry.
 
     Args:

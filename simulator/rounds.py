@@ -21,13 +21,13 @@ from numpy.typing import NDArray
 from simulator.buildings import Building
 from simulator.control import Driver
 from simulator.cruise import follow
-from simulator.drive import EVERY, Drive, Recorder
+from simulator.drive import EVERY, RecordedDrive, Recorder
 from simulator.errors import SimulatorError
-from simulator.freespace import CELL, FreeSpace, Part
+from simulator.freespace import CELL, FreeRectangle, FreeSpace
 from simulator.laser import Laser
 from simulator.odometer import Odometer
 from simulator.plans import Plan
-from simulator.robot import Body, Robot
+from simulator.robot import Body, SimulatedRobot
 from ssh_abduction.data.errors import brief, is_finite
 from ssh_abduction.data.words import counted
 
@@ -127,7 +127,7 @@ class Rooms:
         )
         return len(line) > 0 and bool((self.space.part(line).off(line) >= self.space.least).all())
 
-    def _part(self, room: int) -> Part:
+    def _part(self, room: int) -> FreeRectangle:
         """The part of the building around a room, with all doors shut."""
         sides = [sides[room] for sides in self._sides if room in sides]
         return self.space.part(
@@ -268,7 +268,7 @@ def record_plan(
     body: Body | None = None,
     odometer: Odometer | None = None,
     every: float = EVERY,
-) -> Drive:
+) -> RecordedDrive:
     """Drive rounds through a building, and return the scans with odometry and truth.
 
     Args:
@@ -297,7 +297,7 @@ def record_plan(
     world = rooms.building.world()
     x, y = tour.way[0].tolist()
     recorder = Recorder(every)
-    robot = Robot(body, (x, y, float(chance.uniform(-math.pi, math.pi))), motion)
+    robot = SimulatedRobot(body, (x, y, float(chance.uniform(-math.pi, math.pi))), motion)
     driver = Driver(world, robot, laser, motion, recorder=recorder)
     recorder.note(world, robot.pose)
     # For each scan, the point of the round that was reached. Points are counted on from one round

@@ -25,7 +25,7 @@ AHEAD_AND_LEFT = np.stack([np.cos(BEARINGS), np.sin(BEARINGS)], axis=1)
 
 
 @dataclass(frozen=True)
-class Sight:
+class WallPositions:
     """Positions of the walls in metres and radians. None means that no such wall is visible.
 
     Attributes:
@@ -88,7 +88,7 @@ class Sight:
         return None if right is None else right - reach
 
 
-def sight(image: Array, reach: float, farthest: float) -> Sight:
+def sight(image: Array, reach: float, farthest: float) -> WallPositions:
     """Find the walls in an image.
 
     Args:
@@ -99,14 +99,14 @@ def sight(image: Array, reach: float, farthest: float) -> Sight:
     seen = image < farthest - 0.02
     met = image[seen, None] * AHEAD_AND_LEFT[seen]
     if len(met) < 20:
-        return Sight(0.0, None, None, None, None, None)
+        return WallPositions(0.0, None, None, None, None, None)
     axis = _axis(met)
     axis += _finer(_turned(met, -axis), reach)
     points = _turned(met, -axis)
     x, y = points[:, 0], points[:, 1]
     across, along = _spacing(y), _spacing(x)
     # If the axis is turned to the left of the robot, the robot is turned to the right of the axis.
-    return Sight(
+    return WallPositions(
         tilt=-axis,
         front=_line(x, across, (x > 0.05) & (np.abs(y) < 0.5 * reach)),
         left=_line(y, along, (y > 0.05) & (y < 2 * reach) & (np.abs(x) < 6 * reach)),

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from simulator.control import Driver, Tolerance
 from simulator.motion import DIGITS
 from simulator.panorama import Camera
-from simulator.robot import Body, Report, Robot
+from simulator.robot import Body, Report, SimulatedRobot
 from simulator.world import World
 from ssh_abduction.data.odometry import Covariance, Displacement
 from ssh_abduction.data.odometry import Odometry as Noise
@@ -85,7 +85,7 @@ class OdometryLog:
         begun: Whether a step was logged already on this floor.
     """
 
-    robot: Robot
+    robot: SimulatedRobot
     reports: list[Report] = field(default_factory=list)
     begun: bool = False
 

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from simulator.control import STILL, Corridors, Driver, Tolerance
 from simulator.cruise import follow
-from simulator.drive import EVERY, Drive, Recorder
+from simulator.drive import EVERY, RecordedDrive, Recorder
 from simulator.errors import SimulatorError
 from simulator.freespace import FreeSpace
 from simulator.junctions import ACTIONS, Pilot
 from simulator.laser import Laser
 from simulator.odometer import Odometer
 from simulator.panorama import Camera
-from simulator.robot import Body, Robot
+from simulator.robot import Body, SimulatedRobot
 from simulator.tour_log import Eye, OdometryLog, covariance_of, noise_of
 from simulator.watch import DriveWatch
 from simulator.world import World
@@ -132,7 +132,7 @@ def record(
     body: Body | None = None,
     odometer: Odometer | None = None,
     every: float = EVERY,
-) -> Drive:
+) -> RecordedDrive:
     """Drive tours as `simulate` does, or to the places of a route, and return the scans.
 
     The odometry in the log is not the odometry that the robot drives by. It is as noisy as that of
@@ -249,7 +249,7 @@ def _driver(
     rng = np.random.default_rng(seed)
     return Driver(
         world.arranged(rng),
-        Robot(body, world.start, rng),
+        SimulatedRobot(body, world.start, rng),
         laser or Laser(),
         rng,
         tolerance or Tolerance(),

@@ -15,7 +15,7 @@ from perception.places.skeleton import junctions
 from perception.places.stays import joined
 from perception.places.track import Track
 from perception.places.visits import Visit, Way, apart
-from perception.readers.scans import Laser, RobotLog, Scan
+from perception.readers.scans import LaserScanner, RobotLog, Scan
 from simulator.laser import meetings
 
 ROOM = 0.25  # half of the robot's width in metres
@@ -154,7 +154,7 @@ def test_a_corner_of_a_corridor_is_a_junction_of_two_ways(degrees: int, ways: in
 
 def log_of(walls: Segments, way: list[tuple[float, float]]) -> tuple[RobotLog, Track]:
     """The log of a robot with an exact odometer that drives along a way between walls."""
-    laser = Laser(float(BEARINGS[0]), math.radians(2), len(BEARINGS), 20.0)
+    laser = LaserScanner(float(BEARINGS[0]), math.radians(2), len(BEARINGS), 20.0)
     poses = []
     for here, there in pairwise(way):
         dx, dy = np.subtract(there, here)

@@ -24,7 +24,7 @@ from simulator.laser import Laser
 from simulator.motion import between
 from simulator.odometer import Odometer
 from simulator.plans import Plan
-from simulator.robot import Body, Robot
+from simulator.robot import Body, SimulatedRobot
 from simulator.rounds import Rooms, Round, holds, record_plan
 from simulator.tours import record, simulate
 from simulator.world import World
@@ -440,7 +440,10 @@ def test_a_way_leads_around_what_was_not_known() -> None:
     assert way is not None
     rng = np.random.default_rng(0)
     driver = Driver(
-        World("box", np.vstack([walls, box])), Robot(Body(), (1.0, 1.5, 0.0), rng), Laser(), rng
+        World("box", np.vstack([walls, box])),
+        SimulatedRobot(Body(), (1.0, 1.5, 0.0), rng),
+        Laser(),
+        rng,
     )
     track = []
     come = []
@@ -462,7 +465,7 @@ def test_a_way_that_is_closed_is_an_error() -> None:
     rng = np.random.default_rng(0)
     driver = Driver(
         World("shut", np.vstack([walls, [[6, 0, 6, 3]]])),
-        Robot(Body(), (1.0, 1.5, 0.0), rng),
+        SimulatedRobot(Body(), (1.0, 1.5, 0.0), rng),
         Laser(),
         rng,
     )

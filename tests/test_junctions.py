@@ -20,7 +20,7 @@ from simulator.errors import SimulatorError
 from simulator.junctions import Pilot
 from simulator.laser import BEARINGS, Laser
 from simulator.motion import between
-from simulator.robot import Body, Robot
+from simulator.robot import Body, SimulatedRobot
 from simulator.surroundings import Panorama, Place, compass
 from simulator.tours import simulate
 from simulator.world import World
@@ -201,7 +201,7 @@ def test_control_never_reads_the_true_pose() -> None:
     for shift in (0.0, 100.0):
         rng = np.random.default_rng(5)
         x, y, heading = FIVE.start
-        robot = Robot(Body(), (x + shift, y + shift, heading), rng)
+        robot = SimulatedRobot(Body(), (x + shift, y + shift, heading), rng)
         world = World("w", FIVE.segments + shift, reach=FIVE.reach)
         told: list[tuple[float, float]] = []
         honest = robot.move

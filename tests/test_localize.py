@@ -27,7 +27,7 @@ from ssh_abduction.cli import main
 from ssh_abduction.data import Action, LocaliserError, MapError, Step, TraceError
 from ssh_abduction.data.map_parts import DState, Fit, Pose
 from ssh_abduction.online import Belief, Chances
-from ssh_abduction.online.belief import COLLAPSED, Verdict
+from ssh_abduction.online.belief import COLLAPSED, BeliefVerdict
 
 Array = np.ndarray[Any, Any]
 
@@ -296,7 +296,7 @@ def test_a_kidnapped_robot_is_noticed_and_found_again(seed: int) -> None:
     assert beliefs[30].lost
     assert beliefs[30].normaliser < COLLAPSED < 1 < min(b.normaliser for b in beliefs[5:30])
     assert [b.dstate for b in beliefs[42:]] == at[42:]
-    assert {b.verdict for b in beliefs[42:]} == {Verdict.LOCATED}
+    assert {b.verdict for b in beliefs[42:]} == {BeliefVerdict.LOCATED}
     assert not beliefs[-1].lost
 
 
@@ -309,7 +309,7 @@ def test_one_misread_view_is_forgiven() -> None:
     beliefs = list(Localiser(ssh_map).beliefs(trace.with_views(views)))
     assert beliefs[20].collapsed
     assert [b.dstate for b in beliefs[25:]] == at[25:]
-    assert beliefs[25].verdict is Verdict.LOCATED
+    assert beliefs[25].verdict is BeliefVerdict.LOCATED
 
 
 def test_a_robot_is_found_again_where_it_is_as_sure_as_before() -> None:
@@ -320,9 +320,9 @@ def test_a_robot_is_found_again_where_it_is_as_sure_as_before() -> None:
     beliefs = list(Localiser(ssh_map).beliefs(trace))
     assert dict(beliefs[8].above(0.4)) == pytest.approx({0: 0.5, 4: 0.5}, abs=0.01)
     assert beliefs[8].entropy == pytest.approx(1, abs=0.05)
-    assert {b.verdict for b in beliefs[:9]} == {Verdict.UNSURE}
-    assert (beliefs[9].verdict, beliefs[9].entropy > 2) == (Verdict.LOST, True)
-    assert (beliefs[-1].verdict, beliefs[-1].lost) == (Verdict.UNSURE, False)
+    assert {b.verdict for b in beliefs[:9]} == {BeliefVerdict.UNSURE}
+    assert (beliefs[9].verdict, beliefs[9].entropy > 2) == (BeliefVerdict.LOST, True)
+    assert (beliefs[-1].verdict, beliefs[-1].lost) == (BeliefVerdict.UNSURE, False)
 
 
 def test_views_that_the_map_does_not_have_are_nowhere() -> None:
@@ -331,7 +331,7 @@ def test_views_that_the_map_does_not_have_are_nowhere() -> None:
     views = [v if t < 12 or t >= 16 else "a lift" for t, v in enumerate(trace.views)]
     beliefs = list(Localiser(ssh_map).beliefs(trace.with_views(views)))
     assert beliefs[12].collapsed
-    assert [b.verdict for b in beliefs[13:16]] == [Verdict.NOWHERE] * 3
+    assert [b.verdict for b in beliefs[13:16]] == [BeliefVerdict.NOWHERE] * 3
     assert [b.dstate for b in beliefs[13:16]] == [None] * 3
     assert beliefs[-1].dstate == at[-1]
     assert Localiser(ssh_map).start("a lift").dstate is None
@@ -346,9 +346,9 @@ def test_another_world_that_shows_the_same_views_is_nowhere(seed: int) -> None:
     ssh_map, foreign = true_map(*_walk_of_moore(seed)), true_map(*_walk_of_moore(50 + seed))
     trace, _ = drive(foreign, 60, seed)
     verdicts = [b.verdict for b in Localiser(ssh_map).beliefs(trace)][20:]
-    assert verdicts.count(Verdict.NOWHERE) > 0.6 * len(verdicts)
+    assert verdicts.count(BeliefVerdict.NOWHERE) > 0.6 * len(verdicts)
     own, _ = drive(ssh_map, 60, seed)
-    assert Verdict.NOWHERE not in [b.verdict for b in Localiser(ssh_map).beliefs(own)]
+    assert BeliefVerdict.NOWHERE not in [b.verdict for b in Localiser(ssh_map).beliefs(own)]
 
 
 def _walk_of_moore(seed: int) -> tuple[Sequence[object], Trace]:
@@ -385,7 +385,7 @@ def test_a_belief_is_a_frozen_value_that_says_what_it_comes_to() -> None:
     prior, belief = localiser.prior, localiser.start("a")
     assert prior.probabilities.sum() + prior.nowhere == pytest.approx(1)
     assert prior.entropy == pytest.approx(-(0.9 * math.log2(0.3) + 0.1 * math.log2(0.1)))
-    assert (belief.verdict, belief.likeliest, belief.dstate) == (Verdict.UNSURE, 0, 0)
+    assert (belief.verdict, belief.likeliest, belief.dstate) == (BeliefVerdict.UNSURE, 0, 0)
     with pytest.raises(ValueError, match="read-only"):
         belief.probabilities[0] = 1
     with pytest.raises(FrozenInstanceError):
@@ -397,7 +397,7 @@ def test_a_belief_is_a_frozen_value_that_says_what_it_comes_to() -> None:
     assert told["dstate"] == told["probabilities"][0][0] == 2
     assert told["verdict"] == "located"
     nowhere = Belief(np.zeros(2), 1.0)
-    assert (nowhere.entropy, nowhere.dstate, nowhere.verdict) == (0, None, Verdict.NOWHERE)
+    assert (nowhere.entropy, nowhere.dstate, nowhere.verdict) == (0, None, BeliefVerdict.NOWHERE)
 
 
 def test_probabilities_sum_to_one_over_a_long_run() -> None:

@@ -24,7 +24,7 @@ from perception.places.following import follow
 from perception.places.importing import Imported, import_log
 from perception.places.track import Track
 from perception.readers.logs import read_log
-from perception.readers.scans import Laser, RobotLog, Scan
+from perception.readers.scans import LaserScanner, RobotLog, Scan
 from perception.readers.writers import write_carmen
 from perception.store import load
 from simulator.rounds import record_plan
@@ -217,7 +217,7 @@ def test_corrected_poses_are_not_read(hall: Path) -> None:
 
 
 def test_a_log_of_a_robot_that_stands_or_passes_nothing_is_an_error() -> None:
-    laser = Laser(-math.pi / 2, math.radians(1), 181, 30.0)
+    laser = LaserScanner(-math.pi / 2, math.radians(1), 181, 30.0)
     corridor = np.minimum(1.0 / np.maximum(np.abs(np.sin(laser.bearings)), 1e-9), 30.0)
     still = [Scan(corridor, laser, (0.0, 0.0, 0.0))] * 3
     with pytest.raises(LogError, match="expected a robot that drives"):
@@ -305,7 +305,7 @@ def test_flags_are_laid_over_the_theory_for_logs(
 
 
 def test_a_log_has_a_twentieth_of_its_drive_to_be_mapped_in_less_what_the_import_took() -> None:
-    laser = Laser(-1.0, 1.0, 3, 30.0)
+    laser = LaserScanner(-1.0, 1.0, 3, 30.0)
     timed = tuple(Scan(np.ones(3), laser, (0.1 * i, 0.0, 0.0), time=2.0 * i) for i in range(51))
     track = Track(np.array([scan.odometry for scan in timed]), np.zeros((51, 3, 3)))
     imported = Imported(

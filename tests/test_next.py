@@ -15,7 +15,7 @@ from ssh_abduction import SSHMap, Theory, Trace, next_experiment, solve
 from ssh_abduction.cli import main
 from ssh_abduction.data import DState, MapError, MapPath, SolverError
 from ssh_abduction.rivals.consequences import Consequences
-from ssh_abduction.rivals.experiment import Experiment, Plan
+from ssh_abduction.rivals.experiment import Experiment, ExperimentPlan
 from ssh_abduction.rivals.machines import Seen, links_of
 from ssh_abduction.solver.asp.limits import Watch
 
@@ -109,7 +109,7 @@ def test_two_rivals_are_told_apart_by_the_fewest_actions() -> None:
     assert max(lengths) == 4
 
 
-def walk(plan: Plan, truth: SSHMap) -> Plan:
+def walk(plan: ExperimentPlan, truth: SSHMap) -> ExperimentPlan:
     """The end of a plan if this map is true."""
     words: list[str] = []
     while plan.branches:
@@ -120,7 +120,7 @@ def walk(plan: Plan, truth: SSHMap) -> Plan:
     return plan
 
 
-def path(plan: Plan, end: Plan) -> Iterator[tuple[str, ...]]:
+def path(plan: ExperimentPlan, end: ExperimentPlan) -> Iterator[tuple[str, ...]]:
     """The actions that lead to the end of a plan."""
     while plan is not end:
         yield plan.actions
@@ -367,7 +367,7 @@ def test_limits_leave_a_plan_that_says_so() -> None:
     watch.interrupted = True
     experiment = next_experiment(maps, watch=watch)
     assert experiment.stopped == "interrupted"
-    assert experiment.plan == Plan((1, 2))
+    assert experiment.plan == ExperimentPlan((1, 2))
     assert experiment.warning is not None
     assert not experiment.is_settled
     assert next_experiment(maps, time_limit=1e-9).stopped == "time limit"

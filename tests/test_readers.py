@@ -20,20 +20,22 @@ import pytest
 from perception.errors import LogError
 from perception.readers.lines import LONGEST_LINE
 from perception.readers.logs import FORMATS, live_log, read_log, stream_log
-from perception.readers.scans import Damage, Laser, Pose, RobotLog, Scan
+from perception.readers.scans import Damage, LaserScanner, Pose, RobotLog, Scan
 from perception.readers.writers import write_bag, write_carmen
 from ssh_abduction.data.errors import TraceError
 from ssh_abduction.data.odometry import between, moved
 from ssh_abduction.data.trace import Trace
 
 LOGS = Path(__file__).parents[2] / "shared" / "data" / "logs"
-LASER = Laser(first=-math.pi / 2, step=math.pi / 180, beams=181, reach=8.0, mount=(0.2, 0.0, 0.0))
-SMALL = Laser(first=-math.pi / 2, step=math.pi / 4, beams=5, reach=8.0)
+LASER = LaserScanner(
+    first=-math.pi / 2, step=math.pi / 180, beams=181, reach=8.0, mount=(0.2, 0.0, 0.0)
+)
+SMALL = LaserScanner(first=-math.pi / 2, step=math.pi / 4, beams=5, reach=8.0)
 START: Pose = (0.0, 0.0, 0.0)
 BAGS = {"drive.bag": "ros1", "drive.mcap": "mcap", "drive": "ros2"}
 
 
-def drive(count: int = 12, laser: Laser = LASER, noise: float = 0.03) -> list[Scan]:
+def drive(count: int = 12, laser: LaserScanner = LASER, noise: float = 0.03) -> list[Scan]:
     """Scans of a robot that drives a bend with noisy odometry."""
     rng = np.random.default_rng(7)
     true: Pose = (1.0, -2.0, 0.3)
@@ -515,7 +517,7 @@ def test_odometry_of_a_bag_is_that_at_the_times_of_the_scans(tmp_path: Path) -> 
     scan = log.scans[0]
     assert np.isnan(scan.ranges[0])
     assert scan.ranges[1:].tolist() == [1, 2, math.inf, math.inf]
-    assert scan.laser == Laser(-1.0, 0.5, 5, 8.0, START, float(np.float32(0.1)))
+    assert scan.laser == LaserScanner(-1.0, 0.5, 5, 8.0, START, float(np.float32(0.1)))
     assert "No transform leads" in " ".join(log.notes)
 
 

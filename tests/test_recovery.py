@@ -21,7 +21,7 @@ from ssh_abduction.data import TheoryError, TraceError
 from ssh_abduction.online import Belief
 from ssh_abduction.online import background as solving
 from ssh_abduction.online.background import MEANWHILE, BackgroundTask, Solved
-from ssh_abduction.online.hypotheses import Rival, Scale
+from ssh_abduction.online.hypotheses import ExtendedMap, Scale
 from ssh_abduction.online.recovery import Recovery
 from ssh_abduction.solver import Status
 from ssh_abduction.solver.asp.process import _under_way
@@ -95,7 +95,8 @@ def test_after_every_step_the_maps_are_those_of_brute_force(
         assert len(solution.maps) == len(expected)
         if mapper.standing.certain:
             futures = {
-                Rival.of(ssh_map, mapper.trace, mapper.theory).future() for ssh_map in solution.maps
+                ExtendedMap.of(ssh_map, mapper.trace, mapper.theory).future()
+                for ssh_map in solution.maps
             }
             assert len(futures) == 1
 
@@ -319,7 +320,7 @@ def test_what_is_decided_is_what_will_be() -> None:
             100,
         ):
             if mapper.standing.certain and len({m.faults for m in solution.maps}) > 1:
-                rivals = [Rival.of(m, mapper.trace, mapper.theory) for m in solution.maps]
+                rivals = [ExtendedMap.of(m, mapper.trace, mapper.theory) for m in solution.maps]
                 assert len({rival.future() for rival in rivals}) == 1
                 assert len({rival.labels for rival in rivals}) > 1
                 return
@@ -329,7 +330,7 @@ def test_what_is_decided_is_what_will_be() -> None:
 def test_rivals_are_weighed_by_faults_and_by_what_they_assume() -> None:
     trace = circuit(16)
     theory = Theory.causal().replace(misread=1.5, slipped=3)
-    lead = Rival.of(solve(trace, theory).maps[0], trace, theory)
+    lead = ExtendedMap.of(solve(trace, theory).maps[0], trace, theory)
     step = trace.steps[1]
     wrong, slipped, new = lead.ways_on("right", replace(step, view="v2"), ("v2", None), theory)
     assert [rival.cost[0] for rival in (lead, wrong, slipped, new)] == [40, 55, 70, 80]

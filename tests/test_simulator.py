@@ -17,7 +17,7 @@ from simulator.control import Driver, act, climb
 from simulator.errors import SimulatorError
 from simulator.laser import BEARINGS, Laser
 from simulator.motion import between, moved, reported
-from simulator.robot import Body, Robot
+from simulator.robot import Body, SimulatedRobot
 from simulator.sight import LONG, sight
 from simulator.tour_log import noise_model
 from simulator.tours import simulate
@@ -262,7 +262,7 @@ def test_hill_climbing_ends_at_the_fixed_point(
 ) -> None:
     """From anywhere near x0, the robot reaches the tolerance of the control law."""
     rng = np.random.default_rng(seed)
-    robot = Robot(Body(), (3.4 + dx, 1.4 + dy, math.radians(degrees)), rng)
+    robot = SimulatedRobot(Body(), (3.4 + dx, 1.4 + dy, math.radians(degrees)), rng)
     climb(Driver(RECTANGLE, robot, Laser(), rng))
     x, y, heading = robot.pose
     assert abs(x - 3.4) < 0.025
@@ -275,7 +275,7 @@ def test_control_never_reads_the_true_pose() -> None:
     commands: list[list[tuple[float, float]]] = []
     for lie in (False, True):
         rng = np.random.default_rng(5)
-        robot = Robot(Body(), RECTANGLE.start, rng)
+        robot = SimulatedRobot(Body(), RECTANGLE.start, rng)
         driver = Driver(RECTANGLE, robot, Laser(), rng)
         told: list[tuple[float, float]] = []
         honest = robot.move
@@ -328,7 +328,7 @@ def test_without_hill_climbing_errors_do_add_up(monkeypatch: pytest.MonkeyPatch)
     rng = np.random.default_rng(0)
     ends = []
     for _ in range(30):
-        robot = Robot(Body(), (3.4, 1.4, -math.pi / 2), rng)
+        robot = SimulatedRobot(Body(), (3.4, 1.4, -math.pi / 2), rng)
         for forward, turn in ((0.8, 0.0), (0.0, -math.pi / 2), (2.8, 0.0)):
             robot.move(forward, turn)
         ends.append(robot.pose[:2])
@@ -337,7 +337,7 @@ def test_without_hill_climbing_errors_do_add_up(monkeypatch: pytest.MonkeyPatch)
 
 def test_odometry_drifts_and_is_not_the_truth(circuits: Trace) -> None:
     rng = np.random.default_rng(0)
-    robot = Robot(Body(), (0.0, 0.0, 0.0), rng)
+    robot = SimulatedRobot(Body(), (0.0, 0.0, 0.0), rng)
     for _ in range(200):
         robot.move(0.1, 0.05)
     assert math.dist(robot.pose[:2], robot.odometry[:2]) > 0.001
@@ -429,7 +429,7 @@ def test_the_covariance_of_a_report_is_that_of_its_errors() -> None:
     rng = np.random.default_rng(0)
     errors = []
     for _ in range(600):
-        robot = Robot(Body(), (1.0, 2.0, 0.7), rng)
+        robot = SimulatedRobot(Body(), (1.0, 2.0, 0.7), rng)
         robot.move(0.3, 0.2)
         robot.report()
         start = robot.pose
@@ -445,7 +445,7 @@ def test_the_covariance_of_a_report_is_that_of_its_errors() -> None:
 
 
 def test_worn_wheels_report_too_long_ways_and_unequal_ones_a_drift() -> None:
-    robot = Robot(
+    robot = SimulatedRobot(
         Body(slip=0, wander=0, odometry=0, scale=0.1, bend=0.02),
         (0.0, 0.0, 0.0),
         np.random.default_rng(0),
@@ -483,7 +483,7 @@ def test_the_shares_of_a_step_are_those_of_its_motions() -> None:
     body = Body(wander=0, odometry=0.05)
     reports, errors = [], []
     for _ in range(300):
-        robot = Robot(body, (0.0, 0.0, 0.0), rng)
+        robot = SimulatedRobot(body, (0.0, 0.0, 0.0), rng)
         for _ in range(60):
             robot.move(0.15, 0.0)
         reports.append(robot.report())

@@ -15,7 +15,7 @@ from perception.places.distinctive import DELAY, find_visits
 from perception.places.following import follow
 from perception.places.importing import stream_visits
 from perception.places.visits import Visit
-from perception.readers.scans import Damage, Laser, RobotLog, Scan
+from perception.readers.scans import Damage, LaserScanner, RobotLog, Scan
 from simulator.laser import meetings
 
 # A room of 6 by 5 m with a door, in which a robot drives round and round.
@@ -73,7 +73,7 @@ def test_a_visit_is_final_soon_after_it() -> None:
 def corridor(metres: float) -> Iterator[Scan]:
     """Scans, 0.5 m apart, of a straight corridor with a side corridor to the left every 10 m."""
     bearings = BEARINGS[::2]
-    laser = Laser(float(bearings[0]), math.radians(4), len(bearings), 20.0)
+    laser = LaserScanner(float(bearings[0]), math.radians(4), len(bearings), 20.0)
     walls = [(x + 1.2, 1, x + 8.8, 1) for x in range(-25, 30, 10)]
     walls += [(x, y, x, 9.0) for x in np.arange(-26.2, 30, 10) for y in (1.0,)]
     walls += [(x, 1.0, x, 9.0) for x in np.arange(-23.8, 30, 10)]

@@ -31,7 +31,7 @@ from visited import (
     with_names,
 )
 
-from perception.readers.scans import Laser, RobotLog, Scan
+from perception.readers.scans import LaserScanner, RobotLog, Scan
 from simulator.laser import BEAMS, BEARINGS, meetings
 from ssh_abduction import SSHMap, Trace, evaluate, solve
 from ssh_abduction.data import Action, DState, Step
@@ -214,7 +214,7 @@ def crossing() -> RobotLog:
     ranges = meetings(
         np.hstack([outline, np.roll(outline, -1, axis=0)]), np.array(ways), BEARINGS
     ).min(axis=2)
-    laser = Laser(float(BEARINGS[0]), math.radians(1), BEAMS, 30.0)
+    laser = LaserScanner(float(BEARINGS[0]), math.radians(1), BEAMS, 30.0)
     return RobotLog(
         tuple(Scan(scan, laser, pose, pose) for scan, pose in zip(ranges, ways, strict=True))
     )

@@ -168,7 +168,7 @@ def followed(
             one = Followed(scan, (0.0, 0.0, 0.0))
         else:
             onward = between(last.scan.odometry, scan.odometry)
-            step = _Step(scan, points, normals, recent, last.pose, onward, before, trust)
+            step = _ScanMotion(scan, points, normals, recent, last.pose, onward, before, trust)
             one = step.judged(doubt_of(i, onward))
             before = between(last.pose, one.pose)
         if one.broken:
@@ -179,7 +179,7 @@ def followed(
 
 
 @dataclass(frozen=True, eq=False)
-class _Step:
+class _ScanMotion:
     """A motion from one scan to the next.
 
     Attributes:
@@ -356,7 +356,7 @@ def _matched(
         kept = np.unique(np.linspace(0, len(points) - 1, min(len(points), POINTS)).astype(int))
         # These settings build the tree faster, and queries take no longer.
         tree = cKDTree(walls, compact_nodes=False, balanced_tree=False)
-        fit = _Fit(points[kept], normals[kept], walls, wall_normals, tree)
+        fit = _ScanFit(points[kept], normals[kept], walls, wall_normals, tree)
         share, pose, information = fit.improved(guess, weight)
         # A poor match may have a wrong heading: try others.
         if share < POOR:
@@ -400,7 +400,7 @@ def _accumulating(information: Array, prior: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class _Fit:
+class _ScanFit:
     """Moves a scan until its points lie on walls.
 
     Points are in the frame of the robot, walls in the frame of the track.

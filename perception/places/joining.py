@@ -191,7 +191,7 @@ def closures_between(
 
 
 @dataclass(frozen=True, eq=False)
-class _Relations:
+class _FrameMatches:
     """What n matches say about how two frames relate.
 
     `turns` are rotations of the later frame, in radians. The middle of the later visit is `here` in
@@ -211,18 +211,18 @@ class _Relations:
         return np.asarray((far < NEAR + DRIFT * np.hypot(*onward.T)) & (twist < TWIST))
 
 
-def _relations(found: Sequence[VisitMatch], first: Imported, last: Imported) -> _Relations:
+def _relations(found: Sequence[VisitMatch], first: Imported, last: Imported) -> _FrameMatches:
     """Collect what matches between the visits of two drives say about their frames."""
     here = [first.visits[one.first].middle + one.match.shift for one in found]
     there = [last.visits[one.last].middle for one in found]
-    return _Relations(
+    return _FrameMatches(
         np.array([one.match.turn for one in found]),
         np.array(here).reshape(-1, 2),
         np.array(there).reshape(-1, 2),
     )
 
 
-def _largest(found: Sequence[VisitMatch], relations: _Relations) -> list[VisitMatch]:
+def _largest(found: Sequence[VisitMatch], relations: _FrameMatches) -> list[VisitMatch]:
     """Find the relation of the frames on which most matches agree, and list these matches.
 
     The list is empty if too few visits agree, or if another relation has more than half as many.

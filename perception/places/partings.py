@@ -59,7 +59,7 @@ def with_partings(
         All visits, in order, and the closures between them. An added visit has the local map of the
         nearest other one.
     """
-    drive = _Drive(track, visits)
+    drive = _DrivePoints(track, visits)
     relations = [*_closed(drive, closings), *_tracked(drive)]
     places: list[list[_Pass]] = []
     for one in relations:
@@ -79,7 +79,7 @@ def with_partings(
 
 
 @dataclass(frozen=True, eq=False)
-class _Relation:
+class _Alignment:
     """How the trajectory at a visit lies relative to the trajectory at an earlier one.
 
     Attributes:
@@ -97,15 +97,15 @@ class _Relation:
     there: Array
 
     @property
-    def reverse(self) -> _Relation:
-        return _Relation(self.last, self.first, -self.turn, self.there, self.here)
+    def reverse(self) -> _Alignment:
+        return _Alignment(self.last, self.first, -self.turn, self.there, self.here)
 
     def moved(self, points: Array) -> Array:
         """Move points, (..., 2) metres, from the later to the earlier trajectory."""
         return self.here + points_turned(self.turn, points - self.there)
 
 
-class _Drive:
+class _DrivePoints:
     """A drive as points along its trajectory.
 
     Args:
@@ -135,7 +135,7 @@ class _Drive:
         begin, end = max(self._cuts[k - 1], way - reach), min(self._cuts[k], way + reach)
         return range(math.ceil(begin / PACE), min(math.floor(end / PACE) + 1, len(self.points)))
 
-    def partings(self, one: _Relation) -> Iterator[tuple[_Pass, _Pass]]:
+    def partings(self, one: _Alignment) -> Iterator[tuple[_Pass, _Pass]]:
         """Yield the earlier and the later pass of each parting of two stretches."""
         ours, theirs = self.stretch(one.first), self.stretch(one.last)
         if ours.stop > theirs.start:  # Stretches share no points.
@@ -177,25 +177,25 @@ class _Drive:
         return None
 
 
-def _closed(drive: _Drive, closings: Sequence[VisitMatch]) -> Iterator[_Relation]:
+def _closed(drive: _DrivePoints, closings: Sequence[VisitMatch]) -> Iterator[_Alignment]:
     """Yield how trajectories lie relative to each other by closures."""
     for one in closings:
         first, last = drive.visits[one.first], drive.visits[one.last]
         first_way, last_way = float(drive.ways[one.first]), float(drive.ways[one.last])
         here = first.middle + one.match.shift
-        yield _Relation(first_way, last_way, one.match.turn, here, last.middle)
+        yield _Alignment(first_way, last_way, one.match.turn, here, last.middle)
 
 
-def _tracked(drive: _Drive) -> Iterator[_Relation]:
+def _tracked(drive: _DrivePoints) -> Iterator[_Alignment]:
     """Yield how trajectories lie relative to each other by the track, for successive visits."""
     for way in drive.ways.tolist():
         first, last = np.searchsorted(drive.ways, (way, way + MOST))
         for other in drive.ways[first:last].tolist():
-            yield _Relation(way, other, 0.0, np.zeros(2), np.zeros(2))
+            yield _Alignment(way, other, 0.0, np.zeros(2), np.zeros(2))
 
 
 def _passes(
-    drive: _Drive, pair: tuple[_Pass, _Pass], relations: Sequence[_Relation]
+    drive: _DrivePoints, pair: tuple[_Pass, _Pass], relations: Sequence[_Alignment]
 ) -> list[_Pass]:
     """List all passes of a parting: two of the pair, and those that relations find elsewhere."""
     place = list(pair)

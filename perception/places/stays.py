@@ -41,7 +41,7 @@ RIM, SMALL = 0.5, 0.5
 
 
 @dataclass(frozen=True)
-class _Turn:
+class _TurningPoint:
     """A scan at which the robot turned around, or at which the drive begins or ends.
 
     `way` is in metres. Over `stride` metres before and after the scan, directions differ by
@@ -68,7 +68,7 @@ class Stays:
         self._recent, self._maps, self._half = recent, maps, half
         self._passing: Visit | None = None  # the last visit, which the next one may replace
         self._found: list[tuple[float, Visit]] = []  # the metres driven up to each visit
-        self._turns = [_Turn(0.0, END, math.pi, 0)]
+        self._turns = [_TurningPoint(0.0, END, math.pi, 0)]
         self._asked = dict.fromkeys(STRIDES, 0)  # the next scan that may be a turn
         self._done = 0  # all visits before this scan are complete
         self._staying: Visit | None = None
@@ -92,7 +92,7 @@ class Stays:
             self._settle()
         self._find_turns()
         if horizon is None and (last := self._recent.end - 1) >= 0:
-            self._turns.append(_Turn(self._recent.way(last), END, math.pi, last))
+            self._turns.append(_TurningPoint(self._recent.way(last), END, math.pi, last))
         for visit in self._complete(self._limit(horizon)):
             if self._staying and self._comes_back(visit):
                 self._staying = joined(self._staying, visit)
@@ -140,7 +140,7 @@ class Stays:
             while recent.way(here) >= (way := recent.way(self._asked[stride])) + stride:
                 angle = self._angle(self._asked[stride], stride) if way >= stride else 0.0
                 if angle > REVERSED:
-                    self._turns.append(_Turn(way, stride, angle, self._asked[stride]))
+                    self._turns.append(_TurningPoint(way, stride, angle, self._asked[stride]))
                 self._asked[stride] += 1
         self._turns.sort(key=lambda turn: turn.scan)
 
@@ -172,7 +172,7 @@ class Stays:
 
     def _before_turns(self, limit: int) -> int:
         """Find the last scan up to a limit that does not separate turns near each other."""
-        first: _Turn | None = None  # of the turns near each other
+        first: _TurningPoint | None = None  # of the turns near each other
         last = -math.inf
         for turn in self._turns:
             if first is None or turn.way - last > NEARBY or turn.way - first.way > TURNING:
@@ -201,7 +201,7 @@ class Stays:
         self._done = limit
         return completed
 
-    def _is_apart(self, turn: _Turn) -> bool:
+    def _is_apart(self, turn: _TurningPoint) -> bool:
         """Whether a turn is neither in the disc of a place nor close to a visit along the way."""
         here = self._recent.poses(turn.scan, turn.scan + 1)[0, :2]
         for at, visit in self._found:

@@ -20,7 +20,7 @@ FIXED = (0.01, 0.01)
 
 
 @dataclass
-class Frame:
+class FrameTransform:
     """The transform from a parent frame to a frame, which is the pose of the frame in its parent.
 
     Attributes:
@@ -47,7 +47,7 @@ class Frame:
 
 
 # The transforms to each frame, by parent. A frame should have one parent, but some have several.
-Frames = dict[str, dict[str, Frame]]
+Frames = dict[str, dict[str, FrameTransform]]
 
 
 def frames_of(bag: Bag, seen: set[str], damaged: list[Damage]) -> Frames:
@@ -94,14 +94,18 @@ def frames_of(bag: Bag, seen: set[str], damaged: list[Damage]) -> Frames:
     return frames
 
 
-def _record(frames: Frames, child: str, parent: str, transform: Any, is_static: bool) -> Frame:
+def _record(
+    frames: Frames, child: str, parent: str, transform: Any, is_static: bool
+) -> FrameTransform:
     """Record a message with the transform from a parent frame to a child frame."""
     move, turn = transform.translation, transform.rotation
     flat = flat_pose(move, turn)
     parents = frames.setdefault(child, {})
     edge = parents.get(parent)
     if edge is None or (edge.track is None) != is_static:
-        edge = Frame(parent, np.zeros(3), np.eye(3), flat, None if is_static else RecordedTrack())
+        edge = FrameTransform(
+            parent, np.zeros(3), np.eye(3), flat, None if is_static else RecordedTrack()
+        )
     parents.pop(parent, None)
     parents[parent] = edge  # The parent in the last message comes last.
     edge.translation = np.array([move.x, move.y, move.z])
@@ -113,8 +117,8 @@ def _record(frames: Frames, child: str, parent: str, transform: Any, is_static: 
     return edge
 
 
-def parent_of(frames: Frames, child: str) -> Frame:
-    """Return the pose of a frame in its parent, as a `Frame` that also names the parent.
+def parent_of(frames: Frames, child: str) -> FrameTransform:
+    """Return the pose of a frame in its parent, as a `FrameTransform` that also names the parent.
 
     If a frame has several parents, one with "odom" in its name is taken, otherwise the last one.
     """

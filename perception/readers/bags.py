@@ -41,7 +41,7 @@ from perception.readers.bag_frames import (
 from perception.readers.bag_topics import Bag
 from perception.readers.messages import Damaged
 from perception.readers.poses import RecordedTrack, TimedPoses, clock_of, sources_of
-from perception.readers.scans import Damage, Laser, Pose, Scan, SurveyedLog, laser_of
+from perception.readers.scans import Damage, LaserScanner, Pose, Scan, SurveyedLog, laser_of
 from ssh_abduction.data.errors import brief
 from ssh_abduction.data.odometry import moved
 
@@ -316,7 +316,9 @@ def _scans(
             yield Damage(number, f"{connection.topic}: {damage}")
 
 
-def _measured(message: Any, mount: Pose, is_flipped: bool) -> tuple[NDArray[np.float64], Laser]:
+def _measured(
+    message: Any, mount: Pose, is_flipped: bool
+) -> tuple[NDArray[np.float64], LaserScanner]:
     """Read the ranges of a message, and describe its laser. Raises Damaged.
 
     The beams of a flipped laser, which hangs upside down, turn clockwise.

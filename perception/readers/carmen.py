@@ -70,7 +70,7 @@ from perception.readers.messages import (
     vertex_of,
     words,
 )
-from perception.readers.scans import Damage, Laser, Scan, SurveyedLog, laser_of
+from perception.readers.scans import Damage, LaserScanner, Scan, SurveyedLog, laser_of
 from ssh_abduction.data.files import LINE_OF_A_LOG
 from ssh_abduction.data.odometry import Pose, between, moved
 
@@ -170,12 +170,12 @@ def read(
             f"The log does not say how wide the laser looks: its {survey.beams} beams are "
             "taken to cover 180 degrees. If they cover more or less, say so: --set fov=DEGREES."
         )
-    items = _scans(file, source, _Odometer(found, meaning, is_corrected), kind, mount, reach)
+    items = _scans(file, source, _OdometerPoses(found, meaning, is_corrected), kind, mount, reach)
     return SurveyedLog("g2o" if found.graph.vertices else "carmen", tuple(notes), items, assumed)
 
 
 def _scans(
-    file: IO[bytes], source: str, odometer: _Odometer, kind: str, mount: Pose, reach: float
+    file: IO[bytes], source: str, odometer: _OdometerPoses, kind: str, mount: Pose, reach: float
 ) -> Iterator[Scan | Damage]:
     """Yield the scans, and damage for lines that cannot be read.
 
@@ -215,7 +215,7 @@ def _scans(
 
 
 @dataclass(slots=True)
-class _Odometer:
+class _OdometerPoses:
     """Computes the pose of the odometer at each scan, from the lines of the log up to that scan.
 
     Attributes:
@@ -335,7 +335,7 @@ class _Odometer:
 
 def _measured(
     line: ScanLine, mount: Pose, reach: float, fov: float
-) -> tuple[NDArray[np.float64], Laser]:
+) -> tuple[NDArray[np.float64], LaserScanner]:
     """The ranges of a scan in metres, and its laser.
 
     `reach`, in metres, and `fov`, in radians, hold if the line does not give them.

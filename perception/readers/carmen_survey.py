@@ -58,7 +58,7 @@ MOST_BETWEEN = 100
 
 
 @dataclass(frozen=True)
-class Chain:
+class VertexPoses:
     """Poses by odometry at the vertices, computed by adding up the motions along the edges.
 
     Attributes:
@@ -95,7 +95,7 @@ class PoseGraph:
     edges: dict[tuple[int, int], Pose] = field(default_factory=dict)
 
     @cached_property
-    def chain(self) -> Chain:
+    def chain(self) -> VertexPoses:
         """Pose by odometry at each vertex, computed by adding up the motions along the edges."""
         poses: list[Pose] = [(0.0, 0.0, 0.0)]
         gaps: list[int] = []
@@ -104,7 +104,7 @@ class PoseGraph:
             if motion is None:
                 gaps.append(end)
             poses.append(moved(poses[-1], motion or (0.0, 0.0, 0.0)))
-        return Chain(tuple(poses), tuple(gaps))
+        return VertexPoses(tuple(poses), tuple(gaps))
 
     def _motion(self, start: int, end: int) -> Pose | None:
         """Find the motion from one vertex to another; None if it is unknown.

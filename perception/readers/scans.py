@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 from ssh_abduction.data.odometry import Pose
 from ssh_abduction.data.words import counted
 
-__all__ = ["Damage", "Laser", "Pose", "RobotLog", "Scan", "SurveyedLog", "laser_of"]
+__all__ = ["Damage", "LaserScanner", "Pose", "RobotLog", "Scan", "SurveyedLog", "laser_of"]
 
 
 @dataclass(frozen=True)
-class Laser:
+class LaserScanner:
     """A laser scanner.
 
     Attributes:
@@ -62,7 +62,7 @@ class Laser:
 
 
 # All scans of a log share the few lasers that it has.
-laser_of = lru_cache(maxsize=64)(Laser)
+laser_of = lru_cache(maxsize=64)(LaserScanner)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -83,7 +83,7 @@ class Scan:
     """
 
     ranges: NDArray[np.float64]
-    laser: Laser
+    laser: LaserScanner
     odometry: Pose
     corrected: Pose | None = None
     time: float | None = None

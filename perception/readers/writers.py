@@ -34,7 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.errors import LogError
-from perception.readers.scans import Laser, Scan
+from perception.readers.scans import LaserScanner, Scan
 from ssh_abduction.data.errors import named
 from ssh_abduction.data.files import write_file
 from ssh_abduction.data.odometry import Pose, between, moved
@@ -307,7 +307,7 @@ class _Maker:
             twist=self.types[geometry + "TwistWithCovariance"](twist=still, covariance=unknown),
         )
 
-    def scan(self, ranges: NDArray[np.float64], laser: Laser) -> Any:
+    def scan(self, ranges: NDArray[np.float64], laser: LaserScanner) -> Any:
         """Make a LaserScan message with ranges in metres."""
         return self.types["sensor_msgs/msg/LaserScan"](
             header=self.header(LASER),

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 from ssh_abduction.checker.floors import other_floor, path_on_one_floor
-from ssh_abduction.checker.moves import Move, heading_of
+from ssh_abduction.checker.moves import MapLink, heading_of
 from ssh_abduction.checker.planarity import Edges
 from ssh_abduction.checker.reading import Check, Found, Reading
 from ssh_abduction.checker.stars import stars_of
@@ -145,7 +145,7 @@ def planar(m: Reading) -> Found:
         else {}
     )
 
-    def cross(travels: Sequence[Move]) -> bool:
+    def cross(travels: Sequence[MapLink]) -> bool:
         edges = Edges([(t.source.id, t.target.id) for t in travels], turns, place_of)
         if m.theory.star != "frame":
             return not edges.can_be_drawn(crossing=m.theory.symmetric_sides)

@@ -265,7 +265,7 @@ def _sets(rows: Steps, filtered: ErrorFilter, most: float) -> Iterator[tuple[Ste
     A portion is two arrays of indices into `rows`: first step, last step and degrees of freedom of
     each return, sorted by last step, (m, 3). `most` is the least chi-square that may be rejected.
     """
-    alone = _Alone(filtered, rows)
+    alone = _EachReturn(filtered, rows)
     found = []
     for end in np.unique(rows[:, 1]):
         look_at_clock()
@@ -278,7 +278,7 @@ def _sets(rows: Steps, filtered: ErrorFilter, most: float) -> Iterator[tuple[Ste
         yield first[portion], second[portion]
 
 
-class _Alone:
+class _EachReturn:
     """Values of m returns, each taken alone.
 
     Attributes:
@@ -307,7 +307,7 @@ class _Alone:
 
 
 def _unsafe(
-    filtered: ErrorFilter, rows: Steps, alone: _Alone, end: int, most: float
+    filtered: ErrorFilter, rows: Steps, alone: _EachReturn, end: int, most: float
 ) -> tuple[Steps, Steps]:
     """Find the pairs that need a test, among the pairs whose later return ends at step `end`.
 

@@ -117,7 +117,7 @@ def _named(joins: Sequence[Join]) -> str:
     return f"steps {pairs}" + (f", and {counted(more, 'more joins')}" if more > 0 else "")
 
 
-class _Classes:
+class _StepClasses:
     """Classes of steps that share a property.
 
     At first each step is a class. Classes can be merged.
@@ -153,7 +153,7 @@ class _Joining:
 
     def __init__(self, trace: Trace, ssh_map: SSHMap, theory: Theory) -> None:
         self.trace, self.map, self.axioms = trace, ssh_map, set(theory.axioms)
-        self.places, self.courses = _Classes(len(trace)), _Classes(len(trace))
+        self.places, self.courses = _StepClasses(len(trace)), _StepClasses(len(trace))
         self.by_heading = any(headings <= self.axioms for headings in HEADINGS)
         self.by_course = "one_dstate_per_course" in self.axioms
         asserted = [sorted(pair) for pair in theory.same if max(pair) < len(trace)]

@@ -13,7 +13,7 @@ Course: TypeAlias = tuple[int, int]
 
 
 @dataclass(frozen=True)
-class Move:
+class MapLink:
     """A link of a map with its dstates.
 
     Attributes:

@@ -8,7 +8,7 @@ from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
 from typing import Any, TypeAlias, TypeVar
 
-from ssh_abduction.checker.moves import Course, Move, course_of
+from ssh_abduction.checker.moves import Course, MapLink, course_of
 from ssh_abduction.data.drives import drives_of, named_steps
 from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.star import Openings
@@ -92,22 +92,22 @@ class Reading:
         return {i: records[0] for i, records in self.records.items()}
 
     @cached_property
-    def moves(self) -> list[Move]:
+    def moves(self) -> list[MapLink]:
         """The links between dstates of the map, each once."""
         actions = {action.name: action for action in self.trace.actions}
         return [
-            Move(i, self.states[source], actions[name], self.states[target])
+            MapLink(i, self.states[source], actions[name], self.states[target])
             for (source, name, target), i in self.links.items()
             if {source, target} <= self.states.keys()
         ]
 
     @cached_property
-    def travels(self) -> list[Move]:
+    def travels(self) -> list[MapLink]:
         """The links of `moves` whose action is a travel."""
         return [m for m in self.moves if m.action.kind == "travel"]
 
     @cached_property
-    def turns(self) -> list[Move]:
+    def turns(self) -> list[MapLink]:
         """The links of `moves` whose action is a turn."""
         return [m for m in self.moves if m.action.kind == "turn"]
 
@@ -141,7 +141,7 @@ class Reading:
     @cached_property
     def orders(self) -> dict[int, Order]:
         """A dict from each path that the map lists, or that a dstate is along, to its order."""
-        edges: dict[int, dict[tuple[int, int], Move]] = defaultdict(dict)
+        edges: dict[int, dict[tuple[int, int], MapLink]] = defaultdict(dict)
         for move, (path, direction), p, q in (
             self.along_travels if "travel_orders" in self.axioms else ()
         ):
@@ -152,7 +152,7 @@ class Reading:
         return {h: Order(listed.get(h, ()), edges[h], self.axioms) for h in listed | self.along}
 
     @cached_property
-    def along_travels(self) -> list[tuple[Move, Course, int, int]]:
+    def along_travels(self) -> list[tuple[MapLink, Course, int, int]]:
         """The travels that keep their course and change the place.
 
         Each is a tuple of the travel, its course, the place it leaves and the place it reaches.
@@ -218,7 +218,10 @@ class Order:
     """
 
     def __init__(
-        self, listed: Sequence[int], travels: Mapping[tuple[int, int], Move], axioms: frozenset[str]
+        self,
+        listed: Sequence[int],
+        travels: Mapping[tuple[int, int], MapLink],
+        axioms: frozenset[str],
     ) -> None:
         self.listed, self.travels = listed, travels
         self.position = {p: i for i, p in reversed(list(enumerate(listed)))}

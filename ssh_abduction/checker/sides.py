@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 
-from ssh_abduction.checker.moves import Course, Move, along, course_of, opposite
+from ssh_abduction.checker.moves import Course, MapLink, along, course_of, opposite
 from ssh_abduction.checker.reading import Check, Found, Reading
 
 
@@ -32,7 +32,7 @@ class RightBranch:
     place: int
     course: Course
     branch: Course
-    turn: Move
+    turn: MapLink
     mirrored: bool
 
     def __str__(self) -> str:

@@ -29,7 +29,7 @@ from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
     from ssh_abduction.rivals.consequences import Consequence
-    from ssh_abduction.rivals.experiment import Experiment, Plan, Untried
+    from ssh_abduction.rivals.experiment import Experiment, ExperimentPlan, Untried
 
 # The largest number of columns of a table, and of lines of a plan, that are printed. --json prints
 # all.
@@ -149,7 +149,7 @@ def _lines(experiment: Experiment) -> Iterator[str]:
         yield from _expected(plan.untried)
 
 
-def _tree(plan: Plan, indent: str) -> Iterator[str]:
+def _tree(plan: ExperimentPlan, indent: str) -> Iterator[str]:
     """Yield a plan as indented lines: actions, and for each view the maps left and their plan."""
     if plan.branches:
         yield f"{indent}{printable(', '.join(plan.actions))}"
@@ -160,7 +160,7 @@ def _tree(plan: Plan, indent: str) -> Iterator[str]:
         yield from _tree(rest, f"{indent}    ")
 
 
-def _untried(plan: Plan) -> str:
+def _untried(plan: ExperimentPlan) -> str:
     """Say which untried action to try if known links cannot distinguish the remaining rivals.
 
     The text continues a line. It is empty if one rival remains or the plan goes on.

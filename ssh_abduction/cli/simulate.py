@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from perception.readers.scans import Scan
-    from simulator.drive import Drive
+    from simulator.drive import RecordedDrive
     from simulator.panorama import Camera
     from ssh_abduction.data.trace import Trace
 
@@ -177,7 +177,7 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _drive(options: argparse.Namespace) -> Drive:
+def _drive(options: argparse.Namespace) -> RecordedDrive:
     """Simulate the drive to write as a robot's log. Raise AbductionError for wrong options."""
     import math
 
@@ -219,7 +219,7 @@ def _drive(options: argparse.Namespace) -> Drive:
     )
 
 
-def _write_log(options: argparse.Namespace, drive: Drive) -> int:
+def _write_log(options: argparse.Namespace, drive: RecordedDrive) -> int:
     """Write a drive as a robot's log, and the truth to a file beside it. Return the exit code."""
     import json
     from pathlib import Path
@@ -253,12 +253,14 @@ def _write_log(options: argparse.Namespace, drive: Drive) -> int:
     return 0
 
 
-def scans_of(drive: Drive) -> Iterator[Scan]:
+def scans_of(drive: RecordedDrive) -> Iterator[Scan]:
     """Yield the scans of a drive. Their corrected poses are the true ones."""
-    from perception.readers.scans import Laser, Scan
+    from perception.readers.scans import LaserScanner, Scan
     from simulator.laser import BEAMS, BEARINGS
 
-    laser = Laser(float(BEARINGS[0]), float(BEARINGS[1] - BEARINGS[0]), BEAMS, drive.laser.reach)
+    laser = LaserScanner(
+        float(BEARINGS[0]), float(BEARINGS[1] - BEARINGS[0]), BEAMS, drive.laser.reach
+    )
     rows = zip(
         drive.ranges,
         drive.odometry.tolist(),

@@ -174,7 +174,7 @@ def from_yaml(text: str, source: str = "corrections") -> Corrections:
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise MapError(f"{source}: expected YAML, got {reason}; mend it there") from None
-    return _Reader(source).corrections(data)
+    return _CorrectionsReader(source).corrections(data)
 
 
 def _check_keys(node: Any) -> None:
@@ -192,7 +192,7 @@ def _check_keys(node: Any) -> None:
                 )
 
 
-class _Reader:
+class _CorrectionsReader:
     """Checks the fields of a file of corrections. Errors name the file and the field."""
 
     def __init__(self, source: str) -> None:

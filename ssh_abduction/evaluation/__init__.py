@@ -12,9 +12,9 @@ if TYPE_CHECKING:
         tells_names,
     )
     from ssh_abduction.evaluation.pose_truth import (
+        JudgedPairs,
         MapPairs,
         MapVisits,
-        Pairs,
         VisitsEvaluation,
         evaluate_visits,
         told_poses,
@@ -29,7 +29,7 @@ _HOMES = {
     "pose_truth": (
         "MapPairs",
         "MapVisits",
-        "Pairs",
+        "JudgedPairs",
         "VisitsEvaluation",
         "evaluate_visits",
         "told_poses",
@@ -37,10 +37,10 @@ _HOMES = {
 }
 __all__ = [
     "Evaluation",
+    "JudgedPairs",
     "MapEvaluation",
     "MapPairs",
     "MapVisits",
-    "Pairs",
     "Relation",
     "Relations",
     "Trajectory",

@@ -64,7 +64,7 @@ JUDGED = APART, RETURN
 
 
 @dataclass(frozen=True, slots=True)
-class Pairs:
+class JudgedPairs:
     """The numbers of pairs of visits (or steps) that are judged, and that are left out.
 
     Attributes:
@@ -145,8 +145,8 @@ class VisitsEvaluation:
     near: float
     turned: float
     visits: int
-    places: Pairs
-    dstates: Pairs
+    places: JudgedPairs
+    dstates: JudgedPairs
     maps: tuple[MapVisits, ...]
     by_both: tuple[int, int] | None = None
 
@@ -218,13 +218,15 @@ def evaluate_visits(
             TraceError,
             mend="make them with Relations.load, or leave them out",
         )
-    truth: _Poses | _Related = _Poses(trace) if relations is None else _Related(trace, relations)
+    truth: _PoseTruth | _Related = (
+        _PoseTruth(trace) if relations is None else _Related(trace, relations)
+    )
     # A travel begins a new visit.
     visit = np.cumsum([0, *(action.kind != "turn" for action in trace.actions)])
     places, dstates = _verdicts(truth, visit, near, turned)
     by_both = None
     if relations is not None and any(told_poses(trace)):
-        other, _ = _verdicts(_Poses(trace), visit, near, turned)
+        other, _ = _verdicts(_PoseTruth(trace), visit, near, turned)
         judged = np.isin(places, JUDGED) & np.isin(other, JUDGED)
         by_both = int(judged.sum()), int((judged & (places == other)).sum())
     return VisitsEvaluation(
@@ -260,7 +262,7 @@ def told_poses(trace: Trace) -> list[Pose | None]:
     ]
 
 
-class _Poses:
+class _PoseTruth:
     """The truth by the poses of a trace.
 
     `told` says for each step whether its pose is known, (n,).
@@ -315,7 +317,7 @@ class _Related:
             )
 
     def seen_from(self, step: int) -> tuple[Array, Array, Array]:
-        """Compare all steps with one step, as `_Poses.seen_from` does.
+        """Compare all steps with one step, as `_PoseTruth.seen_from` does.
 
         The relations give the pose of the robot. `seen` of a step gives the pose of the dstate as
         the robot saw it.
@@ -339,7 +341,7 @@ def _degrees(radians: Array) -> Array:
 
 
 def _verdicts(
-    truth: _Poses | _Related, visit: Steps, near: float, turned: float
+    truth: _PoseTruth | _Related, visit: Steps, near: float, turned: float
 ) -> tuple[Verdicts, Verdicts]:
     """Judge each pair of visits, (v, v), and each pair of steps of different visits, (n, n).
 
@@ -371,10 +373,12 @@ def _verdicts(
     return places, dstates
 
 
-def _pairs(verdicts: Verdicts, visit: Steps) -> Pairs:
+def _pairs(verdicts: Verdicts, visit: Steps) -> JudgedPairs:
     """Count pairs of visits by verdict. `verdicts` is (n, n), `visit` is that of each row."""
     counts = Counter(verdicts[visit[:, None] < visit].tolist())
-    return Pairs(counts[APART] + counts[RETURN], counts[RETURN], counts[STAYED], counts[UNKNOWN])
+    return JudgedPairs(
+        counts[APART] + counts[RETURN], counts[RETURN], counts[STAYED], counts[UNKNOWN]
+    )
 
 
 def _evaluated(ssh_map: SSHMap, visit: Steps, places: Verdicts, dstates: Verdicts) -> MapVisits:

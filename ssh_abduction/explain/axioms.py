@@ -31,7 +31,7 @@ class Interrupted(Exception):  # noqa: N818 - not an error
     """Raised to end the work because the caller's function `stop` returned True."""
 
 
-class _Answer(NamedTuple):
+class _ModelMap(NamedTuple):
     """A model of clingo, read as a map. If axioms are relaxed, the map may break some of them."""
 
     labels: tuple[int, ...]
@@ -44,7 +44,7 @@ class _Answer(NamedTuple):
         return all((named[e.of][e.first] == named[e.of][e.second]) == e.holds for e in equalities)
 
 
-class _Seen(NamedTuple):
+class _ArgumentModel(NamedTuple):
     """A model that clingo found during an argument: its conclusions, and the links that it breaks.
 
     `one` has the atoms of the pairs of steps that are one dstate in the model.
@@ -55,7 +55,7 @@ class _Seen(NamedTuple):
     one: frozenset[clingo.Symbol]
 
     @classmethod
-    def of(cls, model: clingo.Model) -> _Seen:
+    def of(cls, model: clingo.Model) -> _ArgumentModel:
         """Read a model of clingo."""
         return cls(*facts.read_argument(model))
 
@@ -93,7 +93,7 @@ class Axioms:
         self._stop = stop
         self._refusals = 0  # constraints added so far, because evidence rejected a map
         self._conclusions: list[clingo.Symbol] = []
-        self._seen: list[_Seen] = []
+        self._seen: list[_ArgumentModel] = []
         self._last_core: tuple[int, ...] = ()  # clingo's literals of the last unsat core
         self._control = clingo.Control(
             ["--warn=none", *(["--heuristic=Domain"] if relaxed else [])]
@@ -214,7 +214,7 @@ class Axioms:
 
         def keep(model: clingo.Model) -> None:
             nonlocal found
-            seen = _Seen.of(model)
+            seen = _ArgumentModel.of(model)
             found &= seen.conclusions
             # with added constraints, a model does not list every axiom that it breaks
             if not self._refusals:
@@ -283,13 +283,15 @@ class Axioms:
 
     def _answer(
         self, active: Sequence[clingo.Symbol], assumed: Sequence[Assumption] = ()
-    ) -> _Answer | None:
+    ) -> _ModelMap | None:
         """Find a model of clingo in which these axioms hold; None if there is none."""
-        found: list[_Answer] = []
+        found: list[_ModelMap] = []
 
         def keep(model: clingo.Model) -> None:
             found.append(
-                _Answer(*facts.read_steps(model), facts.read_map(model, self._trace, self._theory))
+                _ModelMap(
+                    *facts.read_steps(model), facts.read_map(model, self._trace, self._theory)
+                )
             )
 
         return found[0] if self._solve(keep, active, assumed) else None
@@ -314,7 +316,7 @@ class Axioms:
             return satisfiable
 
     def _refused(
-        self, answer: _Answer, active: Collection[tuple[str, int]]
+        self, answer: _ModelMap, active: Collection[tuple[str, int]]
     ) -> tuple[str, Refusal] | None:
         """Find equalities of a model that some evidence rejects, with the axiom of the evidence.
 
@@ -349,7 +351,7 @@ class Axioms:
         return len(self._trace) - 1 if axiom == Planar.axiom else _last_step(refusal)
 
     def _refused_together(
-        self, displacement: Displacement, answer: _Answer, step: int
+        self, displacement: Displacement, answer: _ModelMap, step: int
     ) -> Refusal | None:
         """Find two returns, the later one to `step`, that displacements reject together.
 

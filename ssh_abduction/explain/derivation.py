@@ -9,7 +9,7 @@ from typing import Any
 from ssh_abduction.checker.checker import Violation
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.words import attributes_of
-from ssh_abduction.explain.no_map import Clash
+from ssh_abduction.explain.no_map import ClashingAxiom
 
 # If an inference has more reasons than IN_A_LINE, each gets a line of its own.
 IN_A_LINE, INDENT = 2, " " * 7
@@ -49,7 +49,7 @@ class Inference:
 
     says: tuple[str, ...]
     because: tuple[str, ...]
-    links: tuple[Clash, ...]
+    links: tuple[ClashingAxiom, ...]
     premises: tuple[int, ...]
     supposed: bool
 
@@ -85,7 +85,7 @@ class Derivation:
     summary: str
 
     @property
-    def clashes(self) -> tuple[Clash, ...]:
+    def clashes(self) -> tuple[ClashingAxiom, ...]:
         """The axioms of the links in the order of the argument, each with all its steps."""
         return clashes_of((link.axiom, link.step) for link in self.links)
 
@@ -118,12 +118,12 @@ class Derivation:
         }
 
 
-def clashes_of(links: Iterable[tuple[str, int]]) -> tuple[Clash, ...]:
+def clashes_of(links: Iterable[tuple[str, int]]) -> tuple[ClashingAxiom, ...]:
     """Group links (pairs of an axiom and a step) by axiom, in the order of first links."""
     steps: dict[str, set[int]] = {}
     for axiom, step in links:
         steps.setdefault(axiom, set()).add(step)
-    return tuple(Clash(axiom, tuple(sorted(of_axiom))) for axiom, of_axiom in steps.items())
+    return tuple(ClashingAxiom(axiom, tuple(sorted(of_axiom))) for axiom, of_axiom in steps.items())
 
 
 def _lines_of(inference: Inference, number: int) -> Iterator[str]:

@@ -13,7 +13,7 @@ from ssh_abduction.data.words import attributes_of
 from ssh_abduction.explain.axioms import Axioms
 from ssh_abduction.explain.no_map import Explanation, explain
 from ssh_abduction.explain.piece import Piece
-from ssh_abduction.explain.question import Question
+from ssh_abduction.explain.question import LimitedQuestion
 from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import Status, Stop
 from ssh_abduction.theory.fields import ASSERTIONS
@@ -133,7 +133,7 @@ class TraceExplanation:
         return own | ({"stopped": self.stopped} if self.stopped else {})
 
 
-class TraceQuestion(Question[TraceExplanation]):
+class TraceQuestion(LimitedQuestion[TraceExplanation]):
     """The search for the answer of `explain_trace`. Parameters are as there."""
 
     def __init__(

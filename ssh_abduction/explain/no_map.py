@@ -30,7 +30,7 @@ STRETCH = 8
 
 
 @dataclass(frozen=True, slots=True)
-class Clash:
+class ClashingAxiom:
     """An axiom that cannot hold at all these steps together with the other axioms of a clash.
 
     Attributes:
@@ -59,7 +59,7 @@ class Explanation:
 
     first: int
     last: int
-    clashes: tuple[Clash, ...]
+    clashes: tuple[ClashingAxiom, ...]
     sentences: tuple[str, ...] = ()
 
     @property
@@ -144,7 +144,8 @@ def explain(
         clashes.setdefault(axiom, []).append(piece.steps[step])
     order = theory.axioms
     found = tuple(
-        Clash(name, tuple(sorted(clashes[name]))) for name in sorted(clashes, key=order.index)
+        ClashingAxiom(name, tuple(sorted(clashes[name])))
+        for name in sorted(clashes, key=order.index)
     )
     return Explanation(piece.steps[0], piece.steps[-1], found, axioms.sentences(clash))
 

@@ -30,7 +30,7 @@ from ssh_abduction.explain.axioms import Axioms
 from ssh_abduction.explain.derivation import Derivation
 from ssh_abduction.explain.no_map import Explanation, check_two_steps, explain
 from ssh_abduction.explain.piece import Piece
-from ssh_abduction.explain.question import Question
+from ssh_abduction.explain.question import LimitedQuestion
 from ssh_abduction.explain.verdict import PairExplanation, Side, Verdict
 from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import EQUAL, Cost, Status, Stop, facts
@@ -98,7 +98,7 @@ def explain_pair(
     ).answer()
 
 
-class PairQuestion(Question[PairExplanation]):
+class PairQuestion(LimitedQuestion[PairExplanation]):
     """The search for whether two steps are one dstate, and why. Parameters as in `explain_pair`.
 
     A side of the pair is True for the maps in which the steps are one dstate, and False for the

@@ -28,7 +28,7 @@ _Answer = TypeVar("_Answer")
 SHORTEST = 0.05  # the least time limit of a search in seconds
 
 
-class Question(ABC, Generic[_Answer]):
+class LimitedQuestion(ABC, Generic[_Answer]):
     """A question about a trace under limits of time and memory.
 
     `answer` may be called once. `known` may be called from any thread while `answer` runs.

@@ -26,7 +26,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.regions import course_named, listed, regions_at
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import attributes_of
-from ssh_abduction.explain.question import Question
+from ssh_abduction.explain.question import LimitedQuestion
 from ssh_abduction.solver import Stop, with_regions
 from ssh_abduction.theory.theory import Theory, checked_theory
 
@@ -138,7 +138,7 @@ class PlaceExplanation:
         return attributes_of(self, *names)
 
 
-class PlaceQuestion(Question[PlaceExplanation]):
+class PlaceQuestion(LimitedQuestion[PlaceExplanation]):
     """The search for the maps of a trace and the sides of a place. See `explain_place`."""
 
     def __init__(

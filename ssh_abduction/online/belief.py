@@ -32,7 +32,7 @@ LEAST_LISTED = 0.001
 TINY = np.finfo(float).tiny
 
 
-class Verdict(Enum):
+class BeliefVerdict(Enum):
     """A belief summed up in one word. NOWHERE comes before LOCATED, and LOCATED before LOST.
 
     Attributes:
@@ -137,18 +137,18 @@ class Belief:
         return self.sure is not None
 
     @property
-    def verdict(self) -> Verdict:
+    def verdict(self) -> BeliefVerdict:
         """The belief summed up in one word: located, unsure, lost or nowhere."""
         if self.nowhere > 0.5:
-            return Verdict.NOWHERE
+            return BeliefVerdict.NOWHERE
         if self.probability >= LOCATED:
-            return Verdict.LOCATED
-        return Verdict.LOST if self.lost else Verdict.UNSURE
+            return BeliefVerdict.LOCATED
+        return BeliefVerdict.LOST if self.lost else BeliefVerdict.UNSURE
 
     @property
     def dstate(self) -> int | None:
         """The id of the most probable dstate; None if `nowhere` is above 0.5."""
-        return None if self.verdict is Verdict.NOWHERE else self.likeliest
+        return None if self.verdict is BeliefVerdict.NOWHERE else self.likeliest
 
     def found_again(self, sure: float) -> bool:
         """Whether this belief finds a lost robot again. See `lost` for the conditions.

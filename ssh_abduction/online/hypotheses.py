@@ -42,7 +42,7 @@ DSTATE = 10
 
 
 @dataclass(frozen=True, slots=True)
-class Rival:
+class ExtendedMap:
     """An explanation of all steps so far: a map, and how it was extended.
 
     Attributes:
@@ -63,7 +63,7 @@ class Rival:
     cost: tuple[int, ...]
 
     @classmethod
-    def of(cls, ssh_map: SSHMap, trace: Trace, theory: Theory) -> Rival:
+    def of(cls, ssh_map: SSHMap, trace: Trace, theory: Theory) -> ExtendedMap:
         """Make a rival of a map.
 
         Args:
@@ -156,7 +156,7 @@ class Rival:
                 links.append((number[s], action, number[x]))
         return tuple(self.shows[s] for s in reached), tuple(links), len(self.shows)
 
-    def ways_on(self, action: str, step: Step, seen: Seen, theory: Theory) -> Iterator[Rival]:
+    def ways_on(self, action: str, step: Step, seen: Seen, theory: Theory) -> Iterator[ExtendedMap]:
         """Yield the extensions of this rival by one step. Those without extra cost come first.
 
         Args:
@@ -202,14 +202,14 @@ class Rival:
         new: Seen | None = None,
         faults: Sequence[Fault] = (),
         tenths: int = 0,
-    ) -> Rival:
+    ) -> ExtendedMap:
         """Extend this rival by a step at the dstate `there`.
 
         `link` names the action if the step adds a link. `new` is the view and star of a new dstate.
         `tenths` is the cost of the faults that it adds, in tenths of dstates.
         """
         tenths += DSTATE if new else 0
-        return Rival(
+        return ExtendedMap(
             self.map,
             (*self.labels, there),
             (*self.shows, new) if new else self.shows,
@@ -248,7 +248,7 @@ class Scale:
         cheapest = min(round(10 * price) for price in (theory.misread, theory.slipped) if price)
         return cls(-math.log(chance), cheapest, max(dstates, 2), max(views, 2))
 
-    def improbability(self, rival: Rival) -> float:
+    def improbability(self, rival: ExtendedMap) -> float:
         """Compute the negative natural logarithm of the weight of a rival."""
         kinds = Counter(fault.kind for fault in rival.faults)
         ways = (len(rival.links) + kinds["slipped"]) * math.log(self.dstates)
@@ -258,7 +258,7 @@ class Scale:
             + (kinds["misread"] + kinds["misseen"]) * math.log(self.views)
         )
 
-    def shares(self, rivals: Sequence[Rival]) -> list[float]:
+    def shares(self, rivals: Sequence[ExtendedMap]) -> list[float]:
         """Compute the probability of each rival, given that one of them is true."""
         improbable = [self.improbability(rival) for rival in rivals]
         least = min(improbable, default=0.0)

@@ -13,7 +13,7 @@ from ssh_abduction.data.maps import Fault
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.online.background import Solved
 from ssh_abduction.online.chances import Chances
-from ssh_abduction.online.hypotheses import Rival, Scale, Seen
+from ssh_abduction.online.hypotheses import ExtendedMap, Scale, Seen
 from ssh_abduction.solver import Bound, Judging, Status, observation
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import row
@@ -60,7 +60,7 @@ class RivalMaps:
 
     def __init__(self, problem: Problem, max_maps: int | None, judging: Judging) -> None:
         trace, theory = problem.trace, problem.theory
-        self.rivals: list[Rival] = []
+        self.rivals: list[ExtendedMap] = []
         self.solved: Solved | None = None
         self.bound = Bound()
         self.is_proven = self.is_complete = self.is_impossible = False
@@ -69,7 +69,7 @@ class RivalMaps:
         self._least: tuple[int, ...] = ()  # what a minimal map costs, while proven
         self._replays = row("prefixes").holds_for(theory.replace(misread=0, slipped=0))
         self._has_evidence = bool(problem.evidence)
-        # Under the two causal axioms alone, `Rival.ways_on` lists all links that are possible.
+        # Under the two causal axioms alone, `ExtendedMap.ways_on` lists all possible links.
         self._lists_links = (
             theory.level == "causal"
             and not self._has_evidence
@@ -86,12 +86,12 @@ class RivalMaps:
         return self._problem.theory
 
     @property
-    def lead(self) -> Rival | None:
+    def lead(self) -> ExtendedMap | None:
         """The best rival; None if there is none."""
         return self.rivals[0] if self.rivals else None
 
     @property
-    def minimal(self) -> list[Rival]:
+    def minimal(self) -> list[ExtendedMap]:
         """The rivals that are proven minimal; empty without a proof."""
         if not self.is_proven:
             return []
@@ -104,7 +104,7 @@ class RivalMaps:
             self.is_proven and (self.is_complete or len(self.minimal) == self._max_maps)
         )
 
-    def is_minimal(self, rival: Rival) -> bool:
+    def is_minimal(self, rival: ExtendedMap) -> bool:
         """Whether a rival has the cost that was last proven minimal."""
         return rival.cost == self._least
 
@@ -151,7 +151,7 @@ class RivalMaps:
         if found.status is Status.UNSATISFIABLE:
             self.is_impossible, self.rivals = self._replays or found.steps == steps, []
             return
-        rivals = [Rival.of(ssh_map, self._trace, self._theory) for ssh_map in found.maps]
+        rivals = [ExtendedMap.of(ssh_map, self._trace, self._theory) for ssh_map in found.maps]
         optimal = found.status is Status.OPTIMAL and bool(rivals)
         if optimal:
             self.is_proven, self.is_complete, self._least = True, found.complete, rivals[0].cost
@@ -184,7 +184,8 @@ class RivalMaps:
         if not self.is_proven:
             return False
         return (
-            not found.maps or Rival.of(found.maps[0], self._trace, self._theory).cost < self._least
+            not found.maps
+            or ExtendedMap.of(found.maps[0], self._trace, self._theory).cost < self._least
         )
 
     def drop_inconsistent(self) -> None:
@@ -198,7 +199,7 @@ class RivalMaps:
         while self.rivals and check(self._trace, self.rivals[0].explained(), theory):
             del self.rivals[0]
 
-    def undecided(self) -> tuple[list[Rival], list[float]]:
+    def undecided(self) -> tuple[list[ExtendedMap], list[float]]:
         """List the rivals that later steps have to decide between.
 
         Among rivals with the same faults, only the cheapest ones by the theory count, because no
@@ -214,7 +215,7 @@ class RivalMaps:
         rivals = [r for r in self.rivals if r.cost == least[frozenset(r.faults)]]
         return rivals, self._shares(rivals)
 
-    def _gone_on(self, rivals: Iterable[Rival], t: int) -> list[Rival]:
+    def _gone_on(self, rivals: Iterable[ExtendedMap], t: int) -> list[ExtendedMap]:
         """Extend rivals of the steps before `t` by step `t`, and rank the results."""
         done, step = self._trace.steps[t - 1].action, self._trace.steps[t]
         assert done
@@ -234,7 +235,7 @@ class RivalMaps:
             ]
         return self._ranked(new)
 
-    def _ranked(self, rivals: list[Rival]) -> list[Rival]:
+    def _ranked(self, rivals: list[ExtendedMap]) -> list[ExtendedMap]:
         """Sort rivals, the best first, and drop the improbable ones.
 
         The cheapest rivals come first, and at most `max_maps` of them stay. Then come up to RIVALS
@@ -256,12 +257,12 @@ class RivalMaps:
             self.is_complete, ties = False, self._max_maps
         return ranked[: ties + RIVALS]
 
-    def _shares(self, rivals: list[Rival]) -> list[float]:
+    def _shares(self, rivals: list[ExtendedMap]) -> list[float]:
         """Compute the probability of each rival. They sum to 1."""
         dstates = len(min(rivals, key=lambda rival: rival.cost).shows)
         return Scale.of(self._theory, RARE, dstates, len(self._views)).shares(rivals)
 
-    def _sentence(self, t: int, lead: Rival, there: int, seen: Seen) -> str:
+    def _sentence(self, t: int, lead: ExtendedMap, there: int, seen: Seen) -> str:
         """Describe step t, which contradicts the best map.
 
         It expected the step at the dstate `there`.

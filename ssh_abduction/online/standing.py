@@ -14,7 +14,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.online.belief import Belief
 from ssh_abduction.online.chances import Chances
-from ssh_abduction.online.hypotheses import Rival
+from ssh_abduction.online.hypotheses import ExtendedMap
 from ssh_abduction.online.localiser import Localiser
 from ssh_abduction.online.rival_maps import RARE, RivalMaps
 from ssh_abduction.theory.theory import Theory
@@ -28,7 +28,7 @@ REPLAYED = 200
 
 
 @dataclass(frozen=True, slots=True)
-class Hypothesis:
+class PossibleMap:
     """One possible explanation of the steps so far, with its probability.
 
     Attributes:
@@ -64,7 +64,7 @@ class Standing:
 
     certain: bool
     broke: tuple[str, ...]
-    hypotheses: tuple[Hypothesis, ...]
+    hypotheses: tuple[PossibleMap, ...]
     where: Belief | None = None
 
     def __str__(self) -> str:
@@ -89,7 +89,7 @@ def chances_of(theory: Theory) -> Chances:
 
 
 @dataclass(frozen=True, slots=True)
-class _Located:
+class _LocatedBelief:
     """The belief in a map after the first steps, and the localiser that continues it."""
 
     map_key: object
@@ -113,7 +113,7 @@ class Confidence:
         self.known: SSHMap | None = None
         self._chances = chances_of(theory)
         self._broke: list[tuple[int, str]] = []  # step and sentence, since the map was certain
-        self._located: _Located | None = None
+        self._located: _LocatedBelief | None = None
 
     def note(self, step: int, broke: str | None) -> None:
         """Record that a step contradicted the best map.
@@ -139,7 +139,7 @@ class Confidence:
             said = "no map of these steps is known yet"
             if maps.is_impossible:
                 said = "no map satisfies the axioms"
-            return Standing(False, broke, (Hypothesis(1.0, None, said),))
+            return Standing(False, broke, (PossibleMap(1.0, None, said),))
         rivals, shares = maps.undecided()
         where = self._locate(lead, trace) if self._broke else None
         certain = _is_decided(maps, rivals, shares) and (
@@ -152,7 +152,7 @@ class Confidence:
             self._broke.clear()
         return standing
 
-    def _has_recovered(self, where: Belief, lead: Rival, trace: Trace) -> bool:
+    def _has_recovered(self, where: Belief, lead: ExtendedMap, trace: Trace) -> bool:
         """Whether the mapper has recovered from the last step that contradicted the best map.
 
         This needs a later step, and localisation has to agree with the best map: it gives more than
@@ -165,27 +165,27 @@ class Confidence:
         )
 
     def _hypotheses(
-        self, rivals: Sequence[Rival], shares: Sequence[float]
-    ) -> tuple[Hypothesis, ...]:
+        self, rivals: Sequence[ExtendedMap], shares: Sequence[float]
+    ) -> tuple[PossibleMap, ...]:
         """Make hypotheses of the most probable rivals, and one for all others together."""
         order = sorted(range(len(shares)), key=lambda i: -shares[i])
         first = order if len(order) <= LISTED else order[: LISTED - 1]
         listed = [
-            Hypothesis(shares[i], rivals[i].explained(), self._said(rivals[i])) for i in first
+            PossibleMap(shares[i], rivals[i].explained(), self._said(rivals[i])) for i in first
         ]
         if rest := order[len(first) :]:
             others = f"one of {len(rest)} others"
-            listed.append(Hypothesis(sum(shares[i] for i in rest), None, others))
+            listed.append(PossibleMap(sum(shares[i] for i in rest), None, others))
         return tuple(listed)
 
-    def _said(self, rival: Rival) -> str:
+    def _said(self, rival: ExtendedMap) -> str:
         """Describe a rival: its new faults since the mapper was certain, and the robot's dstate."""
         excused = set(self.known.faults) if self.known else set()
         new = sorted(set(rival.faults) - excused, key=lambda fault: fault.step)
         faults = ", ".join(str(fault) for fault in new) or "nothing else is disbelieved"
         return f"{faults}; the robot is at dstate {rival.here} of {len(rival.shows)}"
 
-    def _locate(self, lead: Rival, trace: Trace) -> Belief:
+    def _locate(self, lead: ExtendedMap, trace: Trace) -> Belief:
         """Locate the robot in the best map.
 
         Begin where this map has the robot just before the first step that contradicted the best
@@ -206,11 +206,11 @@ class Confidence:
             done = trace.steps[i].action
             assert done
             belief = localiser.update(belief, done, trace.steps[i + 1].view)
-        self._located = _Located(key, localiser, belief, t)
+        self._located = _LocatedBelief(key, localiser, belief, t)
         return belief
 
 
-def _is_decided(maps: RivalMaps, rivals: Sequence[Rival], shares: Sequence[float]) -> bool:
+def _is_decided(maps: RivalMaps, rivals: Sequence[ExtendedMap], shares: Sequence[float]) -> bool:
     """Whether the future is decided, whatever the past.
 
     All minimal maps must be known and predict the same from here on. Rivals that predict this too

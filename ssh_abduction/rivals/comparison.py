@@ -38,7 +38,7 @@ from ssh_abduction.rivals.factors import deciding, independent, options_of
 from ssh_abduction.rivals.listing import Listing, Maps
 from ssh_abduction.rivals.questions import (
     MATTERS,
-    Asked,
+    AnsweredQuestion,
     Matter,
     Question,
     members_of,
@@ -312,7 +312,7 @@ def compare(maps: Maps, other: Maps | None = None) -> Comparison:
 
 
 def _depending(
-    asked: Sequence[Asked], options: Sequence[NDArray[np.intp]], table: Table
+    asked: Sequence[AnsweredQuestion], options: Sequence[NDArray[np.intp]], table: Table
 ) -> tuple[list[dict[Matter, tuple[int, ...]]], dict[Matter, tuple[int, ...]]]:
     """Find the steps that depend on each choice alone, and those that depend on several."""
     of_choice: list[dict[Matter, set[int]]] = [{} for _ in options]
@@ -337,7 +337,9 @@ def _in_order(steps: dict[Matter, set[int]]) -> dict[Matter, tuple[int, ...]]:
 
 
 def _choice(
-    asked: Sequence[Asked], option: NDArray[np.intp], differing: dict[Matter, tuple[int, ...]]
+    asked: Sequence[AnsweredQuestion],
+    option: NDArray[np.intp],
+    differing: dict[Matter, tuple[int, ...]],
 ) -> Choice:
     """Make a choice."""
     members = members_of(option.tolist())

@@ -63,7 +63,7 @@ class Branch:
     """
 
     seen: Seen
-    plan: Plan
+    plan: ExperimentPlan
 
     def to_dict(self) -> dict[str, Any]:
         """Return the branch as plain data, as `next --json` prints it."""
@@ -71,7 +71,7 @@ class Branch:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class ExperimentPlan:
     """An experiment as a tree: actions, and a further plan for each observation after them.
 
     Attributes:
@@ -100,7 +100,7 @@ class Plan:
         return len(self.actions) + max((branch.plan.longest for branch in self.branches), default=0)
 
     @property
-    def leaves(self) -> Iterator[Plan]:
+    def leaves(self) -> Iterator[ExperimentPlan]:
         """The plans without branches at the ends of the tree, one after the other."""
         if not self.branches:
             yield self
@@ -150,7 +150,7 @@ class Experiment:
     count: int
     alike: tuple[tuple[int, ...], ...]
     predictions: tuple[Prediction, ...]
-    plan: Plan
+    plan: ExperimentPlan
     sharing: str = ""
     complete: bool = True
     stopped: Stop | None = None

@@ -58,7 +58,7 @@ from ssh_abduction.rivals.experiment import (
     Branch,
     Expectation,
     Experiment,
-    Plan,
+    ExperimentPlan,
     Prediction,
     Untried,
 )
@@ -218,7 +218,7 @@ class Laboratory:
         """The groups of rivals with equal machines. Rivals are numbered from 1."""
         return tuple(_numbers(group) for group in self._groups)
 
-    def plan(self) -> Plan:
+    def plan(self) -> ExperimentPlan:
         """Find the whole plan, greedily."""
         everything = list(range(len(self._groups)))
         return self._plan_for(everything, (0,) * len(everything))
@@ -250,16 +250,16 @@ class Laboratory:
             else ()
         )
 
-    def _plan_for(self, machines: Sequence[int], start: Row) -> Plan:
+    def _plan_for(self, machines: Sequence[int], start: Row) -> ExperimentPlan:
         """Find the plan for some machines, each in the state that `start` has for it."""
         rivals = _numbers(i for m in machines for i in self._groups[m])
         try:
             split = self._split(machines, start) if len(machines) > 1 else None
             if split is None:
-                return Plan(rivals, untried=self._untried(machines, start))
+                return ExperimentPlan(rivals, untried=self._untried(machines, start))
         except LimitError as limit:
             self.stopped = limit.reason
-            return Plan(rivals)
+            return ExperimentPlan(rivals)
         actions, parts = split
         branches = tuple(
             Branch(
@@ -267,7 +267,7 @@ class Laboratory:
             )
             for seen, (part, states) in sorted(parts.items())
         )
-        return Plan(rivals, tuple(self._actions[a].name for a in actions), branches)
+        return ExperimentPlan(rivals, tuple(self._actions[a].name for a in actions), branches)
 
     def _split(
         self, machines: Sequence[int], start: Row

@@ -33,7 +33,7 @@ UNKNOWN = -1  # the state after an action for which a machine has no link
 CHUNK = 2**21
 
 
-class Limits(Protocol):
+class LimitCheck(Protocol):
     """Limits of a search. `check` raises an exception once a limit is reached."""
 
     def check(self) -> None:
@@ -119,13 +119,13 @@ class Observations:
             self._of(ssh_map, None if reading is None else trace, reading) for ssh_map in maps
         ]
 
-    def _of(self, ssh_map: SSHMap, trace: Trace | None, reading: _Reading | None) -> list[int]:
+    def _of(self, ssh_map: SSHMap, trace: Trace | None, reading: _StarReader | None) -> list[int]:
         """Return the number of the observation at each dstate of a map."""
         stars = _first_steps(ssh_map) if trace is not None and reading is not None else {}
         return [self._number(s.view, stars.get(s.id), trace, reading) for s in ssh_map.dstates]
 
     def _number(
-        self, view: View | None, step: int | None, trace: Trace | None, reading: _Reading | None
+        self, view: View | None, step: int | None, trace: Trace | None, reading: _StarReader | None
     ) -> int:
         """Return the number of an observation, from a view and the step that shows the star."""
         if step is None or trace is None or reading is None:
@@ -141,7 +141,7 @@ class Observations:
         return number
 
 
-class _Reading:
+class _StarReader:
     """Reads the star of a step, with a key that stars share if they cannot be distinguished."""
 
     def __init__(self, trace: Trace, theory: Theory, steps: Sequence[int] = ()) -> None:
@@ -156,7 +156,9 @@ class _Reading:
         return key, self._trace.steps[step].openings
 
 
-def _reading(maps: Sequence[SSHMap], trace: Trace | None, theory: Theory | None) -> _Reading | None:
+def _reading(
+    maps: Sequence[SSHMap], trace: Trace | None, theory: Theory | None
+) -> _StarReader | None:
     """Make the function that reads stars; None if stars are not used."""
     if trace is None or not trace.has_stars:
         return None
@@ -164,12 +166,12 @@ def _reading(maps: Sequence[SSHMap], trace: Trace | None, theory: Theory | None)
         settled = settle(trace, theory).theory
         if settled.star == "none":
             return None
-        return _Reading(
+        return _StarReader(
             trace, settled, sorted({t for ssh_map in maps for t in _first_steps(ssh_map).values()})
         )
     # without a theory, stars are read as frames if each dstate has one star in each map
     if trace.in_quarters:
-        reading = _Reading(trace, Theory(star="frame"))
+        reading = _StarReader(trace, Theory(star="frame"))
         looks = [reading(t)[0] for t in range(len(trace))]
         is_read = all(
             len({(label, looks[t]) for t, label in _sound(m)})
@@ -184,7 +186,7 @@ def _reading(maps: Sequence[SSHMap], trace: Trace | None, theory: Theory | None)
         for t, label in _sound(m)
     ):
         return None
-    return _Reading(
+    return _StarReader(
         trace, Theory(star="alike"), sorted({t for m in maps for t in _first_steps(m).values()})
     )
 
@@ -365,7 +367,7 @@ class Walk:
     """
 
     def __init__(
-        self, table: MachineTable, group: Sequence[int], start: Row, limits: Limits | None
+        self, table: MachineTable, group: Sequence[int], start: Row, limits: LimitCheck | None
     ) -> None:
         self.table, self.group, self._limits = table, np.array(group, np.int32), limits
         self._start = start

@@ -91,7 +91,7 @@ class Question:
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class AnsweredQuestion:
     """A question with its answers.
 
     Attributes:
@@ -105,7 +105,9 @@ class Asked:
     steps: dict[Matter, set[int]]
 
 
-def questions_of(table: Table, maps: Sequence[SSHMap], *, same_places: bool) -> list[Asked]:
+def questions_of(
+    table: Table, maps: Sequence[SSHMap], *, same_places: bool
+) -> list[AnsweredQuestion]:
     """List all questions that distinguish maps, each once.
 
     Args:
@@ -117,7 +119,7 @@ def questions_of(table: Table, maps: Sequence[SSHMap], *, same_places: bool) -> 
         The questions with their answers, in the order of causes (faults, dstates, places, paths,
         courses). Among questions of one sort, those about earlier steps come first.
     """
-    found: dict[bytes, Asked] = {}
+    found: dict[bytes, AnsweredQuestion] = {}
     faults = {fault for ssh_map in maps for fault in ssh_map.faults}
     for fault in sorted(faults, key=lambda f: (f.step, f.kind, str(f.seen), str(f.expected))):
         column = np.array([fault in ssh_map.faults for ssh_map in maps])
@@ -125,7 +127,7 @@ def questions_of(table: Table, maps: Sequence[SSHMap], *, same_places: bool) -> 
             at = (fault.step,)
             yes = int(column.sum())
             question = Question("faults", fault.step, fault.step, yes, at, at, fault=fault)
-            asked = found.setdefault(_key(column), Asked(question, column, {}))
+            asked = found.setdefault(_key(column), AnsweredQuestion(question, column, {}))
             asked.steps.setdefault("faults", set()).add(fault.step)
     places = [maps[0].dstates[label].place for label in maps[0].dstate_at] if same_places else []
     steps_by_class = {
@@ -160,7 +162,7 @@ def questions_of(table: Table, maps: Sequence[SSHMap], *, same_places: bool) -> 
                     there=tuple(sides[1]),
                     places=(stand[0], stand[1]) if stand and sort in ("paths", "courses") else None,
                 )
-                found[key] = Asked(question, column, {})
+                found[key] = AnsweredQuestion(question, column, {})
             found[key].steps.setdefault(sort, set()).update(steps_by_class[d])
     return sorted(
         found.values(),

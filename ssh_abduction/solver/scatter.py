@@ -74,7 +74,7 @@ def least_cost(problem: Problem, visit: Sequence[int], most: float) -> float:
     Returns:
         The bound in nats, a little less than `most` at most; 0 if there is none.
     """
-    track, within = _Track.of(problem), math.sqrt(2 * most)
+    track, within = _LinearTrack.of(problem), math.sqrt(2 * most)
     parts = _parts(problem, track, np.array(visit))
     firsts = [part.first_shares() for part in parts]
     for gap in GAPS:
@@ -90,7 +90,7 @@ def least_cost(problem: Problem, visit: Sequence[int], most: float) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class _Track:
+class _LinearTrack:
     """The best track without returns, linearised.
 
     Attributes:
@@ -107,7 +107,7 @@ class _Track:
     scatter: Array
 
     @classmethod
-    def of(cls, problem: Problem) -> _Track:
+    def of(cls, problem: Problem) -> _LinearTrack:
         """Fit the track of a trace with one drive."""
         trace, n = problem.trace, len(problem.trace)
         odometry = replace(trace.odometry or Odometry(), offset=0.0, facing=0.0)
@@ -140,7 +140,7 @@ def _without_rigid_motions(poses: Array) -> Array:
     return matrix
 
 
-def _parts(problem: Problem, track: _Track, visit: NDArray[np.int_]) -> list[_Part]:
+def _parts(problem: Problem, track: _LinearTrack, visit: NDArray[np.int_]) -> list[_Part]:
     """Return the problems of dstates and of places."""
     theory = problem.theory
     dstate, place, _ = theory.prices

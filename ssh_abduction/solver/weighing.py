@@ -162,7 +162,7 @@ class Weighing:
             most = self.candidates[0].nats
             self.bound = least_cost(parts.task.problem, self._misfit.visit, most)
         task = replace(parts.task, speedups=replace(parts.task.speedups, prefixes=False))
-        judging, engine = _Judging(task.problem, self), _engine(task, parts)
+        judging, engine = _CostJudging(task.problem, self), _engine(task, parts)
         engine.grow(len(task.trace))
         prefixes = Prefixes(task, Known(task.theory), judging, engine, 1, parts.report)
         last = prefixes.minimise()
@@ -418,7 +418,7 @@ def _pinned(theory: Theory, ssh_map: SSHMap) -> Theory:
     )
 
 
-class _Judging(Judging):
+class _CostJudging(Judging):
     """Rejects maps that contradict evidence, and then those that are too expensive."""
 
     def __init__(self, problem: Problem, weighing: Weighing) -> None:

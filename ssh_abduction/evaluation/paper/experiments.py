@@ -37,7 +37,7 @@ from ssh_abduction.theory.theory import Theory
 
 
 @dataclass(frozen=True)
-class Experiment:
+class PaperExperiment:
     """One of the paper's experiments.
 
     Attributes:
@@ -60,10 +60,10 @@ class Experiment:
 
 
 EXPERIMENTS = {
-    "notched-rectangle": Experiment(
+    "notched-rectangle": PaperExperiment(
         "notched-rectangle", tours=50, k_max=12, views=4, dstates=8, places=4, paths=4
     ),
-    "taylor-hall": Experiment(
+    "taylor-hall": PaperExperiment(
         "taylor-hall", tours=10, k_max=24, views=10, dstates=20, places=7, paths=4
     ),
 }
@@ -284,7 +284,7 @@ def _labelling(learner: BootstrapLearner, truth: NDArray[Any]) -> Labelling:
     return Labelling(one_to_one(labels, truth), len(pairs), told_apart)
 
 
-def _contrast(e: Experiment, seed: int, trace: Trace, alone: NDArray[Any], k: int) -> Contrast:
+def _contrast(e: PaperExperiment, seed: int, trace: Trace, alone: NDArray[Any], k: int) -> Contrast:
     """Measure the results without a part of the method.
 
     `alone` has the cluster of each image, with as many clusters as dstates. `k` is the chosen
@@ -327,7 +327,7 @@ def _spread(trace: Trace, truth: NDArray[Any], tours: int) -> list[list[float]]:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class NotchOutcome:
     """The result of the method for one notch and one spread of poses.
 
     The offset of a pose is its difference from the mean pose at its dstate.
@@ -352,7 +352,7 @@ class Outcome:
     rate: float
 
 
-def outcome(notch: float, scale: float, seed: int = 0) -> Outcome:
+def outcome(notch: float, scale: float, seed: int = 0) -> NotchOutcome:
     """Take images in the notched rectangle with another notch, and run the method on them.
 
     Args:
@@ -374,7 +374,7 @@ def outcome(notch: float, scale: float, seed: int = 0) -> Outcome:
         Trace.from_steps(clusterer.labels_.tolist(), actions), VIEWS_ALONE, time_limit=5
     )
     is_only = solution.complete and solution.count == 1
-    return Outcome(
+    return NotchOutcome(
         notch=notch,
         scale=scale,
         spread=scale * float(np.sqrt((offsets[:, :2] ** 2).sum(1).mean())),

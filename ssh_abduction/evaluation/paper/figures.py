@@ -19,7 +19,7 @@ from simulator.world import World
 from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.files import write_file
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.evaluation.paper.experiments import Outcome
+from ssh_abduction.evaluation.paper.experiments import NotchOutcome
 from ssh_abduction.output import plot
 
 BLUE, ORANGE, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#888888"
@@ -346,7 +346,9 @@ def draw_spread(path: str | Path, spread: Sequence[Sequence[float]]) -> None:
     _save(figure, path)
 
 
-def draw_outcomes(path: str | Path, outcomes: Sequence[Outcome], here: tuple[float, float]) -> None:
+def draw_outcomes(
+    path: str | Path, outcomes: Sequence[NotchOutcome], here: tuple[float, float]
+) -> None:
     """Draw k, U, the map and the recognition rate over the notch and the spread of poses.
 
     Args:
@@ -360,7 +362,7 @@ def draw_outcomes(path: str | Path, outcomes: Sequence[Outcome], here: tuple[flo
     spreads = [float(np.mean([cell[n, t].spread for n in notches])) for t in scales]
     pyplot: Any = _pyplot()
     figure, grid = pyplot.subplots(2, 2, figsize=(9, 6.4))
-    panels: list[tuple[str, Callable[[Outcome], float], str]] = [
+    panels: list[tuple[str, Callable[[NotchOutcome], float], str]] = [
         ("k chosen by M", lambda o: o.k, "viridis"),
         ("U at that k", lambda o: o.uncertainty, "viridis"),
         ("map right", lambda o: float(o.right), "Greens"),
@@ -422,6 +424,6 @@ def draw_outcomes(path: str | Path, outcomes: Sequence[Outcome], here: tuple[flo
     _save(figure, path)
 
 
-def as_in_paper(o: Outcome) -> bool:
+def as_in_paper(o: NotchOutcome) -> bool:
     """Tell whether an outcome has four views, U = 1, the right map, and full recognition."""
     return o.k == 4 and o.uncertainty > 1 - 1e-9 and o.right and o.rate > 0.999

@@ -28,7 +28,7 @@ from ssh_abduction.evaluation.paper.experiments import (
     EXPERIMENTS,
     VIEWS_ALONE,
     WITH_STARS,
-    Outcome,
+    NotchOutcome,
     SeedRun,
     measure,
     outcome,
@@ -88,7 +88,7 @@ def reproduce(
     _dump(folder / "claims.json", table)
     _dump(folder / "runs.json", [asdict(run) for run in runs])
     _dump(folder / "configuration.json", _configuration(name, seeds, outcomes))
-    found: list[Outcome] = []
+    found: list[NotchOutcome] = []
     if outcomes and name == "notched-rectangle":
         grid = [(notch, scale) for notch in NOTCHES for scale in SCALES]
         for o in _each(outcome, grid, jobs):

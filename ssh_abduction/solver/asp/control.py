@@ -128,12 +128,15 @@ class Control(clingo.Control):
         parts: Sequence[tuple[str, Sequence[clingo.Symbol]]] = (("base", ()),),
         context: Any = None,
     ) -> None:
-        asked = _Asked(self._check)
+        asked = _GroundingCheck(self._check)
         with self._alone():
             self._ground_alone(parts, context, asked)
 
     def _ground_alone(
-        self, parts: Sequence[tuple[str, Sequence[clingo.Symbol]]], context: Any, asked: _Asked
+        self,
+        parts: Sequence[tuple[str, Sequence[clingo.Symbol]]],
+        context: Any,
+        asked: _GroundingCheck,
     ) -> None:
         """Ground program parts, and add up the time and the memory that this takes."""
         began, before = time.perf_counter(), peak_memory()
@@ -158,7 +161,7 @@ class Control(clingo.Control):
                 )
 
 
-class _Asked:
+class _GroundingCheck:
     """Evaluates `@go_on(...)` of encodings, by which clingo asks whether to go on grounding."""
 
     def __init__(self, check: Callable[[], None]) -> None:

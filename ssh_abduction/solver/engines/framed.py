@@ -38,7 +38,7 @@ from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.engines.base import Found, Task, next_charted_size
 from ssh_abduction.solver.engines.doubts import Settled
-from ssh_abduction.solver.engines.framed_paths import Fitted, FramedPaths, Naming
+from ssh_abduction.solver.engines.framed_paths import Fitted, FramedPaths, NodeLabels
 from ssh_abduction.solver.engines.refusing import all_accepted, first_accepted
 from ssh_abduction.solver.engines.sides import FramedSides
 from ssh_abduction.solver.engines.visit_labels import VisitLabels
@@ -74,7 +74,7 @@ class FramedEngine:
         self._unframed_size = 0  # the size of the prefix, in case that its visits fit no frames
         self._framed = True  # whether the visits fit their frames
         # The minimal cost, and all labels with maps of that cost.
-        self._best: tuple[tuple[int, ...], list[Naming]] | None = None
+        self._best: tuple[tuple[int, ...], list[NodeLabels]] | None = None
 
     @property
     def size(self) -> int:
@@ -133,7 +133,7 @@ class FramedEngine:
         best = first.found
         yield best
         # Other labels with the same number of dstates may have fewer paths or places.
-        namings: list[Naming] = []
+        namings: list[NodeLabels] = []
         others = self._all_with_paths(best.cost[0], besides=first.naming.labels)
         for other in chain([first.naming], others):
             control = other.control or self._fitting.control(other.chart, other.labels)
@@ -200,13 +200,13 @@ class FramedEngine:
             if settled.has_map():
                 yield settled
 
-    def _namings_of_cost(self, cost: tuple[int, ...]) -> Iterator[Naming]:
+    def _namings_of_cost(self, cost: tuple[int, ...]) -> Iterator[NodeLabels]:
         """Yield the labels that maps of this cost have, known ones if there are any."""
         if self._best and self._best[0] == cost:
             return iter(self._best[1])
         return self._all_with_paths(cost[0])
 
-    def _all_with_paths(self, dstates: int, besides: Sequence[int] = ()) -> Iterator[Naming]:
+    def _all_with_paths(self, dstates: int, besides: Sequence[int] = ()) -> Iterator[NodeLabels]:
         """Yield each labelling with this many dstates for which paths exist."""
         known: set[Hashable] = {tuple(besides)}
         fitted: dict[tuple[int, ...], Fitted] = {}

@@ -43,7 +43,7 @@ BETTERING = 20_000
 
 
 @dataclass(frozen=True)
-class Naming:
+class NodeLabels:
     """Labels, for which clingo is then asked for places and paths.
 
     Attributes:
@@ -62,7 +62,7 @@ class Fitted:
     """A map (`found`), and its labels (`naming`)."""
 
     found: Found
-    naming: Naming
+    naming: NodeLabels
 
 
 class FramedPaths:
@@ -111,7 +111,7 @@ class FramedPaths:
             `any` may still find a map.
         """
         found = self.separate(chart, labels) if len(set(labels)) > MANY_DSTATES else None
-        return Fitted(found, Naming(chart, list(labels))) if found else None
+        return Fitted(found, NodeLabels(chart, list(labels))) if found else None
 
     def any(self, chart: FramedChart, labels: Sequence[int]) -> Fitted | None:
         """Find a map with these dstates, with a control for all ways to merge segments to paths.
@@ -119,7 +119,7 @@ class FramedPaths:
         Returns:
             The map and the labels with that control; None if no paths fit.
         """
-        naming = Naming(chart, list(labels), self.control(chart, labels))
+        naming = NodeLabels(chart, list(labels), self.control(chart, labels))
         found = next(self.maps(naming, "ignore"), None)
         return Fitted(found, naming) if found else None
 
@@ -129,10 +129,10 @@ class FramedPaths:
         Returns:
             The map; None if there is no such map.
         """
-        naming = Naming(chart, list(labels), self.control(chart, labels, single=True))
+        naming = NodeLabels(chart, list(labels), self.control(chart, labels, single=True))
         return next(self.maps(naming, "ignore"), None)
 
-    def better(self, naming: Naming) -> Iterator[Found]:
+    def better(self, naming: NodeLabels) -> Iterator[Found]:
         """Yield maps with these dstates, none more expensive than the one before.
 
         The last map is the best one. There is none if no paths fit. If improving the maps takes
@@ -146,7 +146,9 @@ class FramedPaths:
             control = self.control(naming.chart, naming.labels, ["--opt-strategy=usc"])
             yield from self.maps(replace(naming, control=control), "opt")
 
-    def maps(self, naming: Naming, mode: str, conflicts: int = -1) -> Generator[Found, None, bool]:
+    def maps(
+        self, naming: NodeLabels, mode: str, conflicts: int = -1
+    ) -> Generator[Found, None, bool]:
         """Yield maps with these dstates.
 
         Args:
@@ -170,7 +172,7 @@ class FramedPaths:
         theory = self.task.theory
         return (yield from mapped(lambda answer: Found.of(reader.map_of(answer), theory), answers))
 
-    def settled(self, naming: Naming, mode: str) -> Settled:
+    def settled(self, naming: NodeLabels, mode: str) -> Settled:
         """Prepare questions about what the best maps with these dstates share.
 
         Args:
@@ -181,7 +183,7 @@ class FramedPaths:
         reader = self._reader(naming, control)
         return Settled(self._asker, control, mode, reader, reader.map_of)
 
-    def _reader(self, naming: Naming, control: clingo.Control) -> path_reader.PathReader:
+    def _reader(self, naming: NodeLabels, control: clingo.Control) -> path_reader.PathReader:
         """Make a reader of the places and paths in answers of a control."""
         return path_reader.PathReader(
             control, self.task.trace, self.task.theory, naming.chart, naming.labels

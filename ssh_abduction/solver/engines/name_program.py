@@ -57,7 +57,7 @@ class Fitting(Protocol):
 
 
 @dataclass
-class _Known:
+class _GivenNodes:
     """A record of everything that one control was given.
 
     Attributes:
@@ -141,7 +141,7 @@ class NameProgram:
         self._known = self._new_control()
         self.give_links(links)
 
-    def _new_control(self) -> _Known:
+    def _new_control(self) -> _GivenNodes:
         """Make a control that has the names, but no node yet."""
         with self._asker.grounding_timed():
             seen, clique = self.chart.seen, self.pinned.clique
@@ -161,7 +161,7 @@ class NameProgram:
             base = names_lp.name_facts(names, spare.values(), self.chart.links, choices)
             self._asker.watch.check(SECONDS_A_CHARACTER * len(base))
             self._asker.control = new_control("names", base, ["--eq=1", *cores])
-            return _Known(spare, choices, np.zeros(len(seen), dtype=bool))
+            return _GivenNodes(spare, choices, np.zeros(len(seen), dtype=bool))
 
     def add(self, links: Iterable[Link]) -> None:
         """Give clingo more links and the nodes at their ends, in batches.

@@ -53,7 +53,7 @@ class Incumbent:
 
 
 @dataclass
-class _Answer:
+class _NamedAnswer:
     """An answer of clingo.
 
     Attributes:
@@ -139,7 +139,7 @@ class NameSearch:
             self._tell_why(lacking)
         yield found.labels if found else self._incumbent.labels or []
 
-    def _cheapest_answer(self) -> Generator[list[int], None, _Answer | None]:
+    def _cheapest_answer(self) -> Generator[list[int], None, _NamedAnswer | None]:
         """Find the cheapest answer for the links that clingo has.
 
         Yields:
@@ -151,7 +151,7 @@ class NameSearch:
         while True:
             names, proven = self._cheapest(self._patience)
             if proven and names is not None:
-                return _Answer(names)
+                return _NamedAnswer(names)
             yield from self._helped()
             if self._incumbent.is_settled():
                 return None
@@ -179,7 +179,7 @@ class NameSearch:
             except StopIteration as end:
                 return answer, bool(end.value)
 
-    def _why_not(self, answer: _Answer) -> _Lacking | None:
+    def _why_not(self, answer: _NamedAnswer) -> _Lacking | None:
         """Return the reason to reject an answer; None if the answer is a map."""
         program = self._program
         if views := program.rests(answer.names):

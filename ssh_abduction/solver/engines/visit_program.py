@@ -72,7 +72,7 @@ class Refusal:
 
 
 @dataclass
-class _Known:
+class _GivenVisits:
     """A record of everything about the chart that the control was given.
 
     Attributes:
@@ -118,7 +118,7 @@ class VisitProgram:
         cores = ["--opt-strategy=usc"] if task.speedups.core_guided else []
         asker.control = new_control("visits", "", ["--heuristic=Domain", *cores])
         self.least = 0
-        self._known = _Known()
+        self._known = _GivenVisits()
         self._pair_of = PairOf()
         self._parts = 0
         sides.begin()

@@ -72,7 +72,7 @@ def _is_gated(theory: Theory) -> bool:
 
 
 @dataclass(slots=True)
-class _Place:
+class _PlaceSights:
     """What was seen and done at a place.
 
     Attributes:
@@ -83,7 +83,7 @@ class _Place:
     sights: dict[_Seen, int] = field(default_factory=dict)
     turns: dict[tuple[_Seen, _Seen], set[Action]] = field(default_factory=dict)
 
-    def with_sight(self, seen: _Seen, step: int, move: tuple[_Seen, Action] | None) -> _Place:
+    def with_sight(self, seen: _Seen, step: int, move: tuple[_Seen, Action] | None) -> _PlaceSights:
         """Return this place after a step there.
 
         Args:
@@ -94,7 +94,7 @@ class _Place:
         if move:
             before, action = move
             turns = {**turns, (before, seen): turns.get((before, seen), set()) | {action}}
-        return _Place({**self.sights, seen: self.sights.get(seen, step)}, turns)
+        return _PlaceSights({**self.sights, seen: self.sights.get(seen, step)}, turns)
 
 
 class GatewaySketch(Sketch):
@@ -108,7 +108,7 @@ class GatewaySketch(Sketch):
     """
 
     def __init__(self, first: Step, theory: Theory, homing: bool = True) -> None:
-        self._shown: dict[int, _Place] = defaultdict(_Place)  # by place
+        self._shown: dict[int, _PlaceSights] = defaultdict(_PlaceSights)  # by place
         self._last: _Seen | None = None  # what the last step saw
         self._turn_made: Action | None = None  # the turn after it, if it was one
         self._star_seen = first.gateways or Star(())  # what the present step sees
@@ -120,7 +120,7 @@ class GatewaySketch(Sketch):
     def beyond(cls, ssh_map: SSHMap, trace: Trace, theory: Theory, homing: bool = True) -> Self:
         """Make a sketch that begins with a map of a trace, see `Sketch.beyond`."""
         sketch = super().beyond(ssh_map, trace, theory, homing)
-        sketch._shown, sketch._last = defaultdict(_Place), None
+        sketch._shown, sketch._last = defaultdict(_PlaceSights), None
         for t, (label, step) in enumerate(zip(ssh_map.dstate_at, trace.steps, strict=True)):
             place = sketch._states[label].place
             sketch._star_seen = step.gateways or Star(())
@@ -152,14 +152,16 @@ class GatewaySketch(Sketch):
             return True
         return fit(*self._sights(grown), self._axioms, as_shown=False) is not None
 
-    def _grown(self, place: int, there: int, t: int) -> _Place:
+    def _grown(self, place: int, there: int, t: int) -> _PlaceSights:
         """Return the place with step t added, the present step, at a dstate there."""
         move = None
         if self._turn_made and self._last and self._states[self._last[0]].place == place:
             move = self._last, self._turn_made
         return self._shown[place].with_sight((there, self._star_seen), t, move)
 
-    def _sights(self, place: _Place) -> tuple[list[Sight], dict[tuple[Sight, Sight], set[Action]]]:
+    def _sights(
+        self, place: _PlaceSights
+    ) -> tuple[list[Sight], dict[tuple[Sight, Sight], set[Action]]]:
         """Return the sights of a place and the turns between them, as `fit` takes them."""
         made: dict[_Seen, Sight] = {}
         shown: set[int] = set()

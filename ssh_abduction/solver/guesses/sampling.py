@@ -147,7 +147,7 @@ class _Transitions:
 
 
 @dataclass
-class _Choice:
+class _DrawnStates:
     """The states that visits are drawn from during a round of sweeps.
 
     Attributes:
@@ -220,7 +220,7 @@ class Sampler:
         """Count the travels that lead elsewhere than most with the same state and action."""
         return int((self._transitions.totals - self._transitions.counts.max(axis=1)).sum())
 
-    def _choose(self, power: float) -> _Choice:
+    def _choose(self, power: float) -> _DrawnStates:
         """Choose LIKELY states for each visit at random, weighted by probability.
 
         The last drawn state is always among them.
@@ -247,9 +247,9 @@ class Sampler:
         chosen = np.argpartition(-rank, few - 1, axis=1)[:, :few]
         states = np.take_along_axis(self._options, chosen, axis=1)
         drawn = (states == self.labels[:, None]).argmax(axis=1)
-        return _Choice(states, self._transitions.entries(states), drawn)
+        return _DrawnStates(states, self._transitions.entries(states), drawn)
 
-    def _sweep(self, choice: _Choice, power: float) -> None:
+    def _sweep(self, choice: _DrawnStates, power: float) -> None:
         """Draw the states of all visits from a choice, all stretches at the same time.
 
         Args:

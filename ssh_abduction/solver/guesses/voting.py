@@ -42,7 +42,7 @@ _Turned = tuple[int, int]
 
 
 @dataclass(frozen=True)
-class _Visit:
+class _SlotVisit:
     """The steps between two travels.
 
     Attributes:
@@ -359,7 +359,7 @@ class Merging:
             self._group_of[visit] = kept
 
 
-def _visits(trace: Trace) -> Iterator[_Visit]:
+def _visits(trace: Trace) -> Iterator[_SlotVisit]:
     """Yield the visits of a trace, in order."""
     steps: list[tuple[int, int]] = [(0, 0)]
     for t, action in enumerate(trace.actions):
@@ -367,9 +367,9 @@ def _visits(trace: Trace) -> Iterator[_Visit]:
         if action.kind == "turn":
             steps.append((t + 1, (slot + QUARTERS[action.turn]) % 4))
         else:
-            yield _Visit(tuple(steps), None if action.unlinked else (slot, action.name))
+            yield _SlotVisit(tuple(steps), None if action.unlinked else (slot, action.name))
             steps = [(t + 1, 0)]
-    yield _Visit(tuple(steps), None)
+    yield _SlotVisit(tuple(steps), None)
 
 
 def _outvoted(votes: Counter[Any]) -> int:

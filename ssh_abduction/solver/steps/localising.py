@@ -55,10 +55,10 @@ def located(chart: FramedChart, states: Mapping[int, State]) -> Located:
     """
     if len(states) == len(chart.stars):
         return Located(tuple(states[visit] for visit in range(len(states))))
-    return _Localiser(chart, states).located()
+    return _VisitLocaliser(chart, states).located()
 
 
-class _Localiser:
+class _VisitLocaliser:
     """Localises visits in the map that the known states of some visits make."""
 
     def __init__(self, chart: FramedChart, states: Mapping[int, State]) -> None:

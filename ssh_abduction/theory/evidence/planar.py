@@ -289,7 +289,7 @@ def _can_draw_sided(shown: _Shown, crossing: bool) -> bool:
     A turn shows which gateway is to the right of an edge, if both its dstates are at an edge.
     After turning around, a robot faces the gateway that was behind it.
     """
-    same = _Classes()
+    same = _ArmClasses()
     for x, turn, y in shown.turns:
         if turn == "around":
             same.join((x, AHEAD), (y, BACK))
@@ -320,7 +320,7 @@ def _can_draw_sided(shown: _Shown, crossing: bool) -> bool:
     )
 
 
-def _paired(shown: _Shown, same: _Classes) -> list[frozenset[Gateway]] | None:
+def _paired(shown: _Shown, same: _ArmClasses) -> list[frozenset[Gateway]] | None:
     """Find the edges, each between two gateways. None if a gateway leads to two places.
 
     Gateways of one place that lead to the same gateway become one, also in `same`.
@@ -374,7 +374,7 @@ def _is_clockwise(order: Sequence[Arm], sequence: Sequence[Arm]) -> bool:
     return sum(positions[i - 1] > positions[i] for i in range(len(positions))) <= 1
 
 
-class _Classes:
+class _ArmClasses:
     """Classes of arms that are one gateway. An arm is the way ahead of a dstate, or behind it."""
 
     def __init__(self) -> None:

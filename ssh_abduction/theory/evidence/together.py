@@ -44,7 +44,7 @@ SAMPLE = 300
 
 
 @dataclass(frozen=True)
-class _Alone:
+class _ReturnsAlone:
     """What is known about each of m returns alone, for one drift of heading.
 
     Attributes:
@@ -58,14 +58,14 @@ class _Alone:
     square: Array
     repeated: Array
 
-    def followed_by(self, other: _Alone) -> _Alone:
+    def followed_by(self, other: _ReturnsAlone) -> _ReturnsAlone:
         """Append what is known about other returns."""
         pairs = (
             (self.inverse, other.inverse),
             (self.square, other.square),
             (self.repeated, other.repeated),
         )
-        return _Alone(*(np.concatenate(pair) for pair in pairs))
+        return _ReturnsAlone(*(np.concatenate(pair) for pair in pairs))
 
 
 class Together:
@@ -96,7 +96,7 @@ class Together:
         """
         self.rows = rows
         self._reckoning, self._thresholds = reckoning, thresholds
-        self._alone: dict[int, _Alone] = dict(before._alone) if before else {}
+        self._alone: dict[int, _ReturnsAlone] = dict(before._alone) if before else {}
         self._number: int  # the number of the drift that is tried first
         self._chosen_among: int  # the number of returns when that drift was chosen
         if before and len(rows) <= 2 * before._chosen_among:
@@ -229,7 +229,7 @@ class Together:
         excess[left] = np.maximum(joint - most, 0.0)
         return excess
 
-    def _largest_share(self, alone: _Alone, returns: Steps, noise: Array) -> Array:
+    def _largest_share(self, alone: _ReturnsAlone, returns: Steps, noise: Array) -> Array:
         """Return an upper bound on the largest eigenvalue of S^-1 F for some returns.
 
         S is the covariance of a return, and F the part of it that `noise`, m x 9, and repeated
@@ -262,7 +262,7 @@ class Together:
         ).square
         return int((squares.reshape(len(numbers), -1).sum(1) + self._reckoning.unlikely).argmin())
 
-    def _of_each(self, number: int) -> _Alone:
+    def _of_each(self, number: int) -> _ReturnsAlone:
         """Return what is known about each return alone, for the drift with this index."""
         known = self._alone.get(number)
         if known is None or len(known.square) < len(self.rows):
@@ -312,13 +312,13 @@ def _common_ends(these: Steps, others: Steps) -> Steps:
     return np.asarray((these[..., :2] == others[..., :2]).sum(-1))
 
 
-def _alone(closing: Array, covariance: Array, repeated: Array, one_dstate: Steps) -> _Alone:
+def _alone(closing: Array, covariance: Array, repeated: Array, one_dstate: Steps) -> _ReturnsAlone:
     """Compute what is known about each of m returns alone, from closing errors, m x 3."""
     _cut_off_headings(closing, covariance, one_dstate)
     inverse: Array = np.asarray(np.linalg.inv(covariance), dtype=float)
     inverse[one_dstate == 0, 2, 2] = 0.0
     square = np.einsum("mi,mij,mj->m", closing, inverse, closing)
-    return _Alone(inverse.reshape(-1, 9), square, repeated.reshape(-1, 9))
+    return _ReturnsAlone(inverse.reshape(-1, 9), square, repeated.reshape(-1, 9))
 
 
 def _cut_off_headings(closing: Array, covariance: Array, one_dstate: Steps) -> None:
