@@ -34,7 +34,7 @@ from ssh_abduction.page.html import Page
 from ssh_abduction.page.replays import ALPHABET, LOST, beams_of, drawn_images
 from ssh_abduction.page.server import PageServer
 from ssh_abduction.rivals import Listing
-from ssh_abduction.solver.asp.process import _under_way
+from ssh_abduction.solver.asp.workers import _under_way
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 ROUTE = EXAMPLES / "aces3-route.jsonl"

@@ -14,7 +14,7 @@ from unittest.mock import patch
 import pytest
 
 from ssh_abduction.solver.asp.limits import LimitError, Watch, peak_memory
-from ssh_abduction.solver.asp.process import in_process
+from ssh_abduction.solver.asp.workers import in_process
 
 
 def double_and_tell_where(values: list[int], watch: Watch) -> tuple[list[int], int]:
@@ -102,7 +102,7 @@ def test_a_process_ends_with_the_one_that_waits_for_it(tmp_path: Path) -> None:
     program = f"""
 from pathlib import Path
 from ssh_abduction.solver.asp.limits import Watch
-from ssh_abduction.solver.asp.process import in_process
+from ssh_abduction.solver.asp.workers import in_process
 from test_process import write_again_and_again
 in_process(write_again_and_again, Path({str(path)!r}), watch=Watch())
 """

@@ -26,7 +26,7 @@ from ssh_abduction.evaluation.ladder import UnderWay
 from ssh_abduction.evaluation.paper import report
 from ssh_abduction.robot_logs.log_maps import LogMapping
 from ssh_abduction.runtime import program
-from ssh_abduction.solver.asp import process, workers
+from ssh_abduction.solver.asp import workers
 from ssh_abduction.solver.asp.limits import Watch
 
 POSIX = pytest.mark.skipif(os.name != "posix", reason="sends signals, which Windows has none of")
@@ -58,7 +58,7 @@ def test_no_process_that_is_begun_runs_a_file_of_the_current_folder(
     hostile: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "path", ["", str(hostile), *sys.path])
-    assert process.in_process(from_here, str(hostile), watch=Watch()) == []
+    assert workers.in_process(from_here, str(hostile), watch=Watch()) == []
     assert list(workers.answers(from_there, [(0, str(hostile))], 1, lambda: False, None, 1.0)) == [
         []
     ]

@@ -24,7 +24,7 @@ from ssh_abduction.online.background import MEANWHILE, BackgroundTask, Solved
 from ssh_abduction.online.hypotheses import ExtendedMap, Scale
 from ssh_abduction.online.recovery import Recovery
 from ssh_abduction.solver import Status
-from ssh_abduction.solver.asp.process import _under_way
+from ssh_abduction.solver.asp.workers import _under_way
 from ssh_abduction.theory import Speedups
 
 NO_TIME = 1e-9  # seconds: every search is stopped before it begins

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
         check_limit,
         resident_memory,
     )
-    from ssh_abduction.solver.asp.process import end_all, in_process
     from ssh_abduction.solver.asp.rules import check_rules
+    from ssh_abduction.solver.asp.workers import end_all, in_process
     from ssh_abduction.solver.engines.base import AT_ONCE, Task
     from ssh_abduction.solver.engines.framed import FramedEngine
     from ssh_abduction.solver.entry import find_backbone, solve
@@ -56,7 +56,7 @@ _HOMES = {  # module: the names that this package exports from it
     "asp": ("facts", "workers"),
     "asp.control": ("has_processors",),
     "asp.limits": ("POLL", "LimitError", "Stop", "Watch", "check_limit", "resident_memory"),
-    "asp.process": ("end_all", "in_process"),
+    "asp.workers": ("end_all", "in_process"),
     "asp.rules": ("check_rules",),
     "engines.base": ("AT_ONCE", "Task"),
     "engines.framed": ("FramedEngine",),

@@ -20,16 +20,18 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple, TypeVar
 
 from ssh_abduction.runtime.program import command, search_path
+from ssh_abduction.solver.asp.limits import POLL, LimitError, Watch
+
+Result = TypeVar("Result")
 
 # A process may take this many seconds to start, even on a busy machine.
 STARTING = 10.0
-# Seconds between two checks whether to stop. Ctrl-C has to take effect within two seconds.
-POLL = 0.05
 
 _BEGIN = b"\0ssh-abduction answers\n"  # whatever Python prints before this is no answer
+_under_way: set[subprocess.Popen[bytes]] = set()
 
 
 class Lost(NamedTuple):
@@ -59,6 +61,7 @@ class Worker:
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
         )
+        _under_way.add(self._process)
         self._send(search_path())
         self._send(folder)
         self._begun = False
@@ -67,6 +70,7 @@ class Worker:
         """Kill the process, and close its pipes."""
         self.kill()
         self._process.wait()
+        _under_way.discard(self._process)
         for end in (self._process.stdin, self._process.stdout):
             with suppress(OSError):  # unread output
                 assert end
@@ -205,6 +209,63 @@ def answers(
         over.set()
         _end([*filter(None, workers)], threads)
         folder.cleanup()
+
+
+def in_process(work: Callable[..., Result], *arguments: object, watch: Watch) -> Result:
+    """Call `work` in another process, or in this one if no other process can be started.
+
+    Args:
+        work: The function to call. It, its arguments, its result and its errors can be pickled.
+        arguments: The first arguments of `work`.
+        watch: The limits. The other process is ended at a limit. The last argument of `work` is a
+            new watch with only the memory limit in the other process, and `watch` in this one.
+
+    Returns:
+        The result of `work`.
+
+    Raises:
+        LimitError: A limit is reached, or the process ended without an answer.
+    """
+
+    def stopped() -> bool:
+        watch.check()
+        return False
+
+    # A program that embeds Python cannot be run as Python.
+    if "python" not in os.path.basename(sys.executable or "").lower():
+        return work(*arguments, watch)
+    tasks = [(0, work, arguments, watch.memory_left())]
+    try:
+        (answer,) = answers(_attempted, tasks, 1, stopped, None, 0.0)
+    except OSError:
+        return work(*arguments, watch)
+    if isinstance(answer, Lost):  # most likely the system is short of memory
+        raise LimitError("memory limit")
+    attempted: tuple[Result, Exception | None] = answer
+    result, error = attempted
+    if error is not None:
+        raise error
+    return result
+
+
+def _attempted(
+    _: int,
+    work: Callable[..., object],
+    arguments: tuple[object, ...],
+    memory: float | None,
+    __: Callable[[], bool],
+) -> tuple[object, Exception | None]:
+    """Call `work` in the other process. Return its result, or the exception that it raised."""
+    try:
+        return work(*arguments, Watch(memory=memory)), None
+    except Exception as error:
+        return None, error
+
+
+def end_all() -> None:
+    """Kill all processes that were started here. Call this before this process exits."""
+    for process in list(_under_way):
+        process.kill()
 
 
 def _living(worker: Worker | None, folder: str) -> Worker:
