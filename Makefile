@@ -2,7 +2,7 @@
 # make bench  time and memory on this machine, ours and those of peers from PyPI, as a table; the better part of an hour
 # make bench-faults  the same of faults: are they found, by ours and by peers; some hours, or ARGS="--seeds 2 --limit 10"
 # make bench-grid  localisation over dstates beside that over all poses of an occupancy grid; an hour, or ARGS="--part growing --seeds 1"
-# make parts  times of single parts: circuits, images, exploring step by step, and small traces
+# make parts  times of single parts: images, exploring step by step, and small traces
 # make docs   the pages of docs/ and a page for each public name as a site, with its links checked; open site/index.html
 # make test   lint, types, layers and tests, with the development tools in .venv; make test-all also runs slow tests
 PYTHON ?= python3
@@ -51,7 +51,6 @@ bench-grid: .venv/base
 	$(BIN)/python benchmarks/grid_localisation.py $(ARGS)
 
 parts: .venv/dev
-	$(BIN)/python benchmarks/circuits.py
 	$(BIN)/python benchmarks/images.py
 	$(BIN)/python benchmarks/online.py
 	$(BIN)/python benchmarks/conformance.py

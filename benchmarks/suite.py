@@ -120,9 +120,6 @@ SUITE = {
         Instance("full aces3", lambda _: aces3(), seeded=False),
     )
 }
-SMALL = _maze(
-    2, 60, full=True
-)  # an instance that the plain encoding of the topological theory can solve, for ablation.py
 # An instance for which a map with frames is sought.
 BARE = Instance(
     "full maze 3x3 n=400, loops, no stars", lambda seed: maze(3, 3, steps=400, seed=seed, loops=0.5)
@@ -163,4 +160,4 @@ PRUNED = (
     _drive("full maze 4x4 n=800, no stars", 4, 800),
     _drive("full maze 5x5 n=1600, no stars", 5, 1600),
 )
-INSTANCES = {**SUITE, **{instance.name: instance for instance in (SMALL, BARE, *PRUNED)}}
+INSTANCES = {**SUITE, **{instance.name: instance for instance in (BARE, *PRUNED)}}
