@@ -484,8 +484,8 @@ def test_ctrl_c_prints_what_waited_for_its_turn(
 @pytest.mark.skipif(sys.platform == "win32", reason="signals")
 @pytest.mark.parametrize(
     ("jobs", "send"),
-    [("1", os.killpg), ("2", os.killpg), ("2", os.kill)],
-    ids=["1", "2", "2, from another program"],
+    [("1", os.killpg), ("2", os.kill)],
+    ids=["1", "2, from another program"],
 )
 def test_ctrl_c_ends_the_processes(
     jobs: str, send: Callable[[int, int], None], traces: Path

@@ -244,6 +244,7 @@ MADE_BY_THE_PACKAGE = {
 OF_SCIKIT_LEARN = {
     f"{name}.X" for name in ("BootstrapLearner.predict", "BootstrapLearner.score")
 } | {f"ViewClusterer.{name}.X" for name in ("fit", "predict", "score")}
+SEARCHES = ("solve", "explain_pair", "explain_place", "explain_trace")
 
 
 class Ring:
@@ -296,12 +297,13 @@ def known() -> dict[str, Any]:
         ).fit(drive),
         "clusterer": ViewClusterer(3, random_state=0).fit(images),
         "localiser": Localiser(solution.maps[0]),
+        "mapper": OnlineMapper("end", Theory.causal()),
         "search": ended(Search(trace)),
         "experiment": next_experiment(solution, trace),
         "rung": next(iter(ladder(trace))),
         "listing": Listing.of(solution),
         "comparison": compare(solution),
-        "faulty": Trace.from_steps(["a", "b", "a", "c"], ["on", "on", "on"]),
+        "plain": Trace.from_steps(["a", "b", "a", "c"], ["travel"] * 3),
     }
 
 
@@ -339,7 +341,7 @@ def receiver(name: str) -> Any:
         "MapEvaluation": lambda: evaluate(solution.maps, trace).maps[0],
         "Move": lambda: route(solution, 0, 1).moves[0],
         "Odometry": Odometry,
-        "OnlineMapper": lambda: OnlineMapper("end", Theory.causal()),
+        "OnlineMapper": lambda: made["mapper"],
         "Page": lambda: view_page(solution),
         "Paint": Paint,
         "Plan": lambda: made["plan"],
@@ -434,10 +436,11 @@ def good(call: str, parameter: inspect.Parameter) -> Any:
         "evaluate.maps": solution.maps,
         "evaluate_visits.maps": solution.maps,
         "explain_place.place": 0,
-        "explain_trace.trace": trace,
+        # Without displacements, each search takes a quarter of the time.
+        **{f"{call}.trace": made["plain"] for call in SEARCHES},
         "fault_front.most": 1,
         "fault_front.theory": Theory.causal(),
-        "fault_front.trace": made["faulty"],
+        "fault_front.trace": made["plain"],
         "together.traces": [trace],
         "tour.steps": 2,
         "compare.maps": solution,
@@ -554,15 +557,17 @@ def do(call: str, function: Any, arguments: dict[str, Any]) -> None:
         next(result, None)
 
 
-@pytest.fixture(autouse=True)
-def _in_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    made = known()
-    made["trace"].save("trace.jsonl")
-    made["map"].save("map.json")
-    made["solution"].save("solution.json")
-    save_corrections(Corrections.for_drives(made["trace"]), "corrections.yaml")
-    Path("theory.toml").write_text('star = "none"')
+@pytest.fixture(scope="module", autouse=True)
+def _in_a_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path_factory.mktemp("calls"))
+        made = known()
+        made["trace"].save("trace.jsonl")
+        made["map"].save("map.json")
+        made["solution"].save("solution.json")
+        save_corrections(Corrections.for_drives(made["trace"]), "corrections.yaml")
+        Path("theory.toml").write_text('star = "none"')
+        yield
 
 
 SWEPT = [(call, function) for call, function in calls() if parameters(function)]
@@ -585,6 +590,8 @@ def test_wrong_arguments_are_refused_by_errors_of_the_package(call: str, functio
         )
         allowed |= {"3.5"} if call == "Odometry" and parameter.name != "extra" else set()
         for name, make in WRONG.items():
+            if name == "None" and right[parameter.name] is None:
+                continue  # the next test makes this call
             try:
                 with contextlib.redirect_stderr(io.StringIO()):
                     do(call, function, {**right, parameter.name: make()})

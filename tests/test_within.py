@@ -115,6 +115,7 @@ def test_maps_come_in_the_order_of_their_cost_up_to_as_many_as_are_asked_for(
     assert solution.complete == (maps == 11)
     assert solution.stopped == (None if maps == 11 else "maps limit")
     assert solution.status is Status.OPTIMAL
+    assert solution.summary.endswith(f"; and {maps - 2} with up to 3 more")
 
 
 @pytest.mark.parametrize(
