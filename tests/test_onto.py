@@ -44,6 +44,7 @@ def keeps(ssh_map: SSHMap) -> Callable[[Key], bool]:
 
 @pytest.mark.filterwarnings("ignore:traces 1 and 2 have the same steps")
 @pytest.mark.filterwarnings("ignore:action. traces 1 and 2 .*have different names")
+@pytest.mark.filterwarnings("ignore:views. trace 1")
 @settings(max_examples=6)
 @given(st.data())
 def test_the_maps_are_the_least_of_those_that_keep_the_standing_map(data: st.DataObject) -> None:
@@ -125,6 +126,23 @@ def test_a_drive_that_contradicts_the_map_is_refused() -> None:
     with pytest.raises(SolverError, match=r"got tuesday: .*; solve all drives together"):
         solve(wrong, sure, onto=standing)
     assert solve([monday, wrong], sure)[0].dstate_at == (0, 1, 2, 3, 2, 3, 4)
+
+
+def test_a_drive_with_displacements_is_added_by_cost() -> None:
+    monday = Trace.from_steps(
+        "abcd", ["travel", "around", "travel"], displacements=[(4, 0, 0), (0, 0, 3.14), (4, 0, 0)]
+    )
+    tuesday = Trace.from_steps("cd", ["travel"], displacements=[(4.1, 0, 0)], name="tuesday")
+    standing, joint = solve(monday), solve([monday, tuesday])
+    solution = solve(tuesday, onto=standing)
+    assert joint.weighed is not None
+    assert solution.weighed is not None
+    assert solution.maps == joint.maps
+    assert solution.weighed.nats == pytest.approx(joint.weighed.nats)
+    assert solution.confidence == pytest.approx(joint.confidence, abs=0.01)
+    assert solution.by_minimality == ()
+    for rival in solution.weighed.rivals:
+        assert rival.dstates[:4] == standing.maps[0].dstate_at
 
 
 def test_a_map_without_its_trace_does_not_stand(tmp_path: Path) -> None:

@@ -235,7 +235,8 @@ def test_drives_that_share_a_place_have_one_map() -> None:
 
 def test_drives_that_share_nothing_are_pieces(tmp_path: Path) -> None:
     far = Trace.from_steps("xyz", ["travel", "around"], name="far")
-    solution = solve([MONDAY, far, TUESDAY], Theory.causal())
+    with pytest.warns(UserWarning, match=r"trace 2 \(far\) has no view in common with another"):
+        solution = solve([MONDAY, far, TUESDAY], Theory.causal())
     (ssh_map,) = solution.maps
     assert ssh_map.pieces == ((0, 1, 2, 3), (4, 5, 6))
     assert "2 pieces that share no place: far alone; monday, tuesday" in pieces_in_words(
@@ -301,6 +302,7 @@ def test_a_localiser_is_lost_where_a_drive_starts() -> None:
     )
 
 
+@pytest.mark.filterwarnings("ignore:views. trace")
 def test_joins_of_drives_are_forced_possible_or_excluded(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -412,6 +414,7 @@ def test_the_checker_and_the_solver_have_one_misfit_of_joint_maps(known: truth.K
     assert misfit(known.trace, names, places) == pytest.approx(poses.misfit(), rel=1e-5)
 
 
+@pytest.mark.filterwarnings("ignore:views. trace")
 def test_worlds_are_cut_where_the_robot_jumped(tmp_path: Path) -> None:
     walk = Trace.from_steps("abcd", ["travel", "jump1", "travel"])
     steps = [replace(s, truth={"dstate": k}) for k, s in enumerate(walk.steps)]

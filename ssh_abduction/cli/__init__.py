@@ -185,7 +185,7 @@ def _main(arguments: Sequence[str] | None) -> int:
                 with contextlib.redirect_stdout(output), guard:
                     code = int(options.run(options))
             finally:
-                warn([printable(str(warning.message)) for warning in caught])
+                warn(dict.fromkeys(printable(str(warning.message)) for warning in caught))
         sys.stdout.flush()
     except AbductionError as error:
         return _failed(options, str(error), output)

@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -132,7 +132,7 @@ def _second_opinion(search: Search, solution: Solution) -> list[str]:
     return _second_opinions[search]
 
 
-def warn(warnings: Sequence[str]) -> None:
+def warn(warnings: Iterable[str]) -> None:
     """Print warnings on stderr."""
     for warning in warnings:
         print(f"ssh-abduction: warning: {warning}", file=sys.stderr)

@@ -259,6 +259,7 @@ def together(traces: Iterable[Trace], names: Iterable[str] | None = None) -> Tra
     _warn_of_repeats(parts)
     _warn_of_other_names(parts)
     _warn_of_other_units(parts)
+    _warn_of_other_views(parts)
     steps: list[Step] = []
     begins = accumulate([0, *map(len, parts[:-1])])
     closures = [
@@ -377,6 +378,21 @@ def _warn_of_other_units(traces: Sequence[Trace]) -> None:
             "give both in metres",
             stacklevel=3,
         )
+
+
+def _warn_of_other_views(traces: Sequence[Trace]) -> None:
+    """Warn if no view of a trace is seen in another one: no dstate of it can be one of theirs."""
+    seen = [set(trace.views) for trace in traces]
+    if any(None in views for views in seen):  # an unknown view may be any view
+        return
+    for i, views in enumerate(seen):
+        if len(seen) > 1 and views.isdisjoint(set().union(*seen[:i], *seen[i + 1 :])):
+            warnings.warn(
+                f"views: trace {i + 1}{_names_of(traces, i)} has no view in common with another "
+                "trace, so nothing seen says where it belongs; leave it out, or give one name to "
+                "views that are one",
+                stacklevel=3,
+            )
 
 
 def _travels(trace: Trace) -> list[float]:

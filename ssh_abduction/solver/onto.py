@@ -37,6 +37,7 @@ from ssh_abduction.solver.obeying import obeyed, with_names
 from ssh_abduction.solver.recorded import Support
 from ssh_abduction.solver.result import Solution
 from ssh_abduction.solver.values import Level, Status
+from ssh_abduction.solver.weighed import Weighed
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory, checked_theory
@@ -146,7 +147,12 @@ def solve_onto(
         levels=(Level(found.cost, len(kept), found.complete),) if found.within else (),
         shared=None,
         trace=joint,
-        support=Support(onto=tuple(drive.name for drive in drives_of(old))),
+        support=Support(
+            odometry_warning=found.support.odometry_warning,
+            weigh_warning=found.support.weigh_warning,
+            weighed=None if short else _weighed(found, len(old), ssh_map),
+            onto=tuple(drive.name for drive in drives_of(old)),
+        ),
     )
     return solution if corrections is None else with_names(corrections, solution, joint)
 
@@ -316,6 +322,26 @@ def _of_all(found: SSHMap, digest: Digest, ssh_map: SSHMap, joint: Trace) -> SSH
     labels = (*(number[s] for s in ssh_map.dstate_at), *new)
     whole = replace(found, dstate_at=labels, starts=starts_of(joint), names=())
     return whole.renumbered()
+
+
+def _weighed(found: Solution, old: int, ssh_map: SSHMap) -> Weighed | None:
+    """Return the costs of the maps found, with the rivals that keep the existing map.
+
+    Args:
+        found: The solution of all drives. Each step of the old drives is a step of its trace.
+        old: The number of these steps.
+        ssh_map: The existing map.
+    """
+    if found.weighed is None:
+        return None
+    dstates = ssh_map.dstate_at
+    places = tuple(ssh_map.dstates[s].place for s in dstates)
+    rivals = tuple(
+        rival
+        for rival in found.weighed.rivals
+        if rival.dstates[:old] == dstates and rival.places[:old] in ((), places)
+    )
+    return replace(found.weighed, rivals=rivals) if rivals else None
 
 
 def _settled(found: Theory, theory: Theory) -> Theory:
