@@ -233,7 +233,7 @@ def test_several_traces_share_views_and_a_map(run: Trace) -> None:
     # Without images, only labels on which all four maps agree are learnt from.
     with pytest.warns(AmbiguousMapWarning, match="4 minimal maps remain, and agree on 13 of"):
         labels_of(learner.solution_.maps)
-    with pytest.warns(UserWarning, match="trace 1 has no view in common with another trace"):
+    with pytest.warns(UserWarning, match="trace 2 has no view in common with another trace"):
         apart = together([Trace.from_steps("ab", ["travel"]), Trace.from_steps("xy", ["travel"])])
     with pytest.warns(AmbiguousMapWarning, match="the map is in 2 pieces that share no place: "):
         warn_of_pieces(apart, solve(apart, Theory.causal()).maps[0])

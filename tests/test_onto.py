@@ -44,7 +44,7 @@ def keeps(ssh_map: SSHMap) -> Callable[[Key], bool]:
 
 @pytest.mark.filterwarnings("ignore:traces 1 and 2 have the same steps")
 @pytest.mark.filterwarnings("ignore:action. traces 1 and 2 .*have different names")
-@pytest.mark.filterwarnings("ignore:views. trace 1")
+@pytest.mark.filterwarnings("ignore:views. trace")
 @settings(max_examples=6)
 @given(st.data())
 def test_the_maps_are_the_least_of_those_that_keep_the_standing_map(data: st.DataObject) -> None:

@@ -383,16 +383,16 @@ def _warn_of_other_units(traces: Sequence[Trace]) -> None:
 def _warn_of_other_views(traces: Sequence[Trace]) -> None:
     """Warn if no view of a trace is seen in another one: no dstate of it can be one of theirs."""
     seen = [set(trace.views) for trace in traces]
-    if any(None in views for views in seen):  # an unknown view may be any view
+    if len(seen) < 2 or any(None in views for views in seen):  # unknown: it may be any view
         return
-    for i, views in enumerate(seen):
-        if len(seen) > 1 and views.isdisjoint(set().union(*seen[:i], *seen[i + 1 :])):
-            warnings.warn(
-                f"views: trace {i + 1}{_names_of(traces, i)} has no view in common with another "
-                "trace, so nothing seen says where it belongs; leave it out, or give one name to "
-                "views that are one",
-                stacklevel=3,
-            )
+    alone = [i for i, v in enumerate(seen) if v.isdisjoint(set().union(*seen[:i], *seen[i + 1 :]))]
+    for i in alone[-1:] if len(seen) == 2 else alone:  # of two traces, one is enough
+        warnings.warn(
+            f"views: trace {i + 1}{_names_of(traces, i)} has no view in common with another "
+            "trace, so nothing seen says where it belongs; leave it out, or give one name to "
+            "views that are one",
+            stacklevel=3,
+        )
 
 
 def _travels(trace: Trace) -> list[float]:
