@@ -44,13 +44,15 @@ class Facilities:
     Attributes:
         points: x and y in metres, or x, y and a heading in radians, (n, 2) or (n, 3).
         variances: The variance of each coordinate of each point, (n, 2) or (n, 3).
-        kinds: Only points of one kind share a facility, (n,).
+        kinds: Each point, and each facility, is of one kind, (n,).
+        fees: What each point pays more at a facility of another kind; inf if it cannot, (n,).
         price: The price of a facility.
     """
 
     points: Array
     variances: Array
     kinds: NDArray[np.int_]
+    fees: Array
     price: float
 
     def shares(self, most: Array, *, checked: bool = True) -> Array:
@@ -102,8 +104,10 @@ class Facilities:
         """Return points to search from: all points, and the middles of near points of one kind."""
         off = self.offsets(self.points)
         both = self.variances[None] + self.variances[:, None]
-        is_near = (off**2 / both).sum(-1) / 2 < 2 * self.price
-        first, second = np.nonzero(np.triu(is_near, 1) & (self.kinds[:, None] == self.kinds))
+        more = self._more(self.kinds)
+        is_near = (off**2 / both).sum(-1) / 2 + more < 2 * self.price
+        is_other = self.kinds[:, None] != self.kinds
+        first, second = np.nonzero(np.triu(is_near, 1) | (is_near & is_other))
         middles = self.points[first] + off[first, second] / 2
         starts = np.concatenate([self.points, middles])
         kinds = np.concatenate([self.kinds, self.kinds[first]])
@@ -143,8 +147,12 @@ class Facilities:
             The offsets of all points, (m, n, d), which points these are, and what all pay, (m, n).
         """
         off = self.offsets(centres)
-        pays = np.einsum("mnd,nd->mn", off**2, 0.5 / self.variances)
-        return off, (pays < shares - TINY) & (kinds[:, None] == self.kinds), pays
+        pays = np.einsum("mnd,nd->mn", off**2, 0.5 / self.variances) + self._more(kinds)
+        return off, pays < shares - TINY, pays
+
+    def _more(self, kinds: NDArray[np.int_]) -> Array:
+        """Return what each point pays more at m facilities because of their kinds, (m, n)."""
+        return np.where(kinds[:, None] == self.kinds, 0.0, self.fees)
 
     def _most_saved(self, shares: Array) -> tuple[float, Array, NDArray[np.int_]]:
         """Bound what the points save at any facility, by dividing space into boxes.
@@ -155,9 +163,10 @@ class Facilities:
         """
         most, found, kinds = self.price, [np.zeros((0, self.points.shape[1]))], []
         for kind in np.unique(self.kinds):
-            chosen = np.flatnonzero((self.kinds == kind) & (shares > TINY))
+            left = shares - np.where(self.kinds == kind, 0.0, self.fees)
+            chosen = np.flatnonzero(left > TINY)
             if len(chosen):
-                boxes = _Boxes(self, chosen, shares)
+                boxes = _Boxes(self, chosen, left)
                 most = max(most, boxes.most_saved())
                 found.append(boxes.found)
                 kinds += [kind] * len(boxes.found)
@@ -211,8 +220,8 @@ class _Boxes:
 
     def __init__(self, facilities: Facilities, chosen: NDArray[np.int_], shares: Array) -> None:
         points, variances = facilities.points[chosen], facilities.variances[chosen]
-        kinds = np.zeros(len(chosen), dtype=int)
-        self._all = Facilities(points, variances, kinds, facilities.price)
+        kinds, fees = np.zeros(len(chosen), dtype=int), np.zeros(len(chosen))
+        self._all = Facilities(points, variances, kinds, fees, facilities.price)
         self._shares = shares[chosen]
         self._saved = facilities.price  # the most that is known to be saved
         self.found = np.zeros((0, points.shape[1]))

@@ -16,8 +16,14 @@ points are too far apart to share a facility. A point that z brings to far ones 
 share. All these losses are at most quadratic forms of z. The numbers c are so small that the sum of
 the forms is at most |z|^2 / 2. So bending costs more than it saves.
 
+*Pieces.* Displacements and closures tie some steps to each other. Steps that they do not tie, as
+those of two drives, may have any relative pose. A facility that serves several such pieces saves in
+each piece at most what the best facility of this piece saves. So for each kind of points only those
+of one piece get shares.
+
 The poses are linearised at the best track without returns. All other axioms can only raise the
-cost. One of them is used: steps with different views are different dstates.
+cost. One of them is used: steps with different views are different dstates. If a view may be wrong,
+the step pays for this at a dstate with another view.
 """
 
 from __future__ import annotations
@@ -29,11 +35,13 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
-from ssh_abduction.data.drives import drives_of
 from ssh_abduction.data.odometry import Odometry
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
-from ssh_abduction.solver.equations import spreads_of
+from ssh_abduction.solver.equations import Equations, spreads_of
 from ssh_abduction.solver.facilities import Array, Facilities
 from ssh_abduction.solver.fit import Poses
 from ssh_abduction.theory.settle import Problem
@@ -57,10 +65,8 @@ LOOSE, LOOSER, LARGEST = 0.25, 3.0, 40
 
 def is_for(problem: Problem) -> bool:
     """Say whether the bound holds for a trace and its theory, and is more than nothing."""
-    trace, theory = problem.trace, problem.theory
-    is_known = all(step.displacement is not None for step in trace.steps[1:])
-    one = len(drives_of(trace)) == 1 and is_known and len(trace) > 2
-    return one and bool(spreads_of(trace).any()) and not theory.has_faults
+    trace = problem.trace
+    return len(trace) > 2 and bool(spreads_of(trace).any()) and not problem.theory.jumped
 
 
 def least_cost(problem: Problem, visit: Sequence[int], most: float) -> float:
@@ -75,10 +81,9 @@ def least_cost(problem: Problem, visit: Sequence[int], most: float) -> float:
         The bound in nats, a little less than `most` at most; 0 if there is none.
     """
     track, within = _LinearTrack.of(problem), math.sqrt(2 * most)
-    parts = _parts(problem, track, np.array(visit))
-    firsts = [part.first_shares() for part in parts]
+    parts = [part.of_best_pieces() for part in _parts(problem, track, np.array(visit))]
     for gap in GAPS:
-        losses = [_Losses.of(*both, gap, within) for both in zip(parts, firsts, strict=True)]
+        losses = [_Losses.of(*part, gap, within) for part in parts]
         left = 1.0 - _largest(sum(found.far.sum(0) for found in losses))
         if left >= LEFT:
             break
@@ -95,6 +100,7 @@ class _LinearTrack:
 
     Attributes:
         nats: What its misfit to the displacements and closures costs.
+        piece: The piece of each step: displacements and closures tie the steps of a piece, (n,).
         poses: x, y and heading of each step, in metres and radians, (n, 3).
         moves: How far each of the most important errors of the track moves each pose, (n, 3, k).
         scatter: The variances of the pose of each step about its dstate, with all other errors of
@@ -102,63 +108,83 @@ class _LinearTrack:
     """
 
     nats: float
+    piece: NDArray[np.int_]
     poses: Array
     moves: Array
     scatter: Array
 
     @classmethod
     def of(cls, problem: Problem) -> _LinearTrack:
-        """Fit the track of a trace with one drive."""
+        """Fit the track of a trace."""
         trace, n = problem.trace, len(problem.trace)
         odometry = replace(trace.odometry or Odometry(), offset=0.0, facing=0.0)
         at_steps = Poses(replace(trace, odometry=odometry), range(n), range(n))
-        squares, unknown, covariance = at_steps.settled(None, (0, 1, 2 * n), range(3 * n))
-        poses = np.stack([unknown[: 2 * n : 2], unknown[1 : 2 * n : 2], unknown[2 * n : 3 * n]], 1)
-        turned = _without_rigid_motions(poses)
+        steps, piece = np.arange(n), _pieces(trace)
+        columns = np.column_stack([2 * steps, 2 * steps + 1, 2 * n + steps])
+        fixed = columns[np.unique(piece, return_index=True)[1]].ravel().tolist()
+        squares, unknown, covariance = at_steps.settled(None, fixed, range(3 * n))
+        poses, order = unknown[columns], columns.ravel()
+        turned = _without_rigid_motions(poses, piece)
         scatter = spreads_of(trace)
-        steps = np.arange(n)
-        order = np.column_stack([2 * steps, 2 * steps + 1, 2 * n + steps]).ravel()
         deviation = np.sqrt(scatter).ravel()
         relative = (turned @ covariance @ turned.T)[np.ix_(order, order)]
         values, vectors = np.linalg.eigh(relative / np.outer(deviation, deviation))
         values, vectors = values[::-1].clip(0.0), vectors[:, ::-1]
         moves = vectors[:, :MODES] * np.sqrt(values[:MODES]) * deviation[:, None]
         others = float(values[MODES]) if len(values) > MODES else 0.0
-        return cls(squares / 2, poses, moves.reshape(n, 3, -1), scatter * (1 + others))
+        return cls(squares / 2, piece, poses, moves.reshape(n, 3, -1), scatter * (1 + others))
 
 
-def _without_rigid_motions(poses: Array) -> Array:
-    """Return the matrix that removes translations and rotations of all poses from their errors."""
-    n, middle = len(poses), poses.mean(0)
-    motions = np.zeros((3 * n, 3))
-    motions[: 2 * n : 2, 0] = motions[1 : 2 * n : 2, 1] = motions[2 * n :, 2] = 1
-    motions[: 2 * n : 2, 2] = middle[1] - poses[:, 1]
-    motions[1 : 2 * n : 2, 2] = poses[:, 0] - middle[0]
-    fitted = np.zeros((3, 3 * n))
-    fitted[:, : 2 * n] = np.linalg.pinv(motions[: 2 * n])
-    matrix: Array = np.identity(3 * n) - motions @ fitted
+def _pieces(trace: Trace) -> NDArray[np.int_]:
+    """Return the piece of each step: displacements and closures tie the steps of a piece, (n,)."""
+    said, n = Equations.of(trace), len(trace)
+    ties = coo_array((np.ones(len(said.first)), (said.first, said.last)), shape=(n, n))
+    piece: NDArray[np.int_] = connected_components(ties, directed=False)[1]
+    return piece
+
+
+def _without_rigid_motions(poses: Array, piece: NDArray[np.int_]) -> Array:
+    """Return the matrix that removes translations and rotations of all pieces from errors."""
+    n = len(poses)
+    matrix = np.identity(3 * n)
+    for number in np.unique(piece):
+        is_in = piece == number
+        middle = poses[is_in].mean(0)
+        motions = np.zeros((3 * n, 3))
+        motions[: 2 * n : 2, 0] = motions[1 : 2 * n : 2, 1] = motions[2 * n :, 2] = is_in
+        motions[: 2 * n : 2, 2] = is_in * (middle[1] - poses[:, 1])
+        motions[1 : 2 * n : 2, 2] = is_in * (poses[:, 0] - middle[0])
+        matrix[:, : 2 * n] -= motions @ np.linalg.pinv(motions[: 2 * n])
     return matrix
 
 
 def _parts(problem: Problem, track: _LinearTrack, visit: NDArray[np.int_]) -> list[_Part]:
     """Return the problems of dstates and of places."""
-    theory = problem.theory
+    theory, steps = problem.theory, problem.trace.steps
     dstate, place, _ = theory.prices
     has_places = theory.level != "causal" and place > 0
-    views = [step.view for step in problem.trace]
-    tell = "functional_view" in theory.hard and None not in views
-    number = {view: i for i, view in enumerate(dict.fromkeys(views))}
-    kinds = np.array([number[view] if tell else 0 for view in views])
+    number = {view: i for i, view in enumerate(dict.fromkeys(step.view for step in steps))}
+    kinds, fees = np.zeros(len(steps), dtype=int), np.full(len(steps), math.inf)
+    if "functional_view" in theory.axioms:
+        kinds = np.array([number[step.view] for step in steps])
+        tenths = [theory.fault_tenths("misread", step) if theory.misread else 0 for step in steps]
+        fees = np.array([dstate * price / 10 or math.inf for price in tenths])
+        fees[[step.view is None for step in steps]] = 0.0
     weights = np.array([1 - PLACES * has_places] * 2 + [1.0])
-    parts = [_Part(track.poses, track.scatter / weights, kinds, dstate, track.moves)]
+    scatter = track.scatter / weights
+    parts = [_Part(track.poses, scatter, kinds, fees, dstate, track.piece, track.moves)]
     if has_places:
-        first, at, steps = np.unique(visit, return_inverse=True, return_counts=True)
+        together = np.column_stack([visit, track.piece])
+        _, first, at, count = np.unique(
+            together, axis=0, return_index=True, return_inverse=True, return_counts=True
+        )
         mean = np.zeros((len(first), len(at)))
-        mean[at, np.arange(len(at))] = 1 / steps[at]
+        mean[at, np.arange(len(at))] = 1 / count[at]
         moves = np.einsum("vt,tak->vak", mean, track.moves[:, :2])
-        scatter = track.scatter[first, :2] / steps[:, None] / PLACES
-        alike = np.zeros(len(first), dtype=int)
-        parts.append(_Part(mean @ track.poses[:, :2], scatter, alike, place, moves))
+        scatter = track.scatter[first, :2] / count[:, None] / PLACES
+        points, alike = mean @ track.poses[:, :2], np.zeros(len(first), dtype=int)
+        free = np.zeros(len(first))
+        parts.append(_Part(points, scatter, alike, free, place, track.piece[first], moves))
     return parts
 
 
@@ -167,9 +193,11 @@ class _Part(Facilities):
     """Points that share facilities, and how errors of the track move them.
 
     Attributes:
+        piece: The piece of the track of each point, (n,).
         moves: How far each error of the track moves each point, (n, d, k).
     """
 
+    piece: NDArray[np.int_]
     moves: Array
 
     def only(self, chosen: NDArray[np.bool_]) -> _Part:
@@ -179,8 +207,26 @@ class _Part(Facilities):
             points=self.points[chosen],
             variances=self.variances[chosen],
             kinds=self.kinds[chosen],
+            fees=self.fees[chosen],
+            piece=self.piece[chosen],
             moves=self.moves[chosen],
         )
+
+    def of_best_pieces(self) -> tuple[_Part, Array]:
+        """Return the points of one piece for each kind, and their approximate shares.
+
+        It is the piece with the greatest shares. If points pay fees, it is one piece for all kinds.
+        """
+        shares = np.zeros(len(self.points))
+        for piece in np.unique(self.piece):
+            inside = self.piece == piece
+            shares[inside] = self.only(inside).first_shares()
+        group = np.where(np.isfinite(self.fees).any(), 0, self.kinds)
+        kept = np.zeros(len(shares), dtype=bool)
+        for kind in np.unique(group):
+            sums = np.bincount(self.piece, shares * (group == kind))
+            kept |= (group == kind) & (self.piece == sums.argmax())
+        return self.only(kept), shares[kept]
 
     def stretched(self, factors: Array) -> _Part:
         """Multiply the variances of each point."""
@@ -232,13 +278,15 @@ class _Losses:
         unit = np.sqrt(part.variances.max(0))
         reach = np.sqrt(2 * most)
         away = np.linalg.norm(part.offsets(part.points) / unit, axis=-1) - reach - reach[:, None]
+        may_pay = part.fees < most
+        may_share = (part.kinds[:, None] == part.kinds) | may_pay | may_pay[:, None]
         near, far = [], []
         for i, apart in enumerate(away):
             look_at_clock()
             moved = part.moves[i] - part.moves
-            is_near = (part.kinds == part.kinds[i]) & (apart < gap)
+            is_near = may_share[i] & (apart < gap)
             near.append(_dominating(moved[is_near] / np.sqrt(2 * part.variances[i])[:, None]))
-            is_far = (part.kinds == part.kinds[i]) & (apart >= gap)
+            is_far = may_share[i] & (apart >= gap)
             gaps, moved = apart[is_far], moved[is_far] / unit[:, None]
             is_cheap = gaps < within * np.linalg.norm(moved, 2, axis=(1, 2))
             factors = np.sqrt(2 * most[i]) / gaps[is_cheap]

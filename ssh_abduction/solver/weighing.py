@@ -148,8 +148,6 @@ class Weighing:
             LimitError: A limit is over. What was found so far is kept.
         """
         parts, self._of_labels = self._parts, of_labels
-        if parts.task.theory.has_faults and len(parts.task.trace) > READABLE:
-            raise LimitError("no proof")
         parts.known.status = Status.UNKNOWN  # what was proven is about counts
         self._improved = parts.watch.elapsed()
         parts.watch.use_reserve()
@@ -161,6 +159,8 @@ class Weighing:
         if self.candidates and is_for(parts.task.problem):
             most = self.candidates[0].nats
             self.bound = least_cost(parts.task.problem, self._misfit.visit, most)
+        if parts.task.theory.has_faults and len(parts.task.trace) > READABLE:
+            raise LimitError("no proof")
         task = replace(parts.task, speedups=replace(parts.task.speedups, prefixes=False))
         judging, engine = _CostJudging(task.problem, self), _engine(task, parts)
         engine.grow(len(task.trace))
