@@ -162,7 +162,7 @@ def test_a_long_trace_with_faults_gets_a_bound() -> None:
     solution = solve(trace, Theory(misread=2.0, boundary="none", star="none"), time_limit=5)
     assert len(trace) > READABLE
     assert solution.weighed is not None
-    assert 0.4 * solution.weighed.nats <= solution.weighed.bound < solution.weighed.nats
+    assert 0.4 * solution.weighed.nats <= solution.weighed.bound <= solution.weighed.nats
 
 
 def test_traces_and_theories_that_the_bound_is_not_for() -> None:
