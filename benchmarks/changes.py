@@ -35,7 +35,7 @@ from instances import HEADINGS, doors_of, maze
 from together import joined
 from truth import NOISE, Known, is_true, with_truth
 
-from simulator.motion import between, reported
+from simulator.motion import displacement_between, reported
 from simulator.plan_tours import Floor, Stand
 from simulator.plans import Plan
 from ssh_abduction import SSHMap, Theory, Trace, solve
@@ -161,7 +161,7 @@ def _plan_drive(plan: Plan, steps: int, seed: tuple[int, int], closed: Collectio
             *plan.rooms[stand.room].centre,
             math.remainder(math.radians(90 - heading), math.tau),
         )
-        moved = None if before is None else between(before, pose)
+        moved = None if before is None else displacement_between(before, pose)
         if moved is not None:
             moved = reported(moved, noise, drawn)
         truth = {

@@ -29,7 +29,7 @@ from perception.places.importing import Imported, import_log
 from perception.places.track import Track
 from perception.readers.logs import read_log
 from ssh_abduction import SSHMap, Trace
-from ssh_abduction.data.odometry import Odometry, Pose, between
+from ssh_abduction.data.odometry import Odometry, Pose, displacement_between
 from ssh_abduction.robot_logs.log_maps import BARE
 from ssh_abduction.solver.guesses.beam import Beam
 from ssh_abduction.solver.steps.log import Log
@@ -76,7 +76,8 @@ def innovations(track: Track, poses: list[Pose], length: float, sigma: float) ->
     while (end := int(np.searchsorted(way, way[begin] + length))) < len(poses):
         x, y, heading = track.poses[begin]
         off = np.subtract(
-            between((x, y, heading), tuple(track.poses[end])), between(poses[begin], poses[end])
+            displacement_between((x, y, heading), tuple(track.poses[end])),
+            displacement_between(poses[begin], poses[end]),
         )
         off[2] = math.remainder(off[2], math.tau)
         cos, sin = math.cos(heading), math.sin(heading)

@@ -23,7 +23,7 @@ from pathlib import Path
 from truth import NOISE, Known, is_true, with_truth, worlds
 
 from simulator.errors import SimulatorWarning
-from simulator.motion import between
+from simulator.motion import displacement_between
 from simulator.robot import Body
 from simulator.tours import simulate
 from simulator.world import TrueDState, World
@@ -85,7 +85,7 @@ def quarter(state: TrueDState) -> int:
 def ahead(tower: World, state: TrueDState) -> TrueDState | None:
     """The next dstate straight ahead on the path of a dstate; None at its end."""
     course = [s for s in tower.dstates if (s.path, s.direction) == (state.path, state.direction)]
-    far = {s: between(state.pose, s.pose)[0] for s in course}
+    far = {s: displacement_between(state.pose, s.pose)[0] for s in course}
     return min((s for s in course if far[s] > 1), key=far.__getitem__, default=None)
 
 

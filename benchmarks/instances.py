@@ -15,7 +15,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from simulator.motion import Pose, between, reported
+from simulator.motion import Pose, displacement_between, reported
 from ssh_abduction import Trace
 from ssh_abduction.data import Odometry
 
@@ -54,7 +54,8 @@ def displaced(
     """
     rng = np.random.default_rng(seed)
     moved = [
-        reported(between(a, b), odometry, rng, scale=scale, bend=bend) for a, b in pairwise(poses)
+        reported(displacement_between(a, b), odometry, rng, scale=scale, bend=bend)
+        for a, b in pairwise(poses)
     ]
     apart = {t for t, action in enumerate(trace.actions, 1) if action.breaks_frame}
     steps = (

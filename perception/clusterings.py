@@ -76,7 +76,7 @@ class Predictor:
 
 def single(fitted: Any, images: NDArray[np.float64], trim: float) -> tuple[Any, Tried]:
     """Return a fitted clusterer, and a `Tried` that holds its clustering alone."""
-    labels = labels_of(fitted, images)
+    labels = cluster_labels(fitted, images)
     inside = labels != NOISE
     k = len(set(labels[inside].tolist()))
     measures = (
@@ -99,7 +99,7 @@ def smallest_good(worth: dict[int, float]) -> int:
     return min(k for k in worth if not worth[k] < EQUAL * max(worth.values()))
 
 
-def labels_of(fitted: Any, images: NDArray[np.float64]) -> NDArray[np.intp]:
+def cluster_labels(fitted: Any, images: NDArray[np.float64]) -> NDArray[np.intp]:
     """The cluster of each fitted image, (n,). Mixtures have no labels_ and predict instead."""
     return np.asarray(
         fitted.labels_ if hasattr(fitted, "labels_") else fitted.predict(images), np.intp

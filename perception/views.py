@@ -26,7 +26,14 @@ from sklearn.neighbors import KNeighborsClassifier
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from perception.clusterings import Predictor, Tried, labels_of, single, smallest_good, to_neighbour
+from perception.clusterings import (
+    Predictor,
+    Tried,
+    cluster_labels,
+    single,
+    smallest_good,
+    to_neighbour,
+)
 from perception.confidence import NOISE, confidence
 from perception.errors import ImageWarning, PerceptionError, equal_length
 from perception.quality import cluster_quality, sample_indices, spanning_tree, trimmed_quality
@@ -247,7 +254,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         found = Tried(0, {}, {}, {})
         for k in range(self.k_min, most + 1):
             tried = self._cluster(images, k, seed)
-            labels = labels_of(tried, images)
+            labels = cluster_labels(tried, images)
             if fitted and len(set(labels.tolist())) < k:
                 continue  # A mixture left some of its components empty.
             fitted[k], found.labels[k] = tried, labels

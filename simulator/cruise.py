@@ -33,7 +33,7 @@ WATCH, KNOWN = 3.0, 0.25
 PATIENCE = 100
 
 
-def follow(driver: Driver, space: FreeSpace, way: Array) -> Iterator[int]:
+def drive_along(driver: Driver, space: FreeSpace, way: Array) -> Iterator[int]:
     """Drive along a route.
 
     Args:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from simulator.errors import SimulatorError
 from simulator.laser import Laser
-from simulator.motion import Pose, between, moved
+from simulator.motion import Pose, displacement_between, moved
 from simulator.odometer import Odometer
 from simulator.world import World
 from ssh_abduction.data.errors import brief, is_finite
@@ -138,7 +138,7 @@ class Recorder:
             self._add(world, pose, 0.0, 0.0)
             return
         start = self.poses[-1]
-        dx, dy, turned = between(start, pose)
+        dx, dy, turned = displacement_between(start, pose)
         way = math.hypot(dx, dy)
         parts = max(math.ceil(FINE * max(way / self.every, abs(turned) / self.turn)), 1)
         for part in range(1, parts):

@@ -13,9 +13,9 @@ import math
 
 import numpy as np
 
-from ssh_abduction.data.odometry import Displacement, Odometry, Pose, between, moved
+from ssh_abduction.data.odometry import Displacement, Odometry, Pose, displacement_between, moved
 
-__all__ = ["DIGITS", "Pose", "between", "moved", "reported"]
+__all__ = ["DIGITS", "Pose", "displacement_between", "moved", "reported"]
 
 # Reported numbers are rounded to this many decimals, as in a log.
 DIGITS = 5

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from simulator.errors import SimulatorError
-from simulator.motion import Pose, between, reported
+from simulator.motion import Pose, displacement_between, reported
 from simulator.plans import APART, Plan
 from ssh_abduction.data.checks import a_number, a_whole_number, an_instance
 from ssh_abduction.data.odometry import Odometry
@@ -105,7 +105,7 @@ def tour(
     before: Pose | None = None
     for stand, action in _drive(plan, steps, walk):
         pose = _pose(plan, stand)
-        moved = None if before is None else between(before, pose)
+        moved = None if before is None else displacement_between(before, pose)
         if moved is not None and odometry is not None:
             moved = reported(moved, odometry, drawn, scale=scale, bend=bend)
         bearings = _bearings(plan, stand)

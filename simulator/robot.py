@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulator.errors import SimulatorError
-from simulator.motion import Pose, between
+from simulator.motion import Pose, displacement_between
 from ssh_abduction.data.errors import brief, is_finite
 from ssh_abduction.data.odometry import Displacement
 
@@ -120,7 +120,9 @@ class SimulatedRobot:
         """Return the motion by odometry since the last call, or since the start."""
         cos, sin = math.cos(self._reported[2]), math.sin(self._reported[2])
         into = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
-        said = Report(between(self._reported, self.odometry), into @ self._covariance @ into.T)
+        said = Report(
+            displacement_between(self._reported, self.odometry), into @ self._covariance @ into.T
+        )
         self._reported, self._covariance = self.odometry, np.zeros((3, 3))
         return said
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from simulator.buildings import Building
 from simulator.control import Driver
-from simulator.cruise import follow
+from simulator.cruise import drive_along
 from simulator.drive import EVERY, RecordedDrive, Recorder
 from simulator.errors import SimulatorError
 from simulator.freespace import CELL, FreeRectangle, FreeSpace
@@ -304,7 +304,7 @@ def record_plan(
     # to the next.
     come = [0]
     for number in range(tours):
-        for at in follow(driver, rooms.space, tour.way):
+        for at in drive_along(driver, rooms.space, tour.way):
             come += [number * len(tour.way) + at] * (recorder.taken - len(come))
     drive = recorder.drive(
         f"{plan.name}, {counted(tours, 'tours')}, seed {seed}", laser, odometer or Odometer(), seed

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulator.control import STILL, Corridors, Driver, Tolerance
-from simulator.cruise import follow
+from simulator.cruise import drive_along
 from simulator.drive import EVERY, RecordedDrive, Recorder
 from simulator.errors import SimulatorError
 from simulator.freespace import FreeSpace
@@ -196,7 +196,7 @@ def _stops(driver: Driver, world: World, tours: int) -> Iterator[tuple[int, str]
                     f"got none; {mend}"
                 )
             try:
-                deque(follow(driver, space, way), maxlen=0)
+                deque(drive_along(driver, space, way), maxlen=0)
             except SimulatorError as error:
                 raise SimulatorError(
                     f"{error} (on the way to {stop}, on tour {tour + 1})"

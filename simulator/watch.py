@@ -18,7 +18,7 @@ import numpy as np
 from simulator.control import TURNS, Driver
 from simulator.errors import SimulatorError, SimulatorWarning
 from simulator.laser import meetings
-from simulator.motion import Pose, between
+from simulator.motion import Pose, displacement_between
 from simulator.world import World
 from simulator.world_files import ACTIONS, are_square
 
@@ -142,7 +142,7 @@ class DriveWatch:
         # The next place straight ahead on the same path.
         ahead = []
         for state in self.world.dstates:
-            x, y, _ = between(here.pose, state.pose)
+            x, y, _ = displacement_between(here.pose, state.pose)
             if (
                 (state.path, state.direction) == (here.path, here.direction)
                 and x > NEAR

@@ -11,7 +11,7 @@ from brute_force import Key
 from hypothesis import strategies as st
 
 from ssh_abduction.data.closure import Closure
-from ssh_abduction.data.odometry import Covariance, Odometry, between
+from ssh_abduction.data.odometry import Covariance, Odometry, displacement_between
 from ssh_abduction.data.odometry import moved as moved_pose
 from ssh_abduction.data.trace import STANDARD_ACTIONS, Action, Trace
 from ssh_abduction.theory.encodings import axioms
@@ -158,7 +158,9 @@ def _closures(trace: Trace) -> st.SearchStrategy[list[Closure]]:
     )
 
     def closure(pair: tuple[int, int], off: tuple[float, ...], spread: Covariance) -> Closure:
-        x, y, turned = map(sum, zip(between(poses[pair[0]], poses[pair[1]]), off, strict=True))
+        x, y, turned = map(
+            sum, zip(displacement_between(poses[pair[0]], poses[pair[1]]), off, strict=True)
+        )
         return Closure(*pair, (x, y, turned), spread)
 
     found = st.builds(closure, pairs, wrong, noise)

@@ -232,8 +232,8 @@ def test_ctrl_c_while_the_end_is_printed_leaves_it_whole(
         signal.raise_signal(signal.SIGINT)
         return end(*args)
 
-    end = verb.ending
-    monkeypatch.setattr(verb, "ending", ending)
+    end = verb.answer_ending
+    monkeypatch.setattr(verb, "answer_ending", ending)
     assert main(["solve", room, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["complete"]
 

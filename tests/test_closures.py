@@ -20,7 +20,13 @@ from strategies import traces
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.misfit import misfit
 from ssh_abduction.data import Closure, TraceError, together
-from ssh_abduction.data.odometry import Covariance, Displacement, Odometry, between, moved
+from ssh_abduction.data.odometry import (
+    Covariance,
+    Displacement,
+    Odometry,
+    displacement_between,
+    moved,
+)
 from ssh_abduction.explain import explain_pair
 from ssh_abduction.solver.fit import Poses
 from ssh_abduction.solver.guesses.beam import Beam
@@ -173,7 +179,7 @@ def test_the_beam_counts_closures_as_a_map_does() -> None:
     noise: Covariance = ((0.04, 0.0, 0.0), (0.0, 0.04, 0.0), (0.0, 0.0, 0.01))
     closures = []
     for i, j in pairs[::10]:
-        x, y, turned = between(poses[i], poses[j])
+        x, y, turned = displacement_between(poses[i], poses[j])
         dx, dy = random.normal(0, 0.2, 2)
         closures.append(Closure(i, j, (x + dx, y + dy, turned), noise))
     assert len(closures) > 3

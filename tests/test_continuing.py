@@ -14,8 +14,8 @@ from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.solver.asp.facts import answer_maps
 from ssh_abduction.solver.guesses import continuing
-from ssh_abduction.solver.guesses.continuing import followed
-from ssh_abduction.solver.guesses.merging import thinned
+from ssh_abduction.solver.guesses.continuing import labels_continued
+from ssh_abduction.solver.guesses.merging import dstates_merged
 from ssh_abduction.solver.steps.chart import Chart, numbered
 from ssh_abduction.solver.steps.log import Log
 from tests.strategies import traces
@@ -38,7 +38,7 @@ def test_the_result_is_a_map(trace: Trace, data: st.DataObject) -> None:
         MANY=data.draw(st.integers(1, 10)),
         **settings,
     ):
-        labels = followed(Log(trace, CAUSAL), solve(beginning, CAUSAL).maps[0].labels)
+        labels = labels_continued(Log(trace, CAUSAL), solve(beginning, CAUSAL).maps[0].labels)
     if labels is not None:
         assert check(trace, answer_maps.causal_map(labels, trace), CAUSAL) == ()
 
@@ -49,18 +49,18 @@ def test_a_map_that_lacks_links_leads_to_a_map_of_all_steps(steps: int, kept: bo
     walk = maze(4, 4, steps=6000, seed=1)
     known, log = numbered(walk.truth[:steps]), Log(walk.trace, CAUSAL)
     assert len(log.replay(known).labels) < len(walk.trace)
-    labels = followed(log, known)
+    labels = labels_continued(log, known)
     assert labels is not None
     assert (labels[:steps] == known) == kept
     assert check(walk.trace, answer_maps.causal_map(labels, walk.trace), CAUSAL) == ()
-    thin = thinned(Chart.of_steps(log, len(walk.trace)), labels)
+    thin = dstates_merged(Chart.of_steps(log, len(walk.trace)), labels)
     assert check(walk.trace, answer_maps.causal_map(thin, walk.trace), CAUSAL) == ()
     assert len(set(thin)) <= len(set(walk.truth))
 
 
 def test_a_map_of_too_few_steps_is_given_up() -> None:
     walk = maze(4, 4, steps=6000, seed=1)
-    assert followed(Log(walk.trace, CAUSAL), numbered(walk.truth[:10])) is None
+    assert labels_continued(Log(walk.trace, CAUSAL), numbered(walk.truth[:10])) is None
 
 
 def test_a_map_with_all_links_is_only_replayed() -> None:
@@ -68,7 +68,7 @@ def test_a_map_with_all_links_is_only_replayed() -> None:
     walk = maze(3, 3, steps=2000, seed=0)
     log = Log(walk.trace, CAUSAL)
     with patch.object(continuing._Map, "_predicting", side_effect=AssertionError):
-        labels = followed(log, numbered(walk.truth[:1500]))
+        labels = labels_continued(log, numbered(walk.truth[:1500]))
     leads = {
         (here, action): there
         for (here, there), action in zip(pairwise(labels or ()), log.actions, strict=True)

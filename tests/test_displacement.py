@@ -25,7 +25,7 @@ from ssh_abduction.checker.geometry import _square_together
 from ssh_abduction.data import DState, Odometry, TheoryError
 from ssh_abduction.solver.asp.facts.answer_maps import causal_map
 from ssh_abduction.solver.fit import Poses, fit
-from ssh_abduction.solver.linear import as_dense, least_squares, solved
+from ssh_abduction.solver.linear import as_dense, least_squares, system_solved
 from ssh_abduction.solver.ranking import noise_warning, units_warning
 from ssh_abduction.theory.evidence import pairs_of
 from ssh_abduction.theory.evidence.displacement import Displacement
@@ -216,7 +216,7 @@ def test_dense_and_sparse_systems_have_one_solution() -> None:
     square, added = some.T @ some, np.full(5, 0.1)
     right = square @ np.arange(5.0) + 0.1 * np.arange(5.0)
     for matrix in (square, csr_array(square)):
-        assert solved(matrix, added, right) == pytest.approx(np.arange(5.0))
+        assert system_solved(matrix, added, right) == pytest.approx(np.arange(5.0))
 
 
 def test_fits_of_true_maps_are_as_likely_as_they_say() -> None:

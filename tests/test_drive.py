@@ -16,12 +16,12 @@ from test_plans import SCHOOLS, plan_of, xml
 from perception.readers.logs import read_log
 from simulator.buildings import Building
 from simulator.control import Driver
-from simulator.cruise import follow
+from simulator.cruise import drive_along
 from simulator.drive import Recorder
 from simulator.errors import SimulatorError, SimulatorWarning
 from simulator.freespace import FreeSpace
 from simulator.laser import Laser
-from simulator.motion import between
+from simulator.motion import displacement_between
 from simulator.odometer import Odometer
 from simulator.plans import Plan
 from simulator.robot import Body, SimulatedRobot
@@ -40,7 +40,7 @@ def ring(tmp_path: Path) -> Building:
 
 
 def steps_of(poses: np.ndarray) -> list[tuple[float, float, float]]:
-    return [between(tuple(a), tuple(b)) for a, b in pairwise(poses)]
+    return [displacement_between(tuple(a), tuple(b)) for a, b in pairwise(poses)]
 
 
 def test_an_odometer_errs_as_it_says() -> None:
@@ -447,7 +447,7 @@ def test_a_way_leads_around_what_was_not_known() -> None:
     )
     track = []
     come = []
-    for at in follow(driver, space, way):
+    for at in drive_along(driver, space, way):
         come.append(at)
         track.append(driver.robot.pose[:2])
     assert math.dist(track[-1], (11.0, 1.5)) < 0.3
@@ -476,7 +476,7 @@ def test_a_way_that_is_closed_is_an_error() -> None:
             r"none"
         ),
     ):
-        for _ in follow(driver, space, way):
+        for _ in drive_along(driver, space, way):
             pass
     part = space.part(np.array([(1.0, 1.5), (11.0, 1.5)]), space.drawn(np.array([[6.0, 0, 6, 3]])))
     assert part.way((1.0, 1.5), (11.0, 1.5)) is None

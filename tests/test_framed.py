@@ -20,7 +20,7 @@ from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.online.keeper import MapKeeper
 from ssh_abduction.solver import Search, Start, Status, choosing
 from ssh_abduction.solver.asp.facts import paths_lp, sides_lp, visits_lp
-from ssh_abduction.solver.asp.facts.atoms import numbers
+from ssh_abduction.solver.asp.facts.atoms import number_symbols
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.engines import base as engine
 from ssh_abduction.solver.engines import (
@@ -443,13 +443,13 @@ def test_sides_and_streets_say_the_same(theory: Theory) -> None:
             )
             control.add("visits", [], sides_lp.sides_framed_facts(theory))
             control.add("visits", [], "\n".join(f":- not same({i},{j},{r})." for i, j, r in pairs))
-            street = ("path", numbers(*chart.facing[labels.index(dstate)], 0))
+            street = ("path", number_symbols(*chart.facing[labels.index(dstate)], 0))
             control.ground(
                 [
                     ("visits", []),
-                    ("more", numbers(0)),
+                    ("more", number_symbols(0)),
                     ("sides", []),
-                    ("paths", numbers(0)),
+                    ("paths", number_symbols(0)),
                     street,
                 ]
             )

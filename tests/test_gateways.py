@@ -206,7 +206,7 @@ def test_rotations_are_those_of_a_plain_search(first: Frame, then: Frame, shift:
         assert not judge.rotations(first, then, shift)
         return
     shift %= max(first.slots, 1)
-    found = frames.members(frames.rotations(first, then, shift))
+    found = frames.members(frames.rotation_bits(first, then, shift))
     assert set(found) == judge.rotations(first, then, shift)
     may = frames.may_face(first, then, shift)
     assert ("alike" in may, "opposite" in may) == judge.ways(first, then, shift, frozenset(found))

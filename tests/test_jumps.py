@@ -19,7 +19,7 @@ from perception.places.jumps import Unknown, unknown_steps
 from perception.places.track import Track
 from perception.readers.scans import Pose, RobotLog, Scan
 from ssh_abduction.checker.checker import check
-from ssh_abduction.data.odometry import between, moved
+from ssh_abduction.data.odometry import displacement_between, moved
 from ssh_abduction.solver import solve
 
 START: Pose = (0.0, 0.0, 0.0)
@@ -41,7 +41,7 @@ def stepwise(scans: Sequence[Scan], step: Callable[[int, Pose], Pose | None]) ->
     """The scans with odometry that makes other steps: None where it starts anew."""
     poses = [scans[0].odometry]
     for i, (last, scan) in enumerate(pairwise(scans), 1):
-        told = step(i, between(last.odometry, scan.odometry))
+        told = step(i, displacement_between(last.odometry, scan.odometry))
         poses.append(START if told is None else moved(poses[-1], told))
     return by(scans, poses)
 

@@ -19,7 +19,7 @@ from simulator.control import Driver
 from simulator.errors import SimulatorError
 from simulator.junctions import Pilot
 from simulator.laser import BEARINGS, Laser
-from simulator.motion import between
+from simulator.motion import displacement_between
 from simulator.robot import Body, SimulatedRobot
 from simulator.surroundings import Panorama, Place, compass
 from simulator.tours import simulate
@@ -165,7 +165,7 @@ def test_the_robot_comes_to_every_dstate(
         step.truth["dstate"].partition(" ")[0] for step in trace.steps
     }
     for step in trace.steps:
-        x, y, heading = between(true[step.truth["dstate"]], step.truth["pose"])
+        x, y, heading = displacement_between(true[step.truth["dstate"]], step.truth["pose"])
         assert math.hypot(x, y) < 0.025
         assert abs(heading) < math.radians(1.5)
         here, facing = step.truth["place"], math.degrees(true[step.truth["dstate"]][2])
@@ -185,7 +185,8 @@ def test_displacements_are_as_good_as_their_covariances_say() -> None:
     for before, after in zip(trace.steps, trace.steps[1:], strict=False):
         assert after.displacement is not None
         error = np.subtract(
-            after.displacement, between(true[before.truth["dstate"]], true[after.truth["dstate"]])
+            after.displacement,
+            displacement_between(true[before.truth["dstate"]], true[after.truth["dstate"]]),
         )
         error[2] = math.remainder(error[2], math.tau)
         if before.action and before.action.kind == "travel":

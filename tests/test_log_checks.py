@@ -20,7 +20,7 @@ from simulator.tours import record
 from simulator.world import World
 from ssh_abduction.cli.mapping import MapQuestion
 from ssh_abduction.cli.simulate import scans_of
-from ssh_abduction.data.odometry import between, moved
+from ssh_abduction.data.odometry import displacement_between, moved
 
 Scans = Sequence[Scan]
 
@@ -60,7 +60,7 @@ def kidnapped(scans: Scans) -> Scans:
     first, last = scans[:100], scans[170:]
     poses = [first[-1].odometry]
     for one, other in pairwise(last):
-        poses.append(moved(poses[-1], between(one.odometry, other.odometry)))
+        poses.append(moved(poses[-1], displacement_between(one.odometry, other.odometry)))
     after = zip(last, poses, strict=True)
     return [
         replace(scan, time=None)

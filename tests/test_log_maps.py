@@ -33,7 +33,7 @@ from ssh_abduction.cli import main
 from ssh_abduction.cli.jobs import StopFlag, answers_here
 from ssh_abduction.cli.mapping import MapQuestion
 from ssh_abduction.cli.simulate import scans_of
-from ssh_abduction.data.odometry import between
+from ssh_abduction.data.odometry import displacement_between
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.evaluation import evaluate_visits
 from ssh_abduction.robot_logs import log_maps
@@ -82,7 +82,10 @@ def test_scans_mend_the_odometry(hall: Path) -> None:
     true = [scan.corrected for scan in log.scans]
 
     def off(poses: object, i: int, j: int) -> float:
-        went = between(between(true[i], true[j]), between(tuple(poses[i]), tuple(poses[j])))  # type: ignore[index, arg-type]
+        went = displacement_between(
+            displacement_between(true[i], true[j]),
+            displacement_between(tuple(poses[i]), tuple(poses[j])),
+        )  # type: ignore[index, arg-type]
         return math.hypot(*went[:2])
 
     last = len(log) - 1
@@ -157,7 +160,9 @@ def test_a_drive_becomes_a_trace_of_the_places_it_passed(runs: Path) -> None:
     # The trajectory agrees with the truth, within a few standard deviations of the displacement.
     for i, (before, after) in enumerate(zip(trace.steps[:-1], trace.steps[1:], strict=True)):
         error = np.array(
-            between(between(before.truth["pose"], after.truth["pose"]), after.displacement)
+            displacement_between(
+                displacement_between(before.truth["pose"], after.truth["pose"]), after.displacement
+            )
         )
         covariance = np.array(trace.covariance(i + 1))
         assert error @ np.linalg.solve(covariance, error) < 30

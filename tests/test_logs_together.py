@@ -26,7 +26,7 @@ from ssh_abduction.cli.run_folders import digest, distinct
 from ssh_abduction.cli.simulate import scans_of
 from ssh_abduction.data import Trace, drives_of, together
 from ssh_abduction.data.drives import starts_of
-from ssh_abduction.data.odometry import between, moved
+from ssh_abduction.data.odometry import displacement_between, moved
 from ssh_abduction.evaluation import evaluate_visits
 from ssh_abduction.robot_logs import log_report
 from ssh_abduction.robot_logs.log_maps import map_log
@@ -103,7 +103,7 @@ def test_closures_between_drives_are_right(
     assert len(found) >= 3
     for closure in found:
         true = [trace[t].truth["pose"] for t in (closure.first, closure.last)]
-        off = between(between(*true), closure.displacement)
+        off = displacement_between(displacement_between(*true), closure.displacement)
         assert math.hypot(*off[:2]) < 0.5
         assert abs(off[2]) < math.radians(5)
     # The rooms of the house look alike, so that two relations of its halves are possible.
@@ -217,7 +217,9 @@ def test_drives_are_laid_over_each_other(
     # The drives keep their shapes.
     for first, last in ((0, start - 1), (start, len(log) - 1)):
         np.testing.assert_allclose(
-            between(laid[first], laid[last]), between(track[first], track[last]), atol=1e-6
+            displacement_between(laid[first], laid[last]),
+            displacement_between(track[first], track[last]),
+            atol=1e-6,
         )
     beside = laid_over(track, imported, None)
     left, right = np.array(beside[:start]), np.array(beside[start:])

@@ -20,7 +20,7 @@ from perception.places.tracing import to_trace
 from perception.places.track import Track, Trust, points_turned
 from perception.places.visits import Visit
 from perception.readers.scans import RobotLog
-from ssh_abduction.data.odometry import between
+from ssh_abduction.data.odometry import displacement_between
 
 # Corners of a room that looks different from all sides, in metres, counterclockwise.
 ROOM = [(-3, -2), (4, -2), (4, 0.5), (2, 0.5), (2, 3), (-1, 3), (-1, 1.5), (-3, 1.5)]
@@ -147,7 +147,7 @@ def test_a_trace_has_the_closures_of_its_visits() -> None:
             x, y, turn = step.extra["seen"]
             ahead, left = points_turned(scan[2], np.array([[x, y]]))[0]
             poses.append((scan[0] + ahead, scan[1] + left, scan[2] + turn))
-        assert closure.displacement == pytest.approx(between(*poses), abs=0.1)
+        assert closure.displacement == pytest.approx(displacement_between(*poses), abs=0.1)
 
 
 def test_a_pose_is_relative_to_the_heading_of_the_earlier_step() -> None:

@@ -16,7 +16,7 @@ from ssh_abduction.cli import main
 from ssh_abduction.data import DState, MapError, MapPath, SolverError
 from ssh_abduction.rivals.consequences import Consequences
 from ssh_abduction.rivals.experiment import Experiment, ExperimentPlan
-from ssh_abduction.rivals.machines import Seen, links_of
+from ssh_abduction.rivals.machines import Seen, leads_of
 from ssh_abduction.solver.asp.limits import Watch
 
 ROOT = Path(__file__).parent.parent
@@ -269,7 +269,7 @@ def framed(headings: Sequence[int]) -> tuple[SSHMap, list[Seen]]:
 
 def test_a_frame_tells_the_end_of_turns() -> None:
     ssh_map, looks = framed([0, 1])
-    says = Consequences(ssh_map, links_of(ssh_map, 0), looks, None)
+    says = Consequences(ssh_map, leads_of(ssh_map, 0), looks, None)
     turn = {
         action.name: action
         for action in Trace.from_steps("aaaa", ["right", "around", "left"]).actions
@@ -282,7 +282,7 @@ def test_a_frame_tells_the_end_of_turns() -> None:
     )  # both know where they would face
     assert says.of(0, turn["right"]).clashes(says.of(0, turn["around"]))
     weak = Consequences(
-        ssh_map, links_of(ssh_map, 0), looks, Theory(star="frame", without=("turn_rotates",))
+        ssh_map, leads_of(ssh_map, 0), looks, Theory(star="frame", without=("turn_rotates",))
     )
     assert weak.of(0, turn["right"]).how == "open"
 
@@ -291,7 +291,7 @@ def test_a_path_tells_what_comes_next() -> None:
     ssh_map = with_paths([0, 0, 0])
     bare = replace(ssh_map, links=())
     looks = [Seen(s.view) for s in bare.dstates]
-    says = Consequences(bare, links_of(bare, 0), looks, None)
+    says = Consequences(bare, leads_of(bare, 0), looks, None)
     (travel,) = Trace.from_steps("ab", ["travel"]).actions
     assert [(says.of(s, travel).how, says.of(s, travel).dstate) for s in range(3)] == [
         ("expected", 1),

@@ -394,7 +394,7 @@ def test_question_whose_asker_is_gone_is_given_up(
     server: PageServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     own = server.url.partition(str(server.port))[2]
-    monkeypatch.setattr("ssh_abduction.page.answers.solved", sleep)
+    monkeypatch.setattr("ssh_abduction.page.answers.solved_with", sleep)
     with socket.create_connection(("127.0.0.1", server.port)) as connection:
         connection.sendall(
             f"POST {own}solve HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\n"

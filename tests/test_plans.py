@@ -17,7 +17,7 @@ from simulator.plans import APART, STRAIGHT, Plan
 from ssh_abduction import Theory, Trace, evaluate, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data import Odometry
-from ssh_abduction.data.gateways import turned
+from ssh_abduction.data.gateways import with_allowed_headings
 from ssh_abduction.data.maps import DState, MapPath, SSHMap
 from ssh_abduction.data.trace import Step
 
@@ -302,7 +302,7 @@ def test_no_axiom_forbids_the_truth_of_doors_close_together(tmp_path: Path, seed
     while trace.actions[-1].kind == "turn":
         trace = trace.prefix(len(trace) - 1)  # no travel starts where the last turn ends
     theory = Theory.topological().replace(star="gateways", boundary="none", displacement="none")
-    ssh_map = turned(trace, true_map(plan.told_apart(), trace), theory.axioms)
+    ssh_map = with_allowed_headings(trace, true_map(plan.told_apart(), trace), theory.axioms)
     assert ssh_map is not None
     assert check(trace, ssh_map, theory) == ()
 

@@ -23,7 +23,7 @@ from perception.readers.logs import FORMATS, live_log, read_log, stream_log
 from perception.readers.scans import Damage, LaserScanner, Pose, RobotLog, Scan
 from perception.readers.writers import write_bag, write_carmen
 from ssh_abduction.data.errors import TraceError
-from ssh_abduction.data.odometry import between, moved
+from ssh_abduction.data.odometry import displacement_between, moved
 from ssh_abduction.data.trace import Trace
 
 LOGS = Path(__file__).parents[2] / "shared" / "data" / "logs"
@@ -54,7 +54,7 @@ def drive(count: int = 12, laser: LaserScanner = LASER, noise: float = 0.03) -> 
 
 
 def is_near(a: Pose | None, b: Pose | None, off: float = 1e-4) -> bool:
-    return a is b if a is None or b is None else max(map(abs, between(a, b))) <= off
+    return a is b if a is None or b is None else max(map(abs, displacement_between(a, b))) <= off
 
 
 def agree(read: Scan, written: Scan) -> bool:
@@ -221,7 +221,7 @@ def test_a_lost_odometer_line_of_gmappings_logs_costs_no_more_than_its_motion(
         *("ODOM 1 2 x" if i == restarts[3] else line for i, line in enumerate(lines)),
     )
     off = [
-        between(moved(a, between(b, c)), d)
+        displacement_between(moved(a, displacement_between(b, c)), d)
         for a, b, c, d in zip(
             odometry,
             [s.odometry for s in log.scans],
@@ -404,7 +404,7 @@ def test_a_damaged_vertex_costs_its_scan_alone(tmp_path: Path) -> None:
 def test_a_missing_edge_is_told(tmp_path: Path) -> None:
     lines = graph(VERTICES, MOTIONS)
     # This edge is as good as the one from 2 to 3.
-    lines[-2] = f"EDGE2 3 2 {pose(between(MOTIONS[2], START))} 1 0 1 1 0 0"
+    lines[-2] = f"EDGE2 3 2 {pose(displacement_between(MOTIONS[2], START))} 1 0 1 1 0 0"
     assert is_near(read_text(tmp_path / "a.graph", *lines).scans[-1].odometry, chained(MOTIONS)[-1])
     log = read_text(tmp_path / "a.graph", *lines[:-1])
     assert "before these vertices, so that it seems to have stood still: 4" in " ".join(log.notes)
@@ -891,23 +891,23 @@ def test_logs_of_real_robots(name: str) -> None:
     assert {(scan.laser.beams, scan.laser.reach) for scan in log.scans} == {(beams, reach)}
     assert 0.001 < np.mean([np.isinf(scan.ranges).mean() for scan in log.scans]) < 0.03
     steps = list(zip(log.scans, log.scans[1:], strict=False))
-    by_odometry = [between(a.odometry, b.odometry) for a, b in steps]
+    by_odometry = [displacement_between(a.odometry, b.odometry) for a, b in steps]
     by_truth = [
-        between(a.corrected, b.corrected)
+        displacement_between(a.corrected, b.corrected)
         for a, b in steps
         if a.corrected is not None and b.corrected is not None
     ]
     assert [
         sum(math.hypot(*step[:2]) for step in way) for way in (by_odometry, by_truth)
     ] == pytest.approx([driven, truly], abs=1)
-    off = np.abs([between(a, b) for a, b in zip(by_odometry, by_truth, strict=True)])
+    off = np.abs([displacement_between(a, b) for a, b in zip(by_odometry, by_truth, strict=True)])
     off = np.column_stack([np.hypot(off[:, 0], off[:, 1]), np.degrees(off[:, 2])])
     assert (np.median(off, axis=0) < median).all()
     assert (np.quantile(off, 0.95, axis=0) < most).all()
     assert (off.max(axis=0) > 0).all()  # Odometry is no copy of the corrected poses.
-    end = between(
-        between(log.scans[0].odometry, log.scans[-1].odometry),
-        between(log.scans[0].corrected or START, log.scans[-1].corrected or START),
+    end = displacement_between(
+        displacement_between(log.scans[0].odometry, log.scans[-1].odometry),
+        displacement_between(log.scans[0].corrected or START, log.scans[-1].corrected or START),
     )
     assert math.hypot(*end[:2]) > 0.5  # And it drifts.
 

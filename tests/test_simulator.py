@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from simulator.control import Driver, act, climb
 from simulator.errors import SimulatorError
 from simulator.laser import BEARINGS, Laser
-from simulator.motion import between, moved, reported
+from simulator.motion import displacement_between, moved, reported
 from simulator.robot import Body, SimulatedRobot
 from simulator.sight import LONG, sight
 from simulator.tour_log import noise_model
@@ -369,7 +369,7 @@ def errors_of(
         if action.kind == kind:
             found.append(
                 whitened(
-                    np.subtract(step.displacement, between(before, after)),
+                    np.subtract(step.displacement, displacement_between(before, after)),
                     odometry.covariance(step.displacement),
                 )
             )
@@ -397,7 +397,7 @@ def fixed_points(trace: Trace) -> list[tuple[float, float, float]]:
 def test_a_displacement_leads_from_one_pose_to_the_other(
     start: tuple[float, float, float], end: tuple[float, float, float]
 ) -> None:
-    x, y, heading = moved(start, between(start, end))
+    x, y, heading = moved(start, displacement_between(start, end))
     assert (x, y) == pytest.approx(end[:2], abs=1e-9)
     assert math.remainder(heading - end[2], math.tau) == pytest.approx(0, abs=1e-9)
 
@@ -437,7 +437,10 @@ def test_the_covariance_of_a_report_is_that_of_its_errors() -> None:
             robot.move(*motion)
         said = robot.report()
         errors.append(
-            whitened(np.subtract(said.displacement, between(start, robot.pose)), said.covariance)
+            whitened(
+                np.subtract(said.displacement, displacement_between(start, robot.pose)),
+                said.covariance,
+            )
         )
     found = np.array(errors)
     np.testing.assert_allclose(found.mean(0), 0, atol=0.15)

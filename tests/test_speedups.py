@@ -40,7 +40,7 @@ from ssh_abduction.solver.engines import naming as named
 from ssh_abduction.solver.engines.name_search import NameSearch
 from ssh_abduction.solver.guesses import annealing
 from ssh_abduction.solver.guesses.annealing import annealed_steps
-from ssh_abduction.solver.guesses.merging import merged, thinned
+from ssh_abduction.solver.guesses.merging import dstates_merged, merged
 from ssh_abduction.solver.steps.apart import Continuations, clique
 from ssh_abduction.solver.steps.chart import Chart
 from ssh_abduction.solver.steps.log import Log
@@ -301,19 +301,19 @@ def test_steps_merged_by_evidence_make_a_map(trace: Trace) -> None:
     fewest = solve(trace, theory).cost
     assert fewest
     known = merged(apart, links, chart.continuations.clique())
-    for labels in known, thinned(chart, range(len(trace))), thinned(chart, known):
+    for labels in known, dstates_merged(chart, range(len(trace))), dstates_merged(chart, known):
         found = answer_maps.causal_map(labels, trace)
         assert check(trace, found, theory) == ()
         assert fewest.dstates <= len(found.dstates) <= len(trace)
         if labels is not known:
-            assert thinned(chart, labels) == labels
+            assert dstates_merged(chart, labels) == labels
 
 
 def test_dstates_that_are_one_are_merged() -> None:
     """A machine of two states. Only odd and even visits differ."""
     log = Log(trace := Trace.from_steps("ababababa", ["go"] * 8), Theory.causal())
     chart = Chart.of_steps(log, len(trace))
-    assert thinned(chart, [0, 1, 2, 3, 0, 1, 2, 3, 0]) == [0, 1, 0, 1, 0, 1, 0, 1, 0]
+    assert dstates_merged(chart, [0, 1, 2, 3, 0, 1, 2, 3, 0]) == [0, 1, 0, 1, 0, 1, 0, 1, 0]
 
 
 def test_a_limit_leaves_a_map_of_merged_steps() -> None:

@@ -49,7 +49,7 @@ from ssh_abduction.rivals import Listing, compare, difference, joins_of_drives
 from ssh_abduction.solver import choosing, prefixes
 from ssh_abduction.solver.fit import Poses
 from ssh_abduction.solver.guesses.beam import Beam
-from ssh_abduction.solver.guesses.pieces import Pieces, headings
+from ssh_abduction.solver.guesses.pieces import Pieces, headings_by_turn
 from ssh_abduction.solver.misfit import Misfit
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import settle
@@ -400,7 +400,7 @@ def test_a_drive_that_meets_others_at_one_place_may_face_four_ways() -> None:
     first = Beam(problem, Log(problem.trace, problem.theory, problem.pairs), 1)._first()
     pieces = Pieces(here=5, of_heading=(0, 5), hinges={5: first.position[0]})
     found = replace(first, heading=first.heading * 2, pieces=pieces)
-    one, other = zip(*headings(found), strict=True)
+    one, other = zip(*headings_by_turn(found), strict=True)
     assert len({*one}) == 1
     assert other == pytest.approx([other[0] + k * math.pi / 2 for k in range(4)])
 

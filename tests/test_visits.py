@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from simulator.motion import Pose, between
+from simulator.motion import Pose, displacement_between
 from ssh_abduction import SSHMap, Trace
 from ssh_abduction.cli import main
 from ssh_abduction.data import DState, TraceError
@@ -132,7 +132,9 @@ def circle(turns: int) -> tuple[list[Pose], list[Relation]]:
         for a in (math.radians(3 * t) for t in range(120 * turns + 1))
     ]
     pairs = [*pairwise(range(len(poses))), *((t, t + 120) for t in range(0, len(poses) - 120, 120))]
-    return poses, [Relation(float(i), float(j), between(poses[i], poses[j])) for i, j in pairs]
+    return poses, [
+        Relation(float(i), float(j), displacement_between(poses[i], poses[j])) for i, j in pairs
+    ]
 
 
 def test_relations_are_composed_along_the_shortest_way() -> None:
@@ -148,7 +150,7 @@ def test_relations_are_composed_along_the_shortest_way() -> None:
             20 * (1 - math.cos(math.radians(90.75))),
             math.radians(90.75),
         )
-        assert pose == pytest.approx(between(start, poses[int(time)]), abs=0.01)
+        assert pose == pytest.approx(displacement_between(start, poses[int(time)]), abs=0.01)
         # not the way that was driven, of up to 215 m, but over the relation that closes the circle
         assert way < 60
     assert seen[4] is None  # long after the last time

@@ -28,7 +28,7 @@ from scipy.spatial import cKDTree
 from perception.places.track import Array, Track, wrapped
 from perception.readers.echoes import moving
 from perception.readers.scans import RobotLog, Scan
-from ssh_abduction.data.odometry import between
+from ssh_abduction.data.odometry import displacement_between
 
 # A stretch ends after this many metres or radians, by odometry.
 STRETCH, BEND = 1.0, math.radians(30)
@@ -118,8 +118,8 @@ def agreement(log: RobotLog, track: Track) -> Agreement:
         return Agreement(
             float(np.hypot(*np.diff(odometry[:, :2], axis=0).T).sum()), float(track.way[-1])
         )
-    measured = np.array([between(odometry[i], odometry[j]) for i, j in stretches])
-    seen = np.array([between(track.poses[i], track.poses[j]) for i, j in stretches])
+    measured = np.array([displacement_between(odometry[i], odometry[j]) for i, j in stretches])
+    seen = np.array([displacement_between(track.poses[i], track.poses[j]) for i, j in stretches])
     motion_told, motion_seen = (way[:, 0] + 1j * way[:, 1] for way in (measured, seen))
     length = np.abs(motion_told)
     # Turning on the spot has no direction of motion.
@@ -152,7 +152,7 @@ def disagreement(log: RobotLog, track: Track) -> str | None:
     """
     found = agreement(log, track)
     covers = None if found.is_good else field_of_view(log)
-    looks = direction(log) if covers is None and not found.has_other_turns else None
+    looks = laser_direction(log) if covers is None and not found.has_other_turns else None
     if found.is_good and looks is None:
         return None
     laser = log.scans[0].laser
@@ -201,7 +201,7 @@ def disagreement(log: RobotLog, track: Track) -> str | None:
     )
 
 
-def direction(log: RobotLog) -> float | None:
+def laser_direction(log: RobotLog) -> float | None:
     """Estimate the direction of the laser, if the log gives a wrong one.
 
     Returns:
@@ -253,7 +253,7 @@ def _apart(log: RobotLog, turns: Array, stretch: float = 1.0) -> Array | None:
     for first, second in _pairs(log):
         x, y, angle = first.laser.mount
         at, looks = complex(x, y), np.exp(1j * (angle + turns))
-        dx, dy, turn = between(first.odometry, second.odometry)
+        dx, dy, turn = displacement_between(first.odometry, second.odometry)
         here, there = _points(first, stretch), _points(second, stretch)
         if first.laser != second.laser or not len(here) or not len(there):
             continue
@@ -278,7 +278,7 @@ def _pairs(log: RobotLog) -> list[tuple[Scan, Scan]]:
     pairs = []
     for i, scan in enumerate(kept):
         for later in kept[i + 1 : i + 10]:
-            dx, dy, turn = between(scan.odometry, later.odometry)
+            dx, dy, turn = displacement_between(scan.odometry, later.odometry)
             if math.hypot(dx, dy) >= GAP[0] or abs(turn) >= TURN_OF_PAIR[0]:
                 if math.hypot(dx, dy) < GAP[1] and abs(turn) < TURN_OF_PAIR[1]:
                     pairs.append((scan, later))

@@ -32,7 +32,7 @@ from perception.places.track import (
     wrapped,
 )
 from perception.readers.scans import Pose, RobotLog, Scan
-from ssh_abduction.data.odometry import between, moved
+from ssh_abduction.data.odometry import displacement_between, moved
 
 # Number of previous scans to match a scan with.
 RECENT = 40
@@ -113,7 +113,7 @@ class _Follower:
     def followed(self, carried: frozenset[int]) -> Track:
         """Make the track, which is broken before each scan to which the robot was carried."""
         steps = replace(self.steps, carried=carried)
-        done = list(followed(self.log.scans, lambda i, _: steps.doubt_of(i), self.trust))
+        done = list(poses_of_scans(self.log.scans, lambda i, _: steps.doubt_of(i), self.trust))
         return Track(
             np.array([one.pose for one in done]),
             np.array([one.covariance for one in done]),
@@ -145,7 +145,7 @@ class Followed:
     broken: bool = False
 
 
-def followed(
+def poses_of_scans(
     scans: Iterable[Scan], doubt_of: Callable[[int, Pose], Doubt], trust: Trust
 ) -> Iterator[Followed]:
     """Compute the pose of each scan from the scans before it.
@@ -167,10 +167,10 @@ def followed(
         if last is None:
             one = Followed(scan, (0.0, 0.0, 0.0))
         else:
-            onward = between(last.scan.odometry, scan.odometry)
+            onward = displacement_between(last.scan.odometry, scan.odometry)
             step = _ScanMotion(scan, points, normals, recent, last.pose, onward, before, trust)
             one = step.judged(doubt_of(i, onward))
-            before = between(last.pose, one.pose)
+            before = displacement_between(last.pose, one.pose)
         if one.broken:
             recent.clear()
         recent.append((points_moved(one.pose, points), points_turned(one.pose[2], normals)))
@@ -289,7 +289,7 @@ def turned_wrongly(log: RobotLog, track: Track) -> list[tuple[int, float]]:
     """
     found: list[tuple[int, float]] = []
     for i in range(1, len(log)):
-        measured = between(log.scans[i - 1].odometry, log.scans[i].odometry)[2]
+        measured = displacement_between(log.scans[i - 1].odometry, log.scans[i].odometry)[2]
         off = wrapped(float(track.poses[i, 2] - track.poses[i - 1, 2]) - measured)
         if abs(off) > TURNED and track.shares[i] >= POOR and i not in track.cuts:
             found.append((i, off))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from perception.readers.poses import RecordedTrack as Odometry
 from perception.readers.poses import sources_of
 from perception.readers.scans import Pose, RobotLog, Scan
-from ssh_abduction.data.odometry import between
+from ssh_abduction.data.odometry import displacement_between
 
 if TYPE_CHECKING:
     from perception.places.track import Track
@@ -145,7 +145,8 @@ def describe_cuts(log: RobotLog, track: Track, turned: list[tuple[int, float]]) 
     """
     # If the odometer moved at a cut, it jumped. Otherwise, it stood still while the robot moved.
     steps = {
-        cut: between(log.scans[cut - 1].odometry, log.scans[cut].odometry) for cut in track.cuts
+        cut: displacement_between(log.scans[cut - 1].odometry, log.scans[cut].odometry)
+        for cut in track.cuts
     }
     far = {cut: math.hypot(x, y) for cut, (x, y, _) in steps.items()}
     jumps = [cut for cut in track.cuts if far[cut] > STILL]

@@ -25,7 +25,7 @@ from perception.errors import LogError
 from perception.places import jumps, log_checks
 from perception.places.agreement import disagreement
 from perception.places.distinctive import WIDTH, visits_of
-from perception.places.following import Followed, followed, turned_wrongly
+from perception.places.following import Followed, poses_of_scans, turned_wrongly
 from perception.places.track import Track, Trust
 from perception.places.units import LEAST_WAY, Units, units_of
 from perception.places.visits import Visit
@@ -117,7 +117,7 @@ class LiveLog:
     def _followed(self) -> Iterator[Followed]:
         """Follow the robot, and keep what is needed of each scan."""
         scans = watched(self._scans_of(), self._tell, self._source)
-        for one in followed(scans, jumps.LiveJumps(), Trust()):
+        for one in poses_of_scans(scans, jumps.LiveJumps(), Trust()):
             self._keep(one)
             if len(self._scans) == COMPARED:
                 self._compare()

@@ -19,7 +19,7 @@ from perception.places.track import Array, Track, Trust, wrapped
 from perception.places.units import FAR_OFF, LEAST_WAY, SIDEWAYS, SPARSE, ahead, units_of, way_of
 from perception.readers.scans import Pose, RobotLog
 from ssh_abduction.data.errors import named
-from ssh_abduction.data.odometry import between, moved
+from ssh_abduction.data.odometry import displacement_between, moved
 
 # In a shuffled log, scans some steps apart are about as far apart as neighbours: the quartiles of
 # their distances differ by at most this factor. In a drive, they grow with the number of steps. If
@@ -285,8 +285,8 @@ def _overriding(log: RobotLog, track: Track) -> float:
     """The share of the steps in which matching contradicts the odometry."""
     trust, count = Trust(), 0
     for i in range(1, len(log)):
-        measured = between(log.scans[i - 1].odometry, log.scans[i].odometry)
-        seen = between(_pose(track, i - 1), _pose(track, i))
+        measured = displacement_between(log.scans[i - 1].odometry, log.scans[i].odometry)
+        seen = displacement_between(_pose(track, i - 1), _pose(track, i))
         off = np.array([*np.subtract(seen[:2], measured[:2]), wrapped(seen[2] - measured[2])])
         spread = np.diag(trust.covariance(measured))
         count += i not in track.cuts and float((off**2 / spread).sum()) > CONTRADICTS
@@ -327,7 +327,7 @@ def _intruding(log: RobotLog, track: Track, one: int, other: int) -> tuple[int, 
     """Count the points of scan `one` in the free space of `other`, and those in its view."""
     pose = moved(_pose(track, one), log.scans[one].laser.mount)
     scan, laser = log.scans[other], log.scans[other].laser
-    x, y, heading = between(moved(_pose(track, other), laser.mount), pose)
+    x, y, heading = displacement_between(moved(_pose(track, other), laser.mount), pose)
     met = np.isfinite(log.scans[one].ranges) & (log.scans[one].ranges > 0)
     angles = log.scans[one].laser.bearings[met] + heading
     points = log.scans[one].ranges[met] * np.exp(1j * angles) + complex(x, y)

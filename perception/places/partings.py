@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from perception.places.closures import VisitMatch
-from perception.places.stays import in_order, taken
+from perception.places.stays import taken, with_ways_in_order
 from perception.places.track import Array, Track, points_turned
 from perception.places.visits import Visit, Way
 
@@ -164,7 +164,7 @@ class _DrivePoints:
         arrived, left = (self._crossed(side, middle, ways) for side in sides)
         far = np.hypot(*(self._middles - middle).T) + np.abs(self.ways - way)
         patch = self.visits[int(far.argmin())].patch
-        return in_order(
+        return with_ways_in_order(
             Visit(scan, middle, scan, scan, RADIUS, tuple(ways), arrived, left, patch=patch)
         )
 

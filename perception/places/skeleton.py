@@ -84,10 +84,10 @@ def junctions(patch: Patch, room: float) -> list[Junction]:
     far = SHORE * 2 * room / CELL
     lines, inner = thinned(mask), open_space(distance, far)
     graph = pruned(graph_of(lines, distance))
-    found = merged(graph, distance)
+    found = junctions_merged(graph, distance)
     if inner.any():
         shores = pruned(graph_of(with_shores(lines, inner), distance))
-        found = _with_mouths(found, merged(shores, distance), far)
+        found = _with_mouths(found, junctions_merged(shores, distance), far)
     corners = [
         (node, branches)
         for node, branches in bends(graph, distance, far)
@@ -198,7 +198,7 @@ def _out(edge: Edge, nodes: Mapping[int, Node], degrees: Mapping[int, int]) -> f
     return out if out < max(OUT, SHARE * junction.radius * CELL) else None
 
 
-def merged(graph: Graph, distance: Array) -> list[Fork]:
+def junctions_merged(graph: Graph, distance: Array) -> list[Fork]:
     """Merge junctions in one open space.
 
     Args:

@@ -236,7 +236,9 @@ class Stays:
         for side in (-1, 1):
             bearing = self._crossing(visit, side)
             numbers.append(None if bearing is None else taken(ways, bearing))
-        return in_order(replace(visit, ways=tuple(ways), arrived=numbers[0], left=numbers[1]))
+        return with_ways_in_order(
+            replace(visit, ways=tuple(ways), arrived=numbers[0], left=numbers[1])
+        )
 
     def _crossing(self, visit: Visit, side: int) -> float | None:
         """The direction in radians in which the robot enters (side -1) or leaves (1) a disc.
@@ -274,10 +276,10 @@ def joined(first: Visit, last: Visit) -> Visit:
     """Make one visit of two successive visits to the same place."""
     ways = list(first.ways)
     left = None if last.left is None else taken(ways, last.ways[last.left].bearing)
-    return in_order(replace(first, end=last.end, ways=tuple(ways), left=left))
+    return with_ways_in_order(replace(first, end=last.end, ways=tuple(ways), left=left))
 
 
-def in_order(visit: Visit) -> Visit:
+def with_ways_in_order(visit: Visit) -> Visit:
     """The visit with its ways in counterclockwise order."""
     order = sorted(range(len(visit.ways)), key=lambda k: visit.ways[k].bearing)
     arrived, left = (None if k is None else order.index(k) for k in (visit.arrived, visit.left))

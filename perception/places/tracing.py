@@ -20,7 +20,7 @@ from perception.places.track import Array, Track, wrapped
 from perception.places.visits import Visit, apart, patches_of
 from perception.readers.scans import Pose, RobotLog
 from ssh_abduction.data.closure import Closure
-from ssh_abduction.data.odometry import Covariance, Odometry, between, moved
+from ssh_abduction.data.odometry import Covariance, Odometry, displacement_between, moved
 from ssh_abduction.data.star import Gateway
 from ssh_abduction.data.trace import Action, Step, Trace
 
@@ -133,7 +133,7 @@ def _step(
     onward = covariance = None
     cuts = [] if last is None else track.cuts_between(last[0].scan, visit.scan)
     if last is not None and not cuts:
-        onward = between(last[1], pose)
+        onward = displacement_between(last[1], pose)
         covariance = _covariance(track, last[0].scan, visit.scan, last[1], pose)
     scan = log.scans[visit.scan]
     extra: dict[str, object] = {"scan": visit.scan, "visit": number}
@@ -143,7 +143,7 @@ def _step(
     if cuts:  # They explain why there is no displacement.
         extra["cuts"] = cuts
     truth = None
-    seen = between(_pose(track, visit.scan), pose)
+    seen = displacement_between(_pose(track, visit.scan), pose)
     extra["seen"] = [round(x, 4) for x in seen]
     if scan.corrected is not None:
         truth = {"pose": [round(x, 4) for x in moved(scan.corrected, seen)]}

@@ -58,7 +58,7 @@ def format_of(head: bytes) -> str | None:
 
 
 @contextmanager
-def opened(path: Path, format: str) -> Iterator[Files]:
+def files_opened(path: Path, format: str) -> Iterator[Files]:
     """Open the files of a bag.
 
     Args:

@@ -13,7 +13,7 @@ from perception.readers.bag_topics import NANO, TRANSFORMS, Bag
 from perception.readers.messages import Damaged
 from perception.readers.poses import RecordedTrack
 from perception.readers.scans import Damage, Pose
-from ssh_abduction.data.odometry import between
+from ssh_abduction.data.odometry import displacement_between
 
 # Largest difference of the messages of a fixed transform, from rounding: metres and radians.
 FIXED = (0.01, 0.01)
@@ -50,7 +50,7 @@ class FrameTransform:
 Frames = dict[str, dict[str, FrameTransform]]
 
 
-def frames_of(bag: Bag, seen: set[str], damaged: list[Damage]) -> Frames:
+def transforms_of(bag: Bag, seen: set[str], damaged: list[Damage]) -> Frames:
     """Read the transforms between the frames of a bag.
 
     Transforms over time are kept only for the frames of scans and their ancestors. Those of the
@@ -112,7 +112,7 @@ def _record(
     if edge.track is None or edge.count == 0 or edge.off != (0.0, 0.0) or flat != edge.first:
         edge.rotation = _rotation(turn)
     edge.count += 1
-    x, y, angle = between(edge.first, flat)
+    x, y, angle = displacement_between(edge.first, flat)
     edge.off = max(edge.off[0], math.hypot(x, y)), max(edge.off[1], abs(angle))
     return edge
 

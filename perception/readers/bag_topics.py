@@ -114,7 +114,7 @@ class Bag:
 
 
 @contextmanager
-def opened(path: str | os.PathLike[str], format: str) -> Iterator[Bag]:
+def bag_opened(path: str | os.PathLike[str], format: str) -> Iterator[Bag]:
     """Open a bag.
 
     Args:
@@ -124,7 +124,7 @@ def opened(path: str | os.PathLike[str], format: str) -> Iterator[Bag]:
     Raises:
         LogError: The bag cannot be opened.
     """
-    with bag_files.opened(Path(path), format) as files:
+    with bag_files.files_opened(Path(path), format) as files:
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
         store = get_typestore(Stores.ROS1_NOETIC if files.format == "ros1" else Stores.ROS2_HUMBLE)

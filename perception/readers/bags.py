@@ -33,10 +33,10 @@ from perception.readers.bag_frames import (
     ancestors,
     flat_pose,
     frame_name,
-    frames_of,
     mount_of,
     parent_of,
     stamp_of,
+    transforms_of,
 )
 from perception.readers.bag_topics import Bag
 from perception.readers.messages import Damaged
@@ -70,7 +70,7 @@ def read(bag: Bag, scan_topics: Sequence[str], odom_topic: str | None) -> Survey
     times, seen = _survey(bag, scans)
     said = " and ".join(scans)
     damaged: list[Damage] = []
-    frames = frames_of(bag, set(seen), damaged)
+    frames = transforms_of(bag, set(seen), damaged)
     frame = seen.most_common(1)[0][0]
     if odometers is not None:
         odometer, odom, base = _odometer(bag, odometers, damaged, notes)

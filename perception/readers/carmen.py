@@ -50,7 +50,7 @@ from perception.readers.carmen_survey import (
     Findings,
     Meaning,
     meaning_of,
-    mount_of,
+    mount_in_log,
     reach_of,
     survey_of,
     without_codes,
@@ -72,7 +72,7 @@ from perception.readers.messages import (
 )
 from perception.readers.scans import Damage, LaserScanner, Scan, SurveyedLog, laser_of
 from ssh_abduction.data.files import LINE_OF_A_LOG
-from ssh_abduction.data.odometry import Pose, between, moved
+from ssh_abduction.data.odometry import Pose, displacement_between, moved
 
 # Poses of vertices were corrected if one is farther than this from its pose by odometry, in metres.
 CORRECTED = 0.05
@@ -163,7 +163,7 @@ def read(
             "The poses of the vertices have not been corrected: they are the chain of the edges."
         )
     assumed: dict[str, str] = {}
-    mount = mount_of(found, survey, meaning, kind)
+    mount = mount_in_log(found, survey, meaning, kind)
     reach = reach_of(found, survey, kind, assumed)
     if kind == "FLASER" and "fov" not in found.parameters and survey.beams not in HALF_A_CIRCLE:
         assumed["fov"] = (
@@ -250,7 +250,7 @@ class _OdometerPoses:
             pose = pose_at(tokens, 1)
             self.behind = self.chain
             if self.last is not None and not self.restarts:
-                self.chain = moved(self.chain, between(self.last[0], pose))
+                self.chain = moved(self.chain, displacement_between(self.last[0], pose))
             self.before, self.last, self.restarts = self.last, (pose, time_at(tokens, 7)), False
         elif tag == b"NEFF":
             # The last ODOM line repeated the pose of a scan, so it is no motion. The line of that
@@ -320,14 +320,14 @@ class _OdometerPoses:
             share = 0.0  # Times that are cut or run backwards are useless.
         else:
             share = (item.time - began) / (ended - began)
-        dx, dy, turned = between(start, end)
+        dx, dy, turned = displacement_between(start, end)
         odometry = moved(start, (share * dx, share * dy, share * turned))
         return replace(item, odometry=odometry, corrected=self._corrected(odometry))
 
     def _corrected(self, odometry: Pose) -> Pose | None:
         """The true pose, from the last corrected pose, if any, and the odometry since then."""
         return (
-            moved(self.truth[0], between(self.truth[1], odometry))
+            moved(self.truth[0], displacement_between(self.truth[1], odometry))
             if self.truth is not None
             else None
         )

@@ -32,7 +32,7 @@ from perception.readers.messages import (
     time_at,
     vertex_of,
 )
-from ssh_abduction.data.odometry import Pose, between, moved
+from ssh_abduction.data.odometry import Pose, displacement_between, moved
 
 # Meaning of the poses of the scans. The first four are the cases in the docstring of `carmen`, in
 # its order. `lines` means that scans have no poses, and ODOM lines between scans give them.
@@ -115,7 +115,7 @@ class PoseGraph:
         if (motion := self.edges.get((start, end))) is not None:
             return motion
         if (back := self.edges.get((end, start))) is not None:
-            return between(back, (0.0, 0.0, 0.0))
+            return displacement_between(back, (0.0, 0.0, 0.0))
         if not start < end <= start + MOST_BETWEEN:
             return None
         motion = (0.0, 0.0, 0.0)
@@ -134,7 +134,7 @@ class PoseGraph:
         """
         first = self.vertices[0][1]
         return any(
-            math.dist(between(first, pose)[:2], odometry[:2]) > farthest
+            math.dist(displacement_between(first, pose)[:2], odometry[:2]) > farthest
             for (_, pose), odometry in zip(self.vertices, self.chain.poses, strict=True)
         )
 
@@ -323,7 +323,7 @@ def _listed(numbers: list[int] | tuple[int, ...]) -> str:
     )
 
 
-def mount_of(found: Findings, survey: Survey, meaning: Meaning, kind: str) -> Pose:
+def mount_in_log(found: Findings, survey: Survey, meaning: Meaning, kind: str) -> Pose:
     """Find the pose of the laser in the frame of the robot.
 
     It is the difference of the two poses of a scan, or else is given by PARAM lines.
@@ -455,9 +455,9 @@ def _count(survey: Survey, line: ScanLine) -> None:
     survey.poses.extend(line.second)
     survey.same += line.first == line.second
     # A constant difference of the poses is the mount; a large change means a correction.
-    mount = between(line.second, line.first)
+    mount = displacement_between(line.second, line.first)
     survey.mount = survey.mount or mount
-    x, y, angle = between(survey.mount, mount)
+    x, y, angle = displacement_between(survey.mount, mount)
     survey.mounted += max(abs(x), abs(y), abs(angle)) <= MOUNTED
     survey.wandered += math.hypot(x, y) > WANDERED[0] or abs(angle) > WANDERED[1]
 
@@ -468,4 +468,4 @@ def without_codes(reach: float) -> float:
 
 
 def same_pose(a: Pose, b: Pose) -> bool:
-    return all(abs(v) <= ROUNDED for v in between(a, b))
+    return all(abs(v) <= ROUNDED for v in displacement_between(a, b))

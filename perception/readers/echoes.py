@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from perception.errors import LogError
 from perception.readers.scans import Scan
 from ssh_abduction.data.errors import brief, is_finite
-from ssh_abduction.data.odometry import Pose, between
+from ssh_abduction.data.odometry import Pose, displacement_between
 
 Array = NDArray[np.float64]
 _Key = tuple[float, float, Pose]
@@ -236,7 +236,9 @@ def moving(scans: Iterable[Scan]) -> list[Scan]:
     """
     kept: list[Scan] = []
     for scan in scans:
-        dx, dy, turned = between(kept[-1].odometry, scan.odometry) if kept else (APART, 0.0, 0.0)
+        dx, dy, turned = (
+            displacement_between(kept[-1].odometry, scan.odometry) if kept else (APART, 0.0, 0.0)
+        )
         if math.hypot(dx, dy) >= APART or abs(turned) >= TURNED:
             kept.append(scan)
     return kept

@@ -209,7 +209,7 @@ def _reading(
                 f"{named(path)}: expected a file of the format {format}, got a folder; name "
                 "the file"
             )
-        with bag_topics.opened(path, "ros2") as bag:
+        with bag_topics.bag_opened(path, "ros2") as bag:
             yield bags.read(bag, topics, odom_topic)
         return
     # A file is a log in lines or a bag, by its content.
@@ -223,7 +223,7 @@ def _reading(
                 )
             yield carmen.read(file, named(path), format)
             return
-    with bag_topics.opened(path, found) as bag:
+    with bag_topics.bag_opened(path, found) as bag:
         yield bags.read(bag, topics, odom_topic)
 
 

@@ -1,8 +1,8 @@
 """The content of a robot's log in any format: laser scans with the pose of the odometer.
 
 >>> import math
->>> from perception.readers.scans import Laser
->>> laser = Laser(first=-math.pi / 2, step=math.pi / 2, beams=3, reach=8.0)
+>>> from perception.readers.scans import LaserScanner
+>>> laser = LaserScanner(first=-math.pi / 2, step=math.pi / 2, beams=3, reach=8.0)
 >>> [round(math.degrees(bearing)) for bearing in laser.bearings]
 [-90, 0, 90]
 

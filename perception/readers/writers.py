@@ -37,7 +37,7 @@ from perception.errors import LogError
 from perception.readers.scans import LaserScanner, Scan
 from ssh_abduction.data.errors import named
 from ssh_abduction.data.files import write_file
-from ssh_abduction.data.odometry import Pose, between, moved
+from ssh_abduction.data.odometry import Pose, displacement_between, moved
 
 HEADER = (
     "# message formats defined: PARAM ODOM TRUEPOS ROBOTLASER1\n"
@@ -250,7 +250,9 @@ def _messages(
                 "/tf",
                 time,
                 make.transform(
-                    MAP, ODOM, moved(scan.corrected, between(scan.odometry, (0.0, 0.0, 0.0)))
+                    MAP,
+                    ODOM,
+                    moved(scan.corrected, displacement_between(scan.odometry, (0.0, 0.0, 0.0))),
                 ),
             )
         yield (

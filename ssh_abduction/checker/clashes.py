@@ -14,7 +14,14 @@ from functools import partial
 
 from ssh_abduction.checker.reading import Check, Found, Reading
 from ssh_abduction.data.drives import drives_of
-from ssh_abduction.data.gateways import Sight, Turns, by_place, changes_of, fit, sights_of
+from ssh_abduction.data.gateways import (
+    Sight,
+    Turns,
+    by_place,
+    changes_of,
+    frames_that_fit,
+    sights_of,
+)
 
 NAMES = (
     "gateway_frame",
@@ -55,17 +62,17 @@ def clashes(sights: Sequence[Sight], turns: Turns, axioms: Collection[str]) -> I
     """
     hard = [name for name in NAMES if name in axioms]
     for place, seen in by_place(sights).items():
-        if fit(seen, turns, hard) is not None:
+        if frames_that_fit(seen, turns, hard) is not None:
             continue
         # drop sights, latest first, as long as no frame fits the others
         core = list(seen)
         for sight in reversed(seen):
             rest = [other for other in core if other is not sight]
-            core = core if fit(rest, turns, hard) is not None else rest
+            core = core if frames_that_fit(rest, turns, hard) is not None else rest
         to_blame = [
             name
             for name in hard
-            if fit(core, turns, [other for other in hard if other != name]) is not None
+            if frames_that_fit(core, turns, [other for other in hard if other != name]) is not None
         ]
         yield Clash(place, tuple(sight.step for sight in core), tuple(to_blame or hard))
 
@@ -80,7 +87,7 @@ def _sights_of(m: Reading) -> tuple[list[Sight], Turns]:
     return sights_of(m.trace, m.map, m.onward, bool(m.theory.changed))
 
 
-def changes(m: Reading) -> Iterator[tuple[int, int, int, str, str]]:
+def bearing_changes(m: Reading) -> Iterator[tuple[int, int, int, str, str]]:
     """Yield each gateway at a bearing that differs between a drive and the one before at its place.
 
     Each is a place, a bearing, the first step of the later drive there, and what the earlier and

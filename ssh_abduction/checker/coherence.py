@@ -10,7 +10,7 @@ from ssh_abduction.checker.floors import floors_are_listed
 from ssh_abduction.checker.moves import course_of, heading_of
 from ssh_abduction.checker.reading import Check, Found, Reading
 from ssh_abduction.checker.sides import is_pair
-from ssh_abduction.checker.stars import changes
+from ssh_abduction.checker.stars import slot_changes
 from ssh_abduction.data.maps import Fault
 from ssh_abduction.data.trace import View
 
@@ -199,7 +199,7 @@ def faults_are_allowed(m: Reading) -> Found:
 
 def _changes(m: Reading) -> Iterator[tuple[int, int, int, str, str]]:
     """Yield the gateways that differ between drives."""
-    return clashes.changes(m) if m.theory.star == "gateways" else changes(m)
+    return clashes.bearing_changes(m) if m.theory.star == "gateways" else slot_changes(m)
 
 
 def _key(fault: Fault) -> tuple[object, ...]:

@@ -11,8 +11,8 @@ from typing import TypeAlias
 
 from ssh_abduction.checker.moves import Course, along, course_of, opposite
 from ssh_abduction.checker.reading import Check, Found, Reading
-from ssh_abduction.checker.sides import RightBranch, right_of
-from ssh_abduction.data.regions import Region, listed
+from ssh_abduction.checker.sides import RightBranch, branches_right_of
+from ssh_abduction.data.regions import Region, list_in_words
 
 _Places: TypeAlias = frozenset[int]
 # ("place", its id), or ("path", its id, its floor); paths are links on one floor only.
@@ -40,7 +40,7 @@ def known_sides(m: Reading) -> Mapping[Course, Mapping[int, RightBranch]]:
             waiting += new
         return reached - {place}
 
-    return right_of(m, after)
+    return branches_right_of(m, after)
 
 
 def _beside(m: Reading) -> dict[_Places, str]:
@@ -177,7 +177,7 @@ def _steps(m: Reading, places: Iterable[int]) -> list[int]:
 
 def _listed(places: _Places) -> str:
     """Name places in words."""
-    return f"place{'' if len(places) == 1 else 's'} {listed(sorted(places))}"
+    return f"place{'' if len(places) == 1 else 's'} {list_in_words(sorted(places))}"
 
 
 AXIOMS: dict[str, Check] = {

@@ -91,7 +91,7 @@ def branches_of(m: Reading) -> list[RightBranch]:
     return list(found.values())
 
 
-def right_of(
+def branches_right_of(
     m: Reading, after: Callable[[int, Course], Iterable[int]]
 ) -> dict[Course, dict[int, RightBranch]]:
     """Find the places to the right of each course, each with the branch that leads to it.
@@ -119,7 +119,7 @@ def _ahead(m: Reading, place: int, course: Course) -> Iterable[int]:
 
 def _conflicts(m: Reading) -> list[Conflict]:
     """Find the places whose sides contradict another axiom."""
-    right = right_of(m, partial(_ahead, m))
+    right = branches_right_of(m, partial(_ahead, m))
     disjoint = _both_sides(m, right) if "sides_disjoint" in m.axioms else ()
     between = _on_and_beside(m, right) if "path_between_sides" in m.axioms else ()
     return [*disjoint, *between]

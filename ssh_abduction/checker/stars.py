@@ -78,7 +78,7 @@ def gateways_by_drive(m: Reading) -> Iterator[tuple[int, str, list[tuple[Opening
         yield place, names[drive - 1], found
 
 
-def changes(m: Reading) -> Iterator[tuple[int, int, int, str, str]]:
+def slot_changes(m: Reading) -> Iterator[tuple[int, int, int, str, str]]:
     """Find the gateways that differ between a drive and the drive before it at the same place.
 
     Yields:

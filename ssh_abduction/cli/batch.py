@@ -25,14 +25,14 @@ from ssh_abduction.cli.options import theory_of
 from ssh_abduction.cli.outcome import (
     Given,
     all_given,
-    ending,
+    answer_ending,
+    answer_opening,
     exit_code,
-    explained,
     given_by,
     on_ctrl_c,
-    opening,
     warn,
     warnings_of,
+    why_no_map,
 )
 from ssh_abduction.cli.text import headline
 from ssh_abduction.data.errors import AbductionError, SolverError, named
@@ -152,7 +152,7 @@ class SolveQuestion:
         with self._guarded(number, path, search, maps, given_up):
             for ssh_map in search:
                 maps += [given_by(search, ssh_map)] if self.json else []
-            explanation = explained(search)
+            explanation = why_no_map(search)
             solution = search.solution(tuple(ssh_map for ssh_map, _ in maps))
             return self._answer(
                 number, path, search, solution, all_given(solution), explanation, search.backbone
@@ -207,9 +207,9 @@ class SolveQuestion:
             line = json_line(
                 {
                     "trace": path,
-                    **opening(search),
+                    **answer_opening(search),
                     "maps": [written_map(*given) for given in maps],
-                    **ending(search, solution, explanation, len(maps), backbone),
+                    **answer_ending(search, solution, explanation, len(maps), backbone),
                 }
             )
         else:

@@ -79,7 +79,7 @@ def run(options: argparse.Namespace) -> int:
         raise AbductionError(
             f"{options.trace}: images: {error}; log more images, or others"
         ) from None
-    truth = true_dstates(trace)
+    truth = true_dstate_names(trace)
     uncertainty: dict[int, float] = {}
     if truth is not None:
         uncertainty = {
@@ -114,7 +114,7 @@ def run(options: argparse.Namespace) -> int:
         f"{chosen}\n{counted(clusterer.k_, 'views')} of {counted(len(images), 'images')}",
     )
     warn_of_doubts(clusterer.labels_, clusterer.confidence_, clusterer.quality_[clusterer.k_])
-    warn(doubts(clustered))
+    warn(runner_up_doubts(clustered))
     if options.plot:
         sys.stdout.flush()  # print first, in case drawing fails
         from ssh_abduction.evaluation.paper.figures import draw_quality
@@ -123,7 +123,7 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def doubts(trace: Trace) -> list[str]:
+def runner_up_doubts(trace: Trace) -> list[str]:
     """Find out whether the second best number of views (the runner-up) gives another map.
 
     Maps are found by the topological theory, or by the causal one if some action has no kind.
@@ -145,7 +145,7 @@ def doubts(trace: Trace) -> list[str]:
     return [found.sentence] if found else []
 
 
-def true_dstates(trace: Trace) -> list[str] | None:
+def true_dstate_names(trace: Trace) -> list[str] | None:
     """The name of the true dstate of each step; None if some step has none."""
     found = [
         step.truth.get("dstate") if isinstance(step.truth, dict) else None for step in trace.steps

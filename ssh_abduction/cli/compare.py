@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ssh_abduction.cli.options import MAPS_SAID, Verbs, maps_in
+from ssh_abduction.cli.options import MAPS_SAID, Verbs, maps_path
 from ssh_abduction.cli.text import compared, counted, depending
 from ssh_abduction.data.errors import brief, named, printable
 from ssh_abduction.data.files import json_line
@@ -57,8 +57,8 @@ def run(options: argparse.Namespace) -> int:
     from ssh_abduction.rivals.listing import Listing
     from ssh_abduction.rivals.sides import shared_sides
 
-    maps = maps_in(options.maps)
-    others = None if options.other is None else maps_in(options.other)
+    maps = maps_path(options.maps)
+    others = None if options.other is None else maps_path(options.other)
     record: dict[str, Any] = {}  # the output of --json
     if maps != options.maps and others != options.other:
         record["runs"] = differences(options.maps, options.other)

@@ -19,11 +19,11 @@ from ssh_abduction.cli.options import (
     Verbs,
     add_limits,
     add_theory,
-    maps_in,
+    maps_path,
     number_steps,
     theory_of,
     theory_of_maps,
-    trace_in,
+    trace_path,
 )
 from ssh_abduction.cli.outcome import on_ctrl_c
 from ssh_abduction.data.drives import step_named
@@ -116,8 +116,8 @@ def run(options: argparse.Namespace) -> int:
             "to be explained, or a place and a path, as in p7 path2"
         )
     if Path(options.trace).is_dir():
-        options.theory = options.theory or maps_in(options.trace)
-    trace = Trace.load(trace_in(options.trace))
+        options.theory = options.theory or maps_path(options.trace)
+    trace = Trace.load(trace_path(options.trace))
     number_steps(options, trace)
     maps, found, data = _maps_of(options)
     trace, theory = as_corrected(trace, theory_of(options, found), maps, options.corrections)
@@ -168,7 +168,7 @@ def _maps_of(options: argparse.Namespace) -> tuple[str | None, Theory | None, An
     Raises:
         MapError: The file cannot be read, or holds no theory.
     """
-    file = maps_in(options.theory) if options.theory else None
+    file = maps_path(options.theory) if options.theory else None
     if file is None or not Path(file).is_file():
         return None, None, None
     if file.endswith(".toml"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from ssh_abduction.cli.options import Verbs, add_map, add_maps, trace_in
+from ssh_abduction.cli.options import Verbs, add_map, add_maps, trace_path
 from ssh_abduction.cli.outcome import warn
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.trace import Trace
@@ -27,7 +27,7 @@ def add_parser(verbs: Verbs) -> None:
     add_map(parser)
     parser.add_argument(
         "--trace",
-        type=trace_in,
+        type=trace_path,
         metavar="TRACE",
         help=("the trace that was mapped; its turns give a better layout of a map without poses"),
     )
@@ -72,7 +72,7 @@ def add_parser(verbs: Verbs) -> None:
 
 def run(options: argparse.Namespace) -> int:
     from ssh_abduction.data.map_file import write_map
-    from ssh_abduction.output.export.formats import doubts, export_map  # loads networkx
+    from ssh_abduction.output.export.formats import export_doubts, export_map  # loads networkx
     from ssh_abduction.rivals.listing import Listing
 
     listing = Listing.load(options.maps)
@@ -94,7 +94,7 @@ def run(options: argparse.Namespace) -> int:
         print(text.removesuffix("\n"))
     else:
         write_map(options.output, text.removesuffix("\n"), "map", "--output")
-    for doubt in doubts(
+    for doubt in export_doubts(
         chosen, options.to, level=options.level, turns=turns, hide_undecided=options.hide_undecided
     ):
         warn([doubt])

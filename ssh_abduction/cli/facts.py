@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from ssh_abduction.cli.options import Verbs, add_theory, theory_of, trace_in
+from ssh_abduction.cli.options import Verbs, add_theory, theory_of, trace_path
 from ssh_abduction.data.errors import printable
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver import facts as encoding
@@ -19,7 +19,7 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser = verbs.add_parser("facts", help="print a trace as .lp facts", description=text)
     parser.add_argument(
-        "trace", type=trace_in, help="trace file (JSON Lines), or - for standard input"
+        "trace", type=trace_path, help="trace file (JSON Lines), or - for standard input"
     )
     add_theory(parser)
     parser.set_defaults(run=run, facts=True)

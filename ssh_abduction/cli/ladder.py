@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.options import Verbs, add_theory, theory_of, trace_in
+from ssh_abduction.cli.options import Verbs, add_theory, theory_of, trace_path
 from ssh_abduction.cli.outcome import on_ctrl_c
 from ssh_abduction.cli.text import table
 from ssh_abduction.data.files import json_line
@@ -34,7 +34,7 @@ def add_parser(verbs: Verbs) -> None:
         "ladder", help="show how much each kind of evidence helps", description=text
     )
     parser.add_argument(
-        "trace", type=trace_in, help="trace file (JSON Lines), or - for standard input"
+        "trace", type=trace_path, help="trace file (JSON Lines), or - for standard input"
     )
     parser.add_argument(
         "-n",

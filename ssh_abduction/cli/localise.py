@@ -16,7 +16,7 @@ from ssh_abduction.cli.options import (
     check_picture,
     picture_file,
     read_maps,
-    trace_in,
+    trace_path,
 )
 from ssh_abduction.cli.text import table
 from ssh_abduction.data.errors import LocaliserError, MapError, named
@@ -43,7 +43,7 @@ def add_parser(verbs: Verbs) -> None:
     add_maps(parser)
     parser.add_argument(
         "other",
-        type=trace_in,
+        type=trace_path,
         help=(
             "trace of a robot in the mapped world that uses the same names of views and actions; "
             "- for standard input; or a folder that map wrote"
@@ -54,7 +54,7 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.add_argument(
         "--trace",
-        type=trace_in,
+        type=trace_path,
         metavar="TRACE",
         help="the trace that was mapped; from its steps localise estimates how reliable views "
         "and links are",

@@ -6,7 +6,7 @@ import argparse
 
 from ssh_abduction.cli.obeying import corrections_of
 from ssh_abduction.cli.options import number_steps, theory_of
-from ssh_abduction.cli.outcome import exit_code, save, warn
+from ssh_abduction.cli.outcome import exit_code, save_solution, warn
 from ssh_abduction.cli.text import describe, headline
 from ssh_abduction.data.drives import pieces_in_words, together
 from ssh_abduction.data.errors import AbductionError, printable
@@ -39,7 +39,7 @@ def run(options: argparse.Namespace) -> int:
         corrections=corrections_of(options),
     )
     warn(solution.warnings)
-    save(solution, options.output)
+    save_solution(solution, options.output)
     if options.json:
         print(json_line(solution.to_dict()))
         return exit_code(solution)

@@ -136,7 +136,7 @@ def write(trace: Trace, target: str, said: str) -> None:
 
 def add_maps(parser: argparse.ArgumentParser) -> None:
     """Add the argument `maps`: a file of maps, or a folder with one."""
-    parser.add_argument("maps", type=maps_in, help=MAPS_SAID)
+    parser.add_argument("maps", type=maps_path, help=MAPS_SAID)
 
 
 def add_trace(parser: argparse.ArgumentParser, what: str = "trace file (JSON Lines)") -> None:
@@ -149,17 +149,17 @@ def add_trace(parser: argparse.ArgumentParser, what: str = "trace file (JSON Lin
     parser.add_argument(
         "trace",
         nargs="?",
-        type=trace_in,
+        type=trace_path,
         help=f"{what}, or - for standard input (default: the trace in the folder of the maps)",
     )
 
 
-def maps_in(text: str) -> str:
+def maps_path(text: str) -> str:
     """Return the file of maps that an argument names: of a folder, its maps.json."""
     return str(Path(text) / MAPS) if Path(text).is_dir() else text
 
 
-def trace_in(text: str) -> str:
+def trace_path(text: str) -> str:
     """Return the trace file that an argument names: of a folder, its trace.jsonl."""
     return str(Path(text) / TRACE) if Path(text).is_dir() else text
 
@@ -307,7 +307,7 @@ def theory_of(options: argparse.Namespace, found: Theory | None = None) -> Theor
         return PRESETS[named_theory]().replace(**chosen)
     if named_theory.endswith(".toml"):
         return Theory.from_toml(named_theory).replace(**chosen)
-    named_theory = maps_in(named_theory)
+    named_theory = maps_path(named_theory)
     if not (named_theory.endswith(".json") or Path(named_theory).is_file()):
         near = difflib.get_close_matches(named_theory, PRESETS, n=1)
         hint = f"; did you mean {near[0]}?" if near else ""

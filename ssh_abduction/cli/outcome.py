@@ -45,7 +45,7 @@ def exit_code(solution: Solution) -> int:
     )
 
 
-def explained(search: Search) -> Explanation | None:
+def why_no_map(search: Search) -> Explanation | None:
     """Explain why there is no map; None if there is a map, or no time to find out."""
     if search.status is not Status.UNSATISFIABLE or search.theory.jumped:
         return None
@@ -62,7 +62,7 @@ def explained(search: Search) -> Explanation | None:
         return None
 
 
-def opening(search: Search) -> dict[str, Any]:
+def answer_opening(search: Search) -> dict[str, Any]:
     """Make the fields of a solution's JSON that come before its maps."""
     return written_opening(search.theory, len(search.trace), search.limits.within)
 
@@ -82,7 +82,7 @@ def all_given(solution: Solution) -> list[Given]:
     return list(zip_longest(solution.maps, solution.costs if solution.within else ()))
 
 
-def ending(
+def answer_ending(
     search: Search,
     solution: Solution,
     explanation: Explanation | None,
@@ -138,7 +138,7 @@ def warn(warnings: Iterable[str]) -> None:
         print(f"ssh-abduction: warning: {warning}", file=sys.stderr)
 
 
-def save(solution: Solution, file: str | None) -> None:
+def save_solution(solution: Solution, file: str | None) -> None:
     """Write a solution to a file, if one is named.
 
     A solution without a map does not replace a file of maps. A warning says so.

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ssh_abduction.cli.options import maps_in, read_maps
+from ssh_abduction.cli.options import maps_path, read_maps
 from ssh_abduction.data.corrections import Corrections
 from ssh_abduction.data.corrections_file import FILE, direction, load_corrections, save_corrections
 from ssh_abduction.data.drives import Drive, step_name, step_of
@@ -54,7 +54,7 @@ class SavedMap:
             MapError: A file cannot be read; the maps do not name their drives; or the
                 corrections are of another map.
         """
-        file = Path(maps_in(str(path)))
+        file = Path(maps_path(str(path)))
         data = read_maps(str(file), "give a file that solve -o wrote")
         listing = Listing.from_dict(data, named(file))
         known = {drive.name: drive.fingerprint for drive in listing.drives}

@@ -19,23 +19,23 @@ from ssh_abduction.cli.options import (
     Verbs,
     add_limits,
     add_theory,
-    maps_in,
+    maps_path,
     number_steps,
     theory_of,
-    trace_in,
+    trace_path,
 )
 from ssh_abduction.cli.outcome import (
     Given,
     all_given,
-    ending,
+    answer_ending,
+    answer_opening,
     exit_code,
-    explained,
     given_by,
     on_ctrl_c,
-    opening,
-    save,
+    save_solution,
     warn,
     warnings_of,
+    why_no_map,
 )
 from ssh_abduction.cli.text import by_displacements, compared, describe, describe_backbone, headline
 from ssh_abduction.data.drives import pieces_in_words, together
@@ -75,7 +75,7 @@ def add_parser(verbs: Verbs) -> None:
         "traces",
         nargs="+",
         metavar="trace",
-        type=trace_in,
+        type=trace_path,
         help="trace file (JSON Lines), or - for standard input",
     )
     parser.add_argument(
@@ -101,7 +101,7 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.add_argument(
         "--onto",
-        type=maps_in,
+        type=maps_path,
         metavar="MAPS",
         help=(
             "add the trace to the first map in this file, which solve -o wrote, and keep its "
@@ -225,7 +225,7 @@ def run(options: argparse.Namespace) -> int:
 
             def print_last(last: tuple[str, Solution]) -> None:
                 print(last[0], end="", flush=True)
-                save(last[1], options.output)
+                save_solution(last[1], options.output)
 
             guard = Guard(
                 search.interrupt,
@@ -240,7 +240,7 @@ def run(options: argparse.Namespace) -> int:
         guard.say(partial(printed.end, solution, explanation))
         warn(warnings_of(search, solution))
         options.json = False  # the JSON is complete: a later error must not follow it
-        save(solution, options.output)
+        save_solution(solution, options.output)
     return exit_code(solution)
 
 
@@ -270,7 +270,7 @@ class _Text:
             if len(self.kept) < HELD and self._room > 0:
                 self.kept.append(ssh_map)
                 self._room -= len(ssh_map.dstates)
-        return explained(self._search)
+        return why_no_map(self._search)
 
     def end(self, solution: Solution, explanation: Explanation | None) -> str:
         """Make the whole output as text."""
@@ -318,7 +318,7 @@ class _Json:
             self._room -= len(ssh_map.dstates)
             if len(self._held) > HELD or self._room < 0:
                 say(self._let_go)
-        return explained(self._search)
+        return why_no_map(self._search)
 
     def end(self, solution: Solution, explanation: Explanation | None) -> str:
         """Make the rest of the JSON: the maps in memory, and the fields after the maps."""
@@ -328,7 +328,7 @@ class _Json:
     def _end(
         self, solution: Solution, explanation: Explanation | None, backbone: Backbone | None
     ) -> str:
-        end = ending(self._search, solution, explanation, self._maps, backbone)
+        end = answer_ending(self._search, solution, explanation, self._maps, backbone)
         if blamed := self._obeying.blamed(explanation):
             end["corrections"] = blamed
         return f"\n],{json_line(end)[1:]}\n"
@@ -346,7 +346,7 @@ class _Json:
         if self._begun:
             return ""
         self._begun = True
-        return json_line(opening(self._search))[:-1] + ', "maps": ['
+        return json_line(answer_opening(self._search))[:-1] + ', "maps": ['
 
     def _let_go(self) -> str:
         """Write the maps in memory in the order in which they were found, and forget them."""

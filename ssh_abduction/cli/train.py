@@ -16,8 +16,8 @@ from ssh_abduction.cli.options import (
     output,
     picture_file,
     seed,
-    trace_in,
     trace_of,
+    trace_path,
 )
 from ssh_abduction.cli.text import counted, table
 from ssh_abduction.data.errors import MapError, named
@@ -103,7 +103,7 @@ def add_parser(verbs: Verbs) -> None:
         "recognise", help="recognise dstates from images", description=text
     )
     recognise.add_argument("recogniser", help="file that train wrote")
-    recognise.add_argument("trace", type=trace_in, help="trace file with images")
+    recognise.add_argument("trace", type=trace_path, help="trace file with images")
     recognise.add_argument(
         "--json", action="store_true", help="print the dstates as a JSON list, null for nowhere"
     )

@@ -8,7 +8,7 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ssh_abduction.cli.options import Verbs, add_maps, flags_of, trace_beside, trace_in
+from ssh_abduction.cli.options import Verbs, add_maps, flags_of, trace_beside, trace_path
 from ssh_abduction.data.errors import AbductionError, MapError, brief, is_whole, named
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_argument(
         "trace",
         nargs="?",
-        type=trace_in,
+        type=trace_path,
         help=(
             "the trace that was mapped; adds actions and laser images, and is needed for --serve "
             "(default: the trace in the folder of the maps, if map wrote it)"
@@ -46,7 +46,7 @@ def add_parser(verbs: Verbs) -> None:
         "robot is at each step. It may be TRACE itself. Beliefs come from its views, or from the "
         "file of --belief"
     )
-    parser.add_argument("--run", dest="followed", type=trace_in, metavar="RUN", help=localised)
+    parser.add_argument("--run", dest="followed", type=trace_path, metavar="RUN", help=localised)
     parser.add_argument(
         "--belief",
         metavar="FILE",

@@ -3,8 +3,9 @@
 A star is all gateways (ways out of a place) seen at a step, each with a bearing. A sight is a
 dstate (distinctive state: a place and a heading) with a star that is seen there. A sight numbers
 its gateways; the numbers are its slots. The sights at a place see the same gateways, but a
-bearing may be off, and some gateways are not observed. So `fit` searches, at each place, for a
-frame (which gateways exist) and a shift of the slots for each sight, such that all axioms hold.
+bearing may be off, and some gateways are not observed. So `frames_that_fit` searches, at each
+place, for a frame (which gateways exist) and a shift of the slots for each sight, such that all
+axioms hold.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ Turns = Mapping[tuple[Sight, Sight], Collection[Action]]
 Turned = tuple[Frame, int]  # what a sight sees, and the shift of its slots
 
 
-def turned(
+def with_allowed_headings(
     trace: Trace, ssh_map: SSHMap, axioms: Collection[str], changes: bool = False
 ) -> SSHMap | None:
     """Replace the headings of a map by headings that all stars (gateways seen) of the trace allow.
@@ -74,7 +75,7 @@ def turned(
         The map with new headings, or None if the stars of some place allow none.
     """
     onward = _onward_of(trace, ssh_map, axioms)
-    found = headings(*sights_of(trace, ssh_map, onward, changes), axioms)
+    found = allowed_headings(*sights_of(trace, ssh_map, onward, changes), axioms)
     if any(s.place is not None and s.id not in found for s in ssh_map.dstates):
         return None
     return replace(
@@ -159,7 +160,9 @@ def _onward_of(
     return onward
 
 
-def headings(sights: Sequence[Sight], turns: Turns, axioms: Collection[str]) -> dict[int, int]:
+def allowed_headings(
+    sights: Sequence[Sight], turns: Turns, axioms: Collection[str]
+) -> dict[int, int]:
     """Find headings of dstates that the stars (gateways seen) allow.
 
     Args:
@@ -173,7 +176,7 @@ def headings(sights: Sequence[Sight], turns: Turns, axioms: Collection[str]) -> 
     """
     found: dict[int, int] = {}
     for seen in by_place(sights).values():
-        fitted = fit(seen, turns, axioms, as_shown=False)
+        fitted = frames_that_fit(seen, turns, axioms, as_shown=False)
         for sight, (frame, shift) in zip(seen, fitted, strict=True) if fitted else ():
             if fitted and sight.shows:
                 found[sight.dstate.id] = middle(rotations(fitted[0][0], frame, shift))
@@ -214,7 +217,7 @@ def facing(
     found = Facing({}, [], [])
     held = {COURSE, *axioms} - {"gateway_end"}
     for seen in by_place(sights).values():
-        fitted = fit(seen, turns, held, as_shown=False)
+        fitted = frames_that_fit(seen, turns, held, as_shown=False)
         if fitted is None:
             return None
         for sight in seen:
@@ -241,7 +244,10 @@ def _opposite_sights(fitted: tuple[Turned, ...]) -> tuple[tuple[int, int], ...]:
 
 
 def are_opposite(seen_a: Turned, seen_b: Turned) -> bool:
-    """Whether the robot surely faces opposite ways in two sights of a place that `fit` read."""
+    """Whether the robot surely faces opposite ways in two sights of a place.
+
+    The sights are as `frames_that_fit` read them.
+    """
     (first, back), (then, on) = seen_a, seen_b
     shift = (on - back) % max(first.slots, 1)
     found = rotations(first, then, shift)
@@ -257,7 +263,7 @@ def by_place(sights: Sequence[Sight]) -> dict[int, list[Sight]]:
     return there
 
 
-def fit(
+def frames_that_fit(
     sights: Sequence[Sight], turns: Turns, axioms: Collection[str], as_shown: bool = True
 ) -> list[Turned] | None:
     """Find a frame and a shift for each sight at a place so that all pairs satisfy the axioms.
@@ -298,9 +304,10 @@ def _fitted(
     axioms: frozenset[str],
     most: int,
 ) -> tuple[Turned, ...] | None:
-    """Do what `fit` does, with a cache: maps of growing prefixes have many places in common.
+    """Do what `frames_that_fit` does, with a cache.
 
-    Dstates that differ only in their heading are equal, so `headings` is an argument of its own.
+    Maps of growing prefixes have many places in common. Dstates that differ only in their heading
+    are equal, so `headings` is an argument of its own.
     `made` has pairs of these sights, and the turns that lead from the first to the second.
     """
     turns = {(a, b): actions for a, b, actions in made}
@@ -421,7 +428,7 @@ def changes_of(
         axioms: Names of the axioms that hold.
     """
     for place, seen in by_place(sights).items():
-        fitted = fit(seen, turns, axioms) or []
+        fitted = frames_that_fit(seen, turns, axioms) or []
         first_of = {s.drive: k for k, s in reversed([*enumerate(seen)])}
         bearing: dict[int, int] = {}
         for frame, shift in fitted:

@@ -219,7 +219,7 @@ def moved(pose: Pose, displacement: Displacement) -> Pose:
     )
 
 
-def between(start: Pose, end: Pose) -> Displacement:
+def displacement_between(start: Pose, end: Pose) -> Displacement:
     """Return the displacement from one pose to another, in the frame of the first pose.
 
     Its dtheta is the shorter of the two possible turns, in radians.

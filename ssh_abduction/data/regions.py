@@ -42,7 +42,7 @@ class Region:
     inside: tuple[int, ...] = ()
 
     def __str__(self) -> str:
-        return described(self, numbered)
+        return described(self, named_by_number)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the region as plain data, without fields that are empty."""
@@ -63,15 +63,15 @@ def described(region: Region, called: Callable[[str, int], str]) -> str:
         region: The region.
         called: Returns words for a kind ("place", "region") and a number, as `SSHMap.called`.
     """
-    places = f"place{'' if len(region.places) == 1 else 's'} {listed(region.places)}"
+    places = f"place{'' if len(region.places) == 1 else 's'} {list_in_words(region.places)}"
     parts = [f"{called('region', region.id)}: {places}"]
     if region.bounds:
-        parts.append(f"right of {listed(map(course_named, region.bounds))}")
+        parts.append(f"right of {list_in_words(map(course_named, region.bounds))}")
     if region.door is not None:
         parts.append(f"behind {called('place', region.door)}")
     if region.inside:
         plural = "" if len(region.inside) == 1 else "s"
-        parts.append(f"in region{plural} {listed(region.inside)}")
+        parts.append(f"in region{plural} {list_in_words(region.inside)}")
     return ", ".join(parts)
 
 
@@ -182,7 +182,7 @@ def renumbered(
     return found, number
 
 
-def numbered(kind: str, number: int) -> str:
+def named_by_number(kind: str, number: int) -> str:
     """Name a thing by its number: "place 4"."""
     return f"{kind} {number}"
 
@@ -192,7 +192,7 @@ def course_named(course: tuple[int, int]) -> str:
     return f"path {course[0]}{'+' if course[1] == 1 else '-'}"
 
 
-def listed(parts: Iterable[object]) -> str:
+def list_in_words(parts: Iterable[object]) -> str:
     """List things in words: "1, 2 and 3"."""
     *first, last = map(str, parts)
     return f"{', '.join(first)} and {last}" if first else last

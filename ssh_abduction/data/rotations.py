@@ -62,7 +62,7 @@ def arc(centre: float, most: float) -> frozenset[int]:
     return frozenset(angle % 360 for angle in range(math.floor(least), math.ceil(last) + 1))
 
 
-def between(a: float, b: float) -> float:
+def angle_between(a: float, b: float) -> float:
     """Return the angle between two bearings, 0 to 180 degrees."""
     return min((a - b) % 360, (b - a) % 360)
 
@@ -77,12 +77,12 @@ def turns_so(action: Action, before: Frame, found: frozenset[int]) -> bool:
     """
     # the bearing or the gateway of a turn is more precise than right, left and around
     if action.bearing is not None:
-        return any(between(r, round(action.bearing)) <= SPREAD for r in found)
+        return any(angle_between(r, round(action.bearing)) <= SPREAD for r in found)
     if action.gateway is not None:
         beside = [
             (bearing, spread)
             for bearing, spread in zip(before.bearings, before.spreads, strict=True)
-            if between(bearing, 0) > spread + ROUNDING
+            if angle_between(bearing, 0) > spread + ROUNDING
         ]
         if action.turn == "left":
             beside.reverse()
@@ -93,7 +93,7 @@ def turns_so(action: Action, before: Frame, found: frozenset[int]) -> bool:
             for bearing, spread, other in zip(
                 before.bearings, before.spreads, before.opposite, strict=True
             )
-            if other is not None and between(bearing, 0) <= spread + ROUNDING
+            if other is not None and angle_between(bearing, 0) <= spread + ROUNDING
         ][:1]
         return any(found & arc(*gateway) for gateway in [(180, 0), *behind])
     sides = (r if action.turn == "right" else 360 - r for r in found)
@@ -116,7 +116,7 @@ def ways(first: Frame, then: Frame, shift: int, found: frozenset[int]) -> tuple[
     alike, opposite = (
         bool(found)
         and all(
-            between(first.bearings[(k + shift) % first.slots] - towards, bearing)
+            angle_between(first.bearings[(k + shift) % first.slots] - towards, bearing)
             <= first.spreads[(k + shift) % first.slots] + spread + ROUNDING
             for k, (bearing, spread) in enumerate(zip(then.bearings, then.spreads, strict=True))
         )
@@ -135,7 +135,7 @@ def ways(first: Frame, then: Frame, shift: int, found: frozenset[int]) -> tuple[
 def leads(frame: Frame, towards: int) -> bool:
     """Whether the robot's path may go on by some gateway ahead (`towards` 0) or behind (180)."""
     return passes(frame) is not None or any(
-        between(bearing, towards) <= 2 * spread + ROUNDING
+        angle_between(bearing, towards) <= 2 * spread + ROUNDING
         for bearing, spread in zip(frame.bearings, frame.spreads, strict=True)
     )
 
@@ -151,8 +151,8 @@ def passes(frame: Frame) -> tuple[int, int] | None:
         zip(frame.bearings, frame.spreads, frame.opposite, strict=True)
     ):
         if other is not None and (
-            between(bearing, 0) <= spread + ROUNDING
-            or between(frame.bearings[other], 180) <= frame.spreads[other] + ROUNDING
+            angle_between(bearing, 0) <= spread + ROUNDING
+            or angle_between(frame.bearings[other], 180) <= frame.spreads[other] + ROUNDING
         ):
             return k, other
     return None

@@ -176,7 +176,7 @@ def of_actions(values: Iterable[Any] | None, name: str, actions: int) -> list[An
         name: The name of the values in messages.
         actions: The number of actions.
     """
-    found = [None] * actions if values is None else listed(values, name)
+    found = [None] * actions if values is None else as_list(values, name)
     if len(found) != actions:
         raise TraceError(
             f"trace: expected one of {name} for each action, got {len(found)} and {actions} "
@@ -185,7 +185,7 @@ def of_actions(values: Iterable[Any] | None, name: str, actions: int) -> list[An
     return [None, *found]
 
 
-def listed(values: Any, name: str) -> list[Any]:
+def as_list(values: Any, name: str) -> list[Any]:
     """Return an iterable as a list. A text becomes a list of its letters, which are views."""
     if not isinstance(values, Iterable) or isinstance(values, bytes | Mapping):
         raise TraceError(f"{name}: expected a list, got {brief(values)}; give one value a step")

@@ -29,7 +29,7 @@ from ssh_abduction.data.notebook import in_output
 from ssh_abduction.data.observation import View, checked_probability, view_or_unknown
 from ssh_abduction.data.odometry import Covariance, Odometry
 from ssh_abduction.data.star import Star
-from ssh_abduction.data.step import Step, listed, of_actions
+from ssh_abduction.data.step import Step, as_list, of_actions
 from ssh_abduction.data.trace_file import FORMAT, VERSION, read_trace
 from ssh_abduction.data.words import counted
 
@@ -293,15 +293,15 @@ class Trace:
                 f"actions: expected a list, got {brief(actions)}; "
                 f"give the name of one action after another, as in ['travel']"
             )
-        seen = listed(views, "views")
-        done = [Action.of(a) for a in listed(actions, "actions")]
+        seen = as_list(views, "views")
+        done = [Action.of(a) for a in as_list(actions, "actions")]
         if len(seen) != len(done) + 1:
             raise TraceError(
                 f"trace: expected one view more than actions, got {len(seen)} views and "
                 f"{len(done)} actions; each action leads from one view to the next"
             )
         # A step has its star. The displacement of an action belongs to the step after the action.
-        openings = [None] * len(seen) if stars is None else listed(stars, "stars")
+        openings = [None] * len(seen) if stars is None else as_list(stars, "stars")
         if len(openings) != len(seen):
             raise TraceError(
                 f"trace: expected a star a view, got {len(openings)} stars and {len(seen)} views; "
@@ -358,8 +358,8 @@ class Trace:
         Raises:
             TraceError: If a value is wrong, or there is not one for each step.
         """
-        seen = listed(views, "views")
-        sure = [None] * len(seen) if confidences is None else listed(confidences, "confidences")
+        seen = as_list(views, "views")
+        sure = [None] * len(seen) if confidences is None else as_list(confidences, "confidences")
         for name, values in (("views", seen), ("confidences", sure)):
             if len(values) != len(self):
                 told = f"expected one a step, {len(self)}, got {len(values)}; add or leave out some"

@@ -162,7 +162,7 @@ def evaluate(maps: Iterable[SSHMap], trace: Trace) -> Evaluation:
     truth = _Truth(checked_trace(trace))
     return Evaluation(
         maps=tuple(
-            _evaluated(checked_map(ssh_map, f"maps[{i}]", trace), truth)
+            _evaluated(map_of_trace(ssh_map, f"maps[{i}]", trace), truth)
             for i, ssh_map in enumerate(maps)
         ),
         steps=sum(
@@ -269,7 +269,7 @@ def _hops(names: Sequence[Hashable]) -> list[int]:
     return [t for t in range(len(names) - 1) if names[t] is not None and names[t + 1] is not None]
 
 
-def checked_map(ssh_map: object, where: str, trace: Trace) -> SSHMap:
+def map_of_trace(ssh_map: object, where: str, trace: Trace) -> SSHMap:
     """Return the map if it has a valid label for each step of the trace.
 
     Args:

@@ -34,13 +34,13 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from simulator.motion import Pose, between, moved
+from simulator.motion import Pose, displacement_between, moved
 from ssh_abduction.data.checks import an_instance
 from ssh_abduction.data.errors import TraceError, brief, is_finite, named
 from ssh_abduction.data.maps import SSHMap, checked_maps
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.data.words import attributes_of, counted
-from ssh_abduction.evaluation.named_truth import checked_map
+from ssh_abduction.evaluation.named_truth import map_of_trace
 from ssh_abduction.evaluation.relations import Relations
 from ssh_abduction.evaluation.trajectory import checked_pose, checked_time, three_numbers
 
@@ -237,7 +237,7 @@ def evaluate_visits(
         places=_pairs(places, np.arange(len(places))),
         dstates=_pairs(dstates, visit),
         maps=tuple(
-            _evaluated(checked_map(ssh_map, f"maps[{i}]", trace), visit, places, dstates)
+            _evaluated(map_of_trace(ssh_map, f"maps[{i}]", trace), visit, places, dstates)
             for i, ssh_map in enumerate(maps)
         ),
         by_both=by_both,
@@ -328,7 +328,7 @@ class _Related:
             [
                 (math.nan,) * 4
                 if robot is None
-                else (*between(origin, moved(robot[0], seen)), robot[1])
+                else (*displacement_between(origin, moved(robot[0], seen)), robot[1])
                 for robot, seen in zip(robots, self._seen, strict=True)
             ]
         ).T

@@ -30,7 +30,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
-from simulator.motion import Pose, between, moved
+from simulator.motion import Pose, displacement_between, moved
 from ssh_abduction.data.errors import TraceError, brief, named
 from ssh_abduction.data.files import read_at_most
 from ssh_abduction.data.odometry import Displacement
@@ -89,7 +89,7 @@ class Relations:
         for relation in relations:
             a, b = number[relation.first], number[relation.second]
             self._to[a, b] = relation.displacement
-            self._to[b, a] = between(relation.displacement, (0.0, 0.0, 0.0))
+            self._to[b, a] = displacement_between(relation.displacement, (0.0, 0.0, 0.0))
         # The length of an edge is the distance of its relation in metres, plus EACH.
         ends = np.array(list(self._to)).T
         metres = [math.hypot(x, y) + EACH for x, y, _ in self._to.values()]
@@ -157,7 +157,7 @@ class Relations:
         # Find the shortest ways from the node nearest to the origin, and compose along each.
         node, offset = start
         metres, before = dijkstra(self._graph, indices=node, return_predecessors=True)
-        poses: dict[int, Pose] = {node: between(offset, (0.0, 0.0, 0.0))}
+        poses: dict[int, Pose] = {node: displacement_between(offset, (0.0, 0.0, 0.0))}
         found: list[tuple[Pose, float] | None] = []
         for i, moment in enumerate(moments):
             if moment is None or not math.isfinite(metres[moment[0]]):

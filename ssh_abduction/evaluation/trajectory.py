@@ -24,7 +24,7 @@ from typing import Any
 
 from ssh_abduction.data.errors import TraceError, brief, is_finite, named
 from ssh_abduction.data.files import read_at_most
-from ssh_abduction.data.odometry import Pose, between, moved
+from ssh_abduction.data.odometry import Pose, displacement_between, moved
 from ssh_abduction.data.trace import Step, Trace
 
 FIELDS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
@@ -145,7 +145,7 @@ class Trajectory:
         share = (time - self.times[first]) / (self.times[last] - self.times[first])
         (x, y, heading), (dx, dy, turned) = (
             self.poses[first],
-            between((0.0, 0.0, 0.0), self.poses[last]),
+            displacement_between((0.0, 0.0, 0.0), self.poses[last]),
         )
         turned = math.remainder(turned - heading, math.tau)
         return (

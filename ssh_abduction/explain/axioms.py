@@ -114,8 +114,8 @@ class Axioms:
         self._control.add("base", [], piece.facts)
         parts = [
             ("base", list[clingo.Symbol]()),
-            *(("step", facts.numbers(t)) for t in range(len(trace))),
-            ("check", facts.numbers(last)),
+            *(("step", facts.number_symbols(t)) for t in range(len(trace))),
+            ("check", facts.number_symbols(last)),
         ]
         for start in range(0, len(parts), AT_A_TIME):
             if stop():

@@ -23,7 +23,7 @@ from ssh_abduction.checker.sides import RightBranch
 from ssh_abduction.data.checks import a_whole_number
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.regions import course_named, listed, regions_at
+from ssh_abduction.data.regions import course_named, list_in_words, regions_at
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import attributes_of
 from ssh_abduction.explain.question import LimitedQuestion
@@ -208,7 +208,7 @@ def _check(name: str, number: int, known: Iterable[int]) -> None:
     """Raise MapError if the first map has no such place or path."""
     known = [*known]
     if number not in known:
-        some = f"{name}s {listed(known)}" if known else f"no {name}s"
+        some = f"{name}s {list_in_words(known)}" if known else f"no {name}s"
         raise MapError(
             f"{name}: expected one of the first minimal map, got {number}; the map has {some}"
         )

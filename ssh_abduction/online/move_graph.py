@@ -13,7 +13,7 @@ import networkx as nx
 from ssh_abduction.data.errors import MapError, brief, is_whole
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.regions import Region
-from ssh_abduction.output.layout import located
+from ssh_abduction.output.layout import drawable_poses
 
 if TYPE_CHECKING:
     from ssh_abduction.data.maps import Pose
@@ -48,7 +48,7 @@ class MoveGraph:
 
     def __init__(self, ssh_map: SSHMap, by: str) -> None:
         self.map, self.by = ssh_map, by
-        self._poses = located(ssh_map)
+        self._poses = drawable_poses(ssh_map)
         if by == "metres" and self._poses is None:
             raise MapError(
                 "by: expected actions or places, got metres: the map has no poses; "

@@ -39,7 +39,7 @@ from typing import Any, Literal, NoReturn
 from ssh_abduction.data.checks import a_list
 from ssh_abduction.data.errors import MapError, brief, printable
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.regions import Region, course_named, numbered, right_of
+from ssh_abduction.data.regions import Region, course_named, named_by_number, right_of
 from ssh_abduction.data.trace import View
 from ssh_abduction.data.words import counted
 from ssh_abduction.online.move_graph import MoveGraph, Node
@@ -375,7 +375,7 @@ class Leg:
     starts: Literal["right", "left"] | None = None
 
     def __str__(self) -> str:
-        return self.in_words(numbered)
+        return self.in_words(named_by_number)
 
     def in_words(self, called: Callable[[str, int], str]) -> str:
         """Say what to do.

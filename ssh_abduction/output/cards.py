@@ -2,7 +2,7 @@
 
 All text is escaped, because views and names may contain any character.
 
->>> table(("view", "place"), [("<b>", 0)])
+>>> html_table(("view", "place"), [("<b>", 0)])
 '<table><thead><tr><th>view</th><th>place</th></tr></thead><tbody><tr><td>&lt;b&gt;</td><td>0</td></tr></tbody></table>'
 """
 
@@ -53,7 +53,7 @@ def map_card(ssh_map: SSHMap) -> str:
         )
         for s in ssh_map.dstates
     ]
-    dstates = folded(counted(len(rows), "dstates"), table(head, rows, "dstates"))
+    dstates = folded(counted(len(rows), "dstates"), html_table(head, rows, "dstates"))
     return card(repr(ssh_map)[1:-1], *parts, dstates)
 
 
@@ -72,7 +72,7 @@ def trace_card(trace: Trace) -> str:
     rows = [(t, *(column[t] for column in shown.values())) for t in range(len(steps))]
     left = len(trace) - len(steps)
     more = paragraph(f"and {counted(left, 'more steps')}") if left else ""
-    return card(repr(trace)[1:-1], table(("step", *shown), rows), more)
+    return card(repr(trace)[1:-1], html_table(("step", *shown), rows), more)
 
 
 def card(heading: str, *parts: str) -> str:
@@ -82,15 +82,15 @@ def card(heading: str, *parts: str) -> str:
         heading: The heading as plain text.
         parts: The parts as HTML.
     """
-    return f"<div><p><b>{text(heading)}</b></p>{''.join(parts)}</div>"
+    return f"<div><p><b>{html_text(heading)}</b></p>{''.join(parts)}</div>"
 
 
 def paragraph(sentence: str) -> str:
     """Make an HTML paragraph of plain text."""
-    return f"<p>{text(sentence)}</p>"
+    return f"<p>{html_text(sentence)}</p>"
 
 
-def table(head: Sequence[str], rows: Iterable[Iterable[object]], more: str = "rows") -> str:
+def html_table(head: Sequence[str], rows: Iterable[Iterable[object]], more: str = "rows") -> str:
     """Make an HTML table of at most ROWS rows. If rows are left out, say how many below it.
 
     Args:
@@ -99,9 +99,9 @@ def table(head: Sequence[str], rows: Iterable[Iterable[object]], more: str = "ro
         more: The word for rows in the sentence below the table, such as "dstates".
     """
     listed = list(rows)
-    names = "".join(f"<th>{text(name)}</th>" for name in head)
+    names = "".join(f"<th>{html_text(name)}</th>" for name in head)
     body = "".join(
-        f"<tr>{''.join(f'<td>{text(_cut(str(cell)))}</td>' for cell in row)}</tr>"
+        f"<tr>{''.join(f'<td>{html_text(_cut(str(cell)))}</td>' for cell in row)}</tr>"
         for row in listed[:ROWS]
     )
     left = paragraph(f"and {len(listed) - ROWS} more {more}") if len(listed) > ROWS else ""
@@ -115,7 +115,7 @@ def folded(title: str, part: str) -> str:
         title: The title as plain text.
         part: The content as HTML.
     """
-    return f"<details><summary>{text(title)}</summary>{part}</details>"
+    return f"<details><summary>{html_text(title)}</summary>{part}</details>"
 
 
 def picture(svg: str) -> str:
@@ -123,7 +123,7 @@ def picture(svg: str) -> str:
     return svg.replace("<svg ", '<svg style="max-width:100%;height:auto" ', 1)
 
 
-def text(value: str) -> str:
+def html_text(value: str) -> str:
     """Escape plain text for HTML."""
     return escape(printable(value))
 

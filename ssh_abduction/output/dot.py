@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ssh_abduction.data.errors import printable
 from ssh_abduction.data.maps import DState, SSHMap, checked_map
-from ssh_abduction.data.regions import course_named, listed
+from ssh_abduction.data.regions import course_named, list_in_words
 
 
 def to_dot(ssh_map: SSHMap) -> str:
@@ -54,7 +54,7 @@ def _clusters(ssh_map: SSHMap, places: set[int], after: int, indent: str = "  ")
 def _beside(ssh_map: SSHMap, place: int) -> str:
     """Say which directed paths a place is known to lie right of."""
     bounds = {c for r in ssh_map.regions or () if place in r.places for c in r.bounds}
-    return f"\nright of {listed(map(course_named, sorted(bounds)))}" if bounds else ""
+    return f"\nright of {list_in_words(map(course_named, sorted(bounds)))}" if bounds else ""
 
 
 def _node(s: DState, ssh_map: SSHMap) -> str:

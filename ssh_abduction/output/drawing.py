@@ -64,7 +64,7 @@ def placed(point: Point, degrees: float) -> str:
     return f"translate({at(point)}) rotate({degrees:.1f})"
 
 
-def text(
+def svg_text(
     x: float,
     y: float,
     label: str,
@@ -115,10 +115,10 @@ def fault_mark(x: float, y: float, title: str, size: float = 1.0) -> str:
         stroke="white",
         stroke_width=1.5,
     )
-    return titled(title, diamond, text(x, y, "!", "white", 11 * size, "bold"), class_="fault")
+    return titled(title, diamond, svg_text(x, y, "!", "white", 11 * size, "bold"), class_="fault")
 
 
-def faults_of(ssh_map: SSHMap) -> dict[int, str]:
+def faults_in_words(ssh_map: SSHMap) -> dict[int, str]:
     """Describe the faults of a map (observations and actions that it treats as wrong).
 
     Returns:
@@ -130,7 +130,7 @@ def faults_of(ssh_map: SSHMap) -> dict[int, str]:
     return {s: "; ".join(said) for s, said in faults.items()}
 
 
-def links_of(ssh_map: SSHMap) -> dict[tuple[int, int], str]:
+def link_names(ssh_map: SSHMap) -> dict[tuple[int, int], str]:
     """Find the actions that lead from one dstate to another one.
 
     Returns:
@@ -163,7 +163,7 @@ def floor_marks(ssh_map: SSHMap, at: Sequence[Point]) -> tuple[list[str], list[P
     for i, members in enumerate(ssh_map.floors):
         x, y = min(at[s][0] for s in members), min(at[s][1] for s in members) - FLOOR
         points.append((x, y))
-        marks.append(text(x, y, f"floor {i}", "#222", size=16, weight="bold", halo=True))
+        marks.append(svg_text(x, y, f"floor {i}", "#222", size=16, weight="bold", halo=True))
     return marks, points
 
 

@@ -77,7 +77,7 @@ def layout(ssh_map: SSHMap, turns: Trace | Turns | None = None) -> Layout:
         MapError: `turns` has a value that is no turn.
     """
     degrees = degrees_of(turns)
-    poses = located(ssh_map)
+    poses = drawable_poses(ssh_map)
     if poses is None:
         return _floor_by_floor(ssh_map, _Drawing(ssh_map, degrees).layout())
     first = {s.place: s.id for s in reversed(ssh_map.dstates)}  # the first dstate of each place
@@ -88,7 +88,7 @@ def layout(ssh_map: SSHMap, turns: Trace | Turns | None = None) -> Layout:
     )
 
 
-def located(ssh_map: SSHMap) -> tuple[Pose, ...] | None:
+def drawable_poses(ssh_map: SSHMap) -> tuple[Pose, ...] | None:
     """Return the poses of the dstates if the map can be drawn at them; None otherwise.
 
     A map cannot be drawn at its poses if displacements between its parts are missing. Each part

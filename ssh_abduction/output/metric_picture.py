@@ -20,13 +20,13 @@ from ssh_abduction.output.drawing import (
     at,
     element,
     fault_mark,
-    faults_of,
+    faults_in_words,
     floor_marks,
     line,
-    links_of,
+    link_names,
     page,
     placed,
-    text,
+    svg_text,
     titled,
 )
 from ssh_abduction.output.layout import travelled
@@ -108,7 +108,7 @@ class _Picture:
         self.points += named
         faults = [
             fault_mark(*self.along(self.map.dstates[s], END), said, self.unit)
-            for s, said in faults_of(self.map).items()
+            for s, said in faults_in_words(self.map).items()
         ]
         return page(
             [
@@ -227,7 +227,7 @@ class _Picture:
     def curves(self) -> list[tuple[Point, Point, Point, str]]:
         """Find the curve (start, bend, end, actions) of each link, for a map without places."""
         curves = []
-        for (source, target), names in links_of(self.map).items():
+        for (source, target), names in link_names(self.map).items():
             a, b = self.map.dstates[source], self.map.dstates[target]
             x, y = self.on_page(self.poses[source])
             turned = math.dist((x, y), self.on_page(self.poses[target])) < 2 * END * self.unit
@@ -266,7 +266,9 @@ class _Picture:
                 for left, top, right, bottom in self.boxes
             ):
                 self.keep_clear(x - w, y - h, x + w, y + h)
-                return [text(x, y, label, colour, size=self.size(size), weight=weight, halo=True)]
+                return [
+                    svg_text(x, y, label, colour, size=self.size(size), weight=weight, halo=True)
+                ]
         return []
 
     def size(self, size: float) -> float:
@@ -356,7 +358,7 @@ class _Picture:
         bar = f"M{left:.1f},{below - 5:.1f} v10 m0,-5 H{right:.1f} m0,-5 v10"
         return [
             element("path", d=bar, fill="none", stroke="#222", stroke_width=1.5),
-            text((left + right) / 2, below + 14, f"{metres:g} m", "#222"),
+            svg_text((left + right) / 2, below + 14, f"{metres:g} m", "#222"),
         ]
 
 

@@ -18,17 +18,17 @@ from ssh_abduction.output.drawing import (
     at,
     element,
     fault_mark,
-    faults_of,
+    faults_in_words,
     floor_marks,
     line,
-    links_of,
+    link_names,
     page,
     placed,
-    text,
+    svg_text,
     titled,
 )
 from ssh_abduction.output.headings import Turns, degrees_of
-from ssh_abduction.output.layout import Layout, layout, located, travelled
+from ssh_abduction.output.layout import Layout, drawable_poses, layout, travelled
 from ssh_abduction.output.metric_picture import metric_svg
 from ssh_abduction.output.region_marks import place_title, region_marks
 
@@ -55,7 +55,7 @@ def to_svg(ssh_map: SSHMap, turns: Trace | Turns | None = None) -> str:
     """
     checked_map(ssh_map)
     degrees_of(turns)
-    if (poses := located(ssh_map)) is not None:
+    if (poses := drawable_poses(ssh_map)) is not None:
         return metric_svg(ssh_map, poses)
     found = layout(ssh_map, turns)
     marks, points = (_topological if ssh_map.places else _causal)(ssh_map, found)
@@ -76,10 +76,10 @@ def _topological(ssh_map: SSHMap, found: Layout) -> tuple[list[str], list[Point]
         lines += _path(ssh_map, path, spots)
         marks += _path_name(ssh_map, path, spots)
     for place, (x, y) in spots.items():
-        number = text(x, y, str(place), "#222", size=15, weight="bold")
+        number = svg_text(x, y, str(place), "#222", size=15, weight="bold")
         marks.append(titled(place_title(ssh_map, place), _circle(x, y, "#222"), number))
         if (name := ssh_map.name_of("place", place)) is not None:
-            marks.append(text(x, y + NAME, name, "#222", size=12, weight="bold"))
+            marks.append(svg_text(x, y + NAME, name, "#222", size=12, weight="bold"))
         marks += _dstates(ssh_map, place, (x, y), found)
     bands, points = region_marks(ssh_map, spots, 3 * RADIUS)
     return bands + lines + marks, [*spots.values(), *points]
@@ -132,7 +132,7 @@ def _path_name(ssh_map: SSHMap, path: MapPath, spots: dict[int, Point]) -> list[
     colour = COLOURS[path.id % len(COLOURS)]
     return [
         element("path", d="M-7,-6 L7,0 L-7,6 Z", fill=colour, transform=placed((mx, my), angle)),
-        text(
+        svg_text(
             mx - (by - ay) * far,
             my + (bx - ax) * far,
             ssh_map.called("path", path.id),
@@ -150,7 +150,7 @@ def _dstates(ssh_map: SSHMap, place: int, spot: Point, found: Layout) -> list[st
     x, y = spot
     taken: list[float] = []
     marks = []
-    faults = faults_of(ssh_map)
+    faults = faults_in_words(ssh_map)
     facing: list[tuple[DState, float | None]] = [
         (s, found.dstates[s.id][2]) for s in ssh_map.dstates if s.place == place
     ]
@@ -166,7 +166,7 @@ def _dstates(ssh_map: SSHMap, place: int, spot: Point, found: Layout) -> list[st
         arrow = element("path", d="M-5,-5 L5,0 L-5,5 Z", fill=colour, transform=turned)
         marks.append(titled(f"dstate {s.id}: {s.shown}", arrow))
         lx, ly = x + dx * DSTATE + aside[0] * 1.5, y + dy * DSTATE + aside[1] * 1.5
-        marks.append(text(lx, ly, f"x{s.id}", "#222", halo=True))
+        marks.append(svg_text(lx, ly, f"x{s.id}", "#222", halo=True))
         if s.id in faults:
             marks.append(fault_mark(lx + dx * 14, ly + dy * 14, faults[s.id]))
     return marks
@@ -187,9 +187,9 @@ def _causal(ssh_map: SSHMap, found: Layout) -> tuple[list[str], list[Point]]:
     Return marks and points to include.
     """
     spots = [_on_page(x, y) for x, y, _ in found.dstates]
-    faults = faults_of(ssh_map)
+    faults = faults_in_words(ssh_map)
     marks = []
-    for (source, target), names in links_of(ssh_map).items():
+    for (source, target), names in link_names(ssh_map).items():
         (ax, ay), (bx, by) = spots[source], spots[target]
         far = math.hypot(bx - ax, by - ay) or 1.0
         ux, uy = (bx - ax) / far, (by - ay) / far
@@ -200,14 +200,14 @@ def _causal(ssh_map: SSHMap, found: Layout) -> tuple[list[str], list[Point]]:
         marks.append(element("path", d=curve, fill="none", stroke="#888", stroke_width=1.5))
         head = placed(end, math.degrees(math.atan2(end[1] - my, end[0] - mx)))
         marks.append(element("path", d="M-8,-4 L0,0 L-8,4 Z", fill="#888", transform=head))
-        marks.append(text(mx - ux * 12, my - uy * 12, names, "#555", halo=True))
+        marks.append(svg_text(mx - ux * 12, my - uy * 12, names, "#555", halo=True))
     for s in ssh_map.dstates:
         x, y = spots[s.id]
         marks.append(_circle(x, y, COLOURS[0]))
-        marks.append(text(x, y, f"x{s.id}", "#222", weight="bold"))
+        marks.append(svg_text(x, y, f"x{s.id}", "#222", weight="bold"))
         view = str(s.shown)
         label = view if len(view) <= LONGEST_LABEL else f"…{view[1 - LONGEST_LABEL :]}"
-        below = text(x, y + RADIUS + 12, label, "#222", halo=True)
+        below = svg_text(x, y + RADIUS + 12, label, "#222", halo=True)
         marks.append(titled(f"dstate {s.id}: {view}", below))
         if s.id in faults:
             marks.append(fault_mark(x + RADIUS, y - RADIUS, faults[s.id]))

@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.regions import Region, course_named, ids_at, listed
-from ssh_abduction.output.drawing import Point, element, line, text, titled
+from ssh_abduction.data.regions import Region, course_named, ids_at, list_in_words
+from ssh_abduction.output.drawing import Point, element, line, svg_text, titled
 
 # The colour and the opacity of bands. WIDER is by how many times the width of the innermost band a
 # band around another one is wider.
@@ -46,7 +46,7 @@ def region_marks(
         own = {*region.places}.difference(*(r.places for r in inner))
         x, y = max((spots[p] for p in own or region.places), key=lambda spot: (spot[1], -spot[0]))
         beside = x - 0.6 * broad, y + 0.5 * broad + 4
-        names.append(text(*beside, ssh_map.called("region", region.id), BAND, 11, halo=True))
+        names.append(svg_text(*beside, ssh_map.called("region", region.id), BAND, 11, halo=True))
         points.append((beside[0] - 30, beside[1]))
     return [*bands, *names], points
 
@@ -93,9 +93,9 @@ def place_title(ssh_map: SSHMap, place: int) -> str:
     """Say where a place lies: "place 2, right of path 0+, in regions 1 and 3"."""
     regions = [r for r in ssh_map.regions or () if place in r.places]
     bounds = sorted({course for region in regions for course in region.bounds})
-    beside = f", right of {listed(map(course_named, bounds))}" if bounds else ""
+    beside = f", right of {list_in_words(map(course_named, bounds))}" if bounds else ""
     ids = ids_at(ssh_map.regions, place)
-    within = f", in region{'' if len(ids) == 1 else 's'} {listed(ids)}" if ids else ""
+    within = f", in region{'' if len(ids) == 1 else 's'} {list_in_words(ids)}" if ids else ""
     return f"{ssh_map.called('place', place)}{beside}{within}"
 
 

@@ -12,7 +12,7 @@ from ssh_abduction.solver import Solution, Watch, solve
 from ssh_abduction.theory.theory import Theory
 
 
-def explained(
+def pair_explained(
     trace: Trace, first: int, second: int, theory: Theory, limit: float | None, watch: Watch
 ) -> PairExplanation:
     """Explain why two steps are one dstate (a place and a heading), or why they are not.
@@ -28,7 +28,9 @@ def explained(
     return explain_pair(trace, first, second, theory, time_limit=limit)
 
 
-def solved(trace: Trace, theory: Theory, maps: int, limit: float | None, watch: Watch) -> Solution:
+def solved_with(
+    trace: Trace, theory: Theory, maps: int, limit: float | None, watch: Watch
+) -> Solution:
     """Find the minimal maps by a theory with assumptions.
 
     Args:
@@ -36,6 +38,6 @@ def solved(trace: Trace, theory: Theory, maps: int, limit: float | None, watch: 
         theory: The theory, with the pairs of steps that the user assumes to be one dstate or not.
         maps: List at most this many maps; None lists all.
         limit: Seconds for the answer; None for no limit.
-        watch: Not used, as in `explained`.
+        watch: Not used, as in `pair_explained`.
     """
     return solve(trace, theory, max_maps=maps, time_limit=limit)

@@ -131,11 +131,11 @@ class PageServer(ThreadingHTTPServer):
         with self._turn(watch):
             if pair is not None:
                 why = in_process(
-                    answers.explained, self._trace, *pair, theory, self._limit, watch=watch
+                    answers.pair_explained, self._trace, *pair, theory, self._limit, watch=watch
                 )
                 return {"text": str(why), "assuming": why.assuming}
             found = in_process(
-                answers.solved, self._trace, theory, self._maps, self._limit, watch=watch
+                answers.solved_with, self._trace, theory, self._maps, self._limit, watch=watch
             )
         if not found.maps:
             return {"text": found.headline}

@@ -70,7 +70,7 @@ from ssh_abduction.rivals.machines import (
     Observations,
     Row,
     Walk,
-    links_of,
+    leads_of,
     machine_of,
     with_ends,
 )
@@ -179,7 +179,7 @@ class Laboratory:
         self._can, self._watch = can, watch
         self._sights = Observations(rivals, trace, theory)
         self._links = [
-            _to_known_views(links_of(ssh_map, i), ssh_map) for i, ssh_map in enumerate(rivals)
+            _to_known_views(leads_of(ssh_map, i), ssh_map) for i, ssh_map in enumerate(rivals)
         ]
         self.stopped: Stop | None = None
         done = [action for action in (trace.actions if trace else ()) if not action.starts]

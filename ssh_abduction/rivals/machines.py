@@ -238,7 +238,7 @@ class Machine:
     ends: tuple[tuple[tuple[str, int], ...], ...]
 
 
-def links_of(ssh_map: SSHMap, number: int) -> dict[int, dict[str, int]]:
+def leads_of(ssh_map: SSHMap, number: int) -> dict[int, dict[str, int]]:
     """For each dstate, find the actions that were tried there and where they lead.
 
     Args:

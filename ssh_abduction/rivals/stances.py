@@ -10,7 +10,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.star import Frame, Star
 from ssh_abduction.data.trace import Action, Step, Trace
 from ssh_abduction.rivals.consequences import OF_FRAMES, QUARTERS, is_possible
-from ssh_abduction.rivals.machines import Can, Seen, links_of
+from ssh_abduction.rivals.machines import Can, Seen, leads_of
 from ssh_abduction.theory.theory import Theory
 
 How: TypeAlias = Literal["known", "implied", "expected", "unknown"]
@@ -72,7 +72,7 @@ class Stances:
         actions: Sequence[Action],
         can: Can | None,
     ) -> None:
-        self._links = links_of(ssh_map, 0)
+        self._links = leads_of(ssh_map, 0)
         known = (*actions, *trace.actions)
         self._actions = {action.name: action for action in known if not action.starts}
         self._can = can

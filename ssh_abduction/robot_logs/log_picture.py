@@ -26,8 +26,8 @@ from perception.places.importing import Imported
 from perception.readers.scans import Pose, RobotLog
 from ssh_abduction.data.drives import Drive, drives_of
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.odometry import between, moved
-from ssh_abduction.output.drawing import ALARM, COLOURS, escaped, page, text, titled
+from ssh_abduction.data.odometry import displacement_between, moved
+from ssh_abduction.output.drawing import ALARM, COLOURS, escaped, page, svg_text, titled
 from ssh_abduction.output.region_marks import band, banded
 from ssh_abduction.output.undecided import place_of_steps, undecided_places
 from ssh_abduction.solver import Solution
@@ -157,7 +157,7 @@ class _Sheet:
         spots, turns = [], []
         for visit in imported.visits:
             x, y = visit.middle
-            middle = between(track[visit.scan], (float(x), float(y), 0.0))
+            middle = displacement_between(track[visit.scan], (float(x), float(y), 0.0))
             spots.append(moved(poses[visit.scan], middle)[:2])
             turns.append(poses[visit.scan][2] - track[visit.scan][2])
         extent = np.ptp(np.concatenate([walls, [pose[:2] for pose in poses]]), axis=0).max()
@@ -321,14 +321,14 @@ def _number(at: Point, name: str, doubt: float | None) -> Iterator[str]:
     x, y = at
     yield (
         f'<circle cx="{x:.1f}" cy="{y:.1f}" r="8" fill="white" stroke="#222"/>'
-        + text(x, y, name, "#222", 10, "bold")
+        + svg_text(x, y, name, "#222", 10, "bold")
     )
     if doubt is not None:
         yield titled(
             f"a join at place {name} has probability {doubt:.2f}",
             f'<circle cx="{x:.1f}" cy="{y:.1f}" r="13" fill="none" stroke="{ALARM}" '
             'stroke-width="2" stroke-dasharray="4 3"/>',
-            text(x + 26, y - 12, f"{doubt:.2f}", ALARM, 11, "bold"),
+            svg_text(x + 26, y - 12, f"{doubt:.2f}", ALARM, 11, "bold"),
         )
 
 

@@ -97,7 +97,7 @@ def _begins(at: Sequence[int], visit: Sequence[int]) -> list[int]:
     return begins
 
 
-def course_of(ssh_map: SSHMap) -> Course:
+def dstates_and_places(ssh_map: SSHMap) -> Course:
     """Return the dstate and the place of each step, numbered by first visit."""
     places = [ssh_map.dstates[label].place for label in ssh_map.dstate_at]
     return tuple(numbered(ssh_map.dstate_at)), tuple(numbered(places))
@@ -105,7 +105,7 @@ def course_of(ssh_map: SSHMap) -> Course:
 
 def rival_of(ssh_map: SSHMap, nats: float) -> Rival:
     """Make a rival of a map and its cost in nats."""
-    dstates, places = course_of(ssh_map)
+    dstates, places = dstates_and_places(ssh_map)
     faults = tuple((fault.kind, fault.step) for fault in ssh_map.faults)
     return Rival(nats, dstates, places if ssh_map.places else (), faults=faults)
 

@@ -36,8 +36,15 @@ from ssh_abduction.data.maps import Fit, Pose, SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.equations import Equations
-from ssh_abduction.solver.linear import as_dense, inverse, least_squares, matrix, solved, weighted
-from ssh_abduction.theory.evidence.loops import turned
+from ssh_abduction.solver.linear import (
+    as_dense,
+    inverse,
+    least_squares,
+    matrix,
+    system_solved,
+    weighted,
+)
+from ssh_abduction.theory.evidence.loops import vectors_turned
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -151,7 +158,7 @@ class Poses:
             normal, gradient = jacobian.T @ jacobian, jacobian.T @ off
             scale = normal.diagonal() + HELD_STILL
             while True:
-                step = solved(normal, damping * scale, -gradient)
+                step = system_solved(normal, damping * scale, -gradient)
                 better = self._residuals(unknown + step)
                 gain = float(off @ off - better @ better)
                 if gain >= 0 or damping > MOST_DAMPING:
@@ -192,8 +199,10 @@ class Poses:
         )
         weights, differences = 1 / self._sigmas(0), self._moves()
         if self._group.max() > 0:
-            heading += self._rotations(turned(self._moved[:, :2], heading[self._from]))[self._group]
-        onward = turned(self._moved[:, :2], heading[self._from])
+            heading += self._rotations(vectors_turned(self._moved[:, :2], heading[self._from]))[
+                self._group
+            ]
+        onward = vectors_turned(self._moved[:, :2], heading[self._from])
         for axis in range(2):
             at[:, axis] = least_squares(differences, onward[:, axis] * weights, weights)
         return unknown
@@ -256,7 +265,7 @@ class Poses:
         mixed = as_dense(moves.T @ turns)
         square = moves.T @ moves
         held = 1e-9 * max(float(square.diagonal().max()), 1.0)
-        best = solved(square, np.full(self._positions, held), mixed)
+        best = system_solved(square, np.full(self._positions, held), mixed)
         form: NDArray[np.complex128] = as_dense(turns.conj().T @ turns) - mixed.conj().T @ best
         return form
 

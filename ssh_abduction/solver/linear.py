@@ -48,7 +48,7 @@ def weighted(some: Any, weights: Array) -> Any:
     return csr_array(some.multiply(weights[:, None]))
 
 
-def solved(square: Any, added: Array, right: Any) -> Any:
+def system_solved(square: Any, added: Array, right: Any) -> Any:
     """Solve a system of linear equations.
 
     Args:
@@ -76,7 +76,7 @@ def least_squares(some: Any, values: Array, weights: Array) -> Array:
     normal = system.T @ system
     scale = normal.diagonal()
     # A little damping makes the matrix regular.
-    found: Array = solved(normal, DAMPING * (scale + scale.max()), system.T @ values)
+    found: Array = system_solved(normal, DAMPING * (scale + scale.max()), system.T @ values)
     return found
 
 
@@ -101,5 +101,5 @@ def inverse(square: Any, added: Array, rows: NDArray[np.intp]) -> Array:
             return part
     columns = np.zeros((len(added), len(rows)))
     columns[rows, np.arange(len(rows))] = 1.0
-    found: Array = solved(square, added, columns)[rows]
+    found: Array = system_solved(square, added, columns)[rows]
     return found

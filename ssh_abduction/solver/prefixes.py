@@ -45,7 +45,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
 
-from ssh_abduction.data.gateways import turned
+from ssh_abduction.data.gateways import with_allowed_headings
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.logs import log_of
 from ssh_abduction.solver.asp.facts import readable
@@ -347,7 +347,7 @@ class Prefixes:
         if (
             self._in_tolerance
             and replays
-            and turned(
+            and with_allowed_headings(
                 self._task.trace,
                 replace(ssh_map, dstate_at=replayed.labels),
                 self._task.theory.axioms,
@@ -365,4 +365,4 @@ class Prefixes:
         whole = replace(ssh_map, dstate_at=replayed.labels)
         if not self._in_tolerance or len(ssh_map.dstate_at) == len(replayed.labels):
             return whole
-        return turned(self._task.trace, whole, self._task.theory.axioms) or whole
+        return with_allowed_headings(self._task.trace, whole, self._task.theory.axioms) or whole

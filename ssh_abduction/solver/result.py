@@ -488,4 +488,4 @@ def _table_of_maps(solution: Solution) -> str:
     columns |= {"chi-square": ["" if chi is None else f"{chi:.1f}" for chi in chi2]}
     # Columns of zeros are left out.
     shown = {name: column for name, column in columns.items() if any(column)}
-    return cards.table([*shown], zip(*shown.values(), strict=True), "maps")
+    return cards.html_table([*shown], zip(*shown.values(), strict=True), "maps")

@@ -43,7 +43,7 @@ from ssh_abduction.solver.equations import spreads_of
 from ssh_abduction.solver.estimating import (
     CostOf,
     Course,
-    course_of,
+    dstates_and_places,
     estimated,
     least_places,
     rival_of,
@@ -220,7 +220,11 @@ class Weighing:
         )
         found, proven = self._of_labels(trace, pinned, self._parts.watch.left())
         jumps = tuple(fault for fault in ssh_map.faults if fault.kind == "jumped")
-        alike = [_with(jumps, other) for other in found if course_of(other) == course_of(ssh_map)]
+        alike = [
+            _with(jumps, other)
+            for other in found
+            if dstates_and_places(other) == dstates_and_places(ssh_map)
+        ]
         return tuple(alike) or (ssh_map,), proven and bool(alike)
 
     def add(self, ssh_map: SSHMap) -> float:
@@ -384,7 +388,7 @@ def _exactly(ssh_map: SSHMap) -> list[Equality]:
     These equalities exclude only maps with exactly these dstates and places. A map with more
     returns is not excluded, as it may have fewer faults.
     """
-    dstates, places = course_of(ssh_map)
+    dstates, places = dstates_and_places(ssh_map)
     found = []
     for of, names in (("dstate", dstates), ("place", places if ssh_map.places else ())):
         pairs = combinations(range(len(names)), 2)

@@ -129,7 +129,7 @@ def _graph_of_places(ssh_map: SSHMap, to: str, turns: Trace | Turns | None) -> n
     return graph
 
 
-def doubts(
+def export_doubts(
     ssh_map: SSHMap,
     to: str,
     *,

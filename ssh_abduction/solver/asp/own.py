@@ -25,7 +25,7 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.asp.control import Control
 from ssh_abduction.solver.asp.facts import readable
-from ssh_abduction.solver.asp.facts.atoms import numbers
+from ssh_abduction.solver.asp.facts.atoms import number_symbols
 from ssh_abduction.solver.asp.limits import POLL
 from ssh_abduction.solver.asp.rules import read_by
 from ssh_abduction.theory.settle import Problem
@@ -98,8 +98,8 @@ def keeps_own_rules(problem: Problem, ssh_map: SSHMap) -> bool:
     control.ground([("base", [])])
     for t in steps:
         look_at_clock()
-        control.ground([("step", numbers(t))])
-    control.ground([("check", numbers(len(trace) - 1))])
+        control.ground([("step", number_symbols(t))])
+    control.ground([("check", number_symbols(len(trace) - 1))])
     with control.solve(async_=True) as handle:
         while not handle.wait(POLL):
             look_at_clock()

@@ -26,7 +26,7 @@ from dataclasses import dataclass, field
 
 from ssh_abduction.solver.asp.control import Asker, Control
 from ssh_abduction.solver.asp.facts import faulty_lp
-from ssh_abduction.solver.asp.facts.atoms import numbers
+from ssh_abduction.solver.asp.facts.atoms import number_symbols
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.steps.apart import Continuations
 from ssh_abduction.theory.evidence import Pairs
@@ -223,7 +223,7 @@ class Blocks:
                 "\n".join([base, batch, faulty_lp.dstates_and_faults_up_to(most, tenths)]),
             )
             asker.control.ground([("base", [])])
-            asker.control.ground([("more", numbers(0))])
+            asker.control.ground([("more", number_symbols(0))])
             answer, core = asker.verdict(lambda _: True, [], CONFLICTS)
             if answer or core is None:
                 return False

@@ -19,7 +19,7 @@ import clingo
 
 from ssh_abduction.solver.asp.control import Asker, Control
 from ssh_abduction.solver.asp.facts import faulty_lp
-from ssh_abduction.solver.asp.facts.atoms import numbers
+from ssh_abduction.solver.asp.facts.atoms import number_symbols
 from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.theory.evidence import Equality
 
@@ -169,7 +169,7 @@ class FaultyControl:
             batch, seen, actions, new, given.steps, pairs, price, self.full
         )
         control.add(f"batch_{batch}", [], rules)
-        control.ground([(f"batch_{batch}", []), ("more", numbers(batch))])
+        control.ground([(f"batch_{batch}", []), ("more", number_symbols(batch))])
         if self._most_faults is not None:
             control.add(f"most_{batch}", [], faulty_lp.at_most_faults(self._most_faults))
             control.ground([(f"most_{batch}", [])])

@@ -20,7 +20,7 @@ import networkx as nx
 
 from ssh_abduction.solver.asp.control import Asker, Control, mapped
 from ssh_abduction.solver.asp.facts import names_lp, path_reader, paths_lp, sides_lp
-from ssh_abduction.solver.asp.facts.atoms import numbers
+from ssh_abduction.solver.asp.facts.atoms import number_symbols
 from ssh_abduction.solver.engines.base import Found, Task
 from ssh_abduction.solver.engines.doubts import Settled
 from ssh_abduction.solver.engines.homes import fewest_paths, homes_of
@@ -169,7 +169,7 @@ class PlacesAndPaths:
                     "sides", [], sides_lp.sides_frameless_facts(self._task.theory, self._actions)
                 )
                 parts.append(("sides", []))
-            parts += [("path", numbers(names[dstate])) for dstate in dstates]
+            parts += [("path", number_symbols(names[dstate])) for dstate in dstates]
             control.ground(parts)  # one call for all parts halves the time to ground and to search
             self._grounded.update(dstates)
 

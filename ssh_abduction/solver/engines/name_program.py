@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ssh_abduction.solver.asp.control import Asker, new_control
 from ssh_abduction.solver.asp.facts import names_lp
-from ssh_abduction.solver.asp.facts.atoms import numbers
+from ssh_abduction.solver.asp.facts.atoms import number_symbols
 from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.pinned import Pinned
 from ssh_abduction.solver.steps.chart import Chart, Link
@@ -218,7 +218,7 @@ class NameProgram:
         self.add_rules(
             f"batch_{known.batches}", names_lp.batch_facts(known.batches, given, added, far)
         )
-        self._asker.control.ground([("more", numbers(known.batches))])
+        self._asker.control.ground([("more", number_symbols(known.batches))])
         known.batches += 1
 
     def add_rules(self, part: str, rules: str) -> None:
@@ -298,7 +298,7 @@ class NameProgram:
         return [
             atom.literal
             for node, label in enumerate(labels)
-            if (atom := atoms[names_lp.named(node, name_of[label])])
+            if (atom := atoms[names_lp.named_atom(node, name_of[label])])
         ]
 
     def no_rests(self) -> list[int]:

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 
 from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.facts import paths_lp, sides_lp
-from ssh_abduction.solver.asp.facts.atoms import numbers
+from ssh_abduction.solver.asp.facts.atoms import number_symbols
 from ssh_abduction.solver.engines.paths import Paths
 from ssh_abduction.solver.steps.chart import FramedChart
 from ssh_abduction.theory import encodings
@@ -43,11 +43,11 @@ class FramedSides:
         self._batch = batch
         if self._said:
             paths = [
-                (part, numbers(*arguments, batch))
+                (part, number_symbols(*arguments, batch))
                 for part, arguments in self._said
                 if part == "path"
             ]
-            self._asker.control.ground([("paths", numbers(batch)), *paths])
+            self._asker.control.ground([("paths", number_symbols(batch)), *paths])
 
     def say_of_path(
         self,
@@ -98,10 +98,12 @@ class FramedSides:
             if not self._said:
                 control.load(encodings.path("sides_framed"))
                 control.add("sides", [], sides_lp.sides_framed_facts(self._theory))
-                control.ground([("sides", []), *(("paths", numbers(batch)) for batch in batches)])
+                control.ground(
+                    [("sides", []), *(("paths", number_symbols(batch)) for batch in batches)]
+                )
             self._said[part, arguments] = None
             if part == "path":
-                control.ground([(part, numbers(*arguments, batch)) for batch in batches])
+                control.ground([(part, number_symbols(*arguments, batch)) for batch in batches])
             else:
-                control.ground([(part, numbers(*arguments))])
+                control.ground([(part, number_symbols(*arguments))])
         return True

@@ -18,8 +18,8 @@ from itertools import islice
 from ssh_abduction.solver.engines.base import AT_ONCE, Task
 from ssh_abduction.solver.engines.pinned import Pinned
 from ssh_abduction.solver.guesses.annealing import annealed, annealed_steps
-from ssh_abduction.solver.guesses.continuing import followed
-from ssh_abduction.solver.guesses.merging import merged, merged_near, thinned
+from ssh_abduction.solver.guesses.continuing import labels_continued
+from ssh_abduction.solver.guesses.merging import dstates_merged, merged, merged_near
 from ssh_abduction.solver.steps.chart import Chart
 
 # If turns cannot be rotations, stop after this many guesses, even if none of them is a map. Guesses
@@ -59,11 +59,11 @@ class SmallMaps:
         while self._task.speedups.annealed:
             beginning = Pinned.of_steps(self._task.log, steps)
             near = self._map_of_guess(beginning, check)
-            tried = () if near is None else (thinned(beginning.chart, near, check), near)
+            tried = () if near is None else (dstates_merged(beginning.chart, near, check), near)
             for known in tried:
-                if labels := followed(self._task.log, known, check):
+                if labels := labels_continued(self._task.log, known, check):
                     yield labels[:size]
-                    yield (labels := thinned(chart, labels[:size], check))
+                    yield (labels := dstates_merged(chart, labels[:size], check))
                     if len(set(labels)) <= len(set(known)):
                         return
             if steps == most:
@@ -75,7 +75,7 @@ class SmallMaps:
         if self._task.speedups.annealed:
             near = self._map_of_guess(self._pinned, check)
             if near is not None:
-                yield thinned(self._pinned.chart, near, check)
+                yield dstates_merged(self._pinned.chart, near, check)
 
     def _map_of_guess(self, pinned: Pinned, check: Callable[[], None]) -> list[int] | None:
         """Return labels of a map of these steps near a guess; None if there is no guess."""

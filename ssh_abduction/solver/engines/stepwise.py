@@ -14,7 +14,7 @@ import clingo
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.facts import answer_maps, questions, readable
-from ssh_abduction.solver.asp.facts.atoms import numbers
+from ssh_abduction.solver.asp.facts.atoms import number_symbols
 from ssh_abduction.solver.engines.base import Found, Task
 from ssh_abduction.solver.engines.doubts import Doubt, Doubts
 from ssh_abduction.theory import encodings
@@ -97,7 +97,9 @@ class StepEngine:
         control.add(part, [], readable.trace_facts(self._task.problem, start, stop))
         before = control.seconds, control.mebibytes
         base: list[tuple[str, list[clingo.Symbol]]] = [] if start else [("base", [])]
-        control.ground([*base, (part, []), *(("step", numbers(t)) for t in range(start, stop))])
+        control.ground(
+            [*base, (part, []), *(("step", number_symbols(t)) for t in range(start, stop))]
+        )
         if base:
             control.assign_external(readable.run_by_steps(), True)
         self._last_step = control.seconds - before[0], control.mebibytes - before[1]
@@ -108,7 +110,7 @@ class StepEngine:
         if self._asked == last:
             return
         control = self.asker.control
-        control.ground([("check", numbers(last))])
+        control.ground([("check", number_symbols(last))])
         if self._asked is not None:
             control.release_external(readable.query(self._asked))
         control.assign_external(readable.query(last), True)

@@ -14,7 +14,7 @@ import clingo
 
 from ssh_abduction.solver.asp.control import Asker, new_control
 from ssh_abduction.solver.asp.facts import sides_lp, visits_lp
-from ssh_abduction.solver.asp.facts.atoms import numbers
+from ssh_abduction.solver.asp.facts.atoms import number_symbols
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.transitive import Pair, PairOf, Three, intransitive
@@ -156,7 +156,7 @@ class VisitProgram:
         """
         control, known = self._asker.control, self._known
         if self.batch >= 0:
-            control.release_external(visits_lp.listed(self.batch))
+            control.release_external(visits_lp.listing_atom(self.batch))
         self.chart = chart
         self.batch += 1
         added = sorted(visits - known.visits)
@@ -186,8 +186,8 @@ class VisitProgram:
         facts = visits_lp.visit_facts(self.batch, nodes, leaves, new, unfit, joined)
         control.add(part, [], facts)
         control.add(part, [], sides_lp.turn_facts(self.batch, chart, added, turns))
-        control.ground([(part, []), ("more", numbers(self.batch))])
-        control.assign_external(visits_lp.listed(self.batch), True)
+        control.ground([(part, []), ("more", number_symbols(self.batch))])
+        control.assign_external(visits_lp.listing_atom(self.batch), True)
         atoms = control.symbolic_atoms
         self.least += sum(
             atom.is_fact for place, *_ in nodes if (atom := atoms[visits_lp.first(place)])
@@ -228,7 +228,7 @@ class VisitProgram:
             self._asker.control.add(name, [], rules)
             self._asker.control.ground([(name, [])])
             if part is not None:
-                self._asker.control.ground([(part, numbers(number))])
+                self._asker.control.ground([(part, number_symbols(number))])
 
     def close(self, threes: Iterable[Three]) -> None:
         """Give clingo the rules of transitivity for these triples of visits."""

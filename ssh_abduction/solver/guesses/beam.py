@@ -38,7 +38,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.guesses.completing import completed
-from ssh_abduction.solver.guesses.pieces import fitted, headings
+from ssh_abduction.solver.guesses.pieces import fitted, headings_by_turn
 from ssh_abduction.solver.guesses.reckoning import Hypothesis, HypothesisPoses, first_pose
 from ssh_abduction.solver.guesses.sights import DEAREST, Sights
 from ssh_abduction.solver.steps.faults import with_changes, with_faults
@@ -298,7 +298,7 @@ class Beam:
 
     def _completed(self, found: Hypothesis, trace: Trace, theory: Theory) -> Iterator[SSHMap]:
         """Yield the maps of a hypothesis that satisfy the axioms, one for each way it may face."""
-        ways = headings(found)
+        ways = headings_by_turn(found)
         for facing in ways if theory.star == "frame" else islice(ways, 1):
             ssh_map = completed(trace, theory, found.labels, found.places, facing)
             changed = None if ssh_map is None else with_changes(ssh_map, trace, theory)

@@ -77,7 +77,7 @@ def completed(
         return None
     found = replace(_on(bare, courses, facing_of.headings), paths=orders)
     if theory.star == "gateways":
-        turned = gateways.turned(trace, found, theory.axioms, bool(theory.changed))
+        turned = gateways.with_allowed_headings(trace, found, theory.axioms, bool(theory.changed))
         return None if turned is None else turned.renumbered()
     return found.renumbered()
 

@@ -1,11 +1,11 @@
 """Localise the steps of a long trace in a map of its first steps, and add links that it lacks.
 
 >>> from ssh_abduction import Theory, Trace
->>> from ssh_abduction.solver.guesses.continuing import followed
+>>> from ssh_abduction.solver.guesses.continuing import labels_continued
 >>> from ssh_abduction.solver.steps.log import Log
 >>> actions = ["go"] * 6 + ["back"] + ["go"] * 11
 >>> trace = Trace.from_steps("abcabca" + "cab" * 4, actions)
->>> followed(Log(trace, Theory.causal()), [0, 1, 2, 0])
+>>> labels_continued(Log(trace, Theory.causal()), [0, 1, 2, 0])
 [0, 1, 2, 0, 1, 2, 0, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1]
 
 A *walk* follows the trace along the links of the map. If an action has no link, it must lead to a
@@ -44,7 +44,7 @@ MANY = 10
 _Link: TypeAlias = tuple[int, int]  # dstate, action
 
 
-def followed(
+def labels_continued(
     log: Log, labels: Sequence[int], check: Callable[[], None] = lambda: None
 ) -> list[int] | None:
     """Label all steps of a trace by extending, and if need be correcting, a map of its first steps.

@@ -29,7 +29,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Self
 
-from ssh_abduction.data.gateways import Sight, are_opposite, fit, headings
+from ssh_abduction.data.gateways import Sight, allowed_headings, are_opposite, frames_that_fit
 from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.rotations import leads
 from ssh_abduction.data.star import Star
@@ -150,7 +150,7 @@ class GatewaySketch(Sketch):
             return True
         if not known.sights and not self._onward(there):
             return True
-        return fit(*self._sights(grown), self._axioms, as_shown=False) is not None
+        return frames_that_fit(*self._sights(grown), self._axioms, as_shown=False) is not None
 
     def _grown(self, place: int, there: int, t: int) -> _PlaceSights:
         """Return the place with step t added, the present step, at a dstate there."""
@@ -209,7 +209,7 @@ class GatewaySketch(Sketch):
         if not self._homing and self._may_begin_path(s):
             return None
         sights, turns = self._sights(self._shown[s.place])
-        read = fit(sights, turns, self._axioms, as_shown=False) or []
+        read = frames_that_fit(sights, turns, self._axioms, as_shown=False) or []
         own = [
             turned for sight, turned in zip(sights, read, strict=False) if sight.dstate.id == here
         ]
@@ -223,7 +223,7 @@ class GatewaySketch(Sketch):
         """Whether a new path may leave a place in the heading of a dstate."""
         self._orders.append([s.place])
         s.path, s.direction = len(self._orders) - 1, 1
-        fitted = fit(*self._sights(self._shown[s.place]), self._axioms, as_shown=False)
+        fitted = frames_that_fit(*self._sights(self._shown[s.place]), self._axioms, as_shown=False)
         s.path = None
         self._orders.pop()
         return fitted is not None
@@ -278,7 +278,7 @@ class GatewaySketch(Sketch):
             seen, made = self._sights(place)
             sights.extend(seen)
             turns.update(made)
-        found = headings(sights, turns, self._axioms)
+        found = allowed_headings(sights, turns, self._axioms)
         dstates = tuple(replace(s, heading=found.get(s.id)) for s in ssh_map.dstates)
         return replace(ssh_map, dstates=dstates)
 

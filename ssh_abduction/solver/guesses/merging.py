@@ -103,7 +103,7 @@ def kept(apart: Matrix, links: Iterable[Link], guess: Sequence[int]) -> list[int
     return _from_guess(apart, links, guess).labels()
 
 
-def thinned(
+def dstates_merged(
     chart: Chart, labels: Sequence[int], check: Callable[[], None] = lambda: None
 ) -> list[int]:
     """Merge dstates of a map of a chart until no two can be one.

@@ -107,7 +107,7 @@ def fitted(found: Hypothesis, place: int, dstate: int | None = None) -> Hypothes
     return replace(turned, pieces=joined.merged(other))
 
 
-def headings(found: Hypothesis) -> Iterator[list[float]]:
+def headings_by_turn(found: Hypothesis) -> Iterator[list[float]]:
     """Yield the headings of the dstates in radians, for each way to turn the pieces with hinges.
 
     At a place with four slots, frames differ by quarter turns. Where only a place joins a piece to

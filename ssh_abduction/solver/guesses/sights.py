@@ -12,7 +12,7 @@ from ssh_abduction.data.star import Frame, Star
 from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.solver.guesses.reckoning import Hypothesis
 from ssh_abduction.solver.steps.chart import numbered
-from ssh_abduction.solver.steps.frames import rotations
+from ssh_abduction.solver.steps.frames import rotation_bits
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.theory import Theory
 
@@ -136,7 +136,7 @@ def _smaller(star: Star, less: int) -> tuple[Frame, ...]:
 def _turns(frame: Frame, other: Frame) -> bool:
     """Whether two frames agree with some shift of their gateways."""
     return frame.slots == other.slots and any(
-        rotations(frame, other, shift) for shift in range(max(frame.slots, 1))
+        rotation_bits(frame, other, shift) for shift in range(max(frame.slots, 1))
     )
 
 

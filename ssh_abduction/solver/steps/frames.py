@@ -9,11 +9,11 @@ the robot between the two frames. A set of rotations has whole degrees clockwise
 rounded outwards. If it is empty, the two frames are not seen at one place with this shift.
 
 >>> from ssh_abduction.data.star import Star
->>> from ssh_abduction.solver.steps.frames import members, rotations
+>>> from ssh_abduction.solver.steps.frames import members, rotation_bits
 >>> junction, turned = Star.of((0, 120, 240)).frames[0], Star.of((60, 180, 300)).frames[0]
->>> [min(members(rotations(junction, turned, shift)), default=None) for shift in range(3)]
+>>> [min(members(rotation_bits(junction, turned, shift)), default=None) for shift in range(3)]
 [280, 40, 160]
->>> rotations(junction, Star.of((0, 90, 180)).frames[0], 0)
+>>> rotation_bits(junction, Star.of((0, 90, 180)).frames[0], 0)
 0
 """
 
@@ -71,12 +71,12 @@ class Frames:
         first, then = self.frames[x], self.frames[y]
         if first.slots == then.slots:
             yield from (
-                shift for shift in range(max(first.slots, 1)) if rotations(first, then, shift)
+                shift for shift in range(max(first.slots, 1)) if rotation_bits(first, then, shift)
             )
 
 
 @lru_cache(maxsize=2**16)
-def rotations(first: Frame, then: Frame, shift: int) -> int:
+def rotation_bits(first: Frame, then: Frame, shift: int) -> int:
     """Find the rotations by which the robot may have turned between two frames at one place.
 
     Args:
@@ -104,13 +104,13 @@ def may_face(first: Frame, then: Frame, shift: int) -> list[str]:
     Slots that the trace declares opposite belong to one path, at any angle. The robot also faces
     alike if it faces the same direction of such a path in both frames, and so on.
 
-    Arguments are as for `rotations`.
+    Arguments are as for `rotation_bits`.
 
     Returns:
         A list with "alike" if it may face the same way, and "opposite" if it may face the opposite
         way.
     """
-    found = rotations(first, then, shift)
+    found = rotation_bits(first, then, shift)
     return [
         way
         for way, towards in WAYS.items()
@@ -120,7 +120,7 @@ def may_face(first: Frame, then: Frame, shift: int) -> list[str]:
 
 def must_face(first: Frame, then: Frame, shift: int) -> list[str]:
     """Return the only way that the robot can face, as `may_face`: a list of at most one."""
-    found = rotations(first, then, shift)
+    found = rotation_bits(first, then, shift)
     return [
         way
         for way, towards in WAYS.items()
@@ -131,7 +131,7 @@ def must_face(first: Frame, then: Frame, shift: int) -> list[str]:
 
 def may_turn(action: Action, first: Frame, then: Frame, shift: int) -> bool:
     """Whether a turn may lead from the first frame to the other one with this shift."""
-    return bool(rotations(first, then, shift) & _turned_by(action, first))
+    return bool(rotation_bits(first, then, shift) & _turned_by(action, first))
 
 
 def ends(frame: Frame) -> list[str]:
@@ -157,10 +157,10 @@ def heading(first: Frame, then: Frame, shift: int) -> int:
 
     It is the middle of the possible rotations; 0 if any rotation is possible, or none.
     """
-    return middle(rotations(first, then, shift)) if first.slots == then.slots else 0
+    return middle_of_bits(rotation_bits(first, then, shift)) if first.slots == then.slots else 0
 
 
-def middle(found: int) -> int:
+def middle_of_bits(found: int) -> int:
     """Return the middle of the longest interval in a set of rotations; 0 if it is full or empty."""
     starts = [r for r in members(found) if not found >> (r - 1) % 360 & 1]
     lengths = {
@@ -205,7 +205,7 @@ def _declared(first: Frame, then: Frame, shift: int) -> str | None:
         opposite one; None if declared slots do not decide this.
     """
     here, there = _way(first), _way(then)
-    if here is None or there is None or not rotations(first, then, shift):
+    if here is None or there is None or not rotation_bits(first, then, shift):
         return None
     ahead, behind = ((slot + shift) % first.slots for slot in there)
     return "alike" if ahead == here[0] else "opposite" if behind == here[0] else None

@@ -400,10 +400,10 @@ def _sums(trace: Trace, start: int, stop: int, bends: Array, last: Array) -> Arr
             moved[t - start], noise[t - start] = displacement, trace.covariance(t)
     way = np.hypot(moved[:, 0], moved[:, 1])
     rotated = moved[:, 2] - bends[:, None] * way
-    straight = turned(moved[None, :, :2], -bends[:, None] * way / 2)
+    straight = vectors_turned(moved[None, :, :2], -bends[:, None] * way / 2)
     heading = _summed(last[:, 2], rotated)
     before = heading - rotated  # the heading at the start of each displacement
-    onward = turned(straight, before)
+    onward = vectors_turned(straight, before)
     position = _summed(last[:, :2], onward)
     rotation = np.zeros((*before.shape, 3, 3))
     rotation[..., 0, 0] = rotation[..., 1, 1] = np.cos(before)
@@ -458,7 +458,7 @@ def chi_squares(closing: Array, covariance: Array) -> tuple[Array, Array]:
     return by_position, by_position + by_heading
 
 
-def turned(vectors: Array, angles: Array) -> Array:
+def vectors_turned(vectors: Array, angles: Array) -> Array:
     """Turn vectors, ... x 2, counterclockwise by angles in radians."""
     cos, sin = np.cos(angles), np.sin(angles)
     return np.stack(

@@ -9,7 +9,7 @@ takes about thirty times as long, but mostly they are grounded only for short pr
 """
 
 from ssh_abduction.solver.asp.facts.answer_maps import read_map, read_steps
-from ssh_abduction.solver.asp.facts.atoms import numbers
+from ssh_abduction.solver.asp.facts.atoms import number_symbols
 from ssh_abduction.solver.asp.facts.derivation_lp import (
     active,
     conclusion,
@@ -42,7 +42,7 @@ __all__ = [
     "forbidden_equalities",
     "may_fail",
     "most_paths",
-    "numbers",
+    "number_symbols",
     "own_rules",
     "picked",
     "program",

@@ -209,11 +209,11 @@ def _paths(
         if p in on[path] and q in on[path]:
             pairs[path].append((p, q))
     return tuple(
-        MapPath(path, tuple(in_order(found, pairs[path]))) for path, found in enumerate(on)
+        MapPath(path, tuple(places_in_order(found, pairs[path]))) for path, found in enumerate(on)
     )
 
 
-def in_order(places: Iterable[int], before: Iterable[tuple[int, int]]) -> list[int]:
+def places_in_order(places: Iterable[int], before: Iterable[tuple[int, int]]) -> list[int]:
     """Sort places by how many places come before each.
 
     Args:

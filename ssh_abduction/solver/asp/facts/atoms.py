@@ -29,6 +29,6 @@ def read_atom(symbol: Symbol) -> tuple[str, tuple[int, ...]]:
 _number = cache(Number)  # takes half the time of making a new number
 
 
-def numbers(*arguments: int) -> list[Symbol]:
+def number_symbols(*arguments: int) -> list[Symbol]:
     """Return numbers as clingo's symbols, for the arguments of a program part or of an atom."""
     return [_number(argument) for argument in arguments]

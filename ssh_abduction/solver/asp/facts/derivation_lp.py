@@ -10,12 +10,12 @@ from collections.abc import Iterable
 
 from clingo import Control, Function, Model, Symbol
 
-from ssh_abduction.solver.asp.facts.atoms import numbers
+from ssh_abduction.solver.asp.facts.atoms import number_symbols
 
 
 def active(axiom: str, t: int) -> Symbol:
     """Return the atom that says that an axiom must hold at step t (explain.lp)."""
-    return Function("active", [Function(axiom), *numbers(t)])
+    return Function("active", [Function(axiom), *number_symbols(t)])
 
 
 def told_of(steps: Iterable[int]) -> str:
@@ -25,7 +25,7 @@ def told_of(steps: Iterable[int]) -> str:
 
 def conclusion(name: str, *steps: int) -> Symbol:
     """Return the atom of a conclusion, such as `one_dstate`, about some steps."""
-    return Function("so", [Function(name, numbers(*steps))])
+    return Function("so", [Function(name, number_symbols(*steps))])
 
 
 def read_conclusion(symbol: Symbol) -> tuple[str, tuple[int, ...]]:

@@ -13,7 +13,7 @@ from itertools import pairwise
 
 from clingo import Function, Model, Symbol
 
-from ssh_abduction.solver.asp.facts.atoms import numbers
+from ssh_abduction.solver.asp.facts.atoms import number_symbols
 
 
 def name_facts(
@@ -81,12 +81,12 @@ def batch_facts(
 
 def resting(batch: int) -> Symbol:
     """Return the atom that says that some step of the batches up to this one is at a rest."""
-    return Function("resting", numbers(batch))
+    return Function("resting", number_symbols(batch))
 
 
-def named(t: int, name: int) -> Symbol:
+def named_atom(t: int, name: int) -> Symbol:
     """Return the atom that says that step t is at the dstate of that name."""
-    return Function("is", numbers(t, name))
+    return Function("is", number_symbols(t, name))
 
 
 def read_names(model: Model) -> dict[int, int]:
@@ -129,7 +129,7 @@ class NameReader:
         name = next(
             s
             for s in self._choices[0]
-            if (atom := atoms[named(0, s)]) and model.is_true(atom.literal)
+            if (atom := atoms[named_atom(0, s)]) and model.is_true(atom.literal)
         )
         names = {0: name}
         for t, action in enumerate(self._actions, 1):
@@ -138,7 +138,8 @@ class NameReader:
                 there, literal = self._last.get(key, (-1, 0))
                 if not literal or not model.is_true(literal):
                     asked = (
-                        (x, atoms[Function("goes", numbers(*key, x))]) for x in self._choices[t]
+                        (x, atoms[Function("goes", number_symbols(*key, x))])
+                        for x in self._choices[t]
                     )
                     there, literal = next(
                         (x, atom.literal)

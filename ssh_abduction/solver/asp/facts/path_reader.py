@@ -16,8 +16,8 @@ from clingo import Control, Function, Model
 
 from ssh_abduction.data.maps import DState, MapPath, SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.solver.asp.facts.answer_maps import in_order
-from ssh_abduction.solver.asp.facts.atoms import numbers, read_atom
+from ssh_abduction.solver.asp.facts.answer_maps import places_in_order
+from ssh_abduction.solver.asp.facts.atoms import number_symbols, read_atom
 from ssh_abduction.solver.steps.chart import Chart
 from ssh_abduction.solver.steps.faults import links_of, view_at
 from ssh_abduction.theory.theory import Theory
@@ -132,7 +132,7 @@ class PathReader:
                     to -= 1
                 order.insert(to, order.pop(i))
         else:
-            order = in_order(
+            order = places_in_order(
                 places,
                 (pair for pair in permutations(places, 2) if self._is_before(model, (path, *pair))),
             )
@@ -143,7 +143,7 @@ class PathReader:
         """Tell whether an answer has the first of two places of a path before the second."""
         literal = self._before.get(ahead)
         if literal is None:
-            atom = model.context.symbolic_atoms[Function("before", numbers(*ahead))]
+            atom = model.context.symbolic_atoms[Function("before", number_symbols(*ahead))]
             literal = self._before[ahead] = atom.literal if atom else 0
         return literal != 0 and model.is_true(literal)
 

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 
 from clingo import Function, Symbol
 
-from ssh_abduction.solver.asp.facts.atoms import numbers
+from ssh_abduction.solver.asp.facts.atoms import number_symbols
 from ssh_abduction.solver.asp.facts.derivation_lp import active
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.fields import Count
@@ -19,7 +19,7 @@ from ssh_abduction.theory.fields import Count
 
 def are_one(first: int, second: int) -> Symbol:
     """Return the atom that says that two steps are one dstate. The first is the earlier step."""
-    return Function("same", numbers(first, second))
+    return Function("same", number_symbols(first, second))
 
 
 def forbidden_equalities(equalities: Iterable[Equality], where: Symbol | None = None) -> str:
@@ -98,12 +98,12 @@ def steps_are_one(sort: str, i: int, j: int) -> str:
 
 def open_doubt(number: int) -> Symbol:
     """Return the external atom that says that a doubt is open: an answer may make it true."""
-    return Function("open_doubt", numbers(number))
+    return Function("open_doubt", number_symbols(number))
 
 
 def some_doubt(part: int) -> Symbol:
     """Return the atom that says that an open doubt of this program part or an earlier one holds."""
-    return Function("some_doubt", numbers(part))
+    return Function("some_doubt", number_symbols(part))
 
 
 def exactly(number: int, count: Count) -> str:
@@ -124,4 +124,4 @@ def exactly(number: int, count: Count) -> str:
 
 def of_number(number: int, count: Count) -> Symbol:
     """Return the external atom that switches the rule of `exactly` on."""
-    return Function("of_number", [Function(count), *numbers(number)])
+    return Function("of_number", [Function(count), *number_symbols(number)])

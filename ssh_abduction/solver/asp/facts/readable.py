@@ -14,7 +14,7 @@ from clingo import Function, Symbol
 from ssh_abduction.data.drives import starts_of
 from ssh_abduction.data.floors import stretches_of
 from ssh_abduction.data.trace import Action, Trace
-from ssh_abduction.solver.asp.facts.atoms import constant, numbers
+from ssh_abduction.solver.asp.facts.atoms import constant, number_symbols
 from ssh_abduction.solver.steps import frames
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.fields import EXCUSED
@@ -215,7 +215,7 @@ def program(problem: Problem) -> str:
 
 def query(t: int) -> Symbol:
     """Return the external atom that says that step t is the last step."""
-    return Function("query", numbers(t))
+    return Function("query", number_symbols(t))
 
 
 def _kind_fact(action: Action) -> str:

@@ -11,7 +11,7 @@ from itertools import product
 
 from clingo import Function, Symbol
 
-from ssh_abduction.solver.asp.facts.atoms import numbers
+from ssh_abduction.solver.asp.facts.atoms import number_symbols
 
 
 def visit_facts(
@@ -47,9 +47,9 @@ def read_same(atom: Symbol) -> tuple[int, int, int]:
     return first, second, turned
 
 
-def listed(batch: int) -> Symbol:
+def listing_atom(batch: int) -> Symbol:
     """Return the external atom that is true while answers up to this batch are listed."""
-    return Function("listed", numbers(batch))
+    return Function("listed", number_symbols(batch))
 
 
 def first(place: int) -> Symbol:
@@ -58,7 +58,7 @@ def first(place: int) -> Symbol:
     Args:
         place: The number of the node, which is its position in the order of nodes.
     """
-    return Function("first", numbers(place))
+    return Function("first", number_symbols(place))
 
 
 def three_facts(batch: int, threes: Iterable[tuple[int, ...]]) -> str:
