@@ -156,7 +156,9 @@ def trimmed_quality(
         and not isinstance(trim, bool)
         and 0 <= trim <= 0.5
     ):
-        raise PerceptionError(f"trim: expected a share from 0 to 0.5, got {trim!r}")
+        raise PerceptionError(
+            f"trim: expected a share from 0 to 0.5, got {trim!r}; give a number such as 0.05"
+        )
     images = check_array(equal_length(X), dtype=np.float64)
     clusters = _numbered(labels, len(images))
     if clusters.max() == 0:
@@ -464,6 +466,6 @@ def _numbered(labels: ArrayLike, count: int | None = None) -> Integers:
     if of.ndim != 1 or not len(of) or (count is not None and len(of) != count):
         raise PerceptionError(
             f"labels: expected a row of {'labels' if count is None else f'{count} labels'}, "
-            f"got an array of shape {of.shape}"
+            f"got an array of shape {of.shape}; give one label for each image"
         )
     return np.unique(of, return_inverse=True)[1].astype(np.intp)

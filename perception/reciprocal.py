@@ -47,7 +47,8 @@ class ReciprocalTransformer(OneToOneFeatureMixin, TransformerMixin, BaseEstimato
         """
         if not is_finite(self.floor) or self.floor <= 0:
             raise PerceptionError(
-                f"floor: expected a positive number of metres, got {self.floor!r}"
+                f"floor: expected a positive number of metres, got {self.floor!r}; give one such "
+                "as 0.1"
             )
         validate_data(self, equal_length(X), dtype=np.float64, ensure_all_finite=False)
         return self

@@ -63,7 +63,7 @@ class PlaceRecogniser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         ):
             raise PerceptionError(
                 f"n_neighbors: expected a whole number from 1 to the {len(images)} images, "
-                f"got {number!r}"
+                f"got {number!r}; give a smaller number, or more images"
             )
         # If many labels are rare, scikit-learn warns that labels might be numbers.
         with warnings.catch_warnings():
@@ -223,7 +223,8 @@ def learning_curve(
     for size in wanted:
         if not 1 <= size <= len(images):
             raise PerceptionError(
-                f"sizes: expected numbers from 1 to the {len(images)} images, got {size}"
+                f"sizes: expected numbers from 1 to the {len(images)} images, got {size}; leave it "
+                "out"
             )
     fold, untested = _deal(labels, folds, random_state)
     rates = np.zeros((len(wanted), folds))

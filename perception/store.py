@@ -177,7 +177,8 @@ def load(path: str | os.PathLike[str]) -> Stored:
             unpacked = sum(part.file_size for part in archive.infolist())
         if unpacked > LARGEST:
             raise PerceptionError(
-                f"{path}: expected at most {LARGEST} bytes once unpacked, got {unpacked}"
+                f"{path}: expected at most {LARGEST} bytes once unpacked, got {unpacked}; "
+                "train with fewer images"
             )
         if foreign := _foreign(file=path):
             raise PerceptionError(

@@ -338,7 +338,8 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
             )
         if self.isolated is not None and not (is_finite(self.isolated) and self.isolated > 1):
             raise PerceptionError(
-                f"isolated: expected a number of more than 1, or None, got {self.isolated!r}"
+                f"isolated: expected a number of more than 1, or None, got {self.isolated!r}; give "
+                "one such as 3, or None"
             )
         if self.k is None and self.k_max is not None and self.k_max < self.k_min:
             raise PerceptionError(
@@ -349,7 +350,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         ):
             raise PerceptionError(
                 "clusterer: expected a scikit-learn clusterer, such as DBSCAN(), got "
-                f"{self.clusterer!r}"
+                f"{self.clusterer!r}; pass an object with fit and get_params"
             )
         if (
             self.k is not None

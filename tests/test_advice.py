@@ -117,6 +117,43 @@ def test_advice_names_options_that_the_verb_has(folder: str) -> None:
     ] == []
 
 
+def without_advice(source: str) -> list[str]:
+    """The errors of a module that say what is wrong, but not what to do: no text after `;`."""
+    raised = [node.exc for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Raise)]
+    found = []
+    for call in raised:
+        parts = [node.value for node in ast.walk(call or ast.Pass()) if is_text(node)]
+        text = "".join(parts)
+        # argparse adds how an option is used. Callers add what to do to the other two.
+        has_caller = isinstance(call, ast.Call) and ast.unparse(call.func).startswith(
+            ("argparse.", "ValueError", "Damaged")
+        )
+        is_mended = ";" in text or "{mend}" in ast.unparse(call or ast.Pass())
+        if re.search("expected .*, got ", text, re.DOTALL) and not is_mended and not has_caller:
+            found.append(text)
+    return found
+
+
+def is_text(node: ast.AST) -> bool:
+    return isinstance(node, ast.Constant) and isinstance(node.value, str)
+
+
+@pytest.mark.parametrize("folder", ["ssh_abduction", "perception", "simulator"])
+def test_errors_say_what_to_do(folder: str) -> None:
+    assert [
+        (path.name, text)
+        for path in sorted((ROOT / folder).rglob("*.py"))
+        for text in without_advice(path.read_text(encoding="utf-8"))
+    ] == []
+
+
+def test_an_error_without_advice_is_found() -> None:
+    assert without_advice('raise MapError(f"{name}: expected a map, got {x}")') == [
+        ": expected a map, got "
+    ]
+    assert without_advice('raise MapError("expected a map, got none; take one")') == []
+
+
 @pytest.mark.parametrize(
     ("path", "text", "bad"),
     [

@@ -84,8 +84,8 @@ def read_log(
                 damaged.append(item)
     if not scans:
         raise LogError(
-            f"{named(path)}: expected scans, got none that can be read; {len(damaged)} are "
-            f"damaged, first: {damaged[0].what if damaged else 'none'}"
+            f"{named(path)}: expected scans, got none that can be read: {len(damaged)} are "
+            f"damaged, first: {damaged[0].what if damaged else 'none'}; record the log again"
         )
     meant, found_out = interpret_log(scans, options)
     log = RobotLog(

@@ -135,7 +135,7 @@ class RobotLog:
             *self.notes,
             (
                 f"{counted(len(self.damaged), 'damaged parts')} of the log {were} skipped; the "
-                f"first is {first.line}: {first.what}"
+                f"first is {first.line}: {first.what}; mend them, or go on without them"
             ),
         )
 

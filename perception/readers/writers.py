@@ -3,9 +3,9 @@
 >>> import math, tempfile
 >>> import numpy as np
 >>> from perception.readers.logs import read_log
->>> from perception.readers.scans import Laser, Scan
+>>> from perception.readers.scans import LaserScanner, Scan
 >>> from perception.readers.writers import write_carmen
->>> laser = Laser(first=-math.pi / 2, step=math.pi / 2, beams=3, reach=8.0)
+>>> laser = LaserScanner(first=-math.pi / 2, step=math.pi / 2, beams=3, reach=8.0)
 >>> ranges, odometry, corrected = np.array([1.0, np.inf, 2.5]), (1.0, 0.0, 0.0), (1.1, 0.0, 0.0)
 >>> scan = Scan(ranges, laser, odometry, corrected, time=0.5)
 >>> with tempfile.TemporaryDirectory() as folder:

@@ -152,7 +152,7 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     options: argparse.Namespace = top.parse_args(arguments)
     for name, value in vars(options).items():
         if isinstance(value, list) and (not value or [] in value):
-            top.error(f"{name}: expected a value, got '--'")
+            top.error(f"{name}: expected a value, got '--'; give one, or leave the option out")
     return options
 
 

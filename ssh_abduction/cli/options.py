@@ -310,10 +310,10 @@ def theory_of(options: argparse.Namespace, found: Theory | None = None) -> Theor
     named_theory = maps_path(named_theory)
     if not (named_theory.endswith(".json") or Path(named_theory).is_file()):
         near = difflib.get_close_matches(named_theory, PRESETS, n=1)
-        hint = f"; did you mean {near[0]}?" if near else ""
+        hint = f"did you mean {near[0]}?" if near else "name one of them"
         raise TheoryError(
             f"--theory: expected {', '.join(PRESETS)}, a .toml file, or a file of maps, "
-            f"got {brief(named_theory)}{hint}"
+            f"got {brief(named_theory)}; {hint}"
         )
     return theory_of_maps(read_json(named_theory), named_theory).replace(**chosen)
 

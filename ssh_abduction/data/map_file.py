@@ -89,7 +89,9 @@ def read_json(path: str | os.PathLike[str]) -> Any:
             f"write it with solve --json"
         ) from None
     except HalfCharacter as error:
-        raise MapError(f"{source}: expected text, got {error}") from None
+        raise MapError(
+            f"{source}: expected text, got {error}; write it with solve --json"
+        ) from None
     except (UnicodeDecodeError, AttributeError):  # text in another encoding, a closed stream
         raise MapError(
             f"{source}: expected JSON in UTF-8, got something else; write it with solve --json"

@@ -127,9 +127,11 @@ def _record(raw: bytes, where: str) -> dict[str, Any]:
             f"replace it, or leave the field out"
         ) from None
     except HalfCharacter as error:
-        raise TraceError(f"{where}: line: expected text, got {error}") from None
+        raise TraceError(f"{where}: line: expected text, got {error}; replace it") from None
     except ValueError as error:
-        raise TraceError(f"{where}: line: expected one JSON object, got {error}") from None
+        raise TraceError(
+            f"{where}: line: expected one JSON object, got {error}; mend it there"
+        ) from None
     if not isinstance(record, dict):
         raise TraceError(
             f"{where}: line: expected a JSON object in braces, got {brief(record)}; "

@@ -63,7 +63,10 @@ def labels_of(
             "maps: expected at least one to take labels from, got none; see the solution's status"
         )
     if choose is not None and (not is_whole(choose) or not 0 <= choose < len(maps)):
-        raise LearnerError(f"map: expected an index from 0 to {len(maps) - 1}, got {brief(choose)}")
+        raise LearnerError(
+            f"map: expected an index from 0 to {len(maps) - 1}, got {brief(choose)}; give the "
+            "index of a map of the solution"
+        )
     labels = np.array(maps[choose or 0].dstate_at, np.intp)
     if choose is not None:
         return labels

@@ -186,7 +186,7 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
         if true.shape != found.shape:
             raise LearnerError(
                 f"y: expected {len(found)} dstates, one an image, "
-                f"got an array of shape {true.shape}"
+                f"got an array of shape {true.shape}; give one label for each image"
             )
         if not (true >= 0).any():
             raise LearnerError(

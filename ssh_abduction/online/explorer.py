@@ -195,7 +195,8 @@ class Explorer:
     ) -> None:
         if not is_whole(margin) or margin < 0:
             raise TraceError(
-                f"margin: expected a number of dstates, 0 or more, got {brief(margin)}"
+                f"margin: expected a number of dstates, 0 or more, got {brief(margin)}; give a "
+                "whole number such as 2"
             )
         check_limit("time_limit", "seconds", time_limit)
         for name in ("look", "can", "do"):
@@ -260,7 +261,10 @@ class Explorer:
             TraceError: `steps` is negative or no whole number, or what the robot sees does not fit.
         """
         if not is_whole(steps) or steps < 0:
-            raise TraceError(f"steps: expected a number of actions, 0 or more, got {brief(steps)}")
+            raise TraceError(
+                f"steps: expected a number of actions, 0 or more, got {brief(steps)}; give a "
+                "whole number such as 50"
+            )
         while steps > 0 and self.step():
             steps -= 1
         if steps == 0 and not self._is_stuck:

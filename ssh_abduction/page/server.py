@@ -125,7 +125,7 @@ class PageServer(ThreadingHTTPServer):
             LimitError: A limit was reached.
         """
         if question not in ("explain", "solve"):
-            raise MapError(f"expected explain or solve, got {brief(question)}")
+            raise MapError(f"expected explain or solve, got {brief(question)}; ask one of the two")
         theory = self._assuming(data)
         pair = self._pair(data.get("pair")) if question == "explain" else None
         with self._turn(watch):
@@ -171,7 +171,10 @@ class PageServer(ThreadingHTTPServer):
         for name in ("same", "different"):
             pairs = data.get(name, [])
             if not isinstance(pairs, list):
-                raise MapError(f"{name}: expected pairs of steps, got {brief(pairs)}")
+                raise MapError(
+                    f"{name}: expected pairs of steps, got {brief(pairs)}; "
+                    "send a list such as [[0, 8]]"
+                )
             theory = theory.replace(
                 **{name: tuple(dict.fromkeys([*getattr(theory, name), *map(self._pair, pairs)]))}
             )
@@ -185,7 +188,10 @@ class PageServer(ThreadingHTTPServer):
             or len(pair) != 2
             or not all(is_whole(t) and 0 <= t <= last for t in pair)
         ):
-            raise MapError(f"expected a pair of steps from 0 to {last}, got {brief(pair)}")
+            raise MapError(
+                f"expected a pair of steps from 0 to {last}, got {brief(pair)}; "
+                "send two such as [0, 8]"
+            )
         return min(pair), max(pair)
 
 
@@ -218,7 +224,7 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             data = json.loads(self.rfile.read(length))
             if not isinstance(data, dict):
-                raise MapError(f"expected an object, got {brief(data)}")
+                raise MapError(f"expected an object, got {brief(data)}; send JSON in braces")
             with _while_there(self.connection, watch):
                 answer = self.server.answer(asked, data, watch)
         except LimitError as error:

@@ -202,7 +202,7 @@ def difference(
     if len(first.dstate_at) != len(other.dstate_at):
         raise MapError(
             f"maps: expected two of one trace, got one of {len(first.dstate_at)} steps and one of "
-            f"{len(other.dstate_at)}"
+            f"{len(other.dstate_at)}; take maps of the same trace"
         )
     first, other = first.renumbered(), other.renumbered()
     named = all_instances("drives", drives, Drive, MapError, mend="take those of a solution")

@@ -74,7 +74,9 @@ def reproduce(
         AbductionError: There is no such experiment, no seed, or no matplotlib, or a process died.
     """
     if name not in EXPERIMENTS:
-        raise AbductionError(f"experiment: expected one of {', '.join(EXPERIMENTS)}, got {name!r}")
+        raise AbductionError(
+            f"experiment: expected one of {', '.join(EXPERIMENTS)}, got {name!r}; write one of them"
+        )
     if not seeds:
         raise AbductionError("seeds: expected at least one, got none; write 0-19")
     figures.require_matplotlib()  # now, and not after hours of work

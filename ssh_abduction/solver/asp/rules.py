@@ -133,7 +133,7 @@ def _check(rules: Rules, others: tuple[Rules, ...], files: tuple[str, ...]) -> N
             ):
                 raise TheoryError(
                     f"{where}: {atom}: expected {_counted(numbers[name])}, "
-                    f"got {len(atom.arguments)}"
+                    f"got {len(atom.arguments)}; write that many"
                 )
             if (
                 name in of_steps

@@ -152,6 +152,7 @@ def _word(trace: Trace, i: int, j: int) -> tuple[str, ...]:
             return tuple(word)
         if here.action is None or there.action is None or here.action.name != there.action.name:
             raise SolverError(
-                f"clique: expected steps that are apart, got {i} and {j}, which may be one dstate"
+                f"clique: expected steps that are apart, got {i} and {j}, which may be one "
+                "dstate; leave out one of them"
             )
         word.append(here.action.name)
