@@ -265,3 +265,26 @@ def test_a_robot_that_goes_on_where_that_ended() -> None:
     assert set(found.maps) == set(
         solve(trace, max_maps=None, speedups=Speedups.without("ways")).maps
     )
+
+
+def test_a_known_map_whose_places_are_refused_is_no_answer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Also if the search ends early, as the known map has as few dstates as the bound."""
+    actions = [*["travel", "travel", "around"] * 2, "travel", "travel"]
+    trace = Trace.from_steps(["end", "hall", "end"] * 3, actions)
+    task = Task.of(settle(trace, Theory.topological()))
+    named, plain = FramelessEngine(task, (0, 1, 2, 3, 4, 5, 0, 1, 2)), StepEngine(task, 9)
+    named.grow(len(trace))
+    assert [*named.improving_maps()][-1].cost[0] == 6
+    searched, calls = name_search.NameSearch._cheapest, [0]
+
+    def late(self: name_search.NameSearch, conflicts: int) -> tuple[dict[int, int] | None, bool]:
+        calls[0] += 1
+        return (None, False) if calls[0] == 1 else searched(self, conflicts)
+
+    monkeypatch.setattr(name_search.NameSearch, "_cheapest", late)
+    plain.grow(len(trace))
+    for engine in (named, plain):
+        engine.forbid([Equality(3, 8, "place")])
+    assert [*named.improving_maps()][-1].cost == [*plain.improving_maps()][-1].cost == (8, 1, 5)

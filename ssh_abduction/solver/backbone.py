@@ -30,7 +30,7 @@ from itertools import combinations
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.logs import log_of
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError
-from ssh_abduction.solver.engines.base import Engine, Task
+from ssh_abduction.solver.engines.base import Engine, LabellingEngine, Task
 from ssh_abduction.solver.engines.doubts import Doubt, Settled
 from ssh_abduction.solver.engines.stepwise import StepEngine, paths_needed
 from ssh_abduction.solver.judging import Judging
@@ -150,9 +150,9 @@ class _Reasoning:
             maps that the evidence rejects.
         """
         forbidden = set[frozenset[Equality]]()
-        while (labellings := engine.labellings(self._cost)) is not None:
+        while isinstance(engine, LabellingEngine):
             failed, refused = 0, None
-            for settled in labellings:
+            for settled in engine.labellings(self._cost):
                 found = settled.any_map()
                 while found is not None:
                     replayed = self._replay(found)

@@ -12,7 +12,7 @@ from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.backbone import Rivals
 from ssh_abduction.solver.candidates import Candidates
 from ssh_abduction.solver.choosing import may_name, new_engine
-from ssh_abduction.solver.engines.base import Engine, Task
+from ssh_abduction.solver.engines.base import Engine, GrowingEngine, Task
 from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
@@ -73,22 +73,22 @@ class Parts:
         """Return the engine of an earlier search if it can take more steps, else a new engine."""
         self.watch.use_reserve()
         before = after.prefixes.engine
-        is_outgrown = not before.goes_on or (isinstance(before, StepEngine) and may_name(self.task))
-        engine = new_engine(self.task) if is_outgrown else before.over(self.task)
+        is_outgrown = isinstance(before, StepEngine) and may_name(self.task)
         # A search that was interrupted may have stopped while clingo grounded a step.
-        is_partial = after.known.stopped == "interrupted" or not engine.intact
-        return engine.with_paths(engine.paths) if is_partial else engine
+        is_partial = after.known.stopped == "interrupted" or not before.intact
+        if isinstance(before, GrowingEngine) and not is_outgrown and not is_partial:
+            return before.over(self.task)
+        return new_engine(self.task)
 
     def _take_over(self, after: Parts, start: Start) -> None:
         """Take over the bounds that a search for the first steps proved, and `start.minimal`."""
         known, before = self.known, after.known
         if self.task.speedups.prefixes:
             known.bound, known.lower = before.bound, before.lower
-            solved = before.status is Status.OPTIMAL
+            solved, engine = before.status is Status.OPTIMAL, self.prefixes.engine
+            first = engine.size if isinstance(engine, StepEngine) else engine.next_size(engine.size)
             self.prefixes.start = (
-                len(self.task.trace)
-                if solved
-                else max(prefixes.FIRST_PREFIX, self.prefixes.engine.size_to_go_on)
+                len(self.task.trace) if solved else max(prefixes.FIRST_PREFIX, first)
             )
         if start.minimal is not None:
             known.status, known.best, known.cost = Status.OPTIMAL, start.minimal, before.cost

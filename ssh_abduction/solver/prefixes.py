@@ -233,6 +233,8 @@ class Prefixes:
         Returns:
             Whether there is a new control.
         """
+        if not isinstance(self.engine, StepEngine):
+            return False  # names for paths are never short
         needed = paths_needed(self._task, self.engine.size, cost)
         if needed <= self.engine.paths:
             return False

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
@@ -100,22 +100,15 @@ class Engine(Protocol):
         asker: Asks clingo.
         intact: False after an error during which clingo may have missed rules.
         lists_least: Whether the engine can only list maps with the fewest dstates.
-        goes_on: Whether `over` may be called after the trace has grown.
     """
 
     asker: Asker
     intact: bool
     lists_least: bool
-    goes_on: bool
 
     @property
     def size(self) -> int:
         """The number of steps in the prefix."""
-        ...
-
-    @property
-    def paths(self) -> int:
-        """The number of names for paths in the encoding. A map cannot have more paths."""
         ...
 
     @property
@@ -129,23 +122,6 @@ class Engine(Protocol):
 
     def next_size(self, failed: int) -> int:
         """Return the size to grow to when no map of the prefix explains step `failed`."""
-        ...
-
-    @property
-    def size_to_go_on(self) -> int:
-        """The size to grow to first after the trace has grown."""
-        ...
-
-    def with_paths(self, paths: int) -> Engine:
-        """Make a new engine with this many names for paths. Its prefix is empty."""
-        ...
-
-    def over(self, task: Task) -> Engine:
-        """Return an engine for a longer trace that begins with the trace of this engine.
-
-        Args:
-            task: The longer trace, with new limits.
-        """
         ...
 
     def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
@@ -163,19 +139,33 @@ class Engine(Protocol):
         """Yield the maps of the prefix that have this cost: `enough` of them, or all if it is 0."""
         ...
 
-    def labellings(self, cost: tuple[int, ...]) -> Iterator[Settled] | None:
-        """Yield the maps of this cost, grouped by their labelling.
-
-        A labelling is the dstate of each step of the prefix. Each item stands for the best maps
-        with one labelling. Return None if the engine does not find dstates before places and paths.
-        """
-        ...
-
     def forbid(self, equalities: Collection[Equality]) -> bool:
         """Exclude all maps in which all of these equalities of steps hold, from now on.
 
         Returns:
             False if the engine cannot forbid such equalities; then nothing has changed.
+        """
+        ...
+
+
+@runtime_checkable
+class GrowingEngine(Protocol):
+    """The protocol of an engine that can take more steps when the trace has grown."""
+
+    def over(self, task: Task) -> Engine:
+        """Go on with a longer trace, with new limits, and return this engine itself."""
+        ...
+
+
+@runtime_checkable
+class LabellingEngine(Protocol):
+    """The protocol of an engine that finds dstates before places and paths."""
+
+    def labellings(self, cost: tuple[int, ...]) -> Iterator[Settled]:
+        """Yield the maps of this cost, grouped by their labelling.
+
+        A labelling is the dstate of each step of the prefix. Each item stands for the best maps
+        with one labelling.
         """
         ...
 

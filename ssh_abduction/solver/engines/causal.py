@@ -19,12 +19,10 @@ class CausalEngine:
     """The engine for the causal theory: it minimises the number of dstates."""
 
     lists_least = False
-    goes_on = True
 
     def __init__(self, task: Task) -> None:
         self.asker = Asker(task.watch)
         self.intact = True
-        self.paths = 0
         self._task = task
         self._named = NamedLabels(task, self.asker)
 
@@ -36,18 +34,8 @@ class CausalEngine:
     def bound(self) -> int | None:
         return self._named.bound
 
-    def with_paths(self, paths: int) -> CausalEngine:
-        return CausalEngine(self._task)
-
-    def over(self, task: Task) -> CausalEngine:
-        return CausalEngine(task)
-
     def next_size(self, failed: int) -> int:
         return self._named.large_enough(next_charted_size(self.size, failed, len(self._task.trace)))
-
-    @property
-    def size_to_go_on(self) -> int:
-        return self.next_size(self.size)
 
     def grow(self, size: int) -> None:
         self._named.grow(size)
@@ -57,9 +45,6 @@ class CausalEngine:
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
         return map(self._found, self._named.all_of(cost[0], enough))
-
-    def labellings(self, cost: tuple[int, ...]) -> None:
-        """Return None, as a labelling has only one map without places and paths."""
 
     def forbid(self, equalities: Collection[Equality]) -> bool:
         self._named.forbid_together([(equality.first, equality.second) for equality in equalities])

@@ -52,7 +52,6 @@ class FaultyEngine:
     """
 
     lists_least = False
-    goes_on = False
 
     def __init__(self, task: Task, most_faults: int | None = None) -> None:
         """Begin with an empty prefix.
@@ -64,7 +63,6 @@ class FaultyEngine:
         self.asker = Asker(task.watch)
         self.intact = True
         self._most_faults = most_faults
-        self.paths = 0
         self.size = 0
         self.bound: int | None = None
         self._task = task
@@ -80,17 +78,7 @@ class FaultyEngine:
         self._explainer = Explainer(self._seen, self._actions, self._price, task.watch.check)
         self._control = FaultyControl(task, self.asker, self._price, most_faults, self._raise_bound)
 
-    def with_paths(self, paths: int) -> FaultyEngine:
-        return FaultyEngine(self._task)
-
-    def over(self, task: Task) -> FaultyEngine:
-        return FaultyEngine(task)
-
     def next_size(self, failed: int) -> int:
-        return len(self._task.trace)
-
-    @property
-    def size_to_go_on(self) -> int:
         return len(self._task.trace)
 
     def grow(self, size: int) -> None:
@@ -216,9 +204,6 @@ class FaultyEngine:
             self._control.learn_from(answer)
             if failed >= 0:
                 self._control.give_around([failed])
-
-    def labellings(self, cost: tuple[int, ...]) -> None:
-        """Return None: a labelling has only one map here, as there are no places and paths."""
 
     def forbid(self, equalities: Collection[Equality]) -> bool:
         self._control.forbidden.append(equalities)

@@ -60,13 +60,11 @@ class FramedEngine:
     """The engine for the topological theory with frames. It minimises the dstates first."""
 
     lists_least = True
-    goes_on = True
 
     def __init__(self, task: Task) -> None:
         """Begin with an empty prefix."""
         self.asker = Asker(task.watch)
         self.intact = True
-        self.paths = len(task.trace)  # names for paths are never short
         self._task = task
         self._sides = FramedSides(task.theory, self.asker)
         self._fitting = FramedPaths(task, self.asker)
@@ -90,10 +88,6 @@ class FramedEngine:
     def _chart(self) -> FramedChart:
         return self._visits.chart
 
-    def with_paths(self, paths: int) -> FramedEngine:
-        """Make a new engine. `paths` changes nothing, as there are always enough names here."""
-        return FramedEngine(self._task)
-
     def over(self, task: Task) -> FramedEngine:
         """Go on with a longer trace, and return this engine itself.
 
@@ -109,11 +103,6 @@ class FramedEngine:
     def next_size(self, failed: int) -> int:
         """Return the size to grow to when no map of the prefix explains step `failed`."""
         return next_charted_size(self.size, failed, len(self._task.trace))
-
-    @property
-    def size_to_go_on(self) -> int:
-        """The first size to grow to, when the trace has grown."""
-        return self.next_size(self.size)
 
     def grow(self, size: int) -> None:
         """Make the first `size` steps the prefix."""

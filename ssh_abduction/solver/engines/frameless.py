@@ -48,7 +48,6 @@ class FramelessEngine:
     """
 
     lists_least = True
-    goes_on = False  # no map of the longer trace is known
 
     def __init__(self, task: Task, known: Sequence[int] = ()) -> None:
         """Begin with an empty prefix.
@@ -60,9 +59,7 @@ class FramelessEngine:
         """
         self.asker = Asker(task.watch)
         self.intact = True
-        self.paths = len(task.trace)  # names for paths are never short
         self._task = task
-        self._given_map = known
         self._fitting = PlacesAndPaths(task, self.asker, known)
         self._named = self._fitting.named
         # The minimal cost, and all labels with this cost.
@@ -76,18 +73,8 @@ class FramelessEngine:
     def bound(self) -> int | None:
         return self._named.bound
 
-    def with_paths(self, paths: int) -> FramelessEngine:
-        return FramelessEngine(self._task, self._given_map)
-
-    def over(self, task: Task) -> FramelessEngine:
-        return FramelessEngine(task)
-
     def next_size(self, failed: int) -> int:
         return next_charted_size(self.size, failed, len(self._task.trace))
-
-    @property
-    def size_to_go_on(self) -> int:
-        return self.next_size(self.size)
 
     def grow(self, size: int) -> None:
         if size != self.size:

@@ -184,6 +184,10 @@ class NamedLabels:
         If the search takes long, other labels with few dstates come first.
         """
         assert self._search is not None  # `grow` comes first
+        known = self._incumbent
+        # Evidence about places may have refused the places of a known map since it was found.
+        if known.labels and self._fitting and not self._fitting.fits(known.labels):
+            known.labels = None
         return self._search.improving()
 
     def is_allowed(self, labels: Sequence[int]) -> bool:

@@ -32,7 +32,6 @@ class StepEngine:
     """The engine that grounds the readable encodings. A dstate is named by its first step."""
 
     lists_least = False
-    goes_on = True
 
     def __init__(self, task: Task, paths: int) -> None:
         self.asker = Asker(task.watch)
@@ -56,6 +55,7 @@ class StepEngine:
         control.add("base", [], readable.own_rules(task.theory))
 
     def with_paths(self, paths: int) -> StepEngine:
+        """Make a new engine with this many names for paths. Its prefix is empty."""
         engine = StepEngine(self._task, paths)
         engine.asker.ground_seconds, engine.asker.solve_seconds = (
             self.asker.ground_seconds,
@@ -71,10 +71,6 @@ class StepEngine:
 
     def next_size(self, failed: int) -> int:
         return min(len(self._task.trace), max(failed + 1, int(self.size * GROWTH)))
-
-    @property
-    def size_to_go_on(self) -> int:
-        return self.size
 
     def grow(self, size: int) -> None:
         is_new = not self.size
@@ -143,9 +139,6 @@ class StepEngine:
             doubts, self._read, f"enum,{','.join(map(str, cost))}" if cost else "ignore"
         )
         return None if found is None else found.map
-
-    def labellings(self, cost: tuple[int, ...]) -> None:
-        """Return None: this engine finds dstates together with places and paths."""
 
     def forbid(self, equalities: Collection[Equality]) -> bool:
         self._forbidden.append(equalities)
