@@ -75,7 +75,7 @@ class Parts:
         before = after.prefixes.engine
         is_outgrown = isinstance(before, StepEngine) and may_name(self.task)
         # A search that was interrupted may have stopped while clingo grounded a step.
-        is_partial = after.known.stopped == "interrupted" or not before.intact
+        is_partial = after.known.stopped == "interrupted" or not before.asker.intact
         if isinstance(before, GrowingEngine) and not is_outgrown and not is_partial:
             return before.over(self.task)
         return new_engine(self.task)
@@ -105,7 +105,7 @@ class Parts:
         self.watch.stop()
         engine = self.prefixes.engine
         self.known.raise_bound(engine.bound)
-        self.rivals.engine = None if self.rivals.listed or not engine.intact else engine
+        self.rivals.engine = None if self.rivals.listed or not engine.asker.intact else engine
 
     def report(self) -> None:
         """Log how far the search is, and call the caller's `on_progress`."""

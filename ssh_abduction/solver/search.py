@@ -292,7 +292,7 @@ class Search:
         except KeyboardInterrupt:
             known.stopped = "interrupted"
         except Exception:
-            parts.prefixes.engine.intact = False
+            parts.prefixes.engine.asker.intact = False
             raise
         finally:
             parts.end_clingo()

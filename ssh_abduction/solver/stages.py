@@ -7,7 +7,7 @@ from ssh_abduction.runtime.logs import log_of
 from ssh_abduction.solver import choosing, prefixes
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError
 from ssh_abduction.solver.choosing import may_name, takes_all
-from ssh_abduction.solver.engines.base import Found
+from ssh_abduction.solver.engines.base import Found, LabellingEngine
 from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.values import Status
@@ -66,7 +66,11 @@ class Stages:
             raise LimitError("no proof")
         if parts.known.status is Status.OPTIMAL:  # an earlier search proved a map minimal
             if not engine.size:
-                engine.grow(steps if engine.lists_least else min(steps, prefixes.FIRST_PREFIX))
+                engine.grow(
+                    steps
+                    if isinstance(engine, LabellingEngine)
+                    else min(steps, prefixes.FIRST_PREFIX)
+                )
             return
         may_change = isinstance(engine, StepEngine) and not self._goes_on and takes_all(task)
         may_frame = may_change and task.speedups.framing

@@ -190,6 +190,7 @@ class Asker:
     Attributes:
         control: The control. It may be replaced.
         watch: The limits. They may be replaced.
+        intact: False after an error during which clingo may have missed rules.
         ground_seconds: The seconds that clingo has grounded so far.
         solve_seconds: The seconds that clingo has solved so far.
     """
@@ -197,6 +198,7 @@ class Asker:
     def __init__(self, watch: Watch) -> None:
         self.control = Control()
         self.watch = watch
+        self.intact = True
         self.ground_seconds = 0.0
         self.solve_seconds = 0.0
 

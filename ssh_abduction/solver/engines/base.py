@@ -98,13 +98,9 @@ class Engine(Protocol):
 
     Attributes:
         asker: Asks clingo.
-        intact: False after an error during which clingo may have missed rules.
-        lists_least: Whether the engine can only list maps with the fewest dstates.
     """
 
     asker: Asker
-    intact: bool
-    lists_least: bool
 
     @property
     def size(self) -> int:
@@ -159,7 +155,10 @@ class GrowingEngine(Protocol):
 
 @runtime_checkable
 class LabellingEngine(Protocol):
-    """The protocol of an engine that finds dstates before places and paths."""
+    """The protocol of an engine that finds dstates before places and paths.
+
+    It can only list maps with the fewest dstates.
+    """
 
     def labellings(self, cost: tuple[int, ...]) -> Iterator[Settled]:
         """Yield the maps of this cost, grouped by their labelling.

@@ -18,11 +18,8 @@ from ssh_abduction.theory.evidence import Equality
 class CausalEngine:
     """The engine for the causal theory: it minimises the number of dstates."""
 
-    lists_least = False
-
     def __init__(self, task: Task) -> None:
         self.asker = Asker(task.watch)
-        self.intact = True
         self._task = task
         self._named = NamedLabels(task, self.asker)
 

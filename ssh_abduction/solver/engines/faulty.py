@@ -51,8 +51,6 @@ class FaultyEngine:
     It minimises the cost of dstates and faults together.
     """
 
-    lists_least = False
-
     def __init__(self, task: Task, most_faults: int | None = None) -> None:
         """Begin with an empty prefix.
 
@@ -61,7 +59,6 @@ class FaultyEngine:
             most_faults: If given, a map may have up to this many faults, and they cost nothing.
         """
         self.asker = Asker(task.watch)
-        self.intact = True
         self._most_faults = most_faults
         self.size = 0
         self.bound: int | None = None

@@ -59,12 +59,9 @@ KEPT = 10
 class FramedEngine:
     """The engine for the topological theory with frames. It minimises the dstates first."""
 
-    lists_least = True
-
     def __init__(self, task: Task) -> None:
         """Begin with an empty prefix."""
         self.asker = Asker(task.watch)
-        self.intact = True
         self._task = task
         self._sides = FramedSides(task.theory, self.asker)
         self._fitting = FramedPaths(task, self.asker)

@@ -47,8 +47,6 @@ class FramelessEngine:
     It minimises the dstates first.
     """
 
-    lists_least = True
-
     def __init__(self, task: Task, known: Sequence[int] = ()) -> None:
         """Begin with an empty prefix.
 
@@ -58,7 +56,6 @@ class FramelessEngine:
                 is known.
         """
         self.asker = Asker(task.watch)
-        self.intact = True
         self._task = task
         self._fitting = PlacesAndPaths(task, self.asker, known)
         self._named = self._fitting.named
@@ -159,6 +156,6 @@ class FramelessEngine:
         if self._best:  # the remaining maps of that cost have some of these labels
             self._best = (
                 self._best[0],
-                [labels for labels in self._best[1] if self._named.is_allowed(labels)],
+                [labels for labels in self._best[1] if self._named.program.is_allowed(labels)],
             )
         return True

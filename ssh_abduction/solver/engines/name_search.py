@@ -10,8 +10,7 @@ best one, one fewer each time. The search ends as soon as some map has as few ds
 
 from __future__ import annotations
 
-from collections.abc import Collection, Generator, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Generator, Iterable, Iterator, Sequence
 
 from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.facts import names_lp
@@ -19,7 +18,6 @@ from ssh_abduction.solver.asp.limits import LimitError
 from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.name_program import Fitting, NameProgram
 from ssh_abduction.solver.engines.small_maps import SmallMaps
-from ssh_abduction.solver.steps.chart import Link
 
 # If clingo has not ended after this many conflicts, give it more links. If it lacks links that
 # matter, this mostly shows sooner.
@@ -50,34 +48,6 @@ class Incumbent:
     def is_settled(self) -> bool:
         """Whether the known labels reach the bound."""
         return self.labels is not None and len(set(self.labels)) <= (self.bound or 0)
-
-
-@dataclass
-class _NamedAnswer:
-    """An answer of clingo.
-
-    Attributes:
-        names: The names of the nodes that clingo was given.
-        labels: The labels of all nodes, once the answer was followed.
-    """
-
-    names: dict[int, int]
-    labels: list[int] = field(default_factory=list)
-
-
-@dataclass(frozen=True)
-class _Lacking:
-    """The reason to reject an answer: what clingo lacks. One attribute is set.
-
-    Attributes:
-        views: Views that need another name.
-        links: Links that the answer does not explain.
-        labels: Labels that violate axioms beyond the causal theory.
-    """
-
-    views: Collection[int] = ()
-    links: Collection[Link] = ()
-    labels: Sequence[int] = ()
 
 
 class NameSearch:
@@ -126,32 +96,26 @@ class NameSearch:
             if isinstance(end, KeyboardInterrupt) or not known.is_settled():
                 raise
 
-    def name_more(self, views: Collection[int]) -> None:
-        """Add a spare name to each of these views."""
-        self._program.name_more(views)
-
     def _searched(self) -> Iterator[list[int]]:
         """Do the work of `improving`. End early if a known map has the fewest dstates."""
-        while (found := (yield from self._cheapest_answer())) is not None:
-            lacking = self._why_not(found)
-            if lacking is None:
-                break
-            self._tell_why(lacking)
-        yield found.labels if found else self._incumbent.labels or []
+        labels = None
+        while labels is None and (names := (yield from self._cheapest_answer())) is not None:
+            labels = self._labels_by(names)
+        yield labels or self._incumbent.labels or []
 
-    def _cheapest_answer(self) -> Generator[list[int], None, _NamedAnswer | None]:
+    def _cheapest_answer(self) -> Generator[list[int], None, dict[int, int] | None]:
         """Find the cheapest answer for the links that clingo has.
 
         Yields:
             If the search takes long, labels that were found in other ways.
 
         Returns:
-            The answer; None if a known map is as good.
+            The names of the nodes that clingo has; None if a known map is as good.
         """
         while True:
             names, proven = self._cheapest(self._patience)
             if proven and names is not None:
-                return _NamedAnswer(names)
+                return names
             yield from self._helped()
             if self._incumbent.is_settled():
                 return None
@@ -179,29 +143,26 @@ class NameSearch:
             except StopIteration as end:
                 return answer, bool(end.value)
 
-    def _why_not(self, answer: _NamedAnswer) -> _Lacking | None:
-        """Return the reason to reject an answer; None if the answer is a map."""
-        program = self._program
-        if views := program.rests(answer.names):
-            return _Lacking(views=views)
-        pinned = len(program.pinned.clique)
-        spares = sum(name >= pinned for name in set(answer.names.values()))
-        self._incumbent.raise_bound(pinned + spares)
-        answer.labels, failed = program.follow(answer.names)
-        if failed:
-            return _Lacking(links=failed)
-        if self._fitting is None or self._fitting.fits(answer.labels):
-            return None
-        return _Lacking(labels=answer.labels)
+    def _labels_by(self, names: dict[int, int]) -> list[int] | None:
+        """Return the labels of all nodes by an answer.
 
-    def _tell_why(self, lacking: _Lacking) -> None:
-        """Give clingo what it lacked when it found a rejected answer."""
-        if lacking.views:
-            self.name_more(lacking.views)
-        elif lacking.links:
-            self._program.add(lacking.links)
-        elif self._fitting:
-            self._fitting.forbid(lacking.labels)
+        None if the answer is no map. Then clingo gets what it lacked.
+        """
+        program = self._program
+        if views := program.rests(names):
+            program.name_more(views)
+            return None
+        pinned = len(program.pinned.clique)
+        spares = sum(name >= pinned for name in set(names.values()))
+        self._incumbent.raise_bound(pinned + spares)
+        labels, failed = program.follow(names)
+        if failed:
+            program.add(failed)
+        elif self._fitting is None or self._fitting.fits(labels):
+            return labels
+        else:
+            self._fitting.forbid(labels)
+        return None
 
     @property
     def _patience(self) -> int:
@@ -254,7 +215,7 @@ class NameSearch:
                     self._incumbent.raise_bound(len(set(labels)))
                     return
                 if found and (views := self._program.rests(found)):
-                    self.name_more(views)
+                    self._program.name_more(views)
                 elif found:
                     labels, _ = self._program.follow(found)
                     yield labels

@@ -190,15 +190,11 @@ class NamedLabels:
             known.labels = None
         return self._search.improving()
 
-    def is_allowed(self, labels: Sequence[int]) -> bool:
-        """Whether the labels of a map agree with evidence about pairs of steps."""
-        return self.program.is_allowed(labels)
-
     def forbid_together(self, pairs: Collection[tuple[int, int]]) -> None:
         """Exclude labels in which the steps of each of these pairs are at one dstate."""
         self._forbidden.append(list(pairs))
         known = self._incumbent
-        if known.labels and not self.is_allowed(known.labels):
+        if known.labels and not self.program.is_allowed(known.labels):
             known.labels = None
         self.program.give_forbidden(len(self._forbidden) - 1)
 
@@ -266,7 +262,6 @@ class NamedLabels:
         Args:
             spares: The cost, as a number of spare names.
         """
-        assert self._search is not None  # `grow` comes first
         answers = self._asker.answers(
             names_lp.read_names,
             f"enum,{spares},{spares}",
@@ -276,7 +271,7 @@ class NamedLabels:
         answer = next(answers, None)
         views = self.program.rests(answer) if answer else set()
         if views:
-            self._search.name_more(views)
+            self.program.name_more(views)
         return bool(views)
 
     def _answers_of(self, spares: int) -> Iterator[dict[int, int]]:

@@ -31,12 +31,9 @@ AT_FIRST, FIRST_STEPS = 8, 32
 class StepEngine:
     """The engine that grounds the readable encodings. A dstate is named by its first step."""
 
-    lists_least = False
-
     def __init__(self, task: Task, paths: int) -> None:
         self.asker = Asker(task.watch)
         self.bound: int | None = None
-        self.intact = True
         self.size = 0
         self.paths = paths
         self._task = task

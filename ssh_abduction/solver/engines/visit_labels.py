@@ -35,14 +35,8 @@ from itertools import combinations
 from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.facts import visits_lp
 from ssh_abduction.solver.engines.base import Task
-from ssh_abduction.solver.engines.refusing import first_accepted
-from ssh_abduction.solver.engines.visit_program import (
-    Refusal,
-    Sides,
-    VisitAnswer,
-    VisitProgram,
-    fits_in_time,
-)
+from ssh_abduction.solver.engines.transitive import Pair
+from ssh_abduction.solver.engines.visit_program import Sides, VisitProgram, fits_in_time
 from ssh_abduction.solver.steps.apart import clique
 from ssh_abduction.solver.steps.chart import FramedChart
 
@@ -181,20 +175,32 @@ class VisitLabels:
     def fewest(self) -> list[int] | None:
         """Find labels of all nodes with the fewest dstates; None if no labels satisfy all rules."""
         if not self._found:
-            answer = first_accepted(self._best_answer, self.program.why_not, self._tell_why)
-            if answer is None:
+            labels = self._first_labels(self._best_answer)
+            if labels is None:
                 return None
-            self._found.append(self.program.labels(answer.located))
+            self._found.append(labels)
         return list(self._found[0])
 
-    def _tell_why(self, reason: Refusal) -> None:
-        """Give clingo what it lacked when it found a rejected answer: rules or visits."""
-        if reason.threes:
-            self.program.close(reason.threes)
-        else:
-            self._give_more(reason.missed)
+    def _first_labels(self, ask: Callable[[], list[Pair] | None]) -> tuple[int, ...] | None:
+        """Return the labels of all nodes by the first answer that is a map of the chart.
 
-    def _best_answer(self) -> VisitAnswer | None:
+        After any other answer, clingo gets what it lacked: rules, or visits.
+
+        Args:
+            ask: Returns the pairs of visits that are at one place in the next answer; None if
+                there is none.
+        """
+        while (pairs := ask()) is not None:
+            program = self.program
+            if threes := program.intransitive(pairs):
+                program.close(threes)
+            elif (located := program.located(pairs)).missed:
+                self._give_more(located.missed)
+            else:
+                return program.labels(located)
+        return None
+
+    def _best_answer(self) -> list[Pair] | None:
         """Find an answer with the fewest first nodes of dstates; None if there is no answer."""
         read = self.program.read
         better = list(
@@ -209,7 +215,7 @@ class VisitLabels:
             return None
         pairs, fewest = better[-1]
         self._raise_bound(fewest)
-        return VisitAnswer(pairs)
+        return pairs
 
     def all_of(self, dstates: int) -> Generator[list[int], None, None]:
         """Yield all labels with this many dstates, each once.
@@ -233,21 +239,13 @@ class VisitLabels:
                 "\n".join(visits_lp.forbidden_pairs(pairs, listed=batch) for pairs in known)
             )
             self._excluded = len(self._found)
-            labels = self._other(dstates)
+            labels = self._first_labels(
+                lambda: self._asker.verdict(self.program.read, [], mode=f"enum,{dstates}")[0]
+            )
             if labels is None:
                 return
             self._found.append(labels)
             yield list(labels)
-
-    def _other(self, dstates: int) -> tuple[int, ...] | None:
-        """Find labels with this many dstates that are not excluded; None if there are none."""
-
-        def ask() -> VisitAnswer | None:
-            found, _ = self._asker.verdict(self.program.read, [], mode=f"enum,{dstates}")
-            return None if found is None else VisitAnswer(found)
-
-        answer = first_accepted(ask, self.program.why_not, self._tell_why)
-        return None if answer is None else self.program.labels(answer.located)
 
     def take_back(self, labels: Sequence[int]) -> None:
         """Forget labels that were found, but turned out to have no map."""

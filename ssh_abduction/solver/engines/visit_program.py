@@ -6,7 +6,7 @@ them. Fewer visits are a relaxation, so a bound proven for them holds for the tr
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence, Set
+from collections.abc import Iterable, Sequence, Set
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -37,38 +37,6 @@ class Sides(Protocol):
     def extend(self, batch: int) -> None:
         """Extend the axioms to the visits of a new batch."""
         ...
-
-
-@dataclass
-class VisitAnswer:
-    """An answer of clingo.
-
-    Attributes:
-        pairs: The pairs of visits that are at one place.
-        everywhere: The places of all visits; None until the pairs are known to be transitive.
-    """
-
-    pairs: Sequence[Pair] = ()
-    everywhere: Located | None = None
-
-    @property
-    def located(self) -> Located:
-        """The places of all visits, in an answer that was not rejected."""
-        assert self.everywhere is not None
-        return self.everywhere
-
-
-@dataclass(frozen=True)
-class Refusal:
-    """The reason to reject an answer.
-
-    Attributes:
-        threes: Triples of visits at which the answer is not transitive.
-        missed: If there are none, the visits that clingo needs next to locate all visits.
-    """
-
-    threes: Sequence[Three]
-    missed: Collection[int]
 
 
 @dataclass
@@ -266,14 +234,6 @@ class VisitProgram:
         return tuple(
             numbered(faced(everywhere.states[visit], slot) for visit, slot in self.chart.facing)
         )
-
-    def why_not(self, answer: VisitAnswer) -> Refusal | None:
-        """Return the reason to reject an answer; None if it is accepted."""
-        threes = self.intransitive(answer.pairs)
-        if not threes:
-            answer.everywhere = self.located(answer.pairs)
-        missed = answer.everywhere.missed if answer.everywhere else ()
-        return Refusal(threes, missed) if threes or missed else None
 
     def standing(self, labels: Sequence[int]) -> dict[int, tuple[int, int]]:
         """For each dstate, return the visit and slot (direction) of some node there.
