@@ -472,6 +472,23 @@ def test_words_name_steps_by_their_drives(tmp_path: Path) -> None:
     assert joint.at(6) == "step tuesday:2"
 
 
+def test_verbs_take_the_trace_in_a_file_of_maps(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    maps = str(tmp_path / "maps.json")
+    solve([MONDAY, TUESDAY]).save(maps)
+    assert main(["check", maps]) == 0
+    assert "1 of 1 maps satisfy" in capsys.readouterr().out
+    assert main(["next", maps]) == 0
+    assert main(["explain", maps, "monday:0", "tuesday:1"]) == 0
+    told = capsys.readouterr().out
+    assert "steps monday:0 and tuesday:1 are different dstates" in told
+    assert "map 1 has both steps at two places" in told
+    for verb in ("evaluate", "train"):  # these need truth, or images
+        assert main([verb, maps, *(["-o", maps] if verb == "train" else [])]) == 1
+        assert "trace: expected the trace of" in capsys.readouterr().err
+
+
 def test_compare_names_steps_by_their_drives() -> None:
     found = compare(solve([THERE, BACK], Theory.causal(), within=1))
     said = "step tuesday:0 is at the dstate of step monday:3"

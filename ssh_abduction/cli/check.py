@@ -12,7 +12,14 @@ from ssh_abduction.checker.checker import Violation, check, unchecked
 from ssh_abduction.checker.claims import false_claims
 from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.cli.obeying import as_corrected
-from ssh_abduction.cli.options import Verbs, add_maps, add_theory, add_trace, theory_of, trace_of
+from ssh_abduction.cli.options import (
+    Verbs,
+    add_maps,
+    add_theory,
+    add_trace,
+    solved_trace,
+    theory_of,
+)
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import MapError, brief, is_finite, printable
 from ssh_abduction.data.files import json_line
@@ -52,7 +59,7 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    trace = Trace.load(trace_of(options))
+    trace = solved_trace(options)
     data = read_json(options.maps)
     found = data.get("theory") if isinstance(data, dict) else None
     solved = None if found is None else Theory.from_dict(found)

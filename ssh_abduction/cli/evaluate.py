@@ -53,7 +53,7 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser = verbs.add_parser("evaluate", help="compare maps with the truth", description=text)
     add_maps(parser)
-    add_trace(parser, "trace file (JSON Lines) with truth")
+    add_trace(parser, " with truth")
     parser.add_setting(
         "near",
         "also judge by true poses; visits within this distance count as one place (default: 2)",

@@ -23,6 +23,7 @@ from ssh_abduction.cli.options import (
     number_steps,
     theory_of,
     theory_of_maps,
+    trace_of_maps,
     trace_path,
 )
 from ssh_abduction.cli.outcome import on_ctrl_c
@@ -66,8 +67,8 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_argument(
         "trace",
         help=(
-            "trace file (JSON Lines), or - for standard input, or a folder that map wrote, for its "
-            "trace and the theory of its maps"
+            "trace file (JSON Lines), or - for standard input; or a file of maps that solve -o "
+            "wrote, or a folder that map wrote, for its trace and the theory of its maps"
         ),
     )
     parser.add_argument(
@@ -115,9 +116,10 @@ def run(options: argparse.Namespace) -> int:
             f"steps: expected two, or none, got {len(options.steps)}; name the two steps that are "
             "to be explained, or a place and a path, as in p7 path2"
         )
-    if Path(options.trace).is_dir():
+    kept = trace_of_maps(options.trace)
+    if kept is not None or Path(options.trace).is_dir():
         options.theory = options.theory or maps_path(options.trace)
-    trace = Trace.load(trace_path(options.trace))
+    trace = Trace.load(trace_path(options.trace)) if kept is None else kept
     number_steps(options, trace)
     maps, found, data = _maps_of(options)
     trace, theory = as_corrected(trace, theory_of(options, found), maps, options.corrections)

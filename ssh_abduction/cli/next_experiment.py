@@ -13,8 +13,8 @@ from ssh_abduction.cli.options import (
     add_maps,
     add_theory,
     add_trace,
+    solved_trace,
     theory_of,
-    trace_of,
 )
 from ssh_abduction.cli.outcome import on_ctrl_c, warn
 from ssh_abduction.cli.text import table
@@ -22,7 +22,6 @@ from ssh_abduction.data.errors import MapError, named, printable
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.maps import maps_of
-from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.program import interrupted_code
 from ssh_abduction.solver import Watch, check_limit
 from ssh_abduction.theory.theory import Theory
@@ -69,7 +68,7 @@ def run(options: argparse.Namespace) -> int:
 
     check_limit("--time-limit", "seconds", options.time_limit)
     check_limit("--memory-limit", "MiB", options.memory_limit)
-    trace = Trace.load(trace_of(options))
+    trace = solved_trace(options)
     data = read_json(options.maps)
     maps = maps_of(data, str(options.maps))
     if not maps:

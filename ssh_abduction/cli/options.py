@@ -139,18 +139,21 @@ def add_maps(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("maps", type=maps_path, help=MAPS_SAID)
 
 
-def add_trace(parser: argparse.ArgumentParser, what: str = "trace file (JSON Lines)") -> None:
+def add_trace(parser: argparse.ArgumentParser, needs: str = "") -> None:
     """Add the argument `trace`, which may be left out after a folder that map wrote (`trace_of`).
 
     Args:
         parser: The parser of a verb that has the argument `maps`.
-        what: The words of the help for the trace.
+        needs: What a step of the trace needs that the trace in a file of maps lacks, in words; if
+            it is empty, that trace is enough (`solved_trace`).
     """
+    kept = "folder" if needs else "file or folder"
     parser.add_argument(
         "trace",
         nargs="?",
         type=trace_path,
-        help=f"{what}, or - for standard input (default: the trace in the folder of the maps)",
+        help=f"trace file (JSON Lines){needs}, or - for standard input (default: the trace in the "
+        f"{kept} of the maps)",
     )
 
 
@@ -180,6 +183,36 @@ def trace_of(options: argparse.Namespace) -> str:
         )
     _in_order(options)
     return str(options.trace)
+
+
+def solved_trace(options: argparse.Namespace) -> Trace:
+    """Load the trace that was solved: the named one (`trace_of`), or the one in the file of maps.
+
+    The trace in the file of maps has no images and no truth.
+
+    Raises:
+        AbductionError: There is no trace, or a file cannot be read.
+    """
+    if options.trace is None and trace_beside(options.maps) is None:
+        kept = trace_of_maps(options.maps)
+        if kept is not None:
+            return kept
+    return Trace.load(trace_of(options))
+
+
+def trace_of_maps(file: str) -> Trace | None:
+    """Return the trace in a file of maps that solve -o wrote; None for any other file.
+
+    Raises:
+        TraceError: The trace is malformed.
+    """
+    from ssh_abduction.solver import trace_in
+
+    try:
+        data = read_json(file) if file != "-" else None
+    except MapError:
+        return None
+    return trace_in(data, named(file)) if isinstance(data, dict) else None
 
 
 def trace_beside(maps: str) -> str | None:

@@ -85,7 +85,7 @@ def add_parser(verbs: Verbs) -> None:
     apart.set_defaults(run=run_tell_apart)
     for parser in (train, curve, apart):
         add_maps(parser)
-        add_trace(parser, "trace file with images")
+        add_trace(parser, " with images")
         parser.add_argument(
             "--map",
             type=int,

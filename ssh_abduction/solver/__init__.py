@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.judging import InternalError, Judging
     from ssh_abduction.solver.obeying import obeyed, with_names
     from ssh_abduction.solver.ranking import Ranking
-    from ssh_abduction.solver.recorded import drives_in, joins_in, theory_in
+    from ssh_abduction.solver.recorded import drives_in, joins_in, theory_in, trace_in
     from ssh_abduction.solver.regions import find_regions, with_regions
     from ssh_abduction.solver.result import Solution
     from ssh_abduction.solver.search import Search
@@ -67,7 +67,7 @@ _HOMES = {  # module: the names that this package exports from it
     "judging": ("InternalError", "Judging"),
     "obeying": ("obeyed", "with_names"),
     "ranking": ("Ranking",),
-    "recorded": ("drives_in", "drives_in", "joins_in", "theory_in"),
+    "recorded": ("drives_in", "joins_in", "theory_in", "trace_in"),
     "regions": ("find_regions", "with_regions"),
     "result": ("Solution",),
     "search": ("Search",),
@@ -147,6 +147,7 @@ __all__ = [
     "stretches",
     "summary_of",
     "theory_in",
+    "trace_in",
     "with_names",
     "with_regions",
     "workers",
