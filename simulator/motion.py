@@ -1,9 +1,9 @@
 """Poses in the plane, the displacements between them, and the errors of odometry.
 
->>> from simulator.motion import between, moved
+>>> from simulator.motion import displacement_between, moved
 >>> [round(v, 6) for v in moved((1.0, 2.0, math.pi / 2), (3.0, 0.0, 0.0))[:2]]
 [1.0, 5.0]
->>> [round(v, 6) for v in between((1.0, 2.0, math.pi / 2), (1.0, 5.0, math.pi))]
+>>> [round(v, 6) for v in displacement_between((1.0, 2.0, math.pi / 2), (1.0, 5.0, math.pi))]
 [3.0, 0.0, 1.570796]
 """
 

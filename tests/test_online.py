@@ -355,13 +355,13 @@ def begun(**options):
     mapper._keeper.mender.mended(trace, mapper.theory, known, 0.0)
     return mapper
 
-assert begun(speedups=Speedups.without("processes"))._keeper.mender.mending is None
+assert begun(speedups=Speedups.without("processes"))._keeper.mender.mending.task is None
 mapper = begun()
 assert threading.active_count() == 2
 del mapper
 assert threading.active_count() == 1
 mapper = begun()
-mending = mapper._keeper.mender.mending
+mending = mapper._keeper.mender.mending.task
 assert mending and not mending.done()
 """
     folder = Path(__file__).parent.parent / "benchmarks"

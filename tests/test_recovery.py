@@ -214,7 +214,7 @@ def test_without_time_there_is_a_map_and_a_belief() -> None:
             1
         )
     assert isinstance(mapper._keeper, Recovery)
-    assert mapper._keeper.solver.background is None
+    assert mapper._keeper.solver.background.task is None
 
 
 def one_of_the_maps(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from ssh_abduction.checker.checker import Violation, check, unchecked
@@ -35,6 +35,64 @@ EXIT_VIOLATED = 20
 SHOWN = 20  # violations that are printed for each map
 
 
+@dataclass(frozen=True)
+class _Judgement:
+    """What `check` found.
+
+    Attributes:
+        violations: The violations of each map.
+        theory: The theory, in which no field is "auto".
+        said: Sentences about what was checked besides the axioms.
+        holds: Whether all maps and claims hold.
+    """
+
+    violations: Sequence[Sequence[Violation]]
+    theory: Theory
+    said: Sequence[str]
+    holds: bool
+
+    @property
+    def not_checked(self) -> list[str]:
+        """The names of the user's own axioms, which cannot be checked."""
+        return list(unchecked(self.theory))
+
+    @property
+    def checked(self) -> int:
+        """The number of axioms that were checked."""
+        return len(set(self.theory.axioms) - set(self.not_checked))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields of the JSON."""
+        return {
+            "holds": self.holds,
+            "maps": len(self.violations),
+            "axioms": self.checked,
+            "violations": [
+                {"map": i, "axiom": v.axiom, "steps": list(v.steps), "message": v.message}
+                for i, some in enumerate(self.violations, 1)
+                for v in some
+            ],
+            "not_checked": self.not_checked,
+            "sentences": list(self.said),
+        }
+
+    def lines(self) -> Iterator[str]:
+        """Yield the lines to print."""
+        for i, some in enumerate(self.violations, 1):
+            for v in some[:SHOWN]:
+                numbers = ", ".join(map(str, v.steps))
+                steps = f"step{'' if len(v.steps) == 1 else 's'} {numbers}: " if v.steps else ""
+                yield f"map {i}: {v.axiom}: {steps}{printable(v.message)}"
+            if more := some[SHOWN:]:
+                yield f"map {i}: and {counted(len(more), 'more violations')}"
+        sound = sum(not some for some in self.violations)
+        yield f"{sound} of {len(self.violations)} maps satisfy the {self.checked} axioms"
+        if self.not_checked:
+            names = printable(", ".join(self.not_checked))
+            yield f"not checked, as they are a user's own: {names}"
+        yield from self.said
+
+
 def add_parser(verbs: Verbs) -> None:
     text = (
         "Check maps against a trace and the axioms, without clingo. Reports each axiom that a "
@@ -61,8 +119,8 @@ def add_parser(verbs: Verbs) -> None:
 def run(options: argparse.Namespace) -> int:
     trace = solved_trace(options)
     data = read_json(options.maps)
-    found = data.get("theory") if isinstance(data, dict) else None
-    solved = None if found is None else Theory.from_dict(found)
+    written = data.get("theory") if isinstance(data, dict) else None
+    solved = None if written is None else Theory.from_dict(written)
     trace, theory = as_corrected(trace, theory_of(options, solved), options.maps)
     theory.check_steps(trace)
     maps = maps_of(data, str(options.maps))
@@ -79,7 +137,6 @@ def run(options: argparse.Namespace) -> int:
     unjudged = other and any(ssh_map.regions is not None for ssh_map in maps)
     maps = [replace(ssh_map, regions=None) for ssh_map in maps] if unjudged else maps
     violations = [check(trace, ssh_map, resolved) for ssh_map in maps]
-    not_checked = unchecked(resolved)
     said: list[str] = []  # sentences about what is checked besides the axioms
     if unjudged:
         said.append("regions are not checked: the file is of another theory")
@@ -96,8 +153,8 @@ def run(options: argparse.Namespace) -> int:
         elif other:
             doubt = "the file is of another theory"
         holds &= _bound(trace, data, theory, maps, doubt, made_by, broken, said)
-    checked = sum(name not in not_checked for name in resolved.axioms)
-    _print(options.json, violations, checked, not_checked, [*map(printable, said)], holds)
+    found = _Judgement(violations, resolved, [*map(printable, said)], holds)
+    print(json_line(found.to_dict()) if options.json else "\n".join(found.lines()))
     return 0 if holds else EXIT_VIOLATED
 
 
@@ -113,61 +170,6 @@ def _refuse_bound(resolved: Theory, solved: Theory | None) -> None:
             "bound: expected a trace whose views are all known, as a step whose view is unknown "
             "may be any dstate; leave out --bound"
         )
-
-
-def _print(
-    as_json: bool,
-    violations: Sequence[Sequence[Violation]],
-    checked: int,
-    not_checked: Sequence[str],
-    said: Sequence[str],
-    holds: bool,
-) -> None:
-    """Print what was found.
-
-    Args:
-        as_json: Whether to print JSON.
-        violations: The violations of each map.
-        checked: The number of axioms that were checked.
-        not_checked: The names of the user's own axioms, which cannot be checked.
-        said: Sentences about what was checked besides the axioms.
-        holds: Whether all maps and claims hold.
-    """
-    if as_json:
-        found = [
-            {"map": i, "axiom": v.axiom, "steps": list(v.steps), "message": v.message}
-            for i, some in enumerate(violations, 1)
-            for v in some
-        ]
-        print(
-            json_line(
-                {
-                    "holds": holds,
-                    "maps": len(violations),
-                    "axioms": checked,
-                    "violations": found,
-                    "not_checked": list(not_checked),
-                    "sentences": list(said),
-                }
-            )
-        )
-        return
-    for i, some in enumerate(violations, 1):
-        for v in some[:SHOWN]:
-            steps = (
-                f"{'step' if len(v.steps) == 1 else 'steps'} {', '.join(map(str, v.steps))}: "
-                if v.steps
-                else ""
-            )
-            print(f"map {i}: {v.axiom}: {steps}{printable(v.message)}")
-        if more := some[SHOWN:]:
-            print(f"map {i}: and {counted(len(more), 'more violations')}")
-    sound = sum(not some for some in violations)
-    print(f"{sound} of {len(violations)} maps satisfy the {checked} axioms")
-    if not_checked:
-        print(f"not checked, as they are a user's own: {printable(', '.join(not_checked))}")
-    for sentence in said:
-        print(sentence)
 
 
 def _axioms_of(theory: Theory) -> Theory:

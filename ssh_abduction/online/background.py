@@ -120,6 +120,38 @@ def _end(watch: Watch, thread: threading.Thread) -> None:
     thread.join()
 
 
+class TaskSlot(Generic[Result]):
+    """Holds the one task of its kind that may run in the background.
+
+    Attributes:
+        task: The task; None if there is none, or its result was taken.
+    """
+
+    def __init__(self) -> None:
+        self.task: BackgroundTask[Result] | None = None
+
+    def begin(
+        self, speedups: Speedups, function: Callable[..., Result | None], *arguments: object
+    ) -> bool:
+        """Start a task as `BackgroundTask.begun` does, unless one is running.
+
+        Returns:
+            Whether a task is running now.
+        """
+        self.task = self.task or BackgroundTask.begun(speedups, function, *arguments)
+        return self.task is not None
+
+    def finished(self) -> Result | None:
+        """Take the result of the task; None if it is not done, or found nothing.
+
+        The result is about the trace as it was when the task began.
+        """
+        if self.task and self.task.done():
+            task, self.task = self.task, None
+            return task.result()
+        return None
+
+
 @dataclass(frozen=True, slots=True)
 class Solved:
     """The parts of a Solution that are needed here. Unlike a Solution, it can be pickled.
@@ -174,12 +206,12 @@ class FaultSolver:
 
     Attributes:
         searches: Number of searches so far, except those in the background.
-        background: The search in the background; None if none is running.
+        background: The search in the background.
     """
 
     def __init__(self, options: StepOptions, searches: int = 0) -> None:
         self.searches = searches
-        self.background: BackgroundTask[Solved] | None = None
+        self.background: TaskSlot[Solved] = TaskSlot()
         self._options = options
         self._next_search = 0  # no search before the trace has this many steps
         # clingo cannot be stopped while it grounds a step. If the last search took far too long,
@@ -225,20 +257,9 @@ class FaultSolver:
             Whether a search is running there. False if processes cannot be used.
         """
         speedups = self._options.speedups
-        self.background = self.background or BackgroundTask.begun(
+        return self.background.begin(
             speedups, solved, trace, theory, MEANWHILE, self._options.max_maps, speedups
         )
-        return self.background is not None
-
-    def finished(self) -> Solved | None:
-        """Take the result of the search in the background; None if it is not done.
-
-        The trace that it solved may lack the last steps.
-        """
-        if self.background and self.background.done():
-            background, self.background = self.background, None
-            return background.result()
-        return None
 
 
 class Mender:
@@ -248,22 +269,15 @@ class Mender:
 
     Args:
         options: The time limit and the other options of a step.
+
+    Attributes:
+        mending: The mending in another process. The map that it makes may lack the last steps.
     """
 
     def __init__(self, options: StepOptions) -> None:
-        self.mending: BackgroundTask[SSHMap] | None = None  # under way in another process
+        self.mending: TaskSlot[SSHMap] = TaskSlot()
         self.options = options
         self._seconds = MENDING
-
-    def finished(self) -> SSHMap | None:
-        """Take the map that the other process made; None if it is not done, or found none.
-
-        The map may lack the last steps of the trace.
-        """
-        if self.mending and self.mending.done():
-            mending, self.mending = self.mending, None
-            return mending.result()
-        return None
 
     def suits(self, trace: Trace, theory: Theory) -> bool:
         """Whether to mend maps.
@@ -298,9 +312,7 @@ class Mender:
             found = mended_map(trace, theory, contradicted, speedups)
             self._seconds = (time.perf_counter() - now) / steps**2
             return found
-        self.mending = self.mending or BackgroundTask.begun(
-            speedups, mended_map, trace, theory, contradicted, speedups
-        )
+        self.mending.begin(speedups, mended_map, trace, theory, contradicted, speedups)
         return None
 
 

@@ -104,7 +104,7 @@ class MapKeeper:
             for ssh_map in [m.map() for m in self.minimal.maps[:DRAFTS]] + self.drafts.maps():
                 keeper.drafts.add(ssh_map, trace)
         else:
-            keeper.mender.mending = None
+            keeper.mender.mending.task = None
         return keeper
 
     def take(self, problem: Problem) -> None:
@@ -147,7 +147,7 @@ class MapKeeper:
         """Search for minimal maps with clingo. If it runs out of time, mend a map."""
         if not self.minimal.is_settled(self._options.max_maps) and self.solver.is_due(self.trace):
             self._ask()
-        finished = self.mender.finished()
+        finished = self.mender.mending.finished()
         if self.minimal.status is not Status.UNKNOWN:
             return
         if finished:
