@@ -165,15 +165,17 @@ def parts(folder: Path, ending: str, count: int = 3) -> None:
 
 
 @pytest.mark.parametrize(
-    "metadata",
+    ("ending", "metadata"),
     [
-        None,
-        "rosbag2_bagfile_information: {version: 9, storage_identifier: ''}\n",
-        "not: a bag\n",
-        "",
+        (".db3", None),
+        (".mcap", None),
+        (".bag", None),
+        (".mcap", "rosbag2_bagfile_information: {version: 9, storage_identifier: ''}\n"),
+        (".mcap", "not: a bag\n"),
+        (".db3", ""),
+        (".bag", ""),
     ],
 )
-@pytest.mark.parametrize("ending", [".db3", ".mcap", ".bag"])
 def test_parts_without_metadata_that_can_be_used_are_one_drive(
     tmp_path: Path, ending: str, metadata: str | None
 ) -> None:

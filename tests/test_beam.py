@@ -131,13 +131,13 @@ def test_a_search_that_is_stopped_gives_the_map_of_least_cost() -> None:
     """
     (known,) = truth.mazes(6, 80, [700], DRIFTING)
     with patch.object(time, "perf_counter", time.process_time):
-        solution = solve(known.trace, time_limit=2)
+        solution = solve(known.trace, time_limit=1)
     assert solution.stopped == "time limit"
     assert truth.is_true(solution.maps[0], known)
 
 
 def test_a_broad_beam_and_a_small_misfit_make_sure() -> None:
-    (known,) = truth.mazes(4, 60, [701], DRIFTING)
+    (known,) = truth.mazes(3, 30, [701], DRIFTING)
     weighing = Search(known.trace)._weighing
     assert weighing is not None
     weighing.guess(lambda: False)

@@ -275,10 +275,10 @@ def test_each_speedup_is_tried_on_three_families() -> None:
 
 
 def test_seconds_of_the_processor_are_what_a_search_is_limited_by() -> None:
-    late = bench.run("ssh-abduction", SUITE["maze 8x8 n=4000"], 0, 1, 4096, "cpu")
+    late = bench.run("ssh-abduction", SUITE["maze 8x8 n=4000"], 0, 0.5, 4096, "cpu")
     assert late["status"] == "timeout"
     assert late["seconds"] == pytest.approx(late["cpu"], abs=0.1)
-    assert 0.7 < late["seconds"] < 5
+    assert 0.3 < late["seconds"] < 5
 
 
 def test_following_is_no_speedup_of_a_user_and_can_be_left_out() -> None:

@@ -96,7 +96,7 @@ def test_a_malformed_closure_is_named(tmp_path: Path, closures: Any, said: str) 
         Trace.load(path)
 
 
-@settings(max_examples=20)
+@settings(max_examples=10)
 @given(st.data())
 def test_solver_checker_and_plain_least_squares_have_one_misfit(data: st.DataObject) -> None:
     trace = data.draw(

@@ -182,7 +182,7 @@ def test_names_make_no_difference(seed: int) -> None:
 # Maps that are known
 
 
-@pytest.mark.parametrize("tour", TOURS)
+@pytest.mark.parametrize("tour", ["square", "tee", "plus", "comb"])
 def test_a_map_is_isomorphic_to_itself_as_the_truth(tour: str) -> None:
     trace = drive(*TOURS[tour], stars=True)
     solution = solve(trace, max_maps=3)

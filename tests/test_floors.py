@@ -60,7 +60,7 @@ def test_the_solver_lists_the_maps_with_floors_of_the_brute_force(data: st.DataO
         agree(trace, theory)
 
 
-@settings(max_examples=5)
+@settings(max_examples=3)
 @given(st.data())
 def test_the_checker_rejects_maps_with_floors_that_the_brute_force_does_not_find(
     data: st.DataObject,

@@ -153,7 +153,7 @@ def test_lists_the_maps_of_the_plain_encoding(
 
 
 @settings(max_examples=5)
-@given(framed_traces(), framed_theories(), st.data())
+@given(framed_traces(most_steps=7), framed_theories(), st.data())
 def test_a_trace_that_grows_has_the_maps_of_the_plain_encoding(
     trace: Trace, theory: Theory, data: st.DataObject
 ) -> None:
@@ -186,7 +186,7 @@ def test_a_trace_that_grows_has_the_maps_of_the_plain_encoding(
 def test_a_maze_is_mapped_while_it_is_explored() -> None:
     """The trace is long enough for cores, transitivity rules of visits, and paths. The longer trace
     keeps them all."""
-    trace = maze(3, 3, steps=36, seed=0, stars=True).trace
+    trace = maze(3, 3, steps=27, seed=0, stars=True).trace
     first, *rest = trace.steps
     paths = set()
     with (
@@ -393,8 +393,8 @@ def test_sides_and_streets_say_the_same(theory: Theory) -> None:
     """Compare sides_framed.lp (one path and visits) with paths_framed.lp (all paths and fixed
     dstates)."""
     contradicted = 0
-    for seed in range(3):
-        trace = maze(3, 3, steps=60, seed=seed, stars=True).trace
+    for seed in range(2):
+        trace = maze(3, 3, steps=45, seed=seed, stars=True).trace
         engine = Search(trace, theory)._parts.prefixes.engine
         assert isinstance(engine, FramedEngine)
         with patch.object(FramedEngine, "_charted", plainly_charted):
