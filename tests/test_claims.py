@@ -51,12 +51,13 @@ CHOICES = [
 
 
 @pytest.mark.parametrize(
-    ("tour", "words"), [
+    ("tour", "words"),
+    [
         *product(["square"], CHOICES),
         *product(["tee"], CHOICES[:4]),
         ("comb", ""),
         ("comb", "-n 2"),
-    ]
+    ],
 )
 def test_what_solve_prints_is_true(
     tour: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

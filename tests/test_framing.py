@@ -22,7 +22,7 @@ from ssh_abduction.theory.speedups import SPEEDUPS, row
 PATTERN = Theory(star="pattern")
 
 
-@settings(max_examples=12)
+@settings(max_examples=8)
 @given(st.data())
 def test_maps_with_frames_are_maps_of_the_theory(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=10).filter(lambda t: t.has_stars), label="trace")

@@ -183,7 +183,7 @@ def test_sketches_of_worlds_satisfy_all_axioms(world: str) -> None:
         assert len(small.places) <= len(large.places)
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(traces())
 def test_there_is_a_sketch_if_there_is_a_map(trace: Trace) -> None:
     theory = settle(trace, Theory.topological().replace(star="gateways")).theory

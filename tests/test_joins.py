@@ -68,7 +68,7 @@ def agree(trace: Trace, theory: Theory, ssh_map: SSHMap) -> tuple[Join, ...]:
     return joins
 
 
-@settings(max_examples=15)
+@settings(max_examples=10)
 @given(st.data())
 def test_joins_imply_all_others_and_none_follows(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=6))

@@ -284,7 +284,7 @@ def test_images_at_even_distances() -> None:
         ("triangle", 2, 1),
         ("three-ways", 1, 3),
         pytest.param("five-ways", 1, 4, marks=pytest.mark.slow),
-        ("six-ways", 1, 5),
+        pytest.param("six-ways", 1, 5, marks=pytest.mark.slow),
     ],
 )
 def test_the_true_map_is_found_from_what_was_simulated(
