@@ -59,7 +59,7 @@ from ssh_abduction.learning.learner import (
 from ssh_abduction.learning.runner_up import runner_up, second_map, with_runner_up
 
 VIEWS_ALONE = Theory.topological().replace(star="none", displacement="none")
-FEW_CIRCUITS = replace(EXPERIMENTS["notched-rectangle"], tours=10, k_max=8)
+FEW_CIRCUITS = replace(EXPERIMENTS["notched-rectangle"], tours=6, k_max=8)
 
 
 @pytest.fixture(scope="module")
@@ -224,7 +224,7 @@ def test_several_traces_share_views_and_a_map(run: Trace) -> None:
     short = simulate(World.named("notched-rectangle"), tours=2, seed=503)
     late = replace(short, steps=short.steps[3:])  # begins at x3
     drives = [late, run, short]
-    learner = BootstrapLearner(VIEWS_ALONE).fit(drives)
+    learner = BootstrapLearner(VIEWS_ALONE, ViewClusterer(k_max=6, random_state=0)).fit(drives)
     # The room has two ends that look alike. Each drive may begin at either, by views alone.
     assert len(learner.solution_.maps) == 4
     assert one_to_one(learner.labels_, np.concatenate([true_dstates(t) for t in drives]))
@@ -355,7 +355,7 @@ def test_another_map_of_the_runner_up_is_said(large_room: Trace) -> None:
             "cluster"
         ),
     ):
-        learner = BootstrapLearner().fit(large_room)
+        learner = BootstrapLearner(clusterer=ViewClusterer(k_max=6, random_state=0)).fit(large_room)
     assert (learner.clusterer_.k_, learner.clusterer_.runner_up_, len(learner.map_.dstates)) == (
         2,
         4,
