@@ -59,7 +59,7 @@ from ssh_abduction.learning.learner import (
 from ssh_abduction.learning.runner_up import runner_up, second_map, with_runner_up
 
 VIEWS_ALONE = Theory.topological().replace(star="none", displacement="none")
-FEW_CIRCUITS = replace(EXPERIMENTS["notched-rectangle"], tours=6, k_max=8)
+FEW_CIRCUITS = replace(EXPERIMENTS["notched-rectangle"], tours=10, k_max=8)
 
 
 @pytest.fixture(scope="module")

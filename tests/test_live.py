@@ -151,7 +151,7 @@ def mirrored(scans: Scans) -> Scans:
         (backwards, "drives backwards all the way"),
         (in_degrees, "headings of the odometry are read as degrees"),
         (lambda scans: with_poses(scans, lambda x, y, h: (100 * x, 100 * y, h)), "as centimetres"),
-        (of_two_clocks, "The clock starts anew before scan 150"),
+        (of_two_clocks, "The clock starts anew before scan 60"),
         (mirrored, "the laser hangs upside down"),
     ],
 )

@@ -447,6 +447,7 @@ def test_a_process_that_is_killed_loses_its_log_alone(hall: Path) -> None:
     assert (lost.code, "got killed" in lost.line) == (1, True)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not REAL.exists(), reason="real logs are not part of the project")
 def test_each_visit_to_a_crossing_of_the_building_of_the_paper_is_noticed() -> None:
     log = read_log(REAL / "aces-corrected.log.gz")

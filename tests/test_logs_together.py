@@ -113,8 +113,10 @@ def test_closures_between_drives_are_right(
     assert closures_between(parts[0], joint[2][0], *scenes) == []
 
 
-def test_a_single_log_stays_as_it_is(halves: tuple[RobotLog, RobotLog]) -> None:
-    part = import_log(halves[0])
+def test_a_single_log_stays_as_it_is(
+    joint: tuple[RobotLog, Imported, list[Imported]], halves: tuple[RobotLog, RobotLog]
+) -> None:
+    part = joint[2][0]
     assert join_logs(halves[:1], [part]) == (halves[0], part)
 
 
