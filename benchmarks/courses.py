@@ -13,7 +13,6 @@ Reference:
 from __future__ import annotations
 
 import math
-from collections import defaultdict
 from collections.abc import Hashable, Sequence
 from itertools import combinations, pairwise, product
 from typing import Any
@@ -26,6 +25,7 @@ from scipy.spatial.distance import cdist
 
 from ssh_abduction import Solution, SSHMap, Trace
 from ssh_abduction.evaluation import told_poses
+from ssh_abduction.robot_logs.edges import edges_of, frechet, resampled
 
 Array = NDArray[np.float64]
 # Two visits are at one place if their middles are within ONE metres. Within SURE metres, no
@@ -34,8 +34,6 @@ ONE, SURE = 2.0, 1.0
 # Courses are compared at points STEP metres apart. Their largest distance is APART metres, and half
 # of the shorter course at most.
 STEP, APART = 0.25, 1.5
-# Two gateways of a place whose directions differ by less than this, in radians, are one.
-MERGED = math.radians(45)
 # The disc of a place without a radius, in metres.
 DISC = 1.0
 # Two stretches run together for TOGETHER metres within BESIDE metres, and part by more than PARTED
@@ -63,7 +61,9 @@ def counts_of(trace: Trace, ssh_map: SSHMap | None, poses: Array) -> dict[str, A
     scans = [int(trace.steps[t].extra["scan"]) for t in starts]
     radii = [float(trace.steps[t].extra.get("radius", DISC)) for t in starts]
     places = [_place(ssh_map, t) for t in starts]
-    return counted(poses, middles, scans, radii, places, edges_of(ssh_map, starts))
+    edges = edges_of(trace, ssh_map) if ssh_map is not None and ssh_map.places else {}
+    travels = [edges.get(after - 1) for after in starts[1:]]
+    return counted(poses, middles, scans, radii, places, travels)
 
 
 def counted(
@@ -121,63 +121,6 @@ def _place(ssh_map: SSHMap | None, step: int) -> int | None:
     return None if ssh_map is None else ssh_map.dstates[ssh_map.dstate_at[step]].place
 
 
-def edges_of(ssh_map: SSHMap | None, starts: Sequence[int]) -> list[Hashable]:
-    """Name the edge of each travel. An edge joins a gateway of a place and a gateway of a place.
-
-    A gateway is a direction from its place, in the frame of the map. Directions less than MERGED
-    apart are one. If the map has no poses, the path of the travel stands for both gateways.
-
-    Args:
-        ssh_map: The map; None if there is none.
-        starts: The first step of each visit.
-
-    Returns:
-        The name of the edge of each travel; None if the map has no places.
-    """
-    places = [_place(ssh_map, t) for t in starts]
-    if ssh_map is None or None in places:
-        return [None] * (len(starts) - 1)
-    if ssh_map.fit is None or not ssh_map.fit.poses:
-        paths = [ssh_map.dstates[ssh_map.dstate_at[after - 1]].path for after in starts[1:]]
-        return [
-            (*sorted(ends), path)  # type: ignore[type-var]
-            for ends, path in zip(pairwise(places), paths, strict=True)
-        ]
-    poses, labels = ssh_map.fit.poses, ssh_map.dstate_at
-    bearings = [
-        (poses[labels[after - 1]].heading, poses[labels[after]].heading + math.pi)
-        for after in starts[1:]
-    ]
-    return edges_between(places, bearings)
-
-
-def edges_between(
-    places: Sequence[Hashable], bearings: Sequence[tuple[float, float]]
-) -> list[Hashable]:
-    """Name the edge of each travel by the gateways at its ends.
-
-    Args:
-        places: The place of each visit.
-        bearings: For each travel, the directions in radians from its first place along its
-            beginning, and from its last place back along its end.
-    """
-    edges: list[Hashable] = []
-    gateways: dict[Hashable, list[float]] = defaultdict(list)
-    for (here, there), (ahead, behind) in zip(pairwise(places), bearings, strict=True):
-        ends = [(here, _named(gateways[here], ahead)), (there, _named(gateways[there], behind))]
-        edges.append(tuple(sorted(ends)))  # type: ignore[type-var]
-    return edges
-
-
-def _named(known: list[float], bearing: float) -> int:
-    """The number of the gateway with a bearing in radians. A new gateway becomes known."""
-    apart = [abs(math.remainder(bearing - other, math.tau)) for other in known]
-    if not known or min(apart) > MERGED:
-        known.append(bearing)
-        return len(known) - 1
-    return apart.index(min(apart))
-
-
 def _visit_pairs(middles: Array, places: Sequence[Hashable]) -> dict[str, int]:
     joined = right = true = found = 0
     for i, j in combinations(range(len(middles)), 2):
@@ -203,24 +146,6 @@ def _travel_pairs(courses: Sequence[Array], edges: Sequence[Hashable]) -> dict[s
 def _noticed(points: Array, middles: Array) -> dict[str, int]:
     near = cdist(points, middles).min(axis=1) <= SEEN if len(points) else np.zeros(0)
     return {"all": len(points), "noticed": int(near.sum())}
-
-
-def resampled(way: Array, step: float) -> Array:
-    """Place points evenly along a polygonal chain.
-
-    Args:
-        way: (n, 2) points in metres.
-        step: Metres between two points.
-
-    Returns:
-        (m, 2) metres; the last point is the end of the chain.
-    """
-    far = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way, axis=0).T))])
-    moving = np.concatenate([[True], np.diff(far) > 1e-6])
-    if far[-1] < 1e-6:
-        return way[:1]
-    at = np.minimum(np.arange(0.0, far[-1] + step / 2, step), far[-1])
-    return np.stack([np.interp(at, far[moving], way[moving, k]) for k in (0, 1)], axis=1)
 
 
 def course_of(way: Array, middles: Array, radii: Sequence[float]) -> Array:
@@ -254,24 +179,6 @@ def is_one(first: Array, second: Array) -> bool:
         and frechet(first, other) <= most
         for other in (second, second[::-1])
     )
-
-
-def frechet(first: Array, second: Array) -> float:
-    """Compute the discrete Fréchet distance of two sequences of points, in metres.
-
-    Args:
-        first: (n, 2) metres.
-        second: (m, 2) metres.
-    """
-    far = cdist(first, second)
-    best = np.empty(far.shape)
-    best[0] = np.maximum.accumulate(far[0])
-    best[:, 0] = np.maximum.accumulate(far[:, 0])
-    for i in range(1, len(far)):
-        before = np.minimum(best[i - 1, 1:], best[i - 1, :-1])
-        for j in range(1, far.shape[1]):
-            best[i, j] = max(far[i, j], min(best[i, j - 1], before[j - 1]))
-    return float(best[-1, -1])
 
 
 def partings(positions: Array) -> Array:

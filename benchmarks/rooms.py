@@ -18,9 +18,8 @@ from collections.abc import Hashable, Mapping, Sequence
 from itertools import combinations, pairwise
 from typing import Any
 
-from courses import edges_of
-
 from ssh_abduction import SSHMap, Trace
+from ssh_abduction.robot_logs.edges import edges_of
 
 
 def untold(
@@ -40,7 +39,8 @@ def untold(
     starts = [t for t in range(len(trace)) if t == 0 or trace.actions[t - 1].kind != "turn"]
     scans = [int(trace.steps[t].extra["scan"]) for t in starts]
     places = [ssh_map.dstates[ssh_map.dstate_at[t]].place for t in starts]
-    edges = edges_of(ssh_map, starts)
+    travels = edges_of(trace, ssh_map)
+    edges = [travels.get(after - 1) for after in starts[1:]]
     passed = [
         frozenset(rooms[begin : end + 1]) - {rooms[begin], rooms[end]}
         for begin, end in pairwise(scans)

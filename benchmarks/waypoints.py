@@ -23,7 +23,7 @@ from typing import Any
 
 import networkx as nx
 import numpy as np
-from courses import counted, counts_of, edges_between
+from courses import counted, counts_of, course_of
 from logs import known_truth, mapped, name_of
 from numpy.typing import NDArray
 from pages import print_rows
@@ -36,6 +36,7 @@ from skimage.morphology import skeletonize
 from perception.readers.logs import read_log
 from perception.readers.scans import Pose, RobotLog
 from ssh_abduction import SSHMap, Trace
+from ssh_abduction.robot_logs.edges import grouped
 
 # Metres between nodes along the skeleton, along walls, and in free space.
 ALONG, BESIDE, FREE = 1.5, 2.5, 1.5
@@ -139,22 +140,15 @@ def row_of_graph(log: Path, name: str, skeleton: Skeleton, poses: Array) -> str:
     scans, nodes = zip(*skeleton.events(poses.tolist()), strict=True)
     middles = np.array([graph.nodes[node]["at"] for node in nodes])
     radii = [max(REACH, graph.nodes[node]["clear"]) for node in nodes]
-    bearings = []
-    for k, (begin, end) in enumerate(pairwise(scans)):
-        way = poses[begin : end + 1, :2]
-        ahead = _crossing(way, middles[k], radii[k])
-        bearings.append((ahead, _crossing(way[::-1], middles[k + 1], radii[k + 1])))
-    counts = counted(poses, middles, scans, radii, nodes, edges_between(nodes, bearings))
+    courses = [
+        course_of(poses[begin : end + 1, :2], middles[k : k + 2], radii[k : k + 2])
+        for k, (begin, end) in enumerate(pairwise(scans))
+    ]
+    edges = grouped(zip(nodes, nodes[1:], courses, strict=False))
+    counts = counted(poses, middles, scans, radii, nodes, edges)
     return _line(
         log, name, len(graph), nx.number_connected_components(graph), len(set(nodes)), counts
     )
-
-
-def _crossing(way: Array, middle: Array, radius: float) -> float:
-    """The direction in radians in which a way leaves the disc of a node; else that of its end."""
-    outside = np.flatnonzero(np.hypot(*(way - middle).T) > radius)
-    x, y = way[outside[0] if len(outside) else -1] - middle
-    return math.atan2(y, x)
 
 
 def row_of_map(log: Path, trace: Trace, ssh_map: SSHMap, poses: Array) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -14,9 +15,11 @@ from simulator.world import World
 from ssh_abduction import solve
 from ssh_abduction.cli.simulate import scans_of
 from ssh_abduction.data.maps import DState, SSHMap
+from ssh_abduction.data.odometry import between, moved
 from ssh_abduction.output.drawing import ALARM
 from ssh_abduction.output.undecided import place_of_steps, undecided_places
 from ssh_abduction.robot_logs import log_picture
+from ssh_abduction.robot_logs.edges import resampled
 from ssh_abduction.robot_logs.log_maps import LogMap, map_log
 from ssh_abduction.robot_logs.log_picture import EDGE, figure
 from ssh_abduction.robot_logs.log_report import report
@@ -76,11 +79,32 @@ def test_edges_follow_the_robot_and_each_is_drawn_once(house: LogMap) -> None:
     assert max(mark.count("L") for mark in courses) > 5
 
 
-def test_courses_side_by_side_are_one_edge() -> None:
-    way = np.array([[0.0, 0.0], [10.0, 0.0]])
-    assert log_picture._is_beside(way, way[::-1] + np.array([0.0, 1.0]))
-    assert not log_picture._is_beside(way, way + np.array([0.0, 2.0]))
-    assert not log_picture._is_beside(way, np.array([[0.0, 0.0], [5.0, 5.0], [10.0, 0.0]]))
+def test_a_course_follows_the_robot_from_one_middle_to_the_next(house: LogMap) -> None:
+    trace, visits = house.imported.trace, house.imported.visits
+    bows = 0
+    for t, action in enumerate(trace.actions):
+        step, after = trace.steps[t], trace.steps[t + 1]
+        if action.kind != "travel" or after.displacement is None:
+            continue
+        course = np.array([(0.0, 0.0), *step.extra["course"]])
+        assert course[-1] == pytest.approx(after.displacement[:2], abs=0.01)
+        first, last = (visits[s.extra["visit"]] for s in (step, after))
+        spot = between(step.extra["seen"], (0.0, 0.0, 0.0))  # the robot, seen from the middle
+        track = house.imported.track.poses
+        way = [
+            moved(spot, between(track[first.scan], track[scan]))[:2]
+            for scan in range(first.scan, last.scan + 1)
+        ]
+        outside = [
+            point
+            for point in way
+            if math.dist(point, course[0]) > first.radius + 0.1
+            and math.dist(point, course[-1]) > last.radius + 0.1
+        ]
+        fine = resampled(course, 0.05)
+        assert all(np.hypot(*(fine - point).T).min() < 0.15 for point in outside)
+        bows += len(course) > 2
+    assert bows
 
 
 def test_paths_are_shown_only_if_the_theory_says_something_of_them(house: LogMap) -> None:

@@ -333,8 +333,8 @@ def corridor_map(places: str, paths: str, drive: str) -> tuple[Trace, SSHMap, li
         ("hhh", "rr", "HbHH", {3: "2", 6: "2"}, ["B"], []),
         # Into rooms B and C on one edge: the map tells neither, and confuses doors 2 and 3.
         ("hhh", "rr", "HbHcH", {3: "2", 6: "2", 9: "3", 12: "3"}, ["B", "C"], ["2 and 3"]),
-        # One place for rooms A and B.
-        ("haha", "pqr", "HAHB", {3: "1", 6: "1", 9: "2"}, ["B"], []),
+        # One place for rooms A and B. The map does not say that travels there have two courses.
+        ("haha", "pqr", "HAHB", {3: "1", 6: "1", 9: "2"}, ["B"], ["1 and 2"]),
     ],
 )
 def test_rooms_and_doors_need_places_or_edges_of_their_own(

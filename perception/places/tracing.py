@@ -16,7 +16,7 @@ import numpy as np
 
 from perception.places.closures import NOISE, VisitMatch, relative, uncertainty
 from perception.places.local_map import CELL, PackedPatch
-from perception.places.track import Array, Track, wrapped
+from perception.places.track import Array, Track, points_turned, wrapped
 from perception.places.visits import Visit, apart, patches_of
 from perception.readers.scans import Pose, RobotLog
 from ssh_abduction.data.closure import Closure
@@ -37,6 +37,8 @@ FLOOR = (0.02, 0.02, 0.002)
 SCALE, DRIFT = 0.01, 0.001
 # Standard deviation of the bearing of a gateway, in degrees.
 SPREAD = 16.0
+# A course is at most this many metres away from its polygonal chain.
+DETAIL = 0.1
 # Bearings of an image: a beam in each degree, from the right (-90) to the left (90).
 BEAMS = np.radians(np.arange(-90.0, 91.0))
 
@@ -73,10 +75,11 @@ def to_trace(
             last = (visit, pose)
         if number < len(visits) - 1:
             carried = track.span_of(visit.scan) != track.span_of(visits[number + 1].scan)
-            steps[-1] = replace(
-                steps[-1],
-                action=Action.that_slipped(len(steps) - 1) if carried else Action.of("travel"),
-            )
+            onward = Action.that_slipped(len(steps) - 1) if carried else Action.of("travel")
+            extra = dict(steps[-1].extra)
+            if not track.cuts_between(visit.scan, visits[number + 1].scan):
+                extra["course"] = _course(track, visit, visits[number + 1], headings[-1])
+            steps[-1] = replace(steps[-1], action=onward, extra=extra)
     return Trace(
         tuple(_with_turns(steps, visits)),
         name=name,
@@ -157,6 +160,30 @@ def _step(
         truth=truth,
         extra=extra,
     )
+
+
+def _course(track: Track, first: Visit, last: Visit, heading: float) -> list[list[float]]:
+    """The course of the robot from one visit to the next, as points of a polygonal chain.
+
+    The discs of both places are left out, and the last point is the middle of the next place.
+
+    Args:
+        track: Trajectory of the robot.
+        first: The visit from which it comes.
+        last: The next visit.
+        heading: The direction of the x-axis of the points, in radians. Their origin is the middle
+            of the first place.
+    """
+    from skimage.measure import approximate_polygon
+
+    way = track.poses[first.scan : last.scan + 1, :2]
+    left, come = (
+        np.flatnonzero(np.hypot(*(way - visit.middle).T) > visit.radius) for visit in (first, last)
+    )
+    part = way[left[0] : come[-1] + 1] if len(left) and len(come) else way[:0]
+    chain = approximate_polygon(np.array([first.middle, *part, last.middle]), DETAIL)
+    points = points_turned(-heading, chain[1:] - first.middle)
+    return [[round(x, 2), round(y, 2)] for x, y in points.tolist()]
 
 
 def _pose(track: Track, scan: int) -> Pose:

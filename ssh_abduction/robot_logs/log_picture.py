@@ -20,7 +20,6 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from perception.places.importing import Imported
 from perception.readers.scans import Pose, RobotLog
@@ -30,6 +29,7 @@ from ssh_abduction.data.odometry import displacement_between, moved
 from ssh_abduction.output.drawing import ALARM, COLOURS, escaped, page, svg_text, titled
 from ssh_abduction.output.region_marks import band, banded
 from ssh_abduction.output.undecided import place_of_steps, undecided_places
+from ssh_abduction.robot_logs.edges import edges_of
 from ssh_abduction.solver import Solution
 
 Array = NDArray[np.float64]
@@ -41,8 +41,6 @@ GRAIN = 0.1
 METRE, LARGEST = 24.0, 1500.0
 # Beams longer than this many metres are not drawn: their ends are too far apart to show a wall.
 DRAWN = 12.0
-# Courses are one edge if none of their points is farther than this many metres from the other.
-BESIDE = 1.5
 # Nearer than this many metres to the middle of a place, an edge leads straight to it.
 MIDDLE = 1.0
 # The innermost bands of regions are this many metres wide.
@@ -209,7 +207,7 @@ def _map_marks(sheet: _Sheet, imported: Imported, solution: Solution) -> Iterato
     shown = {place: middle for place, middle in middles.items() if place not in hidden}
     path_of = {state.id: state.path for state in ssh_map.dstates}
     colourful = paths_mean_something(solution)
-    edges = list(_edges(sheet, imported, places, visit_of, shown))
+    edges = list(_edges(sheet, imported, ssh_map, visit_of, shown))
     yield from _bands(sheet, ssh_map, middles, [(places[t], places[t + 1], c) for t, c in edges])
     for step, course in edges:
         path = path_of[ssh_map.dstate_at[step]] or 0
@@ -250,7 +248,7 @@ def _bands(
 def _edges(
     sheet: _Sheet,
     imported: Imported,
-    places: Sequence[int | None],
+    ssh_map: SSHMap,
     visit_of: Sequence[int],
     middles: Mapping[int, Array],
 ) -> Iterator[tuple[int, Array]]:
@@ -259,44 +257,22 @@ def _edges(
     An edge that several drives took comes once for each drive. Edges lead to the `middles` of
     places. At other places, they follow the course of the robot through the place.
     """
-    known: dict[tuple[int, frozenset[int]], list[Array]] = defaultdict(list)
-    for t, action in enumerate(imported.trace.actions):
-        first, last = places[t], places[t + 1]
-        if action.kind != "travel" or first is None or last is None:
-            continue
+    places, drawn = place_of_steps(ssh_map), set[tuple[int, int]]()
+    for t, edge in edges_of(imported.trace, ssh_map).items():
+        ends = [p for p in places[t : t + 2] if p is not None]
         begin, end = (imported.visits[visit_of[k]] for k in (t, t + 1))
+        if (key := (sheet.drive_of(begin.scan), edge)) in drawn:
+            continue
         way = np.array([pose[:2] for pose in sheet.poses[begin.scan : end.scan + 1]])
         way = way.reshape(-1, 2)
         # Near the places, the course leads straight to their middles.
-        shown = [middles[place] for place in (first, last) if place in middles]
-        for middle in shown:
+        first, last = ([middles[p]] if p in middles else [] for p in ends)
+        for middle in (*first, *last):
             way = way[np.hypot(*(way - middle).T) >= MIDDLE]
-        course = np.array(
-            [
-                *(shown[:1] if first in middles else []),
-                *way,
-                *(shown[-1:] if last in middles else []),
-            ]
-        )
-        if len(course) < 2:
-            continue
-        alike = known[sheet.drive_of(begin.scan), frozenset((first, last))]
-        if not any(_is_beside(course, other) for other in alike):
-            alike.append(course)
+        course = np.array([*first, *way, *last])
+        if len(course) > 1:
+            drawn.add(key)
             yield t, course
-
-
-def _is_beside(one: Array, other: Array) -> bool:
-    """Whether two courses lie close together, so that they are one edge."""
-    one, other = _dense(one), _dense(other)
-    return all(cKDTree(a).query(b)[0].max() <= BESIDE for a, b in ((one, other), (other, one)))
-
-
-def _dense(course: Array) -> Array:
-    """Add points to a course, so that neighbours are at most about half a metre apart."""
-    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(course, axis=0).T))])
-    at = np.linspace(0.0, way[-1], int(way[-1] / 0.5) + 2)
-    return np.stack([np.interp(at, way, course[:, k]) for k in (0, 1)], axis=1)
 
 
 def _place(sheet: _Sheet, imported: Imported, at: Point, visits: Sequence[int]) -> Iterator[str]:

@@ -1,0 +1,142 @@
+"""Find which travels of a robot are on one edge of its map, by the courses that it drove.
+
+A course is the way of the robot from the middle of one place to the middle of the next. The map
+says where these middles are. Travels between the same two places are on one edge if their courses
+lie close together. So two ways that leave a place in nearly one direction are two edges, and a
+robot that cuts a corner is on the same edge as one that does not.
+
+Reference:
+    Eiter & Mannila 1994, "Computing discrete Fréchet distance".
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
+
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.trace import Trace
+from ssh_abduction.output.undecided import place_of_steps
+
+Array = NDArray[np.float64]
+
+# Two courses are one edge if their Fréchet distance is at most APART metres. They are compared at
+# points STEP metres apart.
+APART, STEP = 1.5, 0.25
+# Standard deviations of the heading at a dstate in radians, and of the chord of a course in metres.
+# They weigh what both say about the rotation of the course.
+HEADING, CHORD = 0.2, 0.3
+
+
+def edges_of(trace: Trace, ssh_map: SSHMap) -> dict[int, int]:
+    """Number the edges of a map in the order in which the robot first took them.
+
+    Args:
+        trace: The trace of a log. Its travels have a `course`. Others count as straight.
+        ssh_map: A map of the trace.
+
+    Returns:
+        The number of the edge of each travel, by the step at which it begins.
+    """
+    places = place_of_steps(ssh_map)
+    travels = {
+        t: (places[t], places[t + 1], _laid(trace, ssh_map, t))
+        for t, action in enumerate(trace.actions)
+        if action.kind == "travel" and places[t] is not None and places[t + 1] is not None
+    }
+    return dict(zip(travels, grouped(travels.values()), strict=True))
+
+
+def grouped(travels: Iterable[tuple[Any, Any, Array]]) -> list[int]:
+    """Number the edges of travels, each given by its first and last place and its course.
+
+    The places can be compared. A course is (n, 2) metres, with points STEP apart. An edge has the
+    course of its first travel.
+    """
+    known: dict[tuple[Any, Any], list[Array]] = defaultdict(list)
+    numbers: dict[tuple[Any, Any, int], int] = {}
+    found = []
+    for first, last, course in travels:
+        ends = min(first, last), max(first, last)
+        way = course if first == ends[0] else course[::-1]
+        edge = *ends, _nearest(known[ends], way, first == last)
+        found.append(numbers.setdefault(edge, len(numbers)))
+    return found
+
+
+def _nearest(known: list[Array], course: Array, loop: bool) -> int:
+    """The number of the known course that is nearest to a course. If none is near, add it.
+
+    Args:
+        known: Courses between the same two places, from the same one of them.
+        course: (n, 2) metres.
+        loop: Whether both ends are at one place, so that the direction says nothing.
+    """
+    far = [
+        min(frechet(way, other) for way in ([course, course[::-1]] if loop else [course]))
+        for other in known
+    ]
+    if not far or min(far) > APART:
+        known.append(course)
+        return len(known) - 1
+    return int(np.argmin(far))
+
+
+def _laid(trace: Trace, ssh_map: SSHMap, t: int) -> Array:
+    """The course of the travel from step t in the frame of the map: (n, 2) metres."""
+    if ssh_map.fit is None or not ssh_map.fit.poses:
+        return np.zeros((1, 2))
+    here, there = (ssh_map.fit.poses[ssh_map.dstate_at[k]] for k in (t, t + 1))
+    begin, end = complex(here.x, here.y), complex(there.x, there.y)
+    told = trace.steps[t].extra.get("course", ())
+    way = np.array([0.0, *(complex(x, y) for x, y in told)])
+    # This rotation has the least squared errors of the heading and of the chord.
+    turn = np.exp(1j * here.heading) / HEADING**2 + (end - begin) * way[-1].conj() / CHORD**2
+    way = begin + way * turn / abs(turn)
+    if not told:
+        way = np.array([begin, end])
+    far = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(way)))])
+    # The error at the end grows steadily along the course.
+    way += (end - way[-1]) * far / max(far[-1], STEP)
+    return resampled(np.stack([way.real, way.imag], axis=1), STEP)
+
+
+def resampled(way: Array, step: float) -> Array:
+    """Place points evenly along a polygonal chain.
+
+    Args:
+        way: (n, 2) points in metres.
+        step: Metres between two points.
+
+    Returns:
+        (m, 2) metres; the last point is the end of the chain.
+    """
+    far = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way, axis=0).T))])
+    moving = np.concatenate([[True], np.diff(far) > 1e-6])
+    if far[-1] < 1e-6:
+        return way[:1]
+    at = np.minimum(np.arange(0.0, far[-1] + step / 2, step), far[-1])
+    return np.stack([np.interp(at, far[moving], way[moving, k]) for k in (0, 1)], axis=1)
+
+
+def frechet(first: Array, second: Array) -> float:
+    """Compute the discrete Fréchet distance of two sequences of points, in metres.
+
+    Args:
+        first: (n, 2) metres.
+        second: (m, 2) metres.
+    """
+    far = cdist(first, second)
+    best = np.empty(far.shape)
+    best[0] = np.maximum.accumulate(far[0])
+    best[:, 0] = np.maximum.accumulate(far[:, 0])
+    for i in range(1, len(far)):
+        before = np.minimum(best[i - 1, 1:], best[i - 1, :-1])
+        for j in range(1, far.shape[1]):
+            best[i, j] = max(far[i, j], min(best[i, j - 1], before[j - 1]))
+    return float(best[-1, -1])
