@@ -249,7 +249,8 @@ def test_poses_are_where_the_dstates_are() -> None:
 @pytest.mark.parametrize(("factor", "said"), [(0.3, "too loose"), (3.0, "too tight"), (1.0, None)])
 def test_a_noise_model_that_is_off_is_noticed(factor: float, said: str | None) -> None:
     trace = circuit(5, 30, factor, 4)
-    warning = noise_warning(fit(trace, true_circuit(trace, 5)), trace)
+    ssh_map = true_circuit(trace, 5)
+    warning = noise_warning(replace(ssh_map, fit=fit(trace, ssh_map)), trace)
     if said is None:
         assert warning is None
         return
@@ -259,6 +260,17 @@ def test_a_noise_model_that_is_off_is_noticed(factor: float, said: str | None) -
         f"multiply them by {factor:.1g}"[:-1] in warning
         or abs(float(warning.rsplit(" ", 1)[1]) - factor) < 0.2 * factor
     )
+
+
+def test_a_map_that_never_comes_back_says_nothing_about_noise() -> None:
+    """Turns on the spot fit exactly. A chi-square of 0 for them is no sign of too much noise."""
+    trace = Trace.from_steps(
+        "abcd", ["travel", "right", "travel"], displacements=[(5, 0, 0), (0, 0, -1.57), (5, 0, 0)]
+    )
+    solution = solve(trace)
+    assert solution[0].fit is not None
+    assert (solution[0].fit.chi2, solution[0].fit.dof) == (pytest.approx(0, abs=1e-9), 2)
+    assert solution.warnings == ()
 
 
 def test_kilometres_are_noticed() -> None:

@@ -103,7 +103,7 @@ class Answer:
         size = len(trace) if ran_out else parts.prefixes.engine.size
         warning = None
         if self._first and self._first.fit:
-            warning = units_warning(trace) or noise_warning(self._first.fit, trace)
+            warning = units_warning(trace) or noise_warning(self._first, trace)
         return Support(self._basis or self._basis_of(size), warning)
 
     def in_order(self, maps: tuple[SSHMap, ...]) -> tuple[SSHMap, ...]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
-from itertools import chain, islice
+from itertools import chain, islice, pairwise
 from typing import TypeAlias
 
 from ssh_abduction.data.maps import Fit, SSHMap
@@ -137,21 +137,23 @@ def weights(maps: Sequence[SSHMap]) -> tuple[float, ...]:
     return tuple(weight / sum(likely) for weight in likely)
 
 
-def noise_warning(fit: Fit | None, trace: Trace) -> str | None:
+def noise_warning(ssh_map: SSHMap, trace: Trace) -> str | None:
     """Return a warning if the best map contradicts the noise model of the odometry; else None.
 
     Args:
-        fit: The fit of the best map; None if it has none.
+        ssh_map: The best map.
         trace: The trace, with the noise model of its odometry.
     """
+    fit = ssh_map.fit
     if fit is None or fit.dof < 1 or min(fit.p, 1 - fit.p) > DOUBTED / 2:
         return None
     factor = max(math.sqrt(fit.chi2 / fit.dof), NEVER_LESS)
     if 1 / TOO_LARGE < factor < TOO_SMALL:
         return None
-    if factor < 1 and trace.odometry and trace.odometry.offset:
-        # The fit adds the error of a dstate's pose to each displacement there, which is too much.
-        # So a small chi-square says nothing.
+    if factor < 1 and ((trace.odometry and trace.odometry.offset) or not _comes_back(ssh_map)):
+        # A small chi-square says nothing if no visit comes back, as turns on the spot always fit.
+        # Nor does it with an offset, as the fit adds the error of a dstate's pose to each
+        # displacement there, which is too much.
         return None
     how, noise = ("smaller", "tight") if factor > 1 else ("larger", "loose")
     return (
@@ -160,6 +162,14 @@ def noise_warning(fit: Fit | None, trace: Trace) -> str | None:
         f"so its standard deviations are {_times(factor)} {how} than the errors; multiply them by "
         f"{factor:.2g}"
     )
+
+
+def _comes_back(ssh_map: SSHMap) -> bool:
+    """Whether the robot came back to a place, or in a causal map to a dstate."""
+    at = [ssh_map.place_of(t) for t in range(len(ssh_map.dstate_at))]
+    at = list(ssh_map.dstate_at) if None in at else at
+    visits = [here for before, here in pairwise([None, *at]) if before != here]
+    return len(set(visits)) < len(visits)
 
 
 def units_warning(trace: Trace) -> str | None:
