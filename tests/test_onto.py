@@ -145,6 +145,19 @@ def test_a_drive_with_displacements_is_added_by_cost() -> None:
         assert rival.dstates[:4] == standing.maps[0].dstate_at
 
 
+def test_a_short_time_gives_a_map_that_keeps_the_standing_one() -> None:
+    """The first map of a search makes every step a new dstate, so it does not keep a map."""
+    around = Trace.from_steps("abababab" * 2, ["travel", "left"] * 7 + ["travel"], name="monday")
+    again = Trace.from_steps("ababab", ["travel", "left"] * 2 + ["travel"], name="tuesday")
+    standing = solve(around)
+    assert len(standing[0].dstates) < len(around)
+    solution = solve(again, onto=standing, time_limit=1e-9)
+    assert (solution.status, solution.stopped) == (Status.FEASIBLE, "time limit")
+    assert solution.trace is not None
+    assert check(solution.trace, solution[0], solution.theory) == ()
+    assert solution[0].dstate_at[: len(around)] == standing[0].dstate_at
+
+
 def test_a_map_without_its_trace_does_not_stand(tmp_path: Path) -> None:
     standing = solve(MONDAY)
     for bad in (replace(standing, trace=None), replace(standing, maps=())):

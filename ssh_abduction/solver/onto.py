@@ -33,14 +33,19 @@ from ssh_abduction.data.step import Step
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.solver.choosing import READABLE
+from ssh_abduction.solver.guesses.gated import sketch_beyond
+from ssh_abduction.solver.guesses.mended import first_contradiction
+from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.obeying import obeyed, with_names
 from ssh_abduction.solver.recorded import Support
 from ssh_abduction.solver.result import Solution
-from ssh_abduction.solver.values import Level, Status
+from ssh_abduction.solver.values import Cost, Level, Status
 from ssh_abduction.solver.weighed import Weighed
-from ssh_abduction.theory.settle import settle
+from ssh_abduction.theory.settle import Problem, settle
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory, checked_theory
+
+_LIMITS = ("time limit", "memory limit", "interrupted")  # what ends a search early
 
 
 @dataclass(frozen=True)
@@ -134,27 +139,44 @@ def solve_onto(
     pinned = _pinned(theory, digest, ssh_map, old, joins=in_use.star == "frame")
     found = solving.solve(part, pinned)
     kept = tuple(m for m in found.maps if _keeps(m, digest, ssh_map))
-    if not kept and found.status is not Status.UNSATISFIABLE:
+    ended = found.stopped in _LIMITS
+    if not kept and not ended and found.status is not Status.UNSATISFIABLE:
         found, kept = _with_assertions(part, pinned, digest, ssh_map, found, solving)
-    if not kept:
+    maps = tuple(_of_all(m, digest, ssh_map, joint) for m in kept)
+    if not maps and ended and (grown := _grown(ssh_map, old, joint, in_use)):
+        found, maps = replace(found, status=Status.FEASIBLE, cost=Cost.of(grown)), (grown,)
+    if not maps:
         raise _contradiction(old, trace, ssh_map, digest, found)
     assert found.cost is not None
     solution = replace(
         found,
-        maps=tuple(_of_all(m, digest, ssh_map, joint) for m in kept),
+        maps=maps,
         theory=_settled(found.theory, theory),
         steps=len(joint),
-        levels=(Level(found.cost, len(kept), found.complete),) if found.within else (),
+        levels=(Level(found.cost, len(maps), found.complete),) if found.within else (),
         shared=None,
         trace=joint,
         support=Support(
             odometry_warning=found.support.odometry_warning,
             weigh_warning=found.support.weigh_warning,
-            weighed=None if short else _weighed(found, len(old), ssh_map),
+            weighed=None if short or not kept else _weighed(found, len(old), ssh_map),
             onto=tuple(drive.name for drive in drives_of(old)),
         ),
     )
     return solution if corrections is None else with_names(corrections, solution, joint)
+
+
+def _grown(ssh_map: SSHMap, old: Trace, joint: Trace, theory: Theory) -> SSHMap | None:
+    """Make a map without a search: the existing map, and new places for the new drive.
+
+    Returns:
+        The map; None if a step contradicts it, or if the checker does not accept it.
+    """
+    sketch = sketch_beyond(ssh_map, old, theory, homing=False)
+    if first_contradiction(sketch, joint) is not None:
+        return None
+    grown = replace(sketch.map(), starts=starts_of(joint), names=())
+    return grown if Judging(Problem.of(joint, theory)).accepts(grown) else None
 
 
 def _existing(existing: object) -> tuple[Trace, SSHMap]:
@@ -372,6 +394,11 @@ def _contradiction(
             f"{' and '.join(parts)}"
         )
     new = ", ".join(drive.name for drive in drives_of(trace))
+    if found.stopped in _LIMITS:
+        return SolverError(
+            f"onto: expected a map that keeps the existing one, found none for {new} before the "
+            f"search ended ({found.stopped}); give it more time or memory"
+        )
     return SolverError(
         f"onto: expected a drive that agrees with the existing map, got {new}: {reason}; solve all "
         "drives together (solve --together)"
