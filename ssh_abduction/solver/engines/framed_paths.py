@@ -82,13 +82,7 @@ class FramedPaths:
     @property
     def paths(self) -> Paths:
         """The program with the axioms of places and paths for this trace."""
-        return Paths(
-            self.task.trace,
-            self.task.theory,
-            pinned=self.task.speedups.clique,
-            check=self._asker.watch.check,
-            forbidden=tuple(self.forbidden),
-        )
+        return Paths(self.task, tuple(self.forbidden))
 
     @property
     def preparing(self) -> float:

@@ -12,18 +12,17 @@ other segments are assigned to these paths, or to new ones.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 import clingo
 import numpy as np
 
-from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.asp.control import Control
 from ssh_abduction.solver.asp.facts import paths_lp
+from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.steps.apart import large_clique
 from ssh_abduction.solver.steps.chart import FramedChart
 from ssh_abduction.theory.evidence import Equality
-from ssh_abduction.theory.theory import Theory
 
 # With these options, clasp lists the answers with minimal sets of shown atoms.
 SMALLEST = ("--heuristic=Domain", "--dom-mod=5,16", "--enum-mode=domRec")
@@ -35,33 +34,19 @@ PREPARING = (1.6, 2.1)
 class Paths:
     """The axioms of places and paths, for charts of one trace."""
 
-    def __init__(
-        self,
-        trace: Trace,
-        theory: Theory,
-        *,
-        pinned: bool = True,
-        check: Callable[[], None] = lambda: None,
-        forbidden: Sequence[Collection[Equality]] = (),
-    ) -> None:
+    def __init__(self, task: Task, forbidden: Sequence[Collection[Equality]]) -> None:
         """Prepare questions about a trace.
 
         Args:
-            trace: The trace.
-            theory: The theory, with all defaults filled in.
-            pinned: Whether pairwise distinct segments get paths of their own beforehand.
-            check: Called now and then while clingo grounds; may raise to stop.
+            task: The problem, the limits and the speed-ups.
             forbidden: Sets of equalities of steps. In no map do all equalities of one set hold.
         """
-        self._trace = trace
-        self._theory = theory
-        self._pinned = pinned
+        self._task, self._trace, self._theory = task, task.trace, task.theory
         self._forbidden = forbidden
-        self._check = check
 
     def control(self, chart: FramedChart, options: Sequence[str] = ()) -> Control:
         """Make a control with the axioms and the facts of a chart. Nothing is grounded yet."""
-        control = Control(options, self._check, PREPARING)
+        control = Control(options, self._task.watch.check, PREPARING)
         control.load_encodings("paths_framed")
         control.add(
             "base",
@@ -116,7 +101,7 @@ class Paths:
         control.ground(
             [("base", []), *([("again", [])] if single else []), ("segments", []), ("least", [])]
         )
-        if self._pinned and not single:
+        if self._task.speedups.clique and not single:
             control.add(
                 "pinned",
                 [],

@@ -8,7 +8,7 @@ turns join dstates to small places, and several of these may be one place of the
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import permutations
 from typing import TypeAlias
 
@@ -80,10 +80,6 @@ class PathReader:
         self._before: dict[_Ahead, int] = {}
         # For each path, its places in order in the answer that was read last.
         self._order: dict[int, list[int]] = {}
-        # The places and dstates of the last map. Mostly the next map has the same.
-        self._placed: _Placed | None = None
-        # The dstates made so far. Most of them are in most maps.
-        self._made: dict[tuple[object, ...], DState] = {}
 
     def condition(self, sort: str, i: int, j: int) -> str | None:
         """Return the body of a rule that holds if two dstates share a place, path or course.
@@ -149,68 +145,26 @@ class PathReader:
 
     def map_of(self, answer: PathAnswer) -> SSHMap:
         """Make the map that an answer describes."""
-        placed = self._placed
-        if placed is None or placed.at != answer.at:
-            placed = self._placed = self._placed_at(answer.at)
         # For each path, its number in the map, and the direction that its first dstate faces.
         faced: dict[int, tuple[int, int]] = {}
-        dstates = list(placed.dstates)
+        course: dict[int, tuple[int, int]] = {}
         for segment, members in self._runs.items():
             h, ahead = answer.part[segment]
             path, first = faced.setdefault(h, (len(faced), ahead * members[0][1]))
-            key = segment, path, ahead * first
-            along = placed.along.get(key)
-            if along is None:
-                along = placed.along[key] = [
-                    (i, self._dstate(dstates[i], path, key[2] * direction))
-                    for i, direction in members
-                ]
-            for i, dstate in along:
-                dstates[i] = dstate
-        orders = (
-            (path, [placed.number[p] for p in answer.order[h][::first]])
-            for h, (path, first) in faced.items()
-        )
-        paths = tuple(MapPath(path, tuple(order)) for path, order in orders)
-        return SSHMap(
-            self._labels, tuple(dstates), self._links, tuple(range(len(placed.number))), paths
-        )
-
-    def _placed_at(self, at: dict[int, tuple[int, int]]) -> _Placed:
-        """Make the dstates with their places and headings from `at`, without paths."""
+            course |= {i: (path, ahead * first * direction) for i, direction in members}
         # For each place, its number in the map, and the slot that its first dstate faces.
         arrived: dict[int, tuple[int, int]] = {}
         dstates: list[DState] = []
-        for view, component, slot in self._dstates:
-            p, turned = at[component]
+        for i, (view, component, slot) in enumerate(self._dstates):
+            p, turned = answer.at[component]
             place, facing = arrived.setdefault(p, (len(arrived), (slot + turned) % 4))
-            dstates.append(DState(len(dstates), view, place, heading=(slot + turned - facing) % 4))
-        return _Placed(at, {p: number for p, (number, _) in arrived.items()}, dstates, {})
-
-    def _dstate(self, placed: DState, path: int, direction: int) -> DState:
-        """Return a dstate with a path and a direction added. Dstates made before are reused."""
-        key = placed.id, placed.place, placed.heading, path, direction
-        if key not in self._made:
-            self._made[key] = replace(placed, path=path, direction=direction)
-        return self._made[key]
-
-
-@dataclass(frozen=True, slots=True)
-class _Placed:
-    """The part of a map that does not depend on paths: places and dstates.
-
-    Attributes:
-        at: As in PathAnswer.
-        number: For each place, its number in the map.
-        dstates: The dstates of the map, without paths.
-        along: For a segment, a path and a direction: the dstates of the segment, with this path and
-            direction, and their numbers. Filled as maps need them.
-    """
-
-    at: dict[int, tuple[int, int]]
-    number: dict[int, int]
-    dstates: list[DState]
-    along: dict[tuple[int, int, int], list[tuple[int, DState]]]
+            along = course.get(i, (None, None))
+            dstates.append(DState(i, view, place, *along, heading=(slot + turned - facing) % 4))
+        paths = tuple(
+            MapPath(path, tuple(arrived[p][0] for p in answer.order[h][::first]))
+            for h, (path, first) in faced.items()
+        )
+        return SSHMap(self._labels, tuple(dstates), self._links, tuple(range(len(arrived))), paths)
 
 
 class _Choices:
