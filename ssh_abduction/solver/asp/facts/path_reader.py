@@ -158,8 +158,9 @@ class PathReader:
         for i, (view, component, slot) in enumerate(self._dstates):
             p, turned = answer.at[component]
             place, facing = arrived.setdefault(p, (len(arrived), (slot + turned) % 4))
-            along = course.get(i, (None, None))
-            dstates.append(DState(i, view, place, *along, heading=(slot + turned - facing) % 4))
+            path_of, direction = course.get(i, (None, None))
+            heading = (slot + turned - facing) % 4
+            dstates.append(DState(i, view, place, path_of, direction, heading))
         paths = tuple(
             MapPath(path, tuple(arrived[p][0] for p in answer.order[h][::first]))
             for h, (path, first) in faced.items()
