@@ -15,7 +15,7 @@ from simulator.world import World
 from ssh_abduction import solve
 from ssh_abduction.cli.simulate import scans_of
 from ssh_abduction.data.maps import DState, SSHMap
-from ssh_abduction.data.odometry import between, moved
+from ssh_abduction.data.odometry import displacement_between, moved
 from ssh_abduction.output.drawing import ALARM
 from ssh_abduction.output.undecided import place_of_steps, undecided_places
 from ssh_abduction.robot_logs import log_picture
@@ -89,10 +89,11 @@ def test_a_course_follows_the_robot_from_one_middle_to_the_next(house: LogMap) -
         course = np.array([(0.0, 0.0), *step.extra["course"]])
         assert course[-1] == pytest.approx(after.displacement[:2], abs=0.01)
         first, last = (visits[s.extra["visit"]] for s in (step, after))
-        spot = between(step.extra["seen"], (0.0, 0.0, 0.0))  # the robot, seen from the middle
+        # The robot, seen from the middle.
+        spot = displacement_between(step.extra["seen"], (0.0, 0.0, 0.0))
         track = house.imported.track.poses
         way = [
-            moved(spot, between(track[first.scan], track[scan]))[:2]
+            moved(spot, displacement_between(track[first.scan], track[scan]))[:2]
             for scan in range(first.scan, last.scan + 1)
         ]
         outside = [
