@@ -55,28 +55,27 @@ class Facilities:
     fees: Array
     price: float
 
-    def shares(self, most: Array, *, checked: bool = True) -> Array:
-        """Compute the shares of the points.
-
-        Args:
-            most: No share is more than this, (n,).
-            checked: Whether to search all of space for facilities that save more than their price.
-                Without it, the shares are approximate.
-
-        Returns:
-            The shares, (n,).
-        """
+    def shares(self, most: Array) -> Array:
+        """Compute the shares of the points, (n,), none more than its `most`, (n,)."""
         starts, kinds = self._starts()
         program = _Program(self.price, most)
-        for _ in range(RETRIES if checked else 1):
+        for _ in range(RETRIES):
             shares = self._approximate(program, starts, kinds)
-            if not checked:
-                return shares
             saved, found, of_kind = self._most_saved(shares)
             if saved <= self.price * (1 + 2 * TOLERANCE) or not len(found):
                 break
             starts, kinds = np.concatenate([starts, found]), np.concatenate([kinds, of_kind])
         return shares * self.price / saved
+
+    def first_shares(self) -> tuple[Array, Array]:
+        """Compute approximate shares, without a search of all space.
+
+        Returns:
+            The shares, (n,), and what each point pays in the cheapest clustering, (n,). Clusters
+            may be taken in parts there.
+        """
+        program = _Program(self.price, np.full(len(self.points), self.price))
+        return self._approximate(program, *self._starts()), program.pays()
 
     def _approximate(self, program: _Program, starts: Array, kinds: NDArray[np.int_]) -> Array:
         """Compute shares that hold for all facilities that are found from some starts."""
@@ -84,12 +83,12 @@ class Facilities:
         for _ in range(ROUNDS):
             look_at_clock()
             shares = program.solved()
-            saved, members, paid = self.climbed(shares, starts, kinds)[:3]
+            saved, members, pays = self.climbed(shares, starts, kinds)[:3]
             scaled = shares * self.price / max(self.price, float(saved.max()))
             if scaled.sum() > best.sum():
                 best = scaled
             is_more = saved > self.price + 1e-6
-            added = program.add(members[is_more], paid[is_more])
+            added = program.add(members[is_more], pays[is_more])
             if not added or best.sum() >= shares.sum() * (1 - ENOUGH):
                 break
         return best
@@ -121,8 +120,8 @@ class Facilities:
         """Move each of m facilities to the mean of the points that pay less there than their share.
 
         Returns:
-            What the points save there, (m,), which points these are, (m, n), what they pay, (m,),
-            and where the facility is, (m, d).
+            What the points save there, (m,), which points these are, (m, n), what all points pay,
+            (m, n), and where the facility is, (m, d).
         """
         centres, moving = centres.copy(), np.arange(len(centres))
         for _ in range(STEPS):
@@ -136,7 +135,7 @@ class Facilities:
                 break
         _, members, pays = self._members(shares, centres, kinds)
         saved = np.where(members, shares - pays, 0.0).sum(1)
-        return saved, members, np.where(members, pays, 0.0).sum(1), centres
+        return saved, members, pays, centres
 
     def _members(
         self, shares: Array, centres: Array, kinds: NDArray[np.int_]
@@ -179,19 +178,27 @@ class _Program:
     def __init__(self, price: float, most: Array) -> None:
         self._price, self._bounds = price, np.stack([np.zeros(len(most)), most], 1)
         self._clusters: list[tuple[int, ...]] = [(i,) for i in range(len(most))]
-        self._costs = [price] * len(most)
+        self._pays = [np.zeros(1)] * len(most)  # what each member of each cluster pays
+        self._parts = np.zeros(0)  # the part of each cluster in the cheapest clustering
         self._known: set[tuple[int, ...]] = set(self._clusters)
 
-    def add(self, members: NDArray[np.bool_], paid: Array) -> bool:
-        """Add clusters, given who their members are and what these pay. Say if one is new."""
+    def add(self, members: NDArray[np.bool_], pays: Array) -> bool:
+        """Add clusters, given who their members are and what points pay. Say if one is new."""
         before = len(self._clusters)
-        for row, pays in zip(members, paid.tolist(), strict=True):
+        for row, paid in zip(members, pays, strict=True):
             cluster = tuple(np.flatnonzero(row).tolist())
             if cluster not in self._known:
                 self._known.add(cluster)
                 self._clusters.append(cluster)
-                self._costs.append(self._price + pays)
+                self._pays.append(paid[row])
         return len(self._clusters) > before
+
+    def pays(self) -> Array:
+        """Return what each point pays in the cheapest clustering, (n,)."""
+        total = np.zeros(len(self._bounds))
+        for cluster, paid, part in zip(self._clusters, self._pays, self._parts, strict=False):
+            total[list(cluster)] += part * paid
+        return total
 
     def solved(self) -> Array:
         """Find the shares with the greatest sum."""
@@ -203,10 +210,11 @@ class _Program:
         result: Any = linprog(
             -np.ones(len(self._bounds)),
             A_ub=csr_array((np.ones(len(rows)), (rows, columns)), shape=shape),
-            b_ub=self._costs,
+            b_ub=[self._price + paid.sum() for paid in self._pays],
             bounds=self._bounds,
             method="highs",
         )
+        self._parts = -result.ineqlin.marginals
         shares: Array = np.maximum(result.x, 0.0)
         return shares
 

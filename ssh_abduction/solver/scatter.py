@@ -12,9 +12,10 @@ of the error. Its points are the steps. The sum of their bounds is a bound of th
 normal variables. Bending costs |z|^2 / 2. It moves each point by some b against the other points of
 its cluster. For each c > 0, |a + b|^2 >= c / (1 + c) |a|^2 - c |b|^2. So multiply the variances of
 each point by 1 + 1 / c. Then its bound still holds, but for a loss of at most c |b|^2 / 2. Far
-points are too far apart to share a facility. A point that z brings to far ones loses at most its
-share. All these losses are at most quadratic forms of z. The numbers c are so small that the sum of
-the forms is at most |z|^2 / 2. So bending costs more than it saves.
+points are too far apart to share a facility. If z brings two far points together, one of them loses
+at most its share, and the other one nothing. All these losses are at most quadratic forms of z. The
+numbers c are so small that the sum of the forms is at most |z|^2 / 2. So bending costs more than it
+saves. A point whose losses are greater than its share is left out.
 
 *Pieces.* Displacements and closures tie some steps to each other. Steps that they do not tie, as
 those of two drives, may have any relative pose. A facility that serves several such pieces saves in
@@ -31,7 +32,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,17 +50,20 @@ from ssh_abduction.theory.settle import Problem
 PLACES = 0.3
 # The number of errors of the track that are treated one by one. The rest adds to the scatter.
 MODES = 25
-# Points that are too far apart to share a facility, by this many standard deviations, are far. If
-# the losses of far points leave less than LEFT of what bending costs, fewer points count as far.
-GAPS, LEFT = (4.0, 8.0, 16.0), 0.4
+# Points that are too far apart to share a facility, by this many standard deviations, are far.
+GAPS = (4.0, 6.0, 8.0, 12.0)
 # Shares are first computed with variances multiplied by FIRST. Later, no share may be more than
 # GROWTH times the first one plus SLACK.
 FIRST, GROWTH, SLACK = 1.3, 1.15, 0.2
 # The bound alone does not prove a map to be the best one, as poses are linearised.
 UNPROVEN = 0.01
-# Points whose own loss exceeds LOOSE, and LOOSER times the median, are left out. At most LARGEST
-# far points are treated one by one for each point.
-LOOSE, LOOSER, LARGEST = 0.25, 3.0, 40
+# At most LARGEST other points are treated one by one for each point.
+LARGEST = 40
+# The prices of bending are found in 2 * SUBGRADIENTS steps. No c is more than MOST. A point is
+# assumed to pay this share ALONE more than in the cheapest clustering: with a small c, other
+# clusterings would be cheaper.
+SUBGRADIENTS, MOST, ALONE = 150, 1e4, 0.3
+TINY = 1e-12
 
 
 def is_for(problem: Problem) -> bool:
@@ -82,16 +85,16 @@ def least_cost(problem: Problem, visit: Sequence[int], most: float) -> float:
     """
     track, within = _LinearTrack.of(problem), math.sqrt(2 * most)
     parts = [part.of_best_pieces() for part in _parts(problem, track, np.array(visit))]
+    shares, pays = (np.concatenate([part[k] for part in parts]) for k in (1, 2))
+    best: tuple[float, Array, list[_Losses]] = (0.0, np.zeros(0), [])
     for gap in GAPS:
-        losses = [_Losses.of(*part, gap, within) for part in parts]
-        left = 1.0 - _largest(sum(found.far.sum(0) for found in losses))
-        if left >= LEFT:
-            break
-    else:
-        return 0.0
-    bending = _largest(sum(found.scaled().sum(0) for found in losses))
-    shares = [found.shares(left / bending) for found in losses]
-    return min(track.nats + sum(float(found.sum()) for found in shares), most - UNPROVEN)
+        losses = [_Losses.of(part, first, gap, within) for part, first, _ in parts]
+        near, far = (np.concatenate([getattr(x, name) for x in losses]) for name in ("near", "far"))
+        estimate, numbers = _best_numbers(shares, pays, near, far)
+        best = max(best, (estimate, numbers, losses), key=lambda found: found[0])
+    _, numbers, losses = best
+    bounds = [x.bound(c) for x, c in zip(losses, _divided(numbers, losses), strict=True)]
+    return min(track.nats + sum(bounds), most - UNPROVEN)
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,31 +215,38 @@ class _Part(Facilities):
             moves=self.moves[chosen],
         )
 
-    def of_best_pieces(self) -> tuple[_Part, Array]:
-        """Return the points of one piece for each kind, and their approximate shares.
+    def of_best_pieces(self) -> tuple[_Part, Array, Array]:
+        """Return the points of one piece for each kind: the piece with the greatest shares.
 
-        It is the piece with the greatest shares. If points pay fees, it is one piece for all kinds.
+        If points pay fees, it is one piece for all kinds. Also return approximate shares of the
+        points, and what each point pays in the cheapest clustering.
         """
-        shares = np.zeros(len(self.points))
+        shares, pays = np.zeros(len(self.points)), np.zeros(len(self.points))
         for piece in np.unique(self.piece):
             inside = self.piece == piece
-            shares[inside] = self.only(inside).first_shares()
+            shares[inside], pays[inside] = (
+                self.only(inside).stretched(np.full(inside.sum(), FIRST)).first_shares()
+            )
         group = np.where(np.isfinite(self.fees).any(), 0, self.kinds)
         kept = np.zeros(len(shares), dtype=bool)
         for kind in np.unique(group):
             sums = np.bincount(self.piece, shares * (group == kind))
             kept |= (group == kind) & (self.piece == sums.argmax())
-        return self.only(kept), shares[kept]
+        return self.only(kept), shares[kept], pays[kept]
+
+    def near_loss(self, i: int, others: NDArray[np.bool_]) -> Array:
+        """Return twice what a point loses against near points if c is 1, (k, k).
+
+        The cluster moves by a mean of the moves of its points, weighted by c over the variance. So
+        all of its points together lose half of what each loses against each other one. Position
+        and heading have different weights, and means of their own.
+        """
+        moved = (self.moves[i] - self.moves[others]) / np.sqrt(2 * self.variances[i])[:, None]
+        return _dominating(moved[:, :2]) + _dominating(moved[:, 2:])
 
     def stretched(self, factors: Array) -> _Part:
         """Multiply the variances of each point."""
         return replace(self, variances=self.variances * factors[:, None])
-
-    def first_shares(self) -> Array:
-        """Compute approximate shares with greater variances, none above the price."""
-        n = len(self.points)
-        part = self.stretched(np.full(n, FIRST))
-        return part.shares(np.full(n, self.price), checked=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,7 +268,7 @@ class _Losses:
 
     @classmethod
     def of(cls, part: _Part, first: Array, gap: float, within: float) -> _Losses:
-        """Bound the losses. Leave out points that lose too much.
+        """Bound the losses.
 
         Args:
             part: The points.
@@ -267,49 +277,85 @@ class _Losses:
             within: Bending by more than this is too expensive.
         """
         most = np.minimum(part.price, GROWTH * first + SLACK)
-        losses = cls._of_all(part, most, gap, within)
-        sizes = _each_largest(losses.near + losses.far)
-        kept = sizes <= max(LOOSE, LOOSER * float(np.median(sizes)))
-        return losses if kept.all() else cls._of_all(part.only(kept), most[kept], gap, within)
-
-    @classmethod
-    def _of_all(cls, part: _Part, most: Array, gap: float, within: float) -> _Losses:
-        """Bound the losses of all points."""
         unit = np.sqrt(part.variances.max(0))
         reach = np.sqrt(2 * most)
-        away = np.linalg.norm(part.offsets(part.points) / unit, axis=-1) - reach - reach[:, None]
+        apart = np.linalg.norm(part.offsets(part.points) / unit, axis=-1) - reach - reach[:, None]
         may_pay = part.fees < most
         may_share = (part.kinds[:, None] == part.kinds) | may_pay | may_pay[:, None]
-        near, far = [], []
-        for i, apart in enumerate(away):
-            look_at_clock()
-            moved = part.moves[i] - part.moves
-            is_near = may_share[i] & (apart < gap)
-            near.append(_dominating(moved[is_near] / np.sqrt(2 * part.variances[i])[:, None]))
-            is_far = may_share[i] & (apart >= gap)
-            gaps, moved = apart[is_far], moved[is_far] / unit[:, None]
+
+        def far(i: int, others: NDArray[np.bool_]) -> Array:
+            moved, gaps = (part.moves[i] - part.moves[others]) / unit[:, None], apart[i, others]
             is_cheap = gaps < within * np.linalg.norm(moved, 2, axis=(1, 2))
-            factors = np.sqrt(2 * most[i]) / gaps[is_cheap]
-            far.append(_dominating(moved[is_cheap] * factors[:, None, None]))
-        return cls(part, most, np.array(near), np.array(far))
+            return _dominating(
+                moved[is_cheap] * (math.sqrt(2 * most[i]) / gaps[is_cheap])[:, None, None]
+            )
 
-    @cached_property
-    def _weights(self) -> Array:
-        """The numbers c of the points, up to a factor, (n,)."""
-        sizes = _each_largest(self.near)
-        weights = 1 / np.sqrt(sizes + sizes.max(initial=0.0) / 100 + 1e-6)
-        scaled: Array = weights / _largest(np.einsum("n,nij->ij", weights, self.near))
-        return scaled
+        is_near, is_far = may_share & (apart < gap), may_share & (apart >= gap)
+        near = [part.near_loss(i, others) for i, others in enumerate(is_near)]
+        # If two far points share a facility, one of them loses its share: that which loses more.
+        sizes = _each_largest(np.array([far(i, others) for i, others in enumerate(is_far)]))
+        rank = np.argsort(np.argsort(sizes))
+        is_far &= rank < rank[:, None]
+        return cls(part, most, np.array(near), np.array([far(i, o) for i, o in enumerate(is_far)]))
 
-    def scaled(self) -> Array:
-        """Return the losses against near points for the numbers c, (n, k, k)."""
-        losses: Array = self._weights[:, None, None] * self.near
-        return losses
+    def bound(self, c: Array) -> float:
+        """Return the sum of the shares for numbers c. Points whose c is 0 have no share."""
+        kept = c > 0
+        part = self.part.only(kept).stretched(1 + 1 / c[kept])
+        return float(part.shares(self.most[kept]).sum()) if kept.any() else 0.0
 
-    def shares(self, factor: float) -> Array:
-        """Compute the shares if the numbers c are multiplied by a factor."""
-        c = factor * self._weights
-        return self.part.stretched(1 + 1 / c).shares(self.most)
+
+def _best_numbers(shares: Array, pays: Array, near: Array, far: Array) -> tuple[float, Array]:
+    """Find numbers c with which the losses are at most what bending costs.
+
+    A point with the number c has a share of about `shares - pays / (1 + c)`. The sum of these is
+    maximised by Lagrangian duality: a matrix Z is the price of bending, and is found by subgradient
+    steps. Points that cost more than they are worth are left out: their c is 0.
+
+    Args:
+        shares: Approximate shares of all points, (n,).
+        pays: What each point pays in the cheapest clustering, (n,).
+        near: The losses against near points, as in `_Losses`.
+        far: The losses against far points.
+
+    Returns:
+        The estimated sum of the shares, and the numbers, (n,).
+    """
+    size = near.shape[1]
+    pays = FIRST * pays + ALONE * shares
+    least = np.maximum(shares - pays / FIRST, 0.0)
+    unit = float(pays.sum()) / size / 2
+    price, sums, times = unit * np.identity(size), np.zeros(len(shares)), np.zeros(len(shares))
+    for step in range(2 * SUBGRADIENTS):
+        look_at_clock()
+        of_near, of_far = (np.einsum("nij,ij->n", form, price) for form in (near, far))
+        c = np.clip(np.sqrt(pays / np.maximum(of_near, TINY)) - 1, 0.0, MOST)
+        kept = least + pays * c / (1 + c) > of_far + c * of_near
+        slope = (
+            np.identity(size) - np.tensordot(kept * c, near, 1) - np.tensordot(1.0 * kept, far, 1)
+        )
+        size_of_slope = max(1.0, float(np.linalg.norm(slope)))
+        price = _positive(price - 2 * unit / math.sqrt(1 + step) / size_of_slope * slope)
+        if step >= SUBGRADIENTS:
+            sums, times = sums + kept * c, times + kept
+    c = np.where(times > SUBGRADIENTS / 2, sums / np.maximum(times, 1), 0.0)
+    left = 1.0 - _largest(far[c > 0].sum(0))
+    if left <= 0:
+        return 0.0, np.zeros(len(c))
+    c *= left / _largest(np.tensordot(c, near, 1))
+    return float((least + pays * c / (1 + c))[c > 0].sum()), c
+
+
+def _divided(numbers: Array, losses: Sequence[_Losses]) -> list[Array]:
+    """Divide numbers of all points among the parts."""
+    return np.split(numbers, np.cumsum([len(x.most) for x in losses])[:-1]) if losses else []
+
+
+def _positive(form: Array) -> Array:
+    """Return a quadratic form without its negative part."""
+    values, vectors = np.linalg.eigh(form)
+    positive: Array = (vectors * values.clip(0.0)) @ vectors.T
+    return positive
 
 
 def _dominating(moves: Array) -> Array:
