@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import math
-import os
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,12 +17,9 @@ from worlds import TOURS, drive, rectangle
 from ssh_abduction import OnlineMapper, Solution, SSHMap, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data import Action, Odometry, Step, TheoryError, TraceError
-from ssh_abduction.online.background import mended_map
 from ssh_abduction.online.keeper import MapKeeper
 from ssh_abduction.solver import Status
 from ssh_abduction.solver.guesses.tree import Sketch
-from ssh_abduction.solver.steps.chart import Chart
-from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.speedups import Speedups
 
@@ -71,8 +64,7 @@ def limit_steps(mapper: OnlineMapper, limit: float | None) -> None:
     """Give each further step this many seconds."""
     keeper = mapper._keeper
     assert isinstance(keeper, MapKeeper)
-    for part in (keeper.solver, keeper.mender):
-        part.options = replace(part.options, time_limit=limit)
+    keeper.solver.options = replace(keeper.solver.options, time_limit=limit)
 
 
 def sketched(mapper: OnlineMapper) -> SSHMap:
@@ -308,71 +300,6 @@ def explore(trace: Trace, mapper: OnlineMapper) -> list[Solution]:
         observed(mapper, action, step)
         for action, step in zip(trace.actions[len(mapper.trace) - 1 :], rest, strict=True)
     ]
-
-
-def test_a_map_that_is_contradicted_is_mended() -> None:
-    """Keep a map of fewer steps as far as possible. Add new dstates for steps that do not fit."""
-    without = contradicted = 0
-    for seed in range(6):
-        trace = maze(3, 3, steps=120, seed=seed, stars=True).trace
-        theory = settle(trace).theory
-        first = 25 + 5 * seed
-        known = solve(trace.prefix(first), theory, max_maps=1).maps[0]
-        predicted = Log(trace, theory).replay(known.labels).labels
-        for steps in (
-            min(len(predicted), len(trace)),
-            min(len(predicted) + 1, len(trace)),
-            min(len(predicted) + 20, len(trace)),
-        ):
-            found = mended_map(trace.prefix(steps), theory, known, Speedups())
-            if found is None:
-                without += 1
-                continue
-            assert check(trace.prefix(steps), found, theory) == ()
-            if steps == len(predicted):
-                assert found.labels == predicted
-            contradicted += len(found.dstates) > len(known.dstates)
-            assert len(found.dstates) < len(
-                Chart.framed(trace.prefix(steps), Log(trace.prefix(steps), theory)).seen
-            )
-    assert without < 3 < contradicted
-
-
-def test_mending_in_another_process_ends_with_its_mapper_and_with_the_program() -> None:
-    """There is no time for clingo or for mending. Without `processes`, no process is started."""
-    program = """
-import threading
-from instances import maze
-from ssh_abduction import OnlineMapper, solve
-from ssh_abduction.online import background
-from ssh_abduction.theory import Speedups
-background.has_processors = lambda: True
-
-def begun(**options):
-    trace = maze(10, 10, steps=200, seed=1, stars=True).trace
-    mapper = OnlineMapper(trace.steps[0].view, star=trace.steps[0].star, **options)
-    known = solve(trace.prefix(30), max_maps=1)[0]
-    mapper._keeper.mender.mended(trace, mapper.theory, known, 0.0)
-    return mapper
-
-assert begun(speedups=Speedups.without("processes"))._keeper.mender.mending.task is None
-mapper = begun()
-assert threading.active_count() == 2
-del mapper
-assert threading.active_count() == 1
-mapper = begun()
-mending = mapper._keeper.mender.mending.task
-assert mending and not mending.done()
-"""
-    folder = Path(__file__).parent.parent / "benchmarks"
-    done = subprocess.run(
-        [sys.executable, "-c", program],
-        check=False,
-        env={**os.environ, "PYTHONPATH": str(folder)},
-        capture_output=True,
-        timeout=100,
-    )
-    assert (done.returncode, done.stderr) == (0, b"")
 
 
 def test_what_cannot_be_leaves_no_map() -> None:

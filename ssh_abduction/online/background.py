@@ -1,9 +1,4 @@
-"""Run work in another process while the robot drives: mend maps, or solve a trace with faults.
-
-To *mend* a map that later steps contradict, keep as many of its dstates (distinctive states: a
-place and a heading) as possible, and add new dstates for what does not fit. The result satisfies
-the axioms of the theory (`solver/engines/framed.py`), but need not be minimal. This needs a theory
-that numbers the directions at each place (a frame).
+"""Run work in another process while the robot drives, to solve a trace with faults.
 
 Faults are steps that a map treats as wrong: a misread view, or an action that slipped.
 """
@@ -21,7 +16,6 @@ from typing import Generic, TypeVar
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver import (
-    AT_ONCE,
     Bound,
     LimitError,
     Status,
@@ -31,8 +25,7 @@ from ssh_abduction.solver import (
     in_process,
     solve,
 )
-from ssh_abduction.theory.settle import Problem
-from ssh_abduction.theory.speedups import Speedups, row
+from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 
 Result = TypeVar("Result")
@@ -45,8 +38,6 @@ RETRY = 1.05
 PAUSE = 2
 # A search was slow if it took this many times the time limit.
 OVERRUN = 2
-# A first estimate: mending takes this many seconds times the square of the number of steps.
-MENDING = 5e-7
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,81 +251,3 @@ class FaultSolver:
         return self.background.begin(
             speedups, solved, trace, theory, MEANWHILE, self._options.max_maps, speedups
         )
-
-
-class Mender:
-    """Mends maps of a growing trace.
-
-    A map is mended at once if the step has time for that, and in another process otherwise.
-
-    Args:
-        options: The time limit and the other options of a step.
-
-    Attributes:
-        mending: The mending in another process. The map that it makes may lack the last steps.
-    """
-
-    def __init__(self, options: StepOptions) -> None:
-        self.mending: TaskSlot[SSHMap] = TaskSlot()
-        self.options = options
-        self._seconds = MENDING
-
-    def suits(self, trace: Trace, theory: Theory) -> bool:
-        """Whether to mend maps.
-
-        Steps need a time limit, the theory has to number the directions at each place, and the
-        trace may not be too long.
-        """
-        return (
-            self.options.time_limit is not None
-            and row("visits").holds_for(theory)
-            and len(trace) <= AT_ONCE
-        )
-
-    def mended(
-        self, trace: Trace, theory: Theory, contradicted: SSHMap, began: float
-    ) -> SSHMap | None:
-        """Mend a map at once if this step has time for it, else in another process.
-
-        Args:
-            trace: The steps so far.
-            theory: The theory, in which no field is "auto".
-            contradicted: The best map of the steps before the last. The last step contradicts all
-                known maps.
-            began: When the step began, by `time.perf_counter`.
-
-        Returns:
-            The mended map of all steps; None if none was made at once.
-        """
-        steps, now, speedups = len(trace), time.perf_counter(), self.options.speedups
-        assert self.options.time_limit is not None
-        if self._seconds * steps**2 <= self.options.time_limit - (now - began):
-            found = mended_map(trace, theory, contradicted, speedups)
-            self._seconds = (time.perf_counter() - now) / steps**2
-            return found
-        self.mending.begin(speedups, mended_map, trace, theory, contradicted, speedups)
-        return None
-
-
-def mended_map(
-    trace: Trace, theory: Theory, known: SSHMap, speedups: Speedups, watch: Watch | None = None
-) -> SSHMap | None:
-    """Mend a map of the first steps of a trace that the later steps contradict.
-
-    Args:
-        trace: The whole trace.
-        theory: The theory, in which no field is "auto".
-        known: The map of the first steps.
-        speedups: The speed-ups that are on.
-        watch: Limits the work, and can interrupt it; None for no limit.
-
-    Returns:
-        A map of the whole trace, with new dstates for whatever does not fit; None if none is found.
-    """
-    from ssh_abduction.solver import FramedEngine, Task  # loads numpy
-
-    watch = watch or Watch()
-    found = FramedEngine(Task.of(Problem.of(trace, theory), watch, speedups)).map_mended_from(
-        known.dstate_at
-    )
-    return found.map if found else None

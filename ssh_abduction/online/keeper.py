@@ -17,7 +17,7 @@ from itertools import pairwise
 from ssh_abduction.checker.checker import check, unchecked
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Action, Step, Trace
-from ssh_abduction.online.background import Mender, StepOptions
+from ssh_abduction.online.background import StepOptions
 from ssh_abduction.online.replay import MinimalMaps
 from ssh_abduction.solver import (
     Cost,
@@ -69,8 +69,6 @@ class MapKeeper:
         self.solver: IncrementalSolver = IncrementalSolver(
             options, before.solver.searches if before else 0
         )
-        self.mender: Mender = before.mender if before else Mender(options)
-        self._previous: SSHMap | None = None  # the best map of the steps before the last
         self._spent = 0.0  # seconds that all steps took
 
     @property
@@ -99,12 +97,9 @@ class MapKeeper:
         """
         trace = problem.trace
         keeper = MapKeeper(problem, self._options, before=self)
-        keeper._previous = self._best_known()
         if self.theory.displacement == "use":
             for ssh_map in [m.map() for m in self.minimal.maps[:DRAFTS]] + self.drafts.maps():
                 keeper.drafts.add(ssh_map, trace)
-        else:
-            keeper.mender.mending.task = None
         return keeper
 
     def take(self, problem: Problem) -> None:
@@ -113,7 +108,6 @@ class MapKeeper:
         Args:
             problem: The steps so far, with one more, and the theory.
         """
-        self._previous = self._best_known()
         self._problem, trace = problem, problem.trace
         action = trace.steps[-2].action
         assert action
@@ -133,29 +127,14 @@ class MapKeeper:
         Args:
             began: When the step began, by `time.perf_counter`.
         """
-        if not self.minimal.is_impossible:
-            self._find(began)
-        return self._solution(began)
-
-    def _best_known(self) -> SSHMap | None:
-        """Return the first minimal map, else the map of the best draft, else None."""
-        if self.minimal.maps:
-            return self.minimal.maps[0].map()
-        return self.drafts.first()
-
-    def _find(self, began: float) -> None:
-        """Search for minimal maps with clingo. If it runs out of time, mend a map."""
-        if not self.minimal.is_settled(self._options.max_maps) and self.solver.is_due(self.trace):
+        minimal = self.minimal
+        if (
+            not minimal.is_impossible
+            and not minimal.is_settled(self._options.max_maps)
+            and self.solver.is_due(self.trace)
+        ):
             self._ask()
-        finished = self.mender.mending.finished()
-        if self.minimal.status is not Status.UNKNOWN:
-            return
-        if finished:
-            self.drafts.add(finished, self.trace)
-        if self._previous and not self.drafts and self.mender.suits(self.trace, self.theory):
-            mended = self.mender.mended(self.trace, self.theory, self._previous, began)
-            if mended:
-                self.drafts.add(mended, self.trace)
+        return self._solution(began)
 
     def _ask(self) -> None:
         """Search for minimal maps with clingo, and keep them, or the best map as a draft."""
@@ -311,10 +290,6 @@ class Drafts:
     def __bool__(self) -> bool:
         """Whether there are drafts; sketches do not count."""
         return bool(self._drafts)
-
-    def first(self) -> SSHMap | None:
-        """Return the map of the best draft. It need not be consistent. None without a draft."""
-        return self._drafts[0].sketch.map() if self._drafts else None
 
     def maps(self) -> list[SSHMap]:
         """Return the maps of all drafts, the best first. They need not be consistent."""

@@ -49,9 +49,9 @@ When time is short
 ------------------
 A map that predicts the step is minimal even if there is no time to look for others. When no map
 predicts the step and time is short, the answer is *feasible*: it has a consistent map, and the last
-bound, which holds for the longer trace by (1). The map is a draft (`keeper.py`), or is mended
-(`background.py`). clingo searches again when the trace has grown (`keeper.py`). It
-continues from the state in which it stopped, and may prove a map minimal again.
+bound, which holds for the longer trace by (1). The map is a draft or a sketch. clingo searches
+again when the trace has grown (`keeper.py`). It continues from the state in which it stopped, and
+may prove a map minimal again.
 
 If faults are allowed
 ---------------------

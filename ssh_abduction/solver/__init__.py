@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     )
     from ssh_abduction.solver.asp.rules import check_rules
     from ssh_abduction.solver.asp.workers import end_all, in_process
-    from ssh_abduction.solver.engines.base import AT_ONCE, Task
-    from ssh_abduction.solver.engines.framed import FramedEngine
     from ssh_abduction.solver.entry import find_backbone, solve
     from ssh_abduction.solver.front import Front, Point, fault_front
     from ssh_abduction.solver.guesses.gated import sketch_beyond, sketches_of
@@ -58,8 +56,6 @@ _HOMES = {  # module: the names that this package exports from it
     "asp.limits": ("POLL", "LimitError", "Stop", "Watch", "check_limit", "resident_memory"),
     "asp.workers": ("end_all", "in_process"),
     "asp.rules": ("check_rules",),
-    "engines.base": ("AT_ONCE", "Task"),
-    "engines.framed": ("FramedEngine",),
     "entry": ("find_backbone", "solve"),
     "front": ("Front", "Point", "fault_front"),
     "guesses.gated": ("sketch_beyond", "sketches_of"),
@@ -89,7 +85,6 @@ _HOMES = {  # module: the names that this package exports from it
     "writing": ("ending", "opening", "summary_of", "written_map"),
 }
 __all__ = [
-    "AT_ONCE",
     "EQUAL",
     "POLL",
     "RESTS_ON",
@@ -99,7 +94,6 @@ __all__ = [
     "Certificate",
     "Cost",
     "Effort",
-    "FramedEngine",
     "Front",
     "InternalError",
     "Judging",
@@ -120,7 +114,6 @@ __all__ = [
     "Start",
     "Status",
     "Stop",
-    "Task",
     "Watch",
     "Weighed",
     "check_limit",
