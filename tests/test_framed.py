@@ -284,7 +284,7 @@ def test_nodes_that_one_frame_fits_are_not_apart() -> None:
         (4, -3, 3),
     }
     assert [(s, x) for s, _, x in chart.travels] == [(1, 2)]
-    apart = chart.apart(10)
+    apart = chart.apart()
     assert not apart[2, 2]
     assert apart[2, 3]  # they see the same, but face different slots of one place
 

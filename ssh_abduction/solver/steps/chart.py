@@ -21,7 +21,7 @@ they are different dstates, as in `steps/apart.py`.
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, TypeAlias
@@ -244,36 +244,17 @@ class FramedChart(Chart):
         """Return the same chart with more pairs of nodes in `elsewhere`."""
         return replace(self, elsewhere=self.elsewhere | frozenset(more))
 
-    def __getstate__(self) -> dict[str, object]:
-        """Return the fields only: other processes get the chart without its large cached arrays."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
-
-    def apart(
-        self, most: int | None = None, others: Sequence[int] | None = None
-    ) -> NDArray[np.bool_]:
-        """Return the pairs of nodes that are apart, as a matrix of flags, nodes x others.
+    def apart(self) -> NDArray[np.bool_]:
+        """Return the pairs of nodes that are apart, as a matrix of flags, nodes x nodes.
 
         Two nodes are apart if their visits cannot be at one place with both nodes facing one slot.
-
-        Args:
-            most: Compare only the first `most` nodes; all by default.
-            others: The nodes to compare them with; the same nodes by default.
         """
         import numpy as np
 
-        facing = np.asarray(self.facing[:most])
-        visits, slots = facing.T
-        other_visits, other_slots = (facing if others is None else facing[list(others)]).T
-        apart = np.empty((len(visits), len(other_visits)), dtype=bool)
-        for slot in range(4):
-            rows = np.flatnonzero(slots == slot)
-            for other_slot in range(4):
-                columns = np.flatnonzero(other_slots == other_slot)
-                apart[np.ix_(rows, columns)] = self.misfits[(other_slot - slot) % 4][
-                    np.ix_(visits[rows], other_visits[columns])
-                ]
-        apart |= (visits[:, None] == other_visits) & (slots[:, None] != other_slots)
-        return apart
+        visits, slots = np.asarray(self.facing).T
+        turned = (slots - slots[:, None]) % 4
+        apart: NDArray[np.bool_] = self.misfits[turned, visits[:, None], visits]
+        return apart | ((visits[:, None] == visits) & (turned != 0))
 
     @cached_property
     def leaves(self) -> dict[int, tuple[int, int]]:
