@@ -398,7 +398,7 @@ TABLE = (
     Speedup(
         "processes",
         "processes",
-        "While a robot drives, with faults: solve in a second process, if there are two processors.",
+        "While a robot drives, with faults: use a second process, if there are two processors.",
         _any_theory,
         NOTHING,
         EVERY,

@@ -202,7 +202,7 @@ class FramedPaths:
             single: Merge places and segments only if they must be one.
         """
         self._asker.watch.check(0.0 if single else self.preparing)
-        # Measure the time of this thread only, without waiting for the other one.
+        # Time of the processor counts, so that a busy machine does not make the estimate larger.
         worked = time.thread_time()
         with self._asker.grounding_timed():
             control = self.paths.settled(chart, labels, options, nodes, single=single)

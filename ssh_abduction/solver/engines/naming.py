@@ -26,8 +26,7 @@ along the trace, and the links that it does not explain are added, until it expl
 the trace is long. A very long trace is charted only up to a step at which the clique is as large as
 that of all steps.
 
-The search for the fewest dstates is in `engines/name_search.py`. It may use threads, so the order
-of the minimal maps may differ from run to run. The set of minimal maps is always the same.
+The search for the fewest dstates is in `engines/name_search.py`.
 
 Python reads an answer more slowly than clingo finds it. So only the atoms that say where actions
 lead are read, and the labels of all steps are derived from these. While a map is made from one

@@ -254,7 +254,8 @@ class FramedChart(Chart):
         visits, slots = np.asarray(self.facing).T
         turned = (slots - slots[:, None]) % 4
         apart: NDArray[np.bool_] = self.misfits[turned, visits[:, None], visits]
-        return apart | ((visits[:, None] == visits) & (turned != 0))
+        apart |= (visits[:, None] == visits) & (turned != 0)
+        return apart
 
     @cached_property
     def leaves(self) -> dict[int, tuple[int, int]]:
