@@ -87,6 +87,16 @@ VERBS: Mapping[str, tuple[ModuleType, ...]] = {
     "make: simulated robots and the paper's experiments": (simulate, reproduction, examples),
     "about: the axioms, their input, and your shell": (theory, facts, completion),
 }
+WORDS = (
+    "A trace lists the steps of a drive. Each step has a view (the class of the image there), the "
+    "action that came next, and perhaps a star (the gateways seen around the robot) and a "
+    "displacement by odometry. A dstate (distinctive state) is a place and a heading. A map has "
+    "dstates, their places, the paths through the places, and links: actions that lead from one "
+    "dstate to another. A theory is the set of axioms that maps must satisfy. A map is minimal if "
+    "no other map of the trace has fewer dstates (or costs less). docs/reference/glossary.md "
+    "explains all words."
+)
+SEE_WORDS = "Words such as dstate are explained by: ssh-abduction --help"
 # Options whose output is for other programs. It is always UTF-8.
 FOR_PROGRAMS = ("json", "facts", "dot", "graphml", "svg")
 
@@ -98,6 +108,7 @@ def parser() -> Parser:
         prog="ssh-abduction",
         description="Find the topological maps that explain what a robot saw and did.",
         epilog=(
+            f"Words: {WORDS}\n\n"
             "Exit codes: 0 success, or a map that is proven minimal; 1 error; 2 wrong usage; 10 a "
             "map that is not proven minimal; 20 no map exists, or a map breaks an axiom; 30 no "
             "map in time; 130 interrupted; 143 ended by SIGTERM."
@@ -113,6 +124,8 @@ def parser() -> Parser:
             top.groups[group] = (*top.groups.get(group, ()), *(set(verbs.choices) - known))
     for each in (top, *verbs.choices.values()):
         add_verbosity(each)
+    for each in verbs.choices.values():
+        each.epilog = "\n\n".join(filter(None, (each.epilog, SEE_WORDS)))
     return top
 
 

@@ -40,8 +40,8 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.add_setting(
         "by",
-        "choose k by M, or by trimmed M, which has medians of distances instead of the smallest "
-        "and largest ones, so that no single image decides (default: M)",
+        "choose k by M, or by trimmed M (default: M). Trimmed M uses medians instead of the "
+        "smallest and largest distances, so that no single image decides",
         "M",
         choices=("M", "trimmed"),
     )

@@ -13,22 +13,23 @@ from ssh_abduction.data.errors import MapError, brief, named, printable
 from ssh_abduction.data.words import counted
 
 HELPS = {
-    "same": "steps I and J, such as monday:12,tuesday:3, are one dstate; may be given again",
-    "different": "steps I and J are different dstates; may be given again",
-    "elsewhere": "steps I and J are at different places; may be given again",
-    "same_place": "steps I and J are at one place; may be given again",
-    "open": "a gateway is open, named as with --closed; may be given again",
+    "same": "steps I and J, such as monday:12,tuesday:3, are one dstate",
+    "different": "steps I and J are different dstates",
+    "elsewhere": "steps I and J are at different places",
+    "same_place": "steps I and J are at one place",
+    "open": "a gateway is open, named as with --closed",
     "closed": (
         "a gateway is closed: a place and a direction on the drawn map, such as 'p4 north', or a "
-        "step and a direction from the robot, such as 'monday:12 left'; may be given again"
+        "step and a direction from the robot, such as 'monday:12 left'"
     ),
 }
 
 
 def add_parser(verbs: Verbs) -> None:
     text = (
-        "Correct a map. The corrections are saved in corrections.yaml beside it. solve obeys this "
-        "file if it writes its map beside it, or is given the file."
+        "Correct a map. The corrections are saved in corrections.yaml beside the map. solve obeys "
+        "them if it writes into that folder (solve --output) or is given the file "
+        "(solve --corrections)."
     )
     parser = verbs.add_parser("correct", help="say what a map has wrong", description=text)
     add_maps(parser)
@@ -43,13 +44,12 @@ def add_parser(verbs: Verbs) -> None:
         nargs=2,
         metavar=("WHAT", "NAME"),
         help=(
-            "name a place, path or region (p4, path2, region3), or the place of a step "
-            "(monday:12); may be given again"
+            "name a place, path or region (p4, path2, region3), or the place of a step (monday:12)"
         ),
     )
     add_map(parser)
     parser.set_defaults(run=run)
-    parser.epilog = "Without an option, it prints what was said so far."
+    parser.epilog = "Each correction may be given again. Without any, print the corrections so far."
 
 
 def run(options: argparse.Namespace) -> int:

@@ -27,8 +27,9 @@ def add_parser(verbs: Verbs) -> None:
     text = (
         "Solve a trace several times, to show what each kind of evidence is worth. Begin with "
         "views alone, then add one kind at a time: stars, pairs of steps that displacements "
-        "distinguish, sets of two returns, planarity. Each time, called a rung, report the number "
-        "and the size of the minimal maps; and, if the trace has truth, which map is true."
+        "distinguish, pairs of returns that displacements exclude together, planarity. Each time "
+        "(a rung of the ladder), report the number and the size of the minimal maps; and, if the "
+        "trace has truth, which map is true."
     )
     parser = verbs.add_parser(
         "ladder", help="show how much each kind of evidence helps", description=text
@@ -41,7 +42,7 @@ def add_parser(verbs: Verbs) -> None:
         "--maps",
         type=int,
         default=100,
-        metavar="N",
+        metavar="K",
         help="list at most N maps on each rung; 0 for all (default: 100)",
     )
     parser.add_argument(

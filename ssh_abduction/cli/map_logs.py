@@ -52,9 +52,9 @@ def add_parser(verbs: Verbs) -> None:
         type=float,
         metavar="S",
         help=(
-            "seconds for the search (default: a twentieth of the driving time, minus the time of "
-            "the import; a quarter of that is kept for --set ladder; at least 30; a search that "
-            "finds no map goes on for longer)"
+            "seconds for the search. By default, the import, the search and the ladder together "
+            "take a twentieth of the time that the robot drove, and the search takes at least 30 "
+            "s. If it has found no map by then, it goes on"
         ),
     )
     parser.add_setting(

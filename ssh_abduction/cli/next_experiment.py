@@ -41,9 +41,9 @@ HOW = {"link": "known", "implied": "implied", "expected": "expected", "open": "o
 def add_parser(verbs: Verbs) -> None:
     text = (
         "Find the fewest actions, from where the robot is now, after which two maps predict "
-        "different views. For more maps, find a plan that depends on what the robot sees. If "
-        "known links cannot distinguish the maps, find the untried action that distinguishes "
-        "most of them, and the way to it."
+        "different views. If there are more than two maps, find a plan: which actions come next "
+        "depends on what the robot sees. If known links cannot distinguish the maps, find the "
+        "untried action that distinguishes most of them, and the way to it."
     )
     parser = verbs.add_parser(
         "next", help="find the actions after which rival maps disagree", description=text

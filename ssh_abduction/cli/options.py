@@ -30,8 +30,8 @@ RULES = (
 MAPS, TRACE, RUN = "maps.json", "trace.jsonl", "run.json"
 
 MAPS_SAID = (
-    "file of maps that solve -o wrote, one saved map, or a folder that map wrote; - for standard "
-    "input"
+    "file of maps that solve -o wrote, a file of a single map, or a folder that map wrote; - for "
+    "standard input"
 )
 
 Verbs = Any  # the return type of argparse's add_subparsers is private
@@ -44,7 +44,12 @@ def add_theory(parser: Parser, default: str = "topological") -> None:
         parser: The parser of a verb.
         default: The words of the help for the theory that is used if the user names none.
     """
-    group = parser.add_argument_group("theory", "A preset or a file, with single choices changed")
+    group = parser.add_argument_group(
+        "theory",
+        "The axioms that maps must satisfy: a preset or a file, and changes to it. I and J are "
+        "numbers of steps, from 0; in a joint trace, also DRIVE:STEP, such as monday:12. Each "
+        "option but --theory may be given again.",
+    )
     said = {**helps(), "rules": RULES}
     group.add_argument(
         "--theory",
@@ -64,16 +69,15 @@ def add_theory(parser: Parser, default: str = "topological") -> None:
             f"--{name.replace('_', '-')}",
             action="append",
             metavar="I,J",
-            help=(
-                f"assume that steps I and J {text}; a step of a joint trace may be named as "
-                "DRIVE:STEP; may be given again"
-            ),
+            help=f"assume that steps I and J {text}",
         )
     for field in fields(Theory):
         if field.name in ASSERTIONS or field.name in SETTLED:
             continue
         details: dict[str, Any] = {"metavar": "NAMES"}
-        if field.name == "rules":
+        if field.name == "prices":
+            details = {"metavar": "D,P,H"}
+        elif field.name == "rules":
             details = {"metavar": "FILE", "many": True}
         elif field.name in CHOICES:
             details = {"choices": CHOICES[field.name]}
@@ -87,10 +91,14 @@ def add_theory(parser: Parser, default: str = "topological") -> None:
 
 
 def helps() -> dict[str, str]:
-    """Read the help text of each field of Theory from the docstring of that class."""
+    """Read the help text of each field of Theory from the docstring of that class.
+
+    As in other help texts, the first letter is small.
+    """
     _, _, attributes = (Theory.__doc__ or "").partition("Attributes:")
     entries = re.findall(r"^ {8}(\w+): (.+(?:\n {12}.+)*)", attributes, re.MULTILINE)
-    return {name: " ".join(text.split()).rstrip(".") for name, text in entries}
+    words = {name: " ".join(text.split()).rstrip(".") for name, text in entries}
+    return {name: text[0].lower() + text[1:] for name, text in words.items()}
 
 
 def add_limits(parser: argparse.ArgumentParser, printed: str) -> None:

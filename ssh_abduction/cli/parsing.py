@@ -165,7 +165,8 @@ class Parser(argparse.ArgumentParser):
         settings = [(setting.shown, setting.help) for setting in self.settings.values()]
         if settings:
             self._add_section(formatter, "settings, each given as --set NAME=VALUE", settings)
-        formatter.add_text(self.epilog)
+        for paragraph in (self.epilog or "").split("\n\n"):
+            formatter.add_text(paragraph)
         return formatter.format_help()
 
     def _add_section(

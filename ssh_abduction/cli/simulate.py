@@ -85,8 +85,8 @@ def add_parser(verbs: Verbs) -> None:
         ("stars", "whether to log the openings seen at each place (default: true)", True, {}),
         (
             "every",
-            "metres from one image to the next, to log evenly spaced images instead of images at "
-            "dstates; with --format, metres from one scan to the next (default: 0.25)",
+            "log an image each time that the robot has driven this far, instead of an image at "
+            "each dstate; with --format, metres from one scan to the next (default: 0.25)",
             None,
             METRES,
         ),
@@ -101,8 +101,8 @@ def add_parser(verbs: Verbs) -> None:
         (
             "odometry_noise",
             "standard deviation of the odometry, as a share of each motion (default: 0.02); with "
-            "--format, standard deviation after one metre, to which other errors are proportional "
-            "(default: 0.05)",
+            "--format, standard deviation after one metre (default: 0.05); other errors grow with "
+            "it",
             None,
             SHARE,
         ),

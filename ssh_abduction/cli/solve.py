@@ -117,9 +117,9 @@ def add_parser(verbs: Verbs) -> None:
         ),
     )
     front = (
-        "report the fewest dstates of a map with at most 0, 1, … K faults (steps treated as "
-        "wrong), by the causal theory; with misread or slipped set, only faults of these kinds. "
-        "The knee is the number of faults after which further ones save much fewer dstates"
+        "report the fewest dstates of a map with at most 0, 1, … K faults (steps that are treated "
+        "as wrong), by the causal theory. If misread or slipped is set, only faults of these kinds "
+        "count. The report also names the knee: with more faults than that, few dstates are saved"
     )
     parser.add_argument("--front", type=int, metavar="K", help=front)
     add_limits(parser, "the best answer so far")

@@ -101,10 +101,11 @@ class Theory:
         different: Pairs of steps known to be different dstates.
         elsewhere: Pairs of steps known to be at different places.
         same_place: Pairs of steps known to be at one place. They switch off the fast engines.
-        weigh: How to compare maps. count: by the counts in `prefer`. cost: by their cost in nats,
-            which is the prices of what they have, plus half of the chi-square of their misfit to
-            the displacements. auto: cost if displacements are used and the theory allows it.
-        prices: Three numbers D,P,H: the prices of a dstate, a place and a path in nats (natural
+        weigh: How to compare maps. count: by the counts in `prefer`. cost: by their cost in nats:
+            the prices of their dstates, places, paths and faults, plus half of the chi-square of
+            their misfit to the displacements. auto: cost if displacements are used and the theory
+            allows it.
+        prices: Three numbers: the prices of a dstate, a place and a path in nats (natural
             logarithms of odds). Used only if maps are compared by cost.
     """
 
