@@ -19,6 +19,7 @@ from ssh_abduction import SSHMap, Theory, Trace, export_map, solve
 from ssh_abduction.cli import export as verb
 from ssh_abduction.cli import main
 from ssh_abduction.data import MapError
+from ssh_abduction.data.map_parts import Name
 from ssh_abduction.data.maps import DState
 from ssh_abduction.output import to_networkx
 from ssh_abduction.output.export import formats
@@ -414,6 +415,10 @@ def test_exports_have_regions() -> None:
     assert nodes[0]["properties"]["metadata"]["regions"] == "0"
     (first, *_) = yaml.safe_load(export_map(ssh_map, "tmap2"))["nodes"]
     assert first["node"]["properties"]["regions"] == "0"
+    named = replace(ssh_map, names=(Name("region", 0, "wing"),))
+    assert [r.get("name") for r in to_networkx(named).graph["regions"]][:2] == ["wing", None]
+    for form in ("nav2", "tmap2", "graphml", "networkx-json", "dot"):
+        assert "wing" in export_map(named, form), form
 
 
 def test_dot_nests_regions_behind_a_place() -> None:

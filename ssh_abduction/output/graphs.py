@@ -64,7 +64,11 @@ def to_networkx(
         graph = _topological(ssh_map)
         place_of = {("place", p): p for p in ssh_map.places}
     if ssh_map.regions is not None:
-        graph.graph["regions"] = [region.to_dict() for region in ssh_map.regions]
+        names = {region.id: ssh_map.name_of("region", region.id) for region in ssh_map.regions}
+        graph.graph["regions"] = [
+            region.to_dict() | ({"name": name} if (name := names[region.id]) else {})
+            for region in ssh_map.regions
+        ]
         for node, place in place_of.items():
             if found := ids_at(ssh_map.regions, place):
                 graph.nodes[node]["regions"] = found

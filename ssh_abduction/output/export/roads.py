@@ -37,6 +37,7 @@ class Stop:
         floor: The number of its floor; None if the map has no floors.
         name: The name that a person gave to its place; None if it has none.
         regions: The ids of the regions that contain it.
+        region_names: The names that a person gave to these regions.
     """
 
     id: int
@@ -47,12 +48,14 @@ class Stop:
     floor: int | None = None
     name: str | None = None
     regions: tuple[int, ...] = ()
+    region_names: tuple[str, ...] = ()
 
     @property
     def properties(self) -> dict[str, str]:
         """Its views, and its regions if there are any, as texts for files."""
         regions = {"regions": " ".join(map(str, self.regions))} if self.regions else {}
-        return {"views": " ".join(map(str, self.views)), **regions}
+        names = {"region_names": ", ".join(self.region_names)} if self.region_names else {}
+        return {"views": " ".join(map(str, self.views)), **regions, **names}
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +136,7 @@ class Roads:
                     () if s.view is None else (s.view,),
                     s.floor,
                     ssh_map.name_of("place", s.place),
-                    ids_at(ssh_map.regions, s.place),
+                    *_regions_at(ssh_map, s.place),
                 )
                 for s, (x, y, heading) in zip(ssh_map.dstates, drawn.dstates, strict=True)
             )
@@ -222,9 +225,15 @@ def _places(ssh_map: SSHMap, drawn: Layout) -> tuple[Stop, ...]:
         heading = next((h for h in headings if h is not None), 0.0)
         views = tuple(s.view for s in members if s.view is not None)
         floor = members[0].floor if members else None
-        name, regions = ssh_map.name_of("place", p), ids_at(ssh_map.regions, p)
-        stops.append(Stop(p, *drawn.places[p], heading, views, floor, name, regions))
+        name, regions = ssh_map.name_of("place", p), _regions_at(ssh_map, p)
+        stops.append(Stop(p, *drawn.places[p], heading, views, floor, name, *regions))
     return tuple(stops)
+
+
+def _regions_at(ssh_map: SSHMap, place: int | None) -> tuple[tuple[int, ...], tuple[str, ...]]:
+    """The ids of the regions that contain a place, and the names of those that have one."""
+    ids = ids_at(ssh_map.regions, place)
+    return ids, tuple(name for r in ids if (name := ssh_map.name_of("region", r)) is not None)
 
 
 def _streets(ssh_map: SSHMap) -> dict[tuple[int, int], Way]:
