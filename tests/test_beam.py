@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
 
+import floors
 import pytest
 import truth
 from hypothesis import given, settings
@@ -26,6 +27,7 @@ from ssh_abduction.solver import Search, Status, beams
 from ssh_abduction.solver.candidates import Candidates
 from ssh_abduction.solver.guesses.beam import Beam
 from ssh_abduction.solver.guesses.completing import completed
+from ssh_abduction.solver.misfit import Misfit
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import settle
 
@@ -165,6 +167,36 @@ def test_an_action_cannot_lead_to_two_dstates() -> None:
     trace = Trace.from_steps("abab", ["travel", "around", "travel"])
     theory = settle(trace, Theory(boundary="none")).theory
     assert completed(trace, theory, [0, 1, 0, 2], [0, 1, 1], [0.0, 0.0, math.pi]) is None
+
+
+@pytest.mark.parametrize("seed", [201, 203])
+def test_the_cost_of_a_hypothesis_with_floors_is_that_of_its_map(seed: int) -> None:
+    """The headings err by degrees. So equations that stay linear would miss by many nats."""
+    (known,) = floors.towers(2, 60, [seed])
+    problem = settle(known.trace, Theory())
+    beam = Beam(problem, Log(known.trace, problem.theory, problem.pairs), 1)
+    maps = list(beam.maps())
+    dstate, place, _ = problem.theory.prices
+    misfit = Misfit(problem)
+    nats = [dstate * len(m.dstates) + place * len(m.places) + misfit.of_map(m) / 2 for m in maps]
+    assert nats[0] == pytest.approx(beam.nats, abs=0.1)
+    assert any(truth.is_true(m, known) for m in maps)
+
+
+@pytest.mark.parametrize(
+    ("stars", "facing", "fits"),
+    [
+        ("1000 0100", [0.0, math.pi / 2], True),
+        ("1000 0100", [0.0, -math.pi / 2], False),
+        ("1000 0100", [0.0, 0.0], False),
+        ("1111 1111", [0.0, 0.0], False),
+    ],
+)
+def test_stars_and_headings_at_a_place_fit(stars: str, facing: list[float], fits: bool) -> None:
+    seen = [[int(k) for k in star] for star in stars.split()]
+    trace = Trace.from_steps("ab", ["left"], stars=seen)
+    theory = settle(trace, Theory(star="frame", boundary="none")).theory
+    assert (completed(trace, theory, [0, 1], [0, 0], facing) is not None) == fits
 
 
 def test_a_path_is_no_circle() -> None:

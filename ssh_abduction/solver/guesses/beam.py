@@ -40,7 +40,7 @@ from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.guesses.completing import completed
 from ssh_abduction.solver.guesses.pieces import fitted, headings_by_turn
 from ssh_abduction.solver.guesses.reckoning import Hypothesis, HypothesisPoses, first_pose
-from ssh_abduction.solver.guesses.sights import DEAREST, Sights
+from ssh_abduction.solver.guesses.sights import DEAREST, Sights, nats_of_misread, right_view
 from ssh_abduction.solver.steps.faults import with_changes, with_faults
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import Problem
@@ -59,6 +59,9 @@ SPARE = 2
 # With several drives or floors, keep hypotheses that cost up to this many nats more than the best.
 # A false join to a place that looks alike saves some dstates until the drive leads on.
 UNSURE = 60.0
+# With several drives or floors, fit the poses anew if a step adds more than this many nats of
+# misfit: then a return turns or moves other poses by more than a little.
+STRAINED = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +112,7 @@ class Beam:
         self.nats, self.refuses = math.inf, False
         self._kept: list[list[Hypothesis]] = []  # the beam after each check
         self._sights = Sights(trace, self._bare, log, misreads=theory.misread > 0)
-        # For each kind of fault, what it costs at each step in nats.
+        # For each kind of fault, its cost at each step in nats.
         self._fault = {
             kind: [self._prices[0] * theory.fault_tenths(kind, step) / 10 for step in trace.steps]
             for kind in ("misread", "slipped", "jumped")
@@ -170,11 +173,12 @@ class Beam:
 
     def _onward(self, beam: list[Hypothesis], end: int) -> list[Hypothesis]:
         """Extend a beam to its first `end` steps, or fewer if it is crowded. Do not check it."""
+        most = max(CROWDED * self._width, 2 * len(beam))
         for t in range(len(beam[0].labels), end):
             beam = list(self._best(self._options_of(beam, t, joins=True), t, self._width))
-            if len(beam) > CROWDED * self._width:
+            if len(beam) > most:
                 break
-        return beam
+        return sorted(beam, key=lambda found: found.nats)
 
     def _best(
         self, options: Sequence[_Extension], t: int, width: int, checked: bool = False
@@ -183,32 +187,34 @@ class Beam:
 
         With several drives or floors, keep at most ALIKE hypotheses that join them in the same way,
         and LOST times as many in all. Drop those that cost UNSURE more than the best.
-        These two limits do not apply to a hypothesis whose present piece is not joined yet
-        (`Pieces.is_loose`), as it costs more until it is joined.
+        The last two limits apply apart to hypotheses whose present piece is not joined yet
+        (`Pieces.is_loose`), as they cost more until it is joined.
 
         Args:
             options: Ways to extend the beam by step t, sorted by cost.
             checked: Whether to drop hypotheses that the checker refuses.
         """
-        most, dearest = width, math.inf
-        if self._frames:
-            width = min(width, ALIKE)
-            most = LOST * width
+        most, several = width, bool(self._frames)
+        if several:
+            width, most = min(width, ALIKE), LOST * min(width, ALIKE)
         count: Counter[tuple[object, ...]] = Counter()
+        kept, dearest = [0, 0], [math.inf, math.inf]  # by whether the present piece is joined
         for option in options:
-            pieces, enough = option.of.pieces, count.total() >= most
-            if enough and not self._frames:
-                return
-            if count[pieces.joins] >= width or (
-                not pieces.is_loose and (enough or option.nats > dearest)
-            ):
+            pieces, joined = option.of.pieces, not option.of.pieces.is_loose
+            if kept[joined] >= most or option.nats > dearest[joined]:
+                continue
+            if count[pieces.joins] >= width:
                 continue
             child = self._child(option, t)
+            price = self._price_of(child) - self._price_of(option.of)
+            if several and child.nats > option.of.nats + price + STRAINED:
+                child = self._settled([child])[0]
             if checked and self._map(child, t) is None:
                 continue
             count[pieces.joins] += 1
-            if self._frames and not pieces.is_loose:
-                dearest = min(dearest, option.nats + max(UNSURE, self._sights.dearest))
+            kept[joined] += 1
+            if several and kept[joined] == 1:
+                dearest[joined] = option.nats + max(UNSURE, self._sights.dearest)
             yield child
 
     def _extended(self, beam: list[Hypothesis], end: int) -> list[Hypothesis]:
@@ -228,10 +234,9 @@ class Beam:
     def _settled(self, beam: list[Hypothesis]) -> list[Hypothesis]:
         """Fit the poses of hypotheses anew, compute their costs by these, and sort them by cost.
 
-        Do this only for one frame, and only if the robot is off the poses of its dstates. Otherwise
-        return the beam as it is.
+        Do this only if the equations are not linear enough. Otherwise return the beam as it is.
         """
-        if not self._reckoning.is_off or self._frames:
+        if not self._reckoning.is_rough:
             return beam
         settled = []
         for found in beam:
@@ -243,9 +248,9 @@ class Beam:
     def _price_of(self, found: Hypothesis) -> float:
         """Return the price of the dstates, places and faults of a hypothesis, in nats."""
         price = self._prices[0] * len(found.places) + self._prices[1] * len(found.position)
-        price += sum(self._fault[kind][t] for t, kind in found.faults)
+        price += found.changes + sum(self._fault[kind][t] for t, kind in found.faults)
         if "misread" in self._fault:
-            price += sum(map(_nats_of_misread, found.seen))
+            price += sum(map(nats_of_misread, found.seen))
         return price
 
     def _checked(self, beam: list[Hypothesis], end: int, joins: bool = True) -> list[Hypothesis]:
@@ -318,7 +323,7 @@ class Beam:
         steps = list(trace.steps)
         first = {number: t for t, number in reversed([*enumerate(self._sights.seen)])}
         for t, label in enumerate(found.labels):
-            right = self._trace.steps[first[_shown(found.seen[label])]]
+            right = self._trace.steps[first[right_view(found.seen[label])]]
             steps[t] = replace(steps[t], view=right.view)
             if self._bare.star in ("pattern", "frame"):
                 steps[t] = replace(steps[t], star=right.star)
@@ -337,7 +342,7 @@ class Beam:
         if math.isinf(doubt):
             return 0.0 if number in seen else math.inf
         after = {**seen, number: seen.get(number, 0.0) + doubt}
-        return _nats_of_misread(after) - _nats_of_misread(seen)
+        return nats_of_misread(after) - nats_of_misread(seen)
 
     def _options_of(self, beam: Sequence[Hypothesis], t: int, joins: bool) -> list[_Extension]:
         """List the ways to extend the hypotheses of a beam by step t, sorted by cost."""
@@ -444,7 +449,7 @@ class Beam:
         n = len(moved.mean) - 3
         position, heading, places, seen = moved.position, moved.heading, moved.places, moved.seen
         place, there, sights = option.place, option.dstate, moved.sights
-        drives = moved.drives
+        drives, changes = moved.drives, moved.changes
         pose = self._reckoning.met(
             moved,
             t,
@@ -456,6 +461,7 @@ class Beam:
             position, sights = [*position, n], [*sights, self._sights.shown[t]]
             drives = [*drives, self._sights.drive[t]]
         elif drives[place] != self._sights.drive[t]:
+            changes += self._sights.changes(moved, place, t)
             sights = [*sights[:place], self._sights.shown[t], *sights[place + 1 :]]
             drives = [*drives[:place], self._sights.drive[t], *drives[place + 1 :]]
         if there is None:
@@ -479,6 +485,7 @@ class Beam:
             heading,
             *pose,
             option.nats,
+            changes,
             moved.faults,
             moved.pieces.grown(place=option.place is None, dstate=option.dstate is None),
         )
@@ -487,13 +494,3 @@ class Beam:
 def _slips(moved: Hypothesis, t: int) -> bool:
     """Whether the hypothesis says that the action to step t, the newest step, slipped."""
     return moved.faults[-1:] == ((t - 1, "slipped"),)
-
-
-def _nats_of_misread(seen: dict[int, float]) -> float:
-    """Return the cost of misread views at a dstate, in nats. The dearest observation is right."""
-    return sum(seen.values()) - max(seen.values())
-
-
-def _shown(seen: dict[int, float]) -> int:
-    """Return the right observation of a dstate: the one that is dearest to treat as misread."""
-    return max(seen, key=lambda number: seen[number])

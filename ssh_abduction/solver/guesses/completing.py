@@ -116,12 +116,35 @@ def _facing(
         for s in ssh_map.dstates:
             back = first.setdefault(s.place, facing[s.id]) - facing[s.id]
             found.headings[s.id] = round(back / (math.pi / 2)) % 4
+        if not _fits_frames(ssh_map, trace, theory, found.headings):
+            return None
         found.opposite.extend(
             (s.id, x.id)
             for s, x in combinations(ssh_map.dstates, 2)
             if s.place == x.place and (found.headings[s.id] + 2) % 4 == found.headings[x.id]
         )
     return found
+
+
+def _fits_frames(
+    ssh_map: SSHMap, trace: Trace, theory: Theory, headings: Mapping[int, int]
+) -> bool:
+    """Whether the dstates of each place have different headings, and their stars agree."""
+    place = {s.id: s.place for s in ssh_map.dstates}
+    if "one_dstate_per_heading" in theory.axioms:
+        faced = {(place[s], heading) for s, heading in headings.items()}
+        if len(faced) < len(headings):
+            return False
+    if theory.changed or "star_frame" not in theory.axioms:
+        return True
+    seen: dict[int | None, tuple[bool, ...]] = {}
+    for label, step in zip(ssh_map.dstate_at, trace.steps, strict=True):
+        if step.star is not None:
+            star, back = step.openings or (), 4 - headings[label]
+            turned = star[back:] + star[:back]  # slots begin with the first one of the place
+            if seen.setdefault(place[label], turned) != turned:
+                return False
+    return True
 
 
 def _courses(

@@ -72,6 +72,16 @@ class Sights:
         return self._price * _fewest_changes(sight, own)
 
 
+def nats_of_misread(seen: dict[int, float]) -> float:
+    """Return the cost of misread views at a dstate, in nats. The dearest observation is right."""
+    return sum(seen.values()) - max(seen.values())
+
+
+def right_view(seen: dict[int, float]) -> int:
+    """Return the right observation of a dstate: the one that is dearest to treat as misread."""
+    return max(seen, key=lambda number: seen[number])
+
+
 def _shown(step: Step, star: str) -> Star | tuple[bool, ...] | None:
     """Return the star of a step in a form that all steps at its place share; None without stars."""
     if star == "gateways":
