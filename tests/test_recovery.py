@@ -20,7 +20,7 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.data import TheoryError, TraceError
 from ssh_abduction.online import Belief
 from ssh_abduction.online import background as solving
-from ssh_abduction.online.background import MEANWHILE, BackgroundTask, Solved
+from ssh_abduction.online.background import MEANWHILE, BackgroundSearch, Solved
 from ssh_abduction.online.hypotheses import ExtendedMap, Scale
 from ssh_abduction.online.recovery import Recovery
 from ssh_abduction.solver import Status
@@ -214,7 +214,7 @@ def test_without_time_there_is_a_map_and_a_belief() -> None:
             1
         )
     assert isinstance(mapper._keeper, Recovery)
-    assert mapper._keeper.solver.background.task is None
+    assert mapper._keeper.solver._background is None
 
 
 def one_of_the_maps(
@@ -235,8 +235,8 @@ def test_what_takes_too_long_for_a_step_is_solved_while_the_robot_drives(
     trace, solved = circuit(30, wrong=17), solving.solved
     begun = []
 
-    def begin(*task: Any) -> BackgroundTask[Solved]:
-        _, _, now, theory, _, maps, speedups = task
+    def begin(*task: Any) -> BackgroundSearch:
+        now, theory, _, maps, speedups = task
         found = solved(now, theory, None, maps, speedups)
         begun.append(len(now))
         ends = len(now) + 3
@@ -251,7 +251,11 @@ def test_what_takes_too_long_for_a_step_is_solved_while_the_robot_drives(
         return Stub()  # type: ignore[return-value]
 
     mapper = None
-    with patch.object(BackgroundTask, "begun", begin), patch.object(solving, "solved", in_a_step):
+    with (
+        patch.object(solving, "BackgroundSearch", begin),
+        patch.object(solving, "has_processors", return_value=True),
+        patch.object(solving, "solved", in_a_step),
+    ):
         for mapper, solution in followed(trace, BOTH, NO_TIME):  # noqa: B007
             pass
     assert begun
@@ -273,7 +277,8 @@ class Busy:
 
 def test_where_clingo_cannot_be_stopped_in_time_steps_do_not_wait_for_it_again() -> None:
     with (
-        patch.object(BackgroundTask, "begun", lambda *told: Busy()),
+        patch.object(solving, "BackgroundSearch", lambda *told: Busy()),
+        patch.object(solving, "has_processors", return_value=True),
         patch.object(solving, "OVERRUN", 0),
     ):
         answers = list(followed(circuit(30, wrong=17), BOTH, NO_TIME))
@@ -283,14 +288,14 @@ def test_where_clingo_cannot_be_stopped_in_time_steps_do_not_wait_for_it_again()
 
 def test_a_process_of_its_own_solves_the_trace() -> None:
     trace = circuit(20, wrong=17)
-    meanwhile = BackgroundTask(solving.solved, trace, BOTH, MEANWHILE, None, Speedups())
+    meanwhile = BackgroundSearch(trace, BOTH, MEANWHILE, None, Speedups())
     found = meanwhile.result()
     assert meanwhile.done()
     assert found is not None
     assert (found.status, found.complete, found.steps) == (Status.OPTIMAL, True, 21)
     assert found.maps == solve(trace, BOTH, max_maps=None).maps
     long = circuit(2000, wrong=17)
-    ended = BackgroundTask(solving.solved, long, BOTH, MEANWHILE, None, Speedups())
+    ended = BackgroundSearch(long, BOTH, MEANWHILE, None, Speedups())
     del ended  # and with it the process
     assert not _under_way
 

@@ -8,10 +8,8 @@ from __future__ import annotations
 import threading
 import time
 import weakref
-from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
-from typing import Generic, TypeVar
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
@@ -28,7 +26,6 @@ from ssh_abduction.solver import (
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 
-Result = TypeVar("Result")
 # A search in the background stops after this many seconds. By then the trace is much longer, and it
 # is better to search for a map of the longer trace.
 MEANWHILE = 60.0
@@ -54,93 +51,6 @@ class StepOptions:
     time_limit: float | None
     max_maps: int | None
     speedups: Speedups
-
-
-class BackgroundTask(Generic[Result]):
-    """A function that runs in another process, until this object is garbage collected.
-
-    Args:
-        function: The function. It also gets a `watch`, and should stop when this is interrupted.
-        arguments: Its other arguments.
-    """
-
-    def __init__(self, function: Callable[..., Result | None], *arguments: object) -> None:
-        self._found: Future[Result | None] = Future()
-        watch = Watch()
-        thread = threading.Thread(
-            target=_do, args=(function, arguments, watch, self._found), daemon=True
-        )
-        weakref.finalize(self, _end, watch, thread)
-        thread.start()
-
-    @classmethod
-    def begun(
-        cls, speedups: Speedups, function: Callable[..., Result | None], *arguments: object
-    ) -> BackgroundTask[Result] | None:
-        """Start and return a task; None with only one processor, or without `processes`."""
-        can_begin = speedups.processes and has_processors()
-        return cls(function, *arguments) if can_begin else None
-
-    def done(self) -> bool:
-        """Whether the work has ended."""
-        return self._found.done()
-
-    def result(self) -> Result | None:
-        """Wait for the result, and return it; None if there is none or the work was stopped."""
-        return self._found.result()
-
-
-def _do(
-    function: Callable[..., Result | None],
-    arguments: tuple[object, ...],
-    watch: Watch,
-    found: Future[Result | None],
-) -> None:
-    """Do the work, and store its result or its exception in `found`."""
-    try:
-        found.set_result(in_process(function, *arguments, watch=watch))
-    except LimitError:
-        found.set_result(None)
-    except BaseException as error:
-        found.set_exception(error)
-
-
-def _end(watch: Watch, thread: threading.Thread) -> None:
-    """Interrupt the work of a thread, and wait until it has ended."""
-    watch.interrupted = True
-    thread.join()
-
-
-class TaskSlot(Generic[Result]):
-    """Holds the one task of its kind that may run in the background.
-
-    Attributes:
-        task: The task; None if there is none, or its result was taken.
-    """
-
-    def __init__(self) -> None:
-        self.task: BackgroundTask[Result] | None = None
-
-    def begin(
-        self, speedups: Speedups, function: Callable[..., Result | None], *arguments: object
-    ) -> bool:
-        """Start a task as `BackgroundTask.begun` does, unless one is running.
-
-        Returns:
-            Whether a task is running now.
-        """
-        self.task = self.task or BackgroundTask.begun(speedups, function, *arguments)
-        return self.task is not None
-
-    def finished(self) -> Result | None:
-        """Take the result of the task; None if it is not done, or found nothing.
-
-        The result is about the trace as it was when the task began.
-        """
-        if self.task and self.task.done():
-            task, self.task = self.task, None
-            return task.result()
-        return None
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,6 +98,45 @@ def solved(
     return Solved(len(trace), found.status, found.maps, found.bound, found.complete, found.stopped)
 
 
+class BackgroundSearch:
+    """A search in another process, by `solved`, until this object is garbage collected.
+
+    Args:
+        arguments: The arguments of `solved`, but for the watch.
+    """
+
+    def __init__(self, *arguments: object) -> None:
+        self._found: Future[Solved | None] = Future()
+        watch = Watch()
+        thread = threading.Thread(target=_do, args=(arguments, watch, self._found), daemon=True)
+        weakref.finalize(self, _end, watch, thread)
+        thread.start()
+
+    def done(self) -> bool:
+        """Whether the search has ended."""
+        return self._found.done()
+
+    def result(self) -> Solved | None:
+        """Wait for the result, and return it; None if a limit stopped the search."""
+        return self._found.result()
+
+
+def _do(arguments: tuple[object, ...], watch: Watch, found: Future[Solved | None]) -> None:
+    """Run the search, and store its result or its exception in `found`."""
+    try:
+        found.set_result(in_process(solved, *arguments, watch=watch))
+    except LimitError:
+        found.set_result(None)
+    except BaseException as error:
+        found.set_exception(error)
+
+
+def _end(watch: Watch, thread: threading.Thread) -> None:
+    """Interrupt the search of a thread, and wait until it has ended."""
+    watch.interrupted = True
+    thread.join()
+
+
 class FaultSolver:
     """Solves a growing trace with faults again each time that it has grown enough.
 
@@ -197,12 +146,11 @@ class FaultSolver:
 
     Attributes:
         searches: Number of searches so far, except those in the background.
-        background: The search in the background.
     """
 
     def __init__(self, options: StepOptions, searches: int = 0) -> None:
         self.searches = searches
-        self.background: TaskSlot[Solved] = TaskSlot()
+        self._background: BackgroundSearch | None = None  # its result was not taken yet
         self._options = options
         self._next_search = 0  # no search before the trace has this many steps
         # clingo cannot be stopped while it grounds a step. If the last search took far too long,
@@ -245,9 +193,19 @@ class FaultSolver:
         """Start a search in another process, unless one is running.
 
         Returns:
-            Whether a search is running there. False if processes cannot be used.
+            Whether one is running. False without `processes`, or with only one processor.
         """
-        speedups = self._options.speedups
-        return self.background.begin(
-            speedups, solved, trace, theory, MEANWHILE, self._options.max_maps, speedups
-        )
+        maps, speedups = self._options.max_maps, self._options.speedups
+        if not self._background and speedups.processes and has_processors():
+            self._background = BackgroundSearch(trace, theory, MEANWHILE, maps, speedups)
+        return self._background is not None
+
+    def finished(self) -> Solved | None:
+        """Take the result of the search in the background; None if it is not done, or found none.
+
+        The result is about the trace as it was when the search began.
+        """
+        if self._background and self._background.done():
+            search, self._background = self._background, None
+            return search.result()
+        return None

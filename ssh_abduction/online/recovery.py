@@ -107,7 +107,7 @@ class Recovery:
         """
         if not self._maps.is_settled and self.solver.is_due(self._trace):
             self._solve()
-        found = self.solver.background.finished()
+        found = self.solver.finished()
         if found and not self._maps.is_settled and not self._maps.is_outgrown(found):
             self._maps.absorb(found)
         solution = self._solution(began)
