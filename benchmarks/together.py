@@ -11,7 +11,8 @@ and plans, three robots start at random. Nothing is known of where a drive start
 of benchmarks/truth.py. A trace of a world has several drives, which an action "jump…" joins.
 
 With --beam, only the beam searches, with this width and without a time limit. So the load of the
-machine does not matter. Its cheapest map is judged.
+machine does not matter. Its cheapest map is judged. With --join, the maps of single drives are
+joined, without any other search.
 """
 
 from __future__ import annotations
@@ -40,6 +41,7 @@ from simulator.plans import Plan
 from ssh_abduction import SSHMap, Theory
 from ssh_abduction.data import Odometry, together
 from ssh_abduction.solver.guesses.beam import Beam
+from ssh_abduction.solver.guesses.joining import Joining
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import settle
 
@@ -108,15 +110,24 @@ def false_joins(found: SSHMap | None, known: Known) -> int:
     return sum(len(names) > 1 for names in real.values())
 
 
-def report_of_beams(traces: Iterator[Known], theory: Theory, width: int) -> str:
-    """Print a row for the cheapest map of the beam for each trace, and return how many are true."""
+def report_of_guesses(traces: Iterator[Known], theory: Theory, width: int | None) -> str:
+    """Print a row for the map that is guessed for each trace, and return how many are true.
+
+    Args:
+        traces: The traces.
+        theory: The theory.
+        width: The width of a beam, whose cheapest map counts. None to join maps of single drives.
+    """
     head = ("trace", "steps", "true dstates", "dstates", "false joins", "cheapest map", "CPU s")
     print(f"| {' | '.join(head)} |\n|{'---|' * len(head)}")
     right = count = 0
     for known in traces:
         begin, problem = time.process_time(), settle(known.trace, theory)
-        beam = Beam(problem, Log(known.trace, problem.theory, problem.pairs), width)
-        found = next(beam.maps(), None)
+        log = Log(known.trace, problem.theory, problem.pairs)
+        if width is not None:
+            found = next(Beam(problem, log, width).maps(), None)
+        else:
+            *_, found = [None, *Joining(problem, log).maps()]  # the last one has the most joins
         true = found is not None and is_true(found, known)
         count, right = count + 1, right + true
         print(
@@ -155,6 +166,7 @@ def main() -> None:
     parser.add_argument("--drives", type=int, default=DRIVES, metavar="N", help="drives of a maze")
     parser.add_argument("--causal", action="store_true", help="solve by the causal theory")
     parser.add_argument("--beam", type=int, metavar="WIDTH", help="search by a beam alone")
+    parser.add_argument("--join", action="store_true", help="join maps of single drives alone")
     parser.add_argument("--stars", action="store_true", help="give the solver stars, too")
     parser.add_argument(
         "--displacement", choices=("auto", "none"), default="auto", help="none ignores odometry"
@@ -179,10 +191,10 @@ def main() -> None:
         star = "alike" if options.stars else "none"
         theory = Theory.causal().replace(displacement=options.displacement, star=star)
     traces = families[options.family]()
-    if options.beam is None:
+    if options.beam is None and not options.join:
         print(f"\n{report(traces, theory, options.limit)}")
     else:
-        print(f"\n{report_of_beams(traces, theory, options.beam)}")
+        print(f"\n{report_of_guesses(traces, theory, options.beam)}")
 
 
 if __name__ == "__main__":

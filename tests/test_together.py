@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import theories, traces
 from test_property import agree, checker_rejects_foreign_maps
-from together import of_mazes, of_worlds, report_of_beams
+from together import of_mazes, of_worlds, report_of_guesses
 
 from ssh_abduction import (
     Localiser,
@@ -422,7 +422,7 @@ def test_worlds_are_cut_where_the_robot_jumped(tmp_path: Path) -> None:
     (known,) = of_worlds(tmp_path)
     assert [(d.first, d.stop) for d in drives_of(known.trace)] == [(0, 2), (2, 4)]
     assert known.dstates == (0, 1, 2, 3)
-    found = report_of_beams(iter([known]), Theory.causal().replace(displacement="none"), 4)
+    found = report_of_guesses(iter([known]), Theory.causal().replace(displacement="none"), 4)
     assert found == "the cheapest map is true: 1 of 1"
 
 

@@ -17,6 +17,8 @@ from ssh_abduction.solver.weighed import EQUAL
 # The widths of the beams, and the share of the time after which each of them ends. The beam without
 # axioms ends at the share BREAKING.
 WIDTHS, BREAKING = {1: 0.7, 4: 0.6, 16: 0.7}, 0.8
+# Joining the maps of drives ends after the share JOINING.
+JOINING = 0.5
 # A further beam of WIDER hypotheses takes about LONGER times as long as the widest of these. Search
 # it only if all beams then take at most the share QUICK of the time, and MOST_SECONDS.
 WIDER, QUICK, MOST_SECONDS, LONGER = 64, 0.3, 60.0, 5.0
@@ -106,6 +108,13 @@ class Beams:
         # With several drives or floors, a broad beam keeps as many hypotheses as a wider one.
         several = parts.task.theory.several_drives or parts.task.theory.lifts
         widths = [width for width in WIDTHS if width <= BROAD or not several]
+        if several:
+            watch.end_stage_after(time.end(JOINING))
+            with suppress(StageTimeError):
+                for ssh_map in parts.candidates.joined():
+                    self._add(ssh_map)
+            self._keep_best()
+            parts.report()
         for width in widths:
             began = watch.elapsed()
             if width < widths[-1] and self._has_time_for(widths[-1], time, began):
@@ -157,7 +166,8 @@ class Beams:
             return False
         self._ended = max(self._ended, width)
         if width >= BROAD:
-            self._best = min(nats, default=math.inf), beam.nats
+            estimate = beam.best.nats if beam.best else math.inf
+            self._best = min(nats, default=math.inf), estimate
             # A beam without axioms would be the same if the checker refused nothing.
             self.broken = -math.inf if beam.refuses else 0.0
         return True

@@ -107,6 +107,19 @@ class Candidates:
         """Yield the maps that a beam finds and the checker accepts, the best one first."""
         yield from filter(self._judging.accepts, map(self._with_unknown_views, beam.maps()))
 
+    def joined(self) -> Iterator[SSHMap]:
+        """Yield maps that join the maps of single drives, if the checker accepts them.
+
+        Without displacements, or if faults or lifts are allowed, there are none.
+        """
+        theory = self._task.theory
+        if self.beam(1) is None or not theory.several_drives or theory.has_faults or theory.lifts:
+            return
+        from ssh_abduction.solver.guesses.joining import Joining  # loads numpy
+
+        joining = Joining(self._task.problem, self._task.log)
+        yield from filter(self._judging.accepts, map(self._with_unknown_views, joining.maps()))
+
     def go_on(self, beam: Beam) -> None:
         """Offer a sketch that begins with the map of a beam which did not reach the last step.
 

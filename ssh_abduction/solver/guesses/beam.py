@@ -86,7 +86,7 @@ class Beam:
     """The search for hypotheses of little cost.
 
     Attributes:
-        nats: The cost of the best hypothesis of the whole trace; inf before there is one.
+        best: The best hypothesis of the whole trace; None before there is one.
         refuses: Whether the checker refused a hypothesis.
     """
 
@@ -109,7 +109,8 @@ class Beam:
         # The prices of a dstate and of a place.
         self._prices = theory.prices[0], theory.prices[1] if has_places else 0.0
         self._reckoning, self._frames = HypothesisPoses(trace), frames_of(trace)
-        self.nats, self.refuses = math.inf, False
+        self.best: Hypothesis | None = None
+        self.refuses = False
         self._kept: list[list[Hypothesis]] = []  # the beam after each check
         self._sights = Sights(trace, self._bare, log, misreads=theory.misread > 0)
         # For each kind of fault, its cost at each step in nats.
@@ -144,7 +145,7 @@ class Beam:
             kept[-1] = kept[-1][:SPARE]  # saves memory
             kept.append(beam)
         self._kept = kept[-1:]
-        self.nats = float(kept[-1][0].nats)
+        self.best = kept[-1][0]
         for found in kept[-1][: ALIKE * self._width]:
             if (ssh_map := self._map(found, len(self._trace))) is not None:
                 yield ssh_map

@@ -273,7 +273,7 @@ class HypothesisPoses:
         old += [] if position is None or heading is None else [heading]
         mean, covariance = moved.mean, moved.covariance
         if old:
-            mean, covariance = _conditioned(
+            mean, covariance, _ = conditioned(
                 mean, covariance, [*range(n, n + len(old))], old, self._spreads[t]
             )
         new = [*range(n + len(old), n + 3)]  # entries of the robot that become known
@@ -284,26 +284,28 @@ class HypothesisPoses:
         return mean[order], covariance
 
 
-def _conditioned(
+def conditioned(
     mean: Array, covariance: Array, first: Sequence[int], second: Sequence[int], spreads: Array
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array, float]:
     """Condition a Gaussian on the equality of some entries with others, up to some variance.
 
     Args:
-        first: The indices of entries: x and y, and perhaps a heading.
+        first: The indices of entries: x and y, or a heading, or all three.
         second: The indices of the entries that should be equal to them.
         spreads: The variance of each difference, in square metres and square radians.
 
     Returns:
-        The new means and covariance.
+        The new means and covariance, and the chi-square of the differences.
     """
     off = mean[first] - mean[second]
-    off[2:] -= math.tau * np.round(off[2:] / math.tau)
+    if len(off) % 2:
+        off[-1] = math.remainder(off[-1], math.tau)
     across = covariance[:, first] - covariance[:, second]
     spread = across[first] - across[second] + np.diag(spreads[: len(off)])
     gain = np.linalg.solve(spread, across.T).T
-    conditioned = covariance - gain @ across.T
-    return mean - gain @ off, (conditioned + conditioned.T) / 2
+    less = covariance - gain @ across.T
+    square = float(off @ np.linalg.solve(spread, off))
+    return mean - gain @ off, (less + less.T) / 2, square
 
 
 def first_pose() -> tuple[Array, Array]:

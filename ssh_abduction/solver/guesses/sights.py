@@ -60,7 +60,7 @@ class Sights:
             t: The step.
         """
         sight, own = found.sights[place], self.shown[t]
-        if self._misreads or _agree(sight, own):
+        if self._misreads or agree(sight, own):
             return 0.0
         is_one_drive = found.drives[place] == self.drive[t]
         if not self._price or is_one_drive:
@@ -90,7 +90,7 @@ def _shown(step: Step, star: str) -> Star | tuple[bool, ...] | None:
     return None if seen is None else min(seen[k:] + seen[:k] for k in range(4))
 
 
-def _agree(first: Star | tuple[bool, ...] | None, second: Star | tuple[bool, ...] | None) -> bool:
+def agree(first: Star | tuple[bool, ...] | None, second: Star | tuple[bool, ...] | None) -> bool:
     """Whether two steps that show these stars may be at one place."""
     if isinstance(first, Star) and isinstance(second, Star):
         return _may_fit(first, second)

@@ -1,0 +1,184 @@
+"""Join the maps of several drives to one map of little cost, without a search of all steps.
+
+Each drive has a map of its own: a hypothesis with the poses of its places and dstates. An *anchor*
+is a dstate of one map and a dstate of another map that may be one. It says how one map lies on the
+other. An anchor is good if many other dstates then coincide with dstates that show the same. The
+two maps with the best anchor are joined first: `overlaying.py` merges the places and dstates that
+coincide. Then the joint map may be joined to others. Maps that no anchor joins stay pieces.
+
+Reference:
+    Carpin 2008, "Fast and accurate map merging for multi-robot systems" (votes for a turn and a
+    shift).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import combinations, pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ssh_abduction.checker.checker import violations
+from ssh_abduction.data.drives import Drive, drives_of
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.trace import Trace
+from ssh_abduction.runtime.clock import look_at_clock
+from ssh_abduction.solver.guesses.beam import Beam
+from ssh_abduction.solver.guesses.completing import completed
+from ssh_abduction.solver.guesses.overlaying import Overlay, Part
+from ssh_abduction.solver.guesses.sights import Sights
+from ssh_abduction.solver.steps.chart import numbered
+from ssh_abduction.solver.steps.log import Log
+from ssh_abduction.theory.settle import Problem
+
+Array = NDArray[np.float64]
+
+# The width of the beam that maps each drive alone.
+ALONE = 4
+# Two dstates may coincide if their headings differ by less than this many radians, and their
+# positions by less than this share of a usual travel.
+TURNED, SHIFTED = 0.4, 0.4
+# Of the ways to lay a drive on the standing map, count the coincidences of the VOTED ways with the
+# most votes. Merge the dstates that coincide in the ANCHORS best ways.
+VOTED, ANCHORS = 64, 6
+
+
+class Joining:
+    """Joins the maps of the drives of one trace."""
+
+    def __init__(self, problem: Problem, log: Log) -> None:
+        """Prepare the search. `maps` does it.
+
+        Args:
+            problem: The trace, the theory and the evidence.
+            log: The trace as integers.
+        """
+        self._problem, self._log = problem, log
+        self._bare = problem.theory.replace(displacement="none", weigh="count")
+        self._sights = Sights(problem.trace, self._bare, log, misreads=False)
+
+    def maps(self) -> Iterator[SSHMap]:
+        """Yield a map in which no drives are joined, and one in which they are.
+
+        The caller has to check them.
+        """
+        parts = [self._alone(drive) for drive in drives_of(self._problem.trace)]
+        alone = [part for part in parts if part is not None]
+        if len(alone) < len(parts):
+            return
+        yield from self._beside(alone)
+        anchors = {
+            (first, second): self._anchors(first, second)
+            for first, second in combinations(alone, 2)
+        }
+        while anchors:
+            first, second = max(anchors, key=lambda pair: anchors[pair][:1])
+            ways = anchors.pop((first, second))
+            if (joined := self._joined(first, second, ways)) is None:
+                continue
+            alone = [part for part in alone if part not in (first, second)]
+            anchors = {
+                pair: ways for pair, ways in anchors.items() if not {first, second} & set(pair)
+            }
+            anchors |= {(joined, part): self._anchors(joined, part) for part in alone}
+            alone.append(joined)
+        if len(alone) < len(parts):
+            yield from self._beside(alone)
+
+    def _beside(self, parts: Sequence[Part]) -> Iterator[SSHMap]:
+        """Yield the map that has some parts as its pieces, unless it breaks an axiom."""
+        whole = parts[0]
+        for part in parts[1:]:
+            whole = whole.beside(part)
+        if ssh_map := self._map(whole):
+            yield ssh_map
+
+    def _alone(self, drive: Drive) -> Part | None:
+        """Map a drive alone; None if no map is found."""
+        trace = self._problem.trace[drive.first : drive.stop]
+        theory = replace(
+            self._problem.theory.of_steps(drive.first, len(trace)), several_drives=False
+        )
+        problem = Problem.of(trace, theory)
+        beam = Beam(problem, Log(trace, theory, problem.pairs), ALONE)
+        if next(beam.maps(), None) is None or beam.best is None:
+            return None
+        return Part.of(beam.best, drive.first, self._log, self._sights)
+
+    def _anchors(self, first: Part, second: Part) -> list[tuple[float, int, int]]:
+        """List anchors of two maps, the best one first.
+
+        Returns:
+            Triples: how many more dstates coincide that show the same than that do not, the dstate
+            of the first map, and that of the second one.
+        """
+        look_at_clock()
+        alike = np.array([[bool(seen & other) for other in second.seen] for seen in first.seen])
+        s, x = np.nonzero(alike)
+        if not len(s):
+            return []
+        (at, facing), (there, turned) = first.poses, second.poses
+        near = SHIFTED * second.usual_travel(self._problem.trace)
+        turn = facing[s] - turned[x]
+        # Anchors that lay the second map in about the same way put its centre into one cell.
+        centre = at[s] + _turned(there.mean(0) - there[x], turn)
+        around = np.round(turn / TURNED) % round(math.tau / TURNED)
+        cells = np.column_stack([np.round(centre / near), around]).astype(int)
+        _, one, votes = np.unique(cells, axis=0, return_index=True, return_counts=True)
+        found = []
+        for i in one[np.argsort(-votes)[:VOTED]]:
+            moved = at[s[i]] + _turned(there - there[x[i]], turn[i])
+            apart = np.hypot(*np.moveaxis(at[:, None] - moved, -1, 0))
+            twist = facing[:, None] - turned - turn[i]
+            twist -= math.tau * np.round(twist / math.tau)
+            meets = (apart < near) & (np.abs(twist) < TURNED)
+            good = (meets & alike).sum() - (meets & ~alike).sum()
+            found.append((float(good), int(s[i]), int(x[i])))
+        return sorted(found, reverse=True)
+
+    def _joined(
+        self, first: Part, second: Part, ways: Sequence[tuple[float, int, int]]
+    ) -> Part | None:
+        """Join two maps by the anchor that costs least; None if all break axioms."""
+        found: list[Part] = []
+        for _, s, x in ways:
+            look_at_clock()
+            if len(found) == ANCHORS:
+                break
+            overlay = Overlay(first, second, self._problem)
+            if overlay.merge(s, x):
+                found.append(overlay.part())
+        found.sort(key=lambda joined: joined.nats)
+        return next((joined for joined in found if self._map(joined)), None)
+
+    def _map(self, part: Part) -> SSHMap | None:
+        """Make the map of a part; None if it breaks an axiom."""
+        look_at_clock()
+        trace, labels = self._of(part)
+        order = list(dict.fromkeys(labels))  # of first visits
+        places, facing = numbered(part.places[s] for s in order), part.poses[1][order].tolist()
+        ssh_map = completed(trace, self._bare, numbered(labels), places, facing)
+        if ssh_map is None or next(violations(trace, ssh_map, self._bare), None):
+            return None
+        return ssh_map
+
+    def _of(self, part: Part) -> tuple[Trace, list[int]]:
+        """Return the trace of the drives of a part, and the labels of its steps."""
+        trace, steps = self._problem.trace, sorted(part.labels)
+        if len(steps) < len(trace):
+            kept = [trace.steps[t] for t in steps]
+            for i, (t, u) in enumerate(pairwise(steps)):
+                if u > t + 1:  # drives in between are left out
+                    kept[i] = replace(kept[i], action=trace.steps[u - 1].action)
+            kept[-1] = replace(kept[-1], action=None)
+            trace = replace(trace, steps=tuple(kept), closures=())
+        return trace, [part.labels[t] for t in steps]
+
+
+def _turned(vectors: Array, angle: Array) -> Array:
+    """Turn vectors, (n, 2), counterclockwise."""
+    x, y, cos, sin = vectors[:, 0], vectors[:, 1], np.cos(angle), np.sin(angle)
+    return np.stack([cos * x - sin * y, sin * x + cos * y], 1)

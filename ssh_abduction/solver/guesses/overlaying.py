@@ -1,0 +1,359 @@
+"""Merge the places and dstates of two maps that coincide when one is laid on the other.
+
+A *part* is a map of some drives, with the joint Gaussian distribution of its poses. An `Overlay`
+has two parts whose frames are unrelated at first. Merging two dstates fixes the frames to each
+other. From then on the two places that most surely coincide are merged first, and the poses are
+conditioned on each merge. What two merged dstates lead to by one action is merged, too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import combinations
+from statistics import median
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ssh_abduction.data.star import Star
+from ssh_abduction.data.trace import Trace
+from ssh_abduction.solver.equations import spreads_of
+from ssh_abduction.solver.guesses.reckoning import BLUR, Hypothesis, conditioned
+from ssh_abduction.solver.guesses.sights import Sights, agree
+from ssh_abduction.solver.steps.log import Log
+from ssh_abduction.theory.settle import Problem
+
+Array = NDArray[np.float64]
+# The standard deviations of the frame of a drive, in metres and radians, before it is joined.
+ANYWHERE = np.array([1e3, 1e3, 3.0])
+# Poses that are one may differ by this standard deviation in radians, and by this share of a usual
+# travel, as the equations are linear only near the means.
+SLACK = 0.01
+# Merge no places whose positions differ by a chi-square of more than this.
+FAR = 16.0
+# Two dstates of a place may be one if their headings differ by less than this many radians.
+TURNED = 0.4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """A map of some drives. Its fields are like those of a `Hypothesis`.
+
+    Attributes:
+        labels: The dstate of each step of these drives.
+        places: The place of each dstate.
+        seen: For each dstate, what its steps show, as numbers.
+        links: For each (dstate, action) with a link, the dstate that it leads to.
+        sights: For each place, what a step there shows of it.
+        position: For each place, the index of its x in the means.
+        heading: For each dstate, the index of its heading in the means.
+        mean: The means of the poses.
+        covariance: The covariance of these.
+        nats: The cost.
+    """
+
+    labels: Mapping[int, int]
+    places: list[int]
+    seen: list[frozenset[int]]
+    links: Mapping[tuple[int, int], int]
+    sights: list[Star | tuple[bool, ...] | None]
+    position: NDArray[np.int_]
+    heading: NDArray[np.int_]
+    mean: Array
+    covariance: Array
+    nats: float
+
+    @classmethod
+    def of(cls, found: Hypothesis, first: int, log: Log, sights: Sights) -> Part:
+        """Make a part of a hypothesis about a drive that begins with step `first` of a log."""
+        labels = {first + t: label for t, label in enumerate(found.labels)}
+        seen: list[set[int]] = [set() for _ in found.places]
+        links: dict[tuple[int, int], int] = {}
+        shown = list(found.sights)
+        for t, label in labels.items():
+            seen[label].add(sights.seen[t])
+            shown[found.places[label]] = sights.shown[t]
+            if t + 1 in labels:
+                links[label, log.actions[t]] = labels[t + 1]
+        kept = np.array([*(i + k for i in found.position for k in (0, 1)), *found.heading])
+        n = len(found.position)
+        return cls(
+            labels,
+            list(found.places),
+            [frozenset(numbers) for numbers in seen],
+            links,
+            shown,
+            2 * np.arange(n),
+            2 * n + np.arange(len(found.heading)),
+            found.mean[kept],
+            found.covariance[np.ix_(kept, kept)],
+            found.nats,
+        )
+
+    @property
+    def poses(self) -> tuple[Array, Array]:
+        """The position and the heading of each dstate."""
+        at = self.position[self.places]
+        return np.stack([self.mean[at], self.mean[at + 1]], 1), self.mean[self.heading]
+
+    def usual_travel(self, trace: Trace) -> float:
+        """Return the median length in metres of the moves of these drives that are no turns."""
+        moves = [trace.steps[t].displacement or (0.0, 0.0, 0.0) for t in self.labels]
+        ways = [math.hypot(dx, dy) for dx, dy, _ in moves]
+        return median([way for way in ways if way > max(ways) / 10] or [1.0])
+
+    def beside(self, other: Part) -> Part:
+        """Put another part beside this one. The frames of the two stay unrelated."""
+        n, m, dstates = len(self.mean), len(other.mean), len(self.places)
+        covariance = np.zeros((n + m, n + m))
+        covariance[:n, :n], covariance[n:, n:] = self.covariance, other.covariance
+        return Part(
+            {**self.labels, **{t: dstates + s for t, s in other.labels.items()}},
+            [*self.places, *(len(self.sights) + p for p in other.places)],
+            [*self.seen, *other.seen],
+            {**self.links, **{(dstates + s, a): dstates + x for (s, a), x in other.links.items()}},
+            [*self.sights, *other.sights],
+            np.concatenate([self.position, n + other.position]),
+            np.concatenate([self.heading, n + other.heading]),
+            np.concatenate([self.mean, other.mean]),
+            covariance,
+            self.nats + other.nats,
+        )
+
+
+@dataclass(slots=True, eq=False)
+class _State:
+    """What is merged so far.
+
+    Attributes:
+        dstate: For each dstate, the first dstate that it is merged with.
+        place: For each place, the first place that it is merged with.
+        links: For each first dstate, where its actions lead to.
+        mean: The means of the poses.
+        covariance: The covariance of these.
+        nats: The cost.
+    """
+
+    dstate: list[int]
+    place: list[int]
+    links: list[dict[int, int]]
+    mean: Array
+    covariance: Array
+    nats: float
+
+    def copy(self) -> _State:
+        """Copy everything that a merge changes in place."""
+        return replace(self, links=[dict(links) for links in self.links])
+
+
+class _ClashError(Exception):
+    """Two dstates or places cannot be merged."""
+
+
+class Overlay:
+    """Merges the dstates and places of a standing map with those of a drive."""
+
+    def __init__(self, standing: Part, drive: Part, problem: Problem) -> None:
+        theory, both = problem.theory, standing.beside(drive)
+        self._both, self._old = both, (len(standing.places), len(standing.sights))
+        self._has_places = theory.level == "topological"
+        self._prices = theory.prices[0], theory.prices[1] if self._has_places else 0.0
+        slack = SLACK * both.usual_travel(problem.trace)
+        self._spreads = spreads_of(problem.trace).max(axis=0) + np.array([slack, slack, SLACK]) ** 2
+        links: list[dict[int, int]] = [{} for _ in both.places]
+        for (s, action), x in both.links.items():
+            links[s][action] = x
+        self._state = _State(
+            [*range(len(both.places))],
+            [*range(len(both.sights))],
+            links,
+            both.mean,
+            both.covariance,
+            both.nats,
+        )
+        # Pairs of different places that may be one.
+        self._open = np.triu([[agree(p, q) for q in both.sights] for p in both.sights], 1)
+
+    def merge(self, old: int, new: int) -> bool:
+        """Merge a dstate of the standing map with one of the drive, and then all that coincide.
+
+        Returns:
+            Whether the two can be one dstate.
+        """
+        new += self._old[0]
+        self._lay(old, new)
+        if not self._tried([(old, new)]):
+            return False
+        while pair := self._surest():
+            if not self._tried([], pair):
+                self._open[pair] = False
+        return True
+
+    def part(self) -> Part:
+        """Return the map with all merges."""
+        both, state = self._both, self._state
+        dstates, places = sorted(set(state.dstate)), sorted(set(state.place))
+        number = {s: i for i, s in enumerate(dstates)}
+        place = {p: i for i, p in enumerate(places)}
+        position = both.position[places]
+        kept = [*np.stack([position, position + 1], 1).ravel(), *both.heading[dstates]]
+        n = 2 * len(places)
+        return Part(
+            {t: number[state.dstate[s]] for t, s in both.labels.items()},
+            [place[state.place[both.places[s]]] for s in dstates],
+            [both.seen[s] for s in dstates],
+            {
+                (number[s], action): number[state.dstate[x]]
+                for s in dstates
+                for action, x in state.links[s].items()
+            },
+            [both.sights[p] for p in places],
+            2 * np.arange(len(places)),
+            n + np.arange(len(dstates)),
+            state.mean[kept],
+            state.covariance[np.ix_(kept, kept)],
+            state.nats,
+        )
+
+    def _lay(self, old: int, new: int) -> None:
+        """Turn and shift the drive so that one of its dstates has the pose of another one.
+
+        The covariance says that the frame of the drive is unknown.
+        """
+        both, state = self._both, self._state
+        headings = both.heading[self._old[0] :]
+        x = both.position[self._old[1] :]
+        at, there = (both.position[both.places[s]] for s in (old, new))
+        angle = both.mean[both.heading[old]] - both.mean[both.heading[new]]
+        cos, sin = math.cos(angle), math.sin(angle)
+        mean, covariance = both.mean.copy(), both.covariance.copy()
+        dx, dy = mean[x] - mean[there], mean[x + 1] - mean[there + 1]
+        dx, dy = cos * dx - sin * dy, sin * dx + cos * dy
+        mean[x], mean[x + 1] = mean[at] + dx, mean[at + 1] + dy
+        mean[headings] += angle
+        for half in (covariance, covariance.T):  # the rows, and then the columns
+            half[x], half[x + 1] = (
+                cos * half[x] - sin * half[x + 1],
+                sin * half[x] + cos * half[x + 1],
+            )
+        by = np.zeros((len(mean), 3))
+        by[x, 0], by[x + 1, 1] = 1.0, 1.0
+        by[x, 2], by[x + 1, 2] = -dy, dx
+        by[headings, 2] = 1.0
+        by *= ANYWHERE
+        self._state = replace(state, mean=mean, covariance=covariance + by @ by.T)
+
+    def _surest(self) -> tuple[int, int] | None:
+        """Find the two places that most surely coincide; None if there are none."""
+        state = self._state
+        places = np.array(sorted(set(state.place)))
+        at = np.stack([self._both.position[places], self._both.position[places] + 1], 1)
+        c = state.covariance
+        across = c[at[:, None, :, None], at[None, :, None, :]]
+        own = c[at[:, :, None], at[:, None, :]]
+        spread = own[:, None] + own - across - across.swapaxes(2, 3) + np.diag(self._spreads[:2])
+        off = state.mean[at][:, None] - state.mean[at]
+        a, b, d = spread[..., 0, 0], spread[..., 0, 1], spread[..., 1, 1]
+        size = np.maximum(a * d - b * b, BLUR**2)
+        x, y = off[..., 0], off[..., 1]
+        squares = (d * x * x - 2 * b * x * y + a * y * y) / size
+        unlikely = squares + np.log(size)
+        unlikely[(squares > FAR) | ~self._open[np.ix_(places, places)]] = math.inf
+        i, j = np.unravel_index(np.argmin(unlikely), unlikely.shape)
+        return None if math.isinf(unlikely[i, j]) else (int(places[i]), int(places[j]))
+
+    def _tried(self, dstates: list[tuple[int, int]], places: tuple[int, int] | None = None) -> bool:
+        """Merge some dstates or two places, and all that follows, if this costs less than before.
+
+        Returns:
+            Whether they are merged. If not, nothing changes.
+        """
+        before = self._state
+        self._state = before.copy()
+        try:
+            touched = set()
+            if places and self._has_places:
+                self._merge_places(*places, heading=None)
+                touched = {places[0]}
+            elif places:
+                dstates = [(self._dstates_at(places[0])[0], self._dstates_at(places[1])[0])]
+            touched |= self._merge_dstates(dstates)
+            while pairs := [pair for p in touched for pair in self._coinciding(p)]:
+                touched |= self._merge_dstates([min(pairs)[1]])
+        except _ClashError:
+            self._state = before
+        if self._state.nats >= before.nats:
+            self._state = before
+        return self._state is not before
+
+    def _merge_dstates(self, pairs: list[tuple[int, int]]) -> set[int]:
+        """Merge pairs of dstates, and what the same actions lead to. Return their places."""
+        state, places = self._state, set()
+        while pairs:
+            s, x = sorted(state.dstate[i] for i in pairs.pop())
+            if s == x:
+                continue
+            if not self._both.seen[s] & self._both.seen[x]:
+                raise _ClashError
+            for action, there in state.links[x].items():
+                if action in state.links[s]:
+                    pairs.append((state.links[s][action], there))
+                else:
+                    state.links[s][action] = there
+            state.dstate = [s if i == x else i for i in state.dstate]
+            p, q = sorted(state.place[self._both.places[i]] for i in (s, x))
+            headings = self._both.heading[s], self._both.heading[x]
+            if p == q:
+                self._condition([headings], self._prices[0])
+            else:
+                self._merge_places(p, q, headings)
+            places.add(p)
+        return {state.place[p] for p in places}
+
+    def _merge_places(self, p: int, q: int, heading: tuple[int, int] | None) -> None:
+        """Merge two places, and perhaps two headings there. Raises _ClashError."""
+        state, position = self._state, self._both.position
+        if not agree(self._both.sights[p], self._both.sights[q]):
+            raise _ClashError
+        state.place = [p if i == q else i for i in state.place]
+        same = [(position[p], position[q]), (position[p] + 1, position[q] + 1)]
+        if heading is None:
+            self._condition(same, self._prices[1])
+        else:
+            self._condition([*same, heading], sum(self._prices))
+
+    def _condition(self, same: list[tuple[int, int]], saved: float) -> None:
+        """Condition the poses on equal entries of the means, which saves some nats."""
+        state, (first, second) = self._state, map(list, zip(*same, strict=True))
+        spreads = self._spreads[-len(same) :] if len(same) % 2 else self._spreads[:2]
+        state.mean, state.covariance, square = conditioned(
+            state.mean, state.covariance, first, second, spreads
+        )
+        state.nats += square / 2 - saved
+
+    def _dstates_at(self, place: int) -> list[int]:
+        """List the dstates at a place, one of each group."""
+        state = self._state
+        return [
+            s
+            for s, first in enumerate(state.dstate)
+            if s == first and state.place[self._both.places[s]] == place
+        ]
+
+    def _coinciding(self, place: int) -> list[tuple[float, tuple[int, int]]]:
+        """List pairs of dstates at a place that show the same and may face the same way.
+
+        Each has the chi-square of the difference of their headings.
+        """
+        found = []
+        for s, x in combinations(self._dstates_at(place), 2):
+            i, j = self._both.heading[s], self._both.heading[x]
+            c = self._state.covariance
+            off = math.remainder(self._state.mean[i] - self._state.mean[j], math.tau)
+            square = off * off / (c[i, i] + c[j, j] - 2 * c[i, j] + self._spreads[2])
+            is_one_way = abs(off) < TURNED and square < 2 * self._prices[0]
+            if is_one_way and self._both.seen[s] & self._both.seen[x]:
+                found.append((float(square), (s, x)))
+        return found

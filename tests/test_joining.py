@@ -1,0 +1,68 @@
+"""Maps of single drives are joined to one map."""
+
+from __future__ import annotations
+
+import pytest
+import truth
+from together import of_mazes
+
+from ssh_abduction import SSHMap, Theory, Trace, solve
+from ssh_abduction.checker.checker import violations
+from ssh_abduction.data import Odometry, together
+from ssh_abduction.solver.guesses.joining import Joining
+from ssh_abduction.solver.misfit import Misfit
+from ssh_abduction.solver.steps.log import Log
+from ssh_abduction.theory.settle import Problem, settle
+
+NOISE = truth.Noise(Odometry(**truth.NOISE))
+# Joining was developed on seeds below 100.
+MAZES = [*of_mazes(4, 60, range(310, 313), NOISE)]
+
+
+def joined(problem: Problem) -> list[SSHMap]:
+    return [*Joining(problem, Log(problem.trace, problem.theory, problem.pairs)).maps()]
+
+
+@pytest.mark.parametrize("stars", [True, False], ids=["stars", "no stars"])
+@pytest.mark.parametrize("known", MAZES, ids=[known.name for known in MAZES])
+def test_the_joint_map_costs_no_more_than_the_true_one(known: truth.Known, stars: bool) -> None:
+    problem = settle(known.trace, Theory(star="auto" if stars else "none"))
+    misfit = Misfit(problem)
+
+    def nats(dstates: tuple[int, ...], places: tuple[int, ...]) -> float:
+        counts = len(set(dstates)) + len(set(places))
+        return 8 * counts + misfit.of_course(dstates, places) / 2
+
+    apart, best = joined(problem)
+    assert len(apart.pieces) == 3
+    for ssh_map in (apart, best):
+        assert not [*violations(problem.trace, ssh_map, problem.theory)]
+    places = [best.dstates[label].place for label in best.dstate_at]
+    found = nats(best.dstate_at, truth.partition(places))
+    assert found <= nats(truth.partition(known.dstates), truth.partition(known.places)) + 1e-6
+
+
+def test_drives_that_show_other_things_stay_apart() -> None:
+    monday = Trace.from_steps("abc", ["travel"] * 2, displacements=[(5.0, 0.0, 0.0)] * 2)
+    tuesday = Trace.from_steps("xyz", ["travel"] * 2, displacements=[(5.0, 0.0, 0.0)] * 2)
+    with pytest.warns(UserWarning, match="no view in common"):
+        joint = together([monday, tuesday])
+    (apart,) = joined(settle(joint, Theory()))
+    assert [len(piece) for piece in apart.pieces] == [3, 3]
+
+
+def test_a_drive_is_joined_where_no_later_step_contradicts_it() -> None:
+    """Both drives begin at "a" and go on to "b", and then see other things."""
+    way = (5.0, 0.0, 0.0)
+    monday = Trace.from_steps("abca", ["travel"] * 3, displacements=[way] * 3)
+    tuesday = Trace.from_steps("abx", ["travel"] * 2, displacements=[way] * 2)
+    problem = settle(together([monday, tuesday]), Theory())
+    *_, ssh_map = joined(problem)
+    assert ssh_map.dstate_at == (0, 1, 2, 3, 3, 4, 5)
+    assert not [*violations(problem.trace, ssh_map, problem.theory)]
+
+
+def test_many_long_drives_have_a_map_within_a_short_limit() -> None:
+    (known,) = of_mazes(4, 40, [315], NOISE, drives=6)
+    solution = solve(known.trace, time_limit=20, max_maps=1)
+    assert truth.is_true(solution.maps[0], known)
