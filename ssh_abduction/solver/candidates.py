@@ -52,7 +52,8 @@ class Candidates:
     """Makes maps of the whole trace, and keeps the best one that the checker accepts.
 
     Attributes:
-        contradicting: The steps that contradicted a sketch, that of the surest sketch first.
+        contradicting: For each sketch, the step that contradicted it. The surest sketch is
+            first.
     """
 
     def __init__(
@@ -295,7 +296,10 @@ def _with_all_views(task: Task) -> Task:
 
 
 def _processor_clock() -> Callable[[], float]:
-    """Make a clock that counts the processor time of this thread, or 1 / WAITING of all time."""
+    """Make a clock that counts the processor time of this thread.
+
+    On a busy machine it counts at least 1 / WAITING of the wall-clock time.
+    """
     used, began = time.thread_time(), now()
 
     def clock() -> float:

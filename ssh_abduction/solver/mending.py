@@ -71,7 +71,7 @@ class Mending:
         self._cheapest: list[Trace] = []  # traces mended by all cheapest causal maps
         causal = Theory.causal().replace(misread=task.theory.misread, slipped=task.theory.slipped)
         self._causal_labels: tuple[int, ...] = ()  # the labels of the last causal map
-        # The log (the trace as integers) is still that of the theory with places. So stars, and
+        # The log (the trace as integers) still belongs to the theory with places. So stars, and
         # pairs of steps at different places, distinguish dstates here, too.
         self._causal = FaultyEngine(replace(task, problem=task.problem.changed(theory=causal)))
 

@@ -2,13 +2,14 @@
 
 A *return* is a pair of steps that a map has at one dstate or one place. The misfit of a set of
 returns is the least chi-square of the displacements and closures, given that the two steps of each
-return have one pose, or one position (`solver/fit.py`). More returns leave less freedom. So the
-misfit of a set is at least that of any subset. If a map has these returns, its misfit is at least
-that of the set.
+return have one pose, or one position (`solver/fit.py`). More returns leave less freedom. So a
+set never has a smaller misfit than a part of it, and a map never has a smaller misfit than a set of
+its returns.
 
 A visit to a place has several steps, as turns stay at their place. So these steps have one position
-in each topological map, also without a return. But if displacements may be wrong, that of a turn
-may be wrong, too. Then each step is a visit of its own, and a turn is a return, too.
+in each topological map, also without a return. But if displacements may be wrong, the
+displacement of a turn may be wrong, too. Then each step is a visit of its own, and a turn is a
+return, too.
 """
 
 from __future__ import annotations

@@ -45,8 +45,8 @@ class NearMinimal:
             judging: Says which maps the evidence rejects.
             most: The number of maps wanted; 0 for all.
             report: Called now and then to report progress.
-            before: The asker of the search for the minimal maps. Its times are added to those of
-                this engine.
+            before: The asker of the search for the minimal maps. Its times are added to the times
+                of this engine.
         """
         self._task = replace(task, speedups=replace(task.speedups, prefixes=False))
         self._judging, self._most, self._report = judging, most, report

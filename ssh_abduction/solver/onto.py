@@ -224,7 +224,7 @@ def _trails(ssh_map: SSHMap) -> list[list[tuple[int, str | None]]]:
         excess[s] += 1
         excess[x] -= 1
     trails: list[list[tuple[int, str | None]]] = []
-    # A trail that starts where more links leave than arrive cannot be a part of another one.
+    # First start trails at the dstates that more links leave than reach: a trail has to start there.
     for start in sorted(leaving, key=lambda s: -excess[s]):
         while leaving[start]:
             trail: list[tuple[int, str | None]] = []
@@ -313,7 +313,7 @@ def _broken(
 def _with_assertions(
     part: Trace, pinned: Theory, digest: Digest, ssh_map: SSHMap, found: Solution, solving: Solving
 ) -> tuple[Solution, tuple[SSHMap, ...]]:
-    """Solve again with assertions that equal steps of the digest are equal, if it is short enough.
+    """Solve again, and assert which steps of the digest are one dstate, if it is short enough.
 
     Returns:
         The new solution, and its maps that keep the existing map; or the old solution `found` and

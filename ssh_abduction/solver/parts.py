@@ -29,8 +29,8 @@ class Parts:
 
     Attributes:
         limits: The limits of the search.
-        speedups: The speed-ups that the caller has on. `task.speedups` has only those of them that
-            hold for the theory.
+        speedups: The speed-ups that the caller has on. `task.speedups` has only the ones that hold
+            for the theory.
         watch: The clock of the search, with its limits.
         task: The trace and theory, as engines see them.
         known: What is known about the maps of the trace so far.

@@ -69,7 +69,7 @@ _log = log_of(__name__)
 WITHIN = math.log(100)
 # Keep at most this many maps. If there are more, use fewer nats instead of WITHIN.
 RIVALS = 50
-# A misfit is improbable if that of the true map exceeds it with less than this probability.
+# A misfit is improbable if the true map has a larger one with less than this probability.
 IMPROBABLE = 0.01
 # If the robot may be off the poses of its dstates, by errors with heavy tails, a misfit may be this
 # many times as large as expected. Then standard deviations are 1.5 times too small.
@@ -290,7 +290,7 @@ class Weighing:
     def _cost_of_others(self, ssh_map: SSHMap) -> float:
         """Compute a lower bound on the cost of this map and of all maps after it in clingo's order.
 
-        The order is lexicographic: the counts of a later map are equal up to one that is greater.
+        The order is lexicographic: the first count in which a later map differs is greater.
         """
         counts, priorities = Cost.of(ssh_map), self._parts.task.theory.priorities
         least = {name: self._least.get(name, 0) for name in self._prices}

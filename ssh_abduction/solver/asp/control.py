@@ -91,8 +91,8 @@ class Control(clingo.Control):
             options: Command-line options of clingo.
             check: A function that is called now and then while clingo grounds an encoding with
                 `@go_on`. If it raises an exception, the grounding ends and the control is unusable.
-            preparing: What clasp needs to prepare the program: multiples of the time and of the
-                memory that grounding took.
+            preparing: The time and the memory that clasp takes to prepare the program, as multiples
+                of what grounding took.
         """
         super().__init__(["--warn=none", *options])
         self.preparing = preparing

@@ -33,8 +33,8 @@ from ssh_abduction.theory.evidence import Pairs
 
 # A block for clingo extends beyond its faults by up to this many steps for each dstate of the map.
 MARGIN = 3
-# Find the length of the shortest block to within one step. For each COARSE dstates beyond those of
-# the known map, it may be one more step too long.
+# A block may be one step longer than the shortest one, and one more step longer for each COARSE
+# dstates that it has beyond those of the known map.
 COARSE = 5
 # Ask clingo only about blocks up to this length, with at most this many names for dstates.
 MOST_STEPS = 200

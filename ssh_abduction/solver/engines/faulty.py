@@ -1,6 +1,6 @@
 """The engine for the causal theory with faults: it finds all maps of least cost.
 
-A view may be misread, and an action may slip. The cost of a map is that of its dstates and its
+A view may be misread, and an action may slip. The cost of a map is the cost of its dstates and
 faults. Clingo gets only some steps of the trace, the *given* steps (`faulty_control.py`). Fewer
 steps are fewer constraints. So the least cost for the given steps is a lower bound for the whole
 trace. A minimal map of the given steps is then followed through all other steps. If it predicts all
@@ -121,8 +121,8 @@ class FaultyEngine:
     def _guessed(self) -> Iterator[Found]:
         """Yield guessed maps of the whole trace, each cheaper than the one before.
 
-        There are none if the best map is proven minimal. Clingo gets as many names as the best
-        guess has dstates, and the steps around its faults.
+        There are none if the best map is proven minimal. Clingo gets the steps around the faults
+        of the best guess, and as many names as this guess has dstates.
         """
         if not self._guesses() or (self._best is not None and self._best <= (self.bound or 0)):
             return

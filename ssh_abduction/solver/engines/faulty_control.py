@@ -117,7 +117,7 @@ class FaultyControl:
             self.given |= set(range(max(step - AROUND, 0), min(step + AROUND + 1, size)))
 
     def learn_from(self, answer: FaultyAnswer) -> None:
-        """Add names for the rests that an answer uses, and let its lost steps be at any dstate."""
+        """Add names for each rest that an answer uses, and let its lost steps be at any dstate."""
         if answer.rests:
             used = Counter(
                 view

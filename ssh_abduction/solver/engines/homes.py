@@ -95,7 +95,8 @@ def _may_follow(pairs: list[tuple[int, int]], columns: list[int]) -> NDArray[np.
         columns: The numbers of the fixed places.
 
     Returns:
-        A matrix, fixed x fixed: whether the place of the column may come after that of the row.
+        A matrix, fixed x fixed: whether the place of the column may come after the place of the
+        row.
     """
     members = sorted({place for pair in pairs for place in pair})
     number = {place: i for i, place in enumerate(members)}

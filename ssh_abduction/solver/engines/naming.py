@@ -9,15 +9,15 @@ distinct steps, a clique (`steps/apart.py`), are *pinned*: each gets a name of i
 is a lower bound on the dstates. Pinning leaves only one way to name these dstates. Any other step
 may have the name of a pinned step that it can share a dstate with, or a *spare* name of its view. A
 spare name costs one dstate. Each view also has a *rest*, one name that all its other dstates share.
-If there are several largest cliques, the one that leaves the other steps the fewest names is
-pinned.
+If there are several largest cliques, pin the one with which the other steps have the fewest names
+to choose from.
 
 *Claim.* An answer of minimal cost that uses no rest is a minimal map.
 *Proof.* Name the dstates of any map. The pinned steps have their names. The other dstates get spare
 names of their view, while there are any, and then the rest. These names satisfy each rule of
 names.lp, as the rules say nothing about steps that are named by a rest. They use no more spare
 names than the map has dstates beyond the clique. So the minimal cost of answers is a lower bound on
-that of maps. An answer without a rest is a map of the trace with its cost. ∎
+the cost of maps. An answer without a rest is a map of the trace with its cost. ∎
 If a minimal answer uses a rest, its view gets one more spare name, and clingo is asked again.
 
 Not every step is needed. Clingo starts with the links of the pinned steps. Each answer is followed
@@ -190,7 +190,7 @@ class NamedLabels:
         return self._search.improving()
 
     def forbid_together(self, pairs: Collection[tuple[int, int]]) -> None:
-        """Exclude labels in which the steps of each of these pairs are at one dstate."""
+        """Exclude all labels that have both steps of every one of these pairs at one dstate."""
         self._forbidden.append(list(pairs))
         known = self._incumbent
         if known.labels and not self.program.is_allowed(known.labels):

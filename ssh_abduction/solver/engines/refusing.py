@@ -71,7 +71,7 @@ def all_accepted(
 
 
 def minimal_part(suffices: Callable[[list[Member]], bool], members: list[Member]) -> list[Member]:
-    """Find a part of some members that suffices, and from which no member can be left out.
+    """Find a minimal part of some members that still suffices.
 
     Args:
         suffices: Says whether some members suffice. If they do, so do more members.

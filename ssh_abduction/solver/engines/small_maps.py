@@ -109,9 +109,10 @@ class SmallMaps:
 
 
 def mended(guess: Sequence[int], chart: Chart) -> list[int]:
-    """Correct a guess: give each node the label to which the last label and action mostly lead.
+    """Correct a guess by a vote: what does an action at a dstate mostly lead to?
 
-    This corrects a few wrong labels: once a label is right, all that follow become right.
+    Each node gets the label to which the label and action before it mostly lead in the guess. So
+    all labels after a right one become right, if only a few were wrong.
 
     Args:
         guess: The label of each node, -1 if it is unknown.

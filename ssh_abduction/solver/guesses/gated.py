@@ -18,8 +18,8 @@ A path ends at a place if no gateway leads on there. So a travel to a place from
 leads on reaches the end of its path. If the path has an end in this direction already, the travel
 leads back to that place. Otherwise the place is new. All other travels may lead to new places.
 
-A turn leads to a known dstate of its place if the gateways that the robot sees may be those that
-it saw there, in the same directions.
+A turn leads to a known dstate of its place if the gateways that the robot sees fit the gateways
+that it saw there, in the same directions.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ WEIGHT = 0.002
 # The number of states in the prior. The true number would give small and large maps different
 # weights.
 STATES = 60
-# The power of probabilities in the last sweep of a stage, just below that of the model, 1.
+# Probabilities are raised to this power in the last sweep of a stage. The model itself has power 1.
 COLD = 0.95
 # Then come LAST sweeps with the power QUENCHED. They make the result nearly deterministic.
 LAST, QUENCHED = 50, 4.0

@@ -78,7 +78,7 @@ def nats_of_misread(seen: dict[int, float]) -> float:
 
 
 def right_view(seen: dict[int, float]) -> int:
-    """Return the right observation of a dstate: the one that is dearest to treat as misread."""
+    """Return the observation that costs most to treat as misread. It is taken as right."""
     return max(seen, key=lambda number: seen[number])
 
 

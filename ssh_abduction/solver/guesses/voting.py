@@ -3,7 +3,7 @@
 A star is the openings that are seen at a step. A visit is the steps between two travels. This is
 for places with frames: the directions at a place, its slots, are numbered. A group of visits stands
 for a place. Each visit of the group is turned by some quarters (right angles), so that its slots
-become those of the place.
+match the slots of the place.
 
 A group costs its dstates, plus the cost of each view and star that differs from the majority of its
 steps. Groups are merged while that lowers the total cost, those with the largest gain first. If two

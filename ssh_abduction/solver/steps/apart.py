@@ -145,7 +145,8 @@ class Continuations:
 def _spread(excluded: Collection[tuple[int, int]], done: NDArray[np.int_]) -> Matrix:
     """Find all pairs of steps that are different dstates by evidence, as a matrix, steps x steps.
 
-    These are the excluded pairs, and the pairs from which the same actions lead to excluded pairs.
+    A pair is different if it is excluded, or if the same actions at both steps lead to an excluded
+    pair.
 
     Args:
         excluded: The pairs that evidence names.

@@ -134,7 +134,7 @@ class _VisitLocaliser:
         return {state for state in there if state is not None and self._fits[visit + 1, state]}
 
     def _is_unknown(self, possible: set[State], visit: int) -> bool:
-        """Whether a visit has a single possible state from which its action is not known."""
+        """Whether a visit has one possible state, and the map has no link for its action there."""
         slot, action = self._leaves[visit]
         return len(possible) == 1 and not any(
             (faced(state, slot), action) in self._leads for state in possible

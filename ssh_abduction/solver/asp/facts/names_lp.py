@@ -118,8 +118,8 @@ class NameReader:
     def __init__(self, actions: Sequence[int], choices: Sequence[Sequence[int]]) -> None:
         self._actions = actions
         self._choices = choices
-        # For a name and an action: the name that it led to in the last answer, and the literal of
-        # that atom.
+        # For each (name, action) in the last answer: the name that the action leads to, and the
+        # literal of the atom `goes` that says so.
         self._last: dict[tuple[int, int], tuple[int, int]] = {}
 
     def read(self, model: Model) -> dict[int, int]:

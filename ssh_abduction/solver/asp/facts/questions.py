@@ -71,7 +71,7 @@ def doubt(number: int, part: int, condition: str | None, *, one: bool) -> str:
 
 
 def doubts_before(part: int) -> str:
-    """Return the rule that `some_doubt` of this part is true if that of the part before is true."""
+    """Return the rule that derives `some_doubt` of a part from `some_doubt` of the part before."""
     return (
         f"{some_doubt(part)} :- {some_doubt(part - 1)}."
         if part > 1
