@@ -224,7 +224,7 @@ def _trails(ssh_map: SSHMap) -> list[list[tuple[int, str | None]]]:
         excess[s] += 1
         excess[x] -= 1
     trails: list[list[tuple[int, str | None]]] = []
-    # First start trails at the dstates that more links leave than reach: a trail has to start there.
+    # First start trails at dstates that more links leave than reach: a trail must start there.
     for start in sorted(leaving, key=lambda s: -excess[s]):
         while leaving[start]:
             trail: list[tuple[int, str | None]] = []
