@@ -67,12 +67,27 @@ class FieldReader:
             raise self.wrong(name, "an integer", value)
         return value
 
+    def integers(self, value: Any, name: str) -> tuple[int, ...]:
+        if not isinstance(value, list):
+            raise self.wrong(name, "a list of integers", value)
+        return tuple(self.integer(x, f"{name}[{i}]") for i, x in enumerate(value))
+
+    def whole(self, value: Any, name: str) -> int:
+        if self.integer(value, name) < 0:
+            raise self.wrong(name, "a whole number, 0 or more", value)
+        return int(value)
+
     def optional(self, value: Any, name: str) -> int | None:
         return None if value is None else self.integer(value, name)
 
     def number(self, value: Any, name: str) -> float:
         if not is_finite(value):
             raise self.wrong(name, "a finite number", value)
+        return float(value)
+
+    def not_negative(self, value: Any, name: str) -> float:
+        if self.number(value, name) < 0:
+            raise self.wrong(name, "a number, 0 or more", value)
         return float(value)
 
     def numbers(self, value: Any, name: str) -> tuple[float, float, float]:

@@ -243,8 +243,7 @@ def _dstate(read: FieldReader, value: Any, name: str) -> DState:
 
 def _path(read: FieldReader, value: Any, name: str) -> MapPath:
     record = read.mapping(value, name)
-    places = read.list(record, "order")
-    order = tuple(read.integer(p, f"{name}.order[{i}]") for i, p in enumerate(places))
+    order = read.integers(record.get("order"), f"{name}.order")
     if len(set(order)) < len(order):
         raise read.wrong(f"{name}.order", "each place once", list(order))
     return MapPath(read.integer(record.get("id"), f"{name}.id"), order)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -177,12 +177,9 @@ def joins_in(
 def _certificate(read: FieldReader, written: Mapping[str, Any], steps: int) -> Certificate:
     """Read a certificate. Raises MapError."""
     clique, refuted = (
-        tuple(
-            _whole(read, x, f"certificate.{k}[{i}]") for i, x in enumerate(_list(read, written, k))
-        )
-        for k in ("clique", "refuted")
+        read.integers(written.get(k), f"certificate.{k}") for k in ("clique", "refuted")
     )
-    if len(set(clique)) < len(clique) or any(step >= steps for step in clique):
+    if len(set(clique)) < len(clique) or not all(0 <= step < steps for step in clique):
         raise read.wrong(
             "certificate.clique", f"different steps from 0 to {steps - 1}", list(clique)
         )
@@ -191,22 +188,6 @@ def _certificate(read: FieldReader, written: Mapping[str, Any], steps: int) -> C
             "certificate.refuted", f"the numbers of dstates from {len(clique)} on", list(refuted)
         )
     return Certificate(clique, refuted)
-
-
-def _list(read: FieldReader, record: Mapping[str, Any], name: str) -> Sequence[Any]:
-    """Read a list from a field of a certificate. Raises MapError."""
-    value = record.get(name)
-    if not isinstance(value, list):
-        raise read.wrong(f"certificate.{name}", "a list", value)
-    return value
-
-
-def _whole(read: FieldReader, value: Any, name: str) -> int:
-    """Read a whole number, 0 or more. Raises MapError."""
-    number = read.integer(value, name)
-    if number < 0:
-        raise read.wrong(name, "a whole number, 0 or more", value)
-    return number
 
 
 def theory_in(value: Any, where: str) -> Theory:
@@ -222,18 +203,18 @@ def cost_in(read: FieldReader, value: Any, name: str) -> Cost:
     record = read.mapping(value, name)
     if unknown := set(record) - {*COUNTS, "faults"}:
         raise read.wrong(name, f"numbers of {', '.join(COUNTS)} and faults", sorted(unknown))
-    counts = {k: _whole(read, record.get(k, 0), f"{name}.{k}") for k in COUNTS}
-    return Cost(**counts, faults=_positive(read, record.get("faults", 0.0), f"{name}.faults"))
+    counts = {k: read.whole(record.get(k, 0), f"{name}.{k}") for k in COUNTS}
+    return Cost(**counts, faults=read.not_negative(record.get("faults", 0.0), f"{name}.faults"))
 
 
 def bound_in(read: FieldReader, value: Any) -> Bound:
     """Read the proven lower bounds. Raises MapError."""
     record = read.mapping(value, "bound")
-    counts = {str(k): _whole(read, v, f"bound.{k}") for k, v in record.items() if k in COUNTS}
+    counts = {str(k): read.whole(v, f"bound.{k}") for k, v in record.items() if k in COUNTS}
     if unknown := set(record) - {*counts, "cost"}:
         raise read.wrong("bound", f"numbers of {', '.join(COUNTS)}, or a cost", sorted(unknown))
     if "cost" in record:
-        counts["tenths"] = round(10 * _positive(read, record["cost"], "bound.cost"))
+        counts["tenths"] = round(10 * read.not_negative(record["cost"], "bound.cost"))
     return Bound(**counts)
 
 
@@ -242,15 +223,18 @@ def effort_in(read: FieldReader, record: Mapping[str, Any]) -> Effort:
     prefix = read.integer(record.get("prefix", 0), "prefix")
     times = read.mapping(record.get("seconds", {}), "seconds")
     seconds = Seconds(
-        *(_positive(read, times.get(k, 0.0), f"seconds.{k}") for k in ("total", "ground", "solve"))
+        *(
+            read.not_negative(times.get(k, 0.0), f"seconds.{k}")
+            for k in ("total", "ground", "solve")
+        )
     )
     sizes = read.mapping(record.get("grounding", {}), "grounding")
     grounding = Grounding(
-        *(_whole(read, sizes.get(k, 0), f"grounding.{k}") for k in ("rules", "atoms"))
+        *(read.whole(sizes.get(k, 0), f"grounding.{k}") for k in ("rules", "atoms"))
     )
     evidence = {
         kind: {
-            k: _whole(read, v, f"evidence.{kind}.{k}")
+            k: read.whole(v, f"evidence.{kind}.{k}")
             for k, v in read.mapping(said, f"evidence.{kind}").items()
         }
         for kind, said in read.mapping(record.get("evidence", {}), "evidence").items()
@@ -282,7 +266,7 @@ def levels_in(read: FieldReader, record: Mapping[str, Any], maps: int) -> tuple[
     found = tuple(
         Level(
             cost_in(read, level.get("cost"), f"levels[{i}].cost"),
-            _whole(read, level.get("count"), f"levels[{i}].count"),
+            read.whole(level.get("count"), f"levels[{i}].count"),
             complete,
         )
         for i, level in enumerate(levels)
@@ -291,11 +275,3 @@ def levels_in(read: FieldReader, record: Mapping[str, Any], maps: int) -> tuple[
     if sum(counts) != maps:
         raise read.wrong("levels", f"{maps} maps in all, the number of listed maps", counts)
     return found
-
-
-def _positive(read: FieldReader, value: Any, name: str) -> float:
-    """Read a number, 0 or more. Raises MapError."""
-    number = read.number(value, name)
-    if number < 0:
-        raise read.wrong(name, "a number, 0 or more", value)
-    return number

@@ -8,7 +8,6 @@ one that costs 3 nats more is exp(3) = 20 times less probable.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -222,9 +221,11 @@ class Weighed:
         rivals = tuple(
             _rival(read, rival, f"weighed.rivals[{i}]", steps) for i, rival in enumerate(written)
         )
-        bound, within = (_number(read, record, name, "weighed") for name in ("bound", "within"))
-        broken = _number(read, record, "broken", "weighed") if "broken" in record else -math.inf
-        excess = _number(read, record, "excess", "weighed") if "excess" in record else 1.0
+        bound, within = (read.number(record.get(k), f"weighed.{k}") for k in ("bound", "within"))
+        broken = (
+            read.number(record["broken"], "weighed.broken") if "broken" in record else -math.inf
+        )
+        excess = read.number(record.get("excess", 1.0), "weighed.excess")
         if excess < 1:
             raise read.wrong("weighed.excess", "a number of at least 1", excess)
         doubt = record.get("doubt")
@@ -245,12 +246,12 @@ def _rival(read: FieldReader, value: Any, name: str, steps: int) -> Rival:
     """Read a rival from the field `name`. Raises MapError."""
     record = read.mapping(value, name)
     dstates, places = (
-        _names(read, record.get(field, default), f"{name}.{field}")
+        read.integers(record.get(field, default), f"{name}.{field}")
         for field, default in (("dstates", None), ("places", []))
     )
     if len(dstates) != steps or len(places) not in (0, steps):
         raise read.wrong(name, f"the dstates and places of {steps} steps", value)
-    nats = _number(read, record, "nats", name)
+    nats = read.number(record.get("nats"), f"{name}.nats")
     faults = _faults(read, record.get("faults", []), f"{name}.faults")
     return Rival(nats, dstates, places, bool(record.get("estimated", False)), faults)
 
@@ -262,18 +263,3 @@ def _faults(read: FieldReader, value: Any, name: str) -> tuple[tuple[str, int], 
     ):
         raise read.wrong(name, 'a list of faults such as ["jumped", 7]', value)
     return tuple((kind, read.integer(step, name)) for kind, step in value)
-
-
-def _names(read: FieldReader, value: Any, name: str) -> tuple[int, ...]:
-    """Read the dstates or places of all steps, as numbers. Raises MapError."""
-    if not isinstance(value, list):
-        raise read.wrong(name, "a list of numbers", value)
-    return tuple(read.integer(x, f"{name}[{i}]") for i, x in enumerate(value))
-
-
-def _number(read: FieldReader, record: Mapping[Any, Any], name: str, where: str) -> float:
-    """Read a finite number from a field of a record. Raises MapError."""
-    value = record.get(name)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise read.wrong(f"{where}.{name}", "a number", value)
-    return float(value)
