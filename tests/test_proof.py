@@ -40,11 +40,10 @@ def test_what_the_solver_writes_holds(trace: Trace) -> None:
         bound = check_bound(trace, solution.certificate.to_dict(trace))
         assert bound.faults == ()
         if solution.cost is not None:  # boundary axioms leave some random traces without any map
-            assert (
-                bound.dstates + len(bound.refuted)
-                == solution.certificate.bound
-                == solution.cost.dstates
-            )
+            proven = bound.dstates + len(bound.refuted)
+            assert proven == solution.certificate.bound <= solution.cost.dstates
+            # The cheapest map may have more dstates than the smallest one.
+            assert solution.weighed is not None or proven == solution.cost.dstates
 
 
 @pytest.mark.parametrize("length", [12, 120])
