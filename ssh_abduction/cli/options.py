@@ -155,13 +155,13 @@ def add_trace(parser: argparse.ArgumentParser, needs: str = "") -> None:
         needs: What a step of the trace needs that the trace in a file of maps lacks, in words; if
             it is empty, that trace is enough (`solved_trace`).
     """
-    kept = "folder" if needs else "file or folder"
+    by = "map" if needs else "solve -o or map"
     parser.add_argument(
         "trace",
         nargs="?",
         type=trace_path,
-        help=f"trace file (JSON Lines){needs}, or - for standard input (default: the trace in the "
-        f"{kept} of the maps)",
+        help=f"trace file (JSON Lines){needs}, or - for standard input (default: the trace that "
+        f"{by} wrote with the maps)",
     )
 
 
