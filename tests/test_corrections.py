@@ -255,10 +255,14 @@ def test_gateways_are_opened_and_closed(folder: Path, capsys: pytest.CaptureFixt
     capsys.readouterr()
     # The robot came to the corner from behind: that gateway is open.
     for way in ("round:1 back", "round:2 ahead"):
-        file.unlink()
-        assert main(["correct", maps, "--closed", way]) == 0
-        assert main(solving(folder, "round")) == 1
+        file.unlink(missing_ok=True)
+        assert main(["correct", maps, "--closed", way]) == 1
         assert "it contradicts the trace: the robot" in capsys.readouterr().err
+        assert not file.exists()
+    # So does a file that a person wrote.
+    save_corrections(Corrections.for_drives(ROUND).with_gateway(False, [("round:1", 180.0)]), file)
+    assert main(solving(folder, "round")) == 1
+    assert "it contradicts the trace: the robot" in capsys.readouterr().err
 
 
 def test_verbs_with_the_recorded_trace_obey_what_was_said_of_its_stars(

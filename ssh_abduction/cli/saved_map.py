@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ssh_abduction.cli.options import maps_path, read_maps
+from ssh_abduction.cli.options import maps_path, read_maps, trace_of_maps
 from ssh_abduction.data.corrections import Corrections
 from ssh_abduction.data.corrections_file import FILE, direction, load_corrections, save_corrections
 from ssh_abduction.data.drives import Drive, step_name, step_of
@@ -77,8 +77,14 @@ class SavedMap:
         )
 
     def save(self, corrections: Corrections) -> Path:
-        """Write the corrections beside the map, after a check. Returns their file."""
+        """Write the corrections beside the map, after a check. Returns their file.
+
+        Raises:
+            MapError: A gateway contradicts the trace; or a drive or a step is unknown.
+        """
         corrections.known_in(self.drives)
+        if (trace := trace_of_maps(str(self.file))) is not None:
+            corrections.corrected(trace)
         file = self.file.parent / FILE
         save_corrections(corrections, file)
         return file

@@ -286,7 +286,9 @@ class Corrections:
                 step = steps[t]
                 star = step.star
                 if star is None:
-                    raise self._contradicted(said, f"{name} has no star; leave it out")
+                    raise self._contradicted(
+                        said, f"{name} has no star; record stars (gateways), or leave it out"
+                    )
                 changed = with_gateway(star, way, is_open=said.is_open)
                 if changed != star:
                     extra = {SEEN: star_to_json(star), **step.extra}
