@@ -90,7 +90,7 @@ def joins_by_minimality(
     """
     checked_trace(trace)
     check_of_trace([checked_map(ssh_map)], trace, "joins_by_minimality", views=False)
-    return _Joining(trace, ssh_map, checked_theory(theory)).joins()
+    return _JoinCollector(trace, ssh_map, checked_theory(theory)).joins()
 
 
 def joins_in_words(joins: Sequence[Join], maps: int = 1, *, minimal: bool = False) -> str:
@@ -142,7 +142,7 @@ class _StepClasses:
         return self.of(first) == self.of(second)
 
 
-class _Joining:
+class _JoinCollector:
     """Reads a trace step by step, and collects the joins that do not follow from earlier ones.
 
     Attributes:

@@ -39,7 +39,7 @@ BEAM = 3
 
 
 @dataclass(frozen=True, slots=True)
-class _State:
+class _StreetDrawing:
     """A drawing in the search that separates streets: its cost, and the positions, (spots, 2).
 
     `conditions` are the inequalities that were added, `left_alone` the pairs of streets that may
@@ -95,7 +95,7 @@ class StreetProgram:
         This is a beam search. For each pair of streets that are too near, it tries to leave the
         pair alone, and to move one street to either side of the other.
         """
-        best = _State(self.value, self.at, (), frozenset())
+        best = _StreetDrawing(self.value, self.at, (), frozenset())
         beam, left = [best], max(FEWEST, WORK // (len(self.ends) + 1))
         while beam and left > 0:
             children = []
@@ -107,7 +107,7 @@ class StreetProgram:
                 for condition in self._ways_apart(*pair):
                     conditions = (*state.conditions, *condition)
                     at, value = self._solved(conditions)
-                    children.append(_State(value, at, conditions, state.left_alone))
+                    children.append(_StreetDrawing(value, at, conditions, state.left_alone))
                     left -= 1
             beam = sorted(children, key=lambda state: state.value)[:BEAM]
             best = min([best, *beam], key=lambda state: state.value)

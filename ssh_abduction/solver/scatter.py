@@ -161,7 +161,7 @@ def _without_rigid_motions(poses: Array, piece: NDArray[np.int_]) -> Array:
     return matrix
 
 
-def _parts(problem: Problem, track: _LinearTrack, visit: NDArray[np.int_]) -> list[_Part]:
+def _parts(problem: Problem, track: _LinearTrack, visit: NDArray[np.int_]) -> list[_MovedPoints]:
     """Return the problems of dstates and of places."""
     theory, steps = problem.theory, problem.trace.steps
     dstate, place, _ = theory.prices
@@ -175,7 +175,7 @@ def _parts(problem: Problem, track: _LinearTrack, visit: NDArray[np.int_]) -> li
         fees[[step.view is None for step in steps]] = 0.0
     weights = np.array([1 - PLACES * has_places] * 2 + [1.0])
     scatter = track.scatter / weights
-    parts = [_Part(track.poses, scatter, kinds, fees, dstate, track.piece, track.moves)]
+    parts = [_MovedPoints(track.poses, scatter, kinds, fees, dstate, track.piece, track.moves)]
     if has_places:
         together = np.column_stack([visit, track.piece])
         _, first, at, count = np.unique(
@@ -187,12 +187,12 @@ def _parts(problem: Problem, track: _LinearTrack, visit: NDArray[np.int_]) -> li
         scatter = track.scatter[first, :2] / count[:, None] / PLACES
         points, alike = mean @ track.poses[:, :2], np.zeros(len(first), dtype=int)
         free = np.zeros(len(first))
-        parts.append(_Part(points, scatter, alike, free, place, track.piece[first], moves))
+        parts.append(_MovedPoints(points, scatter, alike, free, place, track.piece[first], moves))
     return parts
 
 
 @dataclass(frozen=True, eq=False)
-class _Part(Facilities):
+class _MovedPoints(Facilities):
     """Points that share facilities, and how errors of the track move them.
 
     Attributes:
@@ -203,7 +203,7 @@ class _Part(Facilities):
     piece: NDArray[np.int_]
     moves: Array
 
-    def only(self, chosen: NDArray[np.bool_]) -> _Part:
+    def only(self, chosen: NDArray[np.bool_]) -> _MovedPoints:
         """Return some of the points."""
         return replace(
             self,
@@ -215,7 +215,7 @@ class _Part(Facilities):
             moves=self.moves[chosen],
         )
 
-    def of_best_pieces(self) -> tuple[_Part, Array, Array]:
+    def of_best_pieces(self) -> tuple[_MovedPoints, Array, Array]:
         """Return the points of one piece for each kind: the piece with the greatest shares.
 
         If points pay fees, it is one piece for all kinds. Also return approximate shares of the
@@ -244,7 +244,7 @@ class _Part(Facilities):
         moved = (self.moves[i] - self.moves[others]) / np.sqrt(2 * self.variances[i])[:, None]
         return _dominating(moved[:, :2]) + _dominating(moved[:, 2:])
 
-    def stretched(self, factors: Array) -> _Part:
+    def stretched(self, factors: Array) -> _MovedPoints:
         """Multiply the variances of each point."""
         return replace(self, variances=self.variances * factors[:, None])
 
@@ -261,13 +261,13 @@ class _Losses:
         far: Twice what each point loses against the other points, (n, k, k).
     """
 
-    part: _Part
+    part: _MovedPoints
     most: Array
     near: Array
     far: Array
 
     @classmethod
-    def of(cls, part: _Part, first: Array, gap: float, within: float) -> _Losses:
+    def of(cls, part: _MovedPoints, first: Array, gap: float, within: float) -> _Losses:
         """Bound the losses.
 
         Args:
