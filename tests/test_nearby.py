@@ -266,7 +266,7 @@ def test_a_guess_at_the_beginning_of_a_long_trace_goes_on_if_it_can(
 def test_of_a_long_trace_clingo_is_given_some_links_at_a_time() -> None:
     """The simplest links come first, and the search may end before clingo has all. The map is a
     guess, or from clingo."""
-    walk = maze(3, 3, steps=700, seed=1, loops=0.3)
+    walk = maze(3, 3, steps=500, seed=1, loops=0.3)
     given: list[int] = []
     add = name_program.NameProgram.add
 

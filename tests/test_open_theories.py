@@ -69,7 +69,7 @@ def test_an_axiom_that_nothing_knows_is_obeyed(name: str, toy: Toy, data: st.Dat
         else with_toy(TOYS[0], THEORIES[name])
     )
     allows = TOYS[0].allows if toy.rules not in theory.rules else toy.allows
-    trace = data.draw(traces(max_steps=6), label="trace")
+    trace = data.draw(traces(max_steps=5), label="trace")
     mapper: OnlineMapper | None = None
     with patch.object(prefixes, "FIRST_PREFIX", 1), patch.object(choosing, "FEW_STEPS", 0):
         for steps in range(1, len(trace) + 1):
