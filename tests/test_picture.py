@@ -216,7 +216,7 @@ def test_each_place_of_a_large_map_is_named() -> None:
 
 
 def test_maps_without_poses_are_drawn_as_before() -> None:
-    (without,) = solve(drive(*TOURS["comb"]), Theory.circumscriptive()).maps
+    (without,) = solve(drive(*TOURS["tee"]), Theory.circumscriptive()).maps
     before = to_svg(without)
     poses = [Pose(0.1 * s.id, 0.0, 0.0) for s in without.dstates]
     assert to_svg(replace(without, fit=Fit(1.0, 1, 0.5))) == before

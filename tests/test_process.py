@@ -126,9 +126,9 @@ def test_a_process_that_is_killed_stops_the_search() -> None:
 
 def test_what_is_left_of_the_memory_is_that_of_the_process() -> None:
     """It does not count the memory of this process."""
-    held = b"x" * (300 * 2**20)
-    limited = Watch(memory=peak_memory() + 200)
+    held = b"x" * (150 * 2**20)
+    limited = Watch(memory=peak_memory() + 100)
     assert in_process(use_memory, 10, watch=limited) == 10
     with pytest.raises(LimitError, match="memory"):
-        in_process(use_memory, 400, watch=limited)
+        in_process(use_memory, 200, watch=limited)
     del held
