@@ -539,32 +539,18 @@ def test_import_takes_several_topics(tmp_path: Path, capsys: pytest.CaptureFixtu
     path = bag(tmp_path / "two", lambda m: two_lasers(m, "/front", "/rear"))
     assert (
         main(
-            [
-                "import",
-                str(path),
-                "--set",
-                "scan_topic=/front",
-                "--set",
-                "scan_topic=/none",
-                "-o",
-                str(tmp_path / "t"),
-            ]
+            (
+                f"import {path} --set scan_topic=/front --set scan_topic=/none -o {tmp_path / 't'}"
+            ).split()
         )
         == 1
     )
     assert "expected a topic of LaserScan, got '/none'" in capsys.readouterr().err
     assert (
         main(
-            [
-                "import",
-                str(path),
-                "--set",
-                "scan_topic=/front",
-                "--set",
-                "scan_topic=/rear",
-                "-o",
-                str(tmp_path / "t"),
-            ]
+            (
+                f"import {path} --set scan_topic=/front --set scan_topic=/rear -o {tmp_path / 't'}"
+            ).split()
         )
         == 1
     )

@@ -494,18 +494,10 @@ def test_simulate_writes_logs_that_can_be_read(
     (tmp_path / "school.xml").write_text(xml())
     assert (
         main(
-            [
-                "simulate",
-                str(tmp_path / "school.xml"),
-                "--format",
-                "carmen",
-                "--set",
-                "scale_error=0.1",
-                "--set",
-                "every=2",
-                "-o",
-                str(tmp_path / "run.log.gz"),
-            ]
+            (
+                f"simulate {tmp_path / 'school.xml'} --format carmen --set scale_error=0.1 "
+                f"--set every=2 -o {tmp_path / 'run.log.gz'}"
+            ).split()
         )
         == 0
     )

@@ -124,6 +124,13 @@ def test_the_checker_judges_the_listed_floors() -> None:
     assert any("no lifts" in v.message for v in check(flat, listed, theory))
 
 
+def test_the_checker_rejects_a_lift_that_stays_on_its_floor() -> None:
+    trace = Trace.from_steps("aa", [UP])
+    stays = solve(trace, Theory.causal().replace(without=("other_floor",))).maps[0]
+    assert stays.dstate_at == (0, 0)
+    assert "other_floor" in {v.axiom for v in check(trace, stays, Theory.causal())}
+
+
 def test_each_floor_has_a_frame_of_its_own() -> None:
     with pytest.raises(TraceError, match="step 1: displacement: expected none on the first step"):
         Trace.from_steps("ab", [UP], displacements=[(1, 0, 0)])

@@ -464,14 +464,7 @@ def test_clustering_into_another_folder_keeps_the_images(
     (tmp_path / "views").mkdir()
     assert (
         main(
-            [
-                "cluster",
-                str(tmp_path / "run.jsonl"),
-                "-o",
-                str(tmp_path / "views" / "v.jsonl"),
-                "--k",
-                "4",
-            ]
+            (f"cluster {tmp_path / 'run.jsonl'} -o {tmp_path / 'views' / 'v.jsonl'} --k 4").split()
         )
         == 0
     )
@@ -590,33 +583,15 @@ def test_from_simulation_to_recognition_in_the_shell(
         return str(tmp_path / name)
 
     assert (
-        main(
-            [
-                "simulate",
-                "notched-rectangle",
-                "--tours",
-                "6",
-                "--seed",
-                "3",
-                "-o",
-                path("run.jsonl"),
-            ]
-        )
-        == 0
+        main(f"simulate notched-rectangle --tours 6 --seed 3 -o {path('run.jsonl')}".split()) == 0
     )
     assert "48 images of notched rectangle" in capsys.readouterr().out
     assert (
         main(
-            [
-                "cluster",
-                path("run.jsonl"),
-                "-o",
-                path("views.jsonl"),
-                "--set",
-                "k_max=8",
-                "--plot",
-                path("fig.png"),
-            ]
+            (
+                f"cluster {path('run.jsonl')} -o {path('views.jsonl')} --set k_max=8 "
+                f"--plot {path('fig.png')}"
+            ).split()
         )
         == 0
     )
@@ -638,16 +613,10 @@ def test_from_simulation_to_recognition_in_the_shell(
     )
     assert (
         main(
-            [
-                "learning-curve",
-                path("maps.json"),
-                path("views.jsonl"),
-                "--set",
-                "folds=2",
-                "--json",
-                "--plot",
-                path("curve.png"),
-            ]
+            (
+                f"learning-curve {path('maps.json')} {path('views.jsonl')} --set folds=2 "
+                f"--json --plot {path('curve.png')}"
+            ).split()
         )
         == 0
     )
@@ -666,19 +635,7 @@ def test_from_simulation_to_recognition_in_the_shell(
         "fold",
     ]
     assert (
-        main(
-            [
-                "simulate",
-                "notched-rectangle",
-                "--tours",
-                "2",
-                "--seed",
-                "4",
-                "-o",
-                path("other.jsonl"),
-            ]
-        )
-        == 0
+        main(f"simulate notched-rectangle --tours 2 --seed 4 -o {path('other.jsonl')}".split()) == 0
     )
     capsys.readouterr()
     assert main(["recognise", path("recogniser.skops"), path("other.jsonl"), "--json"]) == 0
@@ -728,14 +685,7 @@ def test_errors_of_the_wings_are_one_line(
             "tours: expected a whole number from 1 to 100,000",
         ),
         (
-            [
-                "simulate",
-                "notched-rectangle",
-                "--route",
-                "travel,travel",
-                "-o",
-                str(tmp_path / "x"),
-            ],
+            f"simulate notched-rectangle --route travel,travel -o {tmp_path / 'x'}".split(),
             "expected a free way ahead, got a wall",
         ),
         (["cluster", str(trace), "-o", str(tmp_path / "x")], "image: expected one, got none"),
@@ -767,18 +717,9 @@ def test_reproduce_writes_the_page_and_all_that_made_it(
     monkeypatch.setattr(
         "ssh_abduction.evaluation.paper.report.measure", lambda *asked: known[asked]
     )
-    words = [
-        "reproduce",
-        "notched-rectangle",
-        "--seeds",
-        "500",
-        "--jobs",
-        "1",
-        "--set",
-        "outcomes=false",
-        "-o",
-        str(tmp_path),
-    ]
+    words = (
+        f"reproduce notched-rectangle --seeds 500 --jobs 1 --set outcomes=false -o {tmp_path}"
+    ).split()
     assert main(words) == 0
     out = capsys.readouterr().out
     assert "k chosen by M" in out

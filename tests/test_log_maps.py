@@ -248,22 +248,7 @@ def test_a_run_is_done_once_and_bad_logs_do_not_stop_the_others(
     hall: Path, runs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bad = hall.with_name("bad.log")
-    assert (
-        main(
-            [
-                "map",
-                str(hall),
-                str(bad),
-                "-o",
-                str(runs),
-                "--set",
-                "ladder=false",
-                "--time-limit",
-                "1000",
-            ]
-        )
-        == 1
-    )
+    assert main(f"map {hall} {bad} -o {runs} --set ladder=false --time-limit 1000".split()) == 1
     told = capsys.readouterr()
     assert f"{hall}: done already, in {runs / 'hall'}" in told.out
     assert f"{bad}: expected a robot's log" in told.out

@@ -166,21 +166,7 @@ def test_every_verb_that_writes_writes_into_a_pipe(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = tmp_path / "run.jsonl"
-    assert (
-        main(
-            [
-                "simulate",
-                "notched-rectangle",
-                "--tours",
-                "2",
-                "--set",
-                "stars=false",
-                "-o",
-                str(run),
-            ]
-        )
-        == 0
-    )
+    assert main(f"simulate notched-rectangle --tours 2 --set stars=false -o {run}".split()) == 0
     views = tmp_path / "views.jsonl"
     assert main(["cluster", str(run), "--k", "4", "-o", str(views)]) == 0
     capsys.readouterr()

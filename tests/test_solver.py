@@ -81,7 +81,7 @@ def clock() -> Iterator[Callable[[float], None]]:
 
 
 @pytest.mark.parametrize("theory", THEORIES.values(), ids=THEORIES)
-@pytest.mark.parametrize("tour", TOURS)
+@pytest.mark.parametrize("tour", ["square", "tee", "comb"])
 def test_prefixes_give_what_solving_at_once_gives(tour: str, theory: Theory) -> None:
     world, place, heading, actions = TOURS[tour]
     trace = drive(world, place, heading, actions, stars=theory.level == "topological")

@@ -55,7 +55,7 @@ def test_a_stream_has_the_visits_of_the_whole_log(name: str) -> None:
 
 
 def test_a_visit_is_final_soon_after_it() -> None:
-    log, fed = log_of(FORK, [(1, 0), (18, 0), (10, 0), (10, 8), (10, 0)] * 2)[0], 0
+    log, fed = log_of(FORK, [(1, 0), (18, 0), (10, 0), (10, 8), (10, 0), (1, 0)])[0], 0
 
     def scans() -> Iterator[Scan | Damage]:
         nonlocal fed
