@@ -260,7 +260,8 @@ def test_map_log_says_what_it_takes(given: Any, names: Any, said: str) -> None:
 
 def test_the_report_names_a_drive_that_shares_nothing() -> None:
     drives = [("monday", "ab"), ("tuesday", "xy")]
-    joint = together([Trace.from_steps(views, ["travel"], name=name) for name, views in drives])
+    with pytest.warns(UserWarning, match="no view in common"):
+        joint = together([Trace.from_steps(views, ["travel"], name=name) for name, views in drives])
     run = {"drives": [{"scans": 9, "metres": 5.0, "visits": 2, "steps": 2}] * 2}
     imported: Any = SimpleNamespace(trace=joint)
     told = "".join(log_report._drives(imported, solve(joint, Theory.causal()), run))
