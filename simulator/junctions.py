@@ -25,12 +25,12 @@ from simulator.surroundings import (
     Panorama,
     Place,
     Street,
-    apart,
     compass,
     points_of,
     streets_of,
     walls_of,
 )
+from ssh_abduction.data.odometry import radians_between
 from ssh_abduction.data.trace import Action
 
 # Radians between two images of a turn.
@@ -173,9 +173,11 @@ class Pilot:
             streets = streets_of(walls_of(points, beams), points, reach, 0.0)
             course_off = course - robot.odometry[2]
             street = min(
-                streets, key=lambda street: apart(street.bearing, course_off), default=None
+                streets,
+                key=lambda street: radians_between(street.bearing, course_off),
+                default=None,
             )
-            if street is not None and apart(street.bearing, course_off) <= STRAIGHT:
+            if street is not None and radians_between(street.bearing, course_off) <= STRAIGHT:
                 course = robot.odometry[2] + street.bearing
                 self.driver.go(STRIDE, _steer(street))
             else:

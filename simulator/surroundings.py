@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulator.laser import BEARINGS
+from ssh_abduction.data.odometry import radians_between
 
 Array = NDArray[np.float64]
 # Largest distance in metres of points from the line of their wall: six times the noise of the
@@ -133,14 +134,9 @@ def streets_of(
     for street in sorted(
         _between(walls, points, reach, farther), key=lambda street: -street.length
     ):
-        if all(apart(street.bearing, other.bearing) > STRAIGHT for other in found):
+        if all(radians_between(street.bearing, other.bearing) > STRAIGHT for other in found):
             found.append(street)
     return sorted(found, key=lambda street: -street.bearing)
-
-
-def apart(one: float, other: float) -> float:
-    """Compute the angle between two directions in radians, from 0 to pi."""
-    return abs(math.remainder(one - other, math.tau))
 
 
 def _straight(points: NDArray[np.complex128]) -> Iterator[Wall]:
@@ -183,7 +179,7 @@ def _between(
     """
     # Rotate both walls so that the street points along the real axis.
     for right, left in permutations(walls, 2):
-        if apart(cmath.phase(right.way), cmath.phase(-left.way)) > PARALLEL:
+        if radians_between(cmath.phase(right.way), cmath.phase(-left.way)) > PARALLEL:
             continue
         along = right.way - left.way
         along /= abs(along)
@@ -251,12 +247,12 @@ class Place:
         return out + [
             bearing + math.pi
             for bearing in out
-            if all(apart(bearing + math.pi, other) > STRAIGHT for other in out)
+            if all(radians_between(bearing + math.pi, other) > STRAIGHT for other in out)
         ]
 
     def heading(self, about: float) -> float:
         """Find the heading of a dstate that is nearest to a heading, both in radians."""
-        return min(self.headings, key=lambda heading: apart(heading, about))
+        return min(self.headings, key=lambda heading: radians_between(heading, about))
 
     def beside(self, heading: float, side: int) -> float | None:
         """Measure the turn to the next street on a side.
@@ -277,7 +273,7 @@ class Place:
 
     def faces(self, heading: float) -> bool:
         """Check whether a street is straight ahead, with a heading in radians."""
-        return any(apart(street.bearing, heading) <= STRAIGHT for street in self.streets)
+        return any(radians_between(street.bearing, heading) <= STRAIGHT for street in self.streets)
 
 
 def _meeting(streets: Sequence[Street]) -> complex | None:
@@ -285,7 +281,10 @@ def _meeting(streets: Sequence[Street]) -> complex | None:
 
     None if two streets are one that goes straight on.
     """
-    if len(streets) == 2 and apart(streets[0].bearing, streets[1].bearing + math.pi) <= STRAIGHT:
+    if (
+        len(streets) == 2
+        and radians_between(streets[0].bearing, streets[1].bearing + math.pi) <= STRAIGHT
+    ):
         return None
     across = np.array([1j * cmath.rect(1, street.bearing) for street in streets])
     offsets = np.array([street.middle for street in streets])

@@ -14,9 +14,10 @@ from perception.places.local_map import CELL, Patch
 from perception.places.skeleton import junctions
 from perception.places.stays import joined
 from perception.places.track import Track
-from perception.places.visits import Visit, Way, apart
+from perception.places.visits import Visit, Way
 from perception.readers.scans import LaserScanner, RobotLog, Scan
 from simulator.laser import meetings
+from ssh_abduction.data.odometry import radians_between
 
 ROOM = 0.25  # half of the robot's width in metres
 BEARINGS = np.radians(np.arange(-180.0, 180.0, 2.0))
@@ -74,7 +75,7 @@ def test_junctions_are_where_ways_part(patch: Patch, bearings: list[float]) -> N
         ways = [np.arctan2(*(branch[-1] - junction.middle)[::-1]) for branch in junction.branches]
         assert len(ways) == len(bearings)
         for bearing in np.radians(bearings):
-            assert min(apart(way, bearing) for way in ways) < math.radians(20)
+            assert min(radians_between(way, bearing) for way in ways) < math.radians(20)
 
 
 HALL = (-6.0, -6.0, 6.0, 6.0)
@@ -148,8 +149,8 @@ def test_a_corner_of_a_corridor_is_a_junction_of_two_ways(degrees: int, ways: in
             (np.arctan2(*(branch[-1] - corner.middle)[::-1]) for branch in corner.branches),
             key=lambda way: -abs(way),
         )
-        assert apart(back, math.pi) < math.radians(15)
-        assert apart(ahead, math.radians(degrees)) < math.radians(15)
+        assert radians_between(back, math.pi) < math.radians(15)
+        assert radians_between(ahead, math.radians(degrees)) < math.radians(15)
 
 
 def log_of(walls: Segments, way: list[tuple[float, float]]) -> tuple[RobotLog, Track]:

@@ -1,4 +1,4 @@
-"""A name means one thing: no two classes of the packages share a name."""
+"""A name means one thing: no two classes share a name, and no two public functions."""
 
 from __future__ import annotations
 
@@ -9,18 +9,29 @@ from pathlib import Path
 ROOT = Path(__file__).parent.parent
 
 
-def classes() -> list[str]:
-    """The names of all classes at the top of a module, without leading underscores."""
+# Modules of one kind have these: verbs of the shell, readers of logs, and workers.
+IN_EACH = {"add_parser", "run", "read", "serve"}
+
+
+def names(kind: type[ast.ClassDef | ast.FunctionDef]) -> list[str]:
+    """The names of all classes, or functions, at the top of a module."""
     return [
-        node.name.lstrip("_")
+        node.name
         for folder in ("ssh_abduction", "perception", "simulator")
         for path in sorted((ROOT / folder).rglob("*.py"))
         for node in ast.parse(path.read_text(encoding="utf-8")).body
-        if isinstance(node, ast.ClassDef)
+        if isinstance(node, kind)
     ]
 
 
 def test_no_two_classes_share_a_name() -> None:
-    found = Counter(classes())
+    found = Counter(name.lstrip("_") for name in names(ast.ClassDef))
     assert len(found) > 400
     assert {name: count for name, count in found.items() if count > 1} == {}
+
+
+def test_no_two_public_functions_share_a_name() -> None:
+    found = Counter(name for name in names(ast.FunctionDef) if not name.startswith("_"))
+    assert len(found) > 400
+    shared = {name: count for name, count in found.items() if count > 1 and name not in IN_EACH}
+    assert shared == {}

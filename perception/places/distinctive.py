@@ -26,8 +26,9 @@ from perception.places.recent import Recent
 from perception.places.skeleton import Junction, junctions
 from perception.places.stays import AROUND, RIM, SAME, SHARE, SMALL, Stays
 from perception.places.track import Array, Track
-from perception.places.visits import MERGED, Visit, Way, apart
+from perception.places.visits import MERGED, Visit, Way
 from perception.readers.scans import Pose, RobotLog, Scan
+from ssh_abduction.data.odometry import radians_between
 
 # The usual width of a robot in metres. It has to fit through the doors that the robot uses.
 WIDTH = 0.5
@@ -293,9 +294,9 @@ def _ways(sightings: Sequence[_Sighting], radius: float) -> tuple[Way, ...]:
     groups: list[list[float]] = []
     for sighting in sightings:
         for bearing in _bearings(sighting.junction, radius):
-            near = [group for group in groups if apart(_mean(group), bearing) < MERGED]
+            near = [group for group in groups if radians_between(_mean(group), bearing) < MERGED]
             if near:
-                min(near, key=lambda group: apart(_mean(group), bearing)).append(bearing)
+                min(near, key=lambda group: radians_between(_mean(group), bearing)).append(bearing)
             else:
                 groups.append([bearing])
     ways = [Way(_mean(group), len(group) >= AGREED * len(sightings)) for group in groups]

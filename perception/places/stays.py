@@ -16,7 +16,8 @@ import numpy as np
 
 from perception.places.local_map import LocalMaps, PackedPatch
 from perception.places.recent import Recent
-from perception.places.visits import MERGED, Visit, Way, apart
+from perception.places.visits import MERGED, Visit, Way
+from ssh_abduction.data.odometry import radians_between
 
 # Junctions are one place within SAME metres, or within this share of the smaller radius.
 SAME, SHARE = 0.6, 0.5
@@ -155,7 +156,7 @@ class Stays:
         there, back = here - first, last - here
         if min(math.hypot(*there), math.hypot(*back)) <= stride / 3:
             return 0.0
-        return apart(math.atan2(there[1], there[0]), math.atan2(back[1], back[0]))
+        return radians_between(math.atan2(there[1], there[0]), math.atan2(back[1], back[0]))
 
     def _limit(self, horizon: int | None) -> int:
         """Find the scan before which all visits and turns can be completed now."""
@@ -292,10 +293,10 @@ def taken(ways: list[Way], bearing: float) -> int:
 
     The way with nearly this bearing becomes sure. If there is none, a new way is added.
     """
-    near = [k for k in range(len(ways)) if apart(ways[k].bearing, bearing) < MERGED]
+    near = [k for k in range(len(ways)) if radians_between(ways[k].bearing, bearing) < MERGED]
     if not near:
         ways.append(Way(bearing))
         return len(ways) - 1
-    k = min(near, key=lambda k: apart(ways[k].bearing, bearing))
+    k = min(near, key=lambda k: radians_between(ways[k].bearing, bearing))
     ways[k] = replace(ways[k], sure=True)
     return k

@@ -17,10 +17,16 @@ import numpy as np
 from perception.places.closures import NOISE, VisitMatch, relative, uncertainty
 from perception.places.local_map import CELL, PackedPatch
 from perception.places.track import Array, Track, points_turned, wrapped
-from perception.places.visits import Visit, apart, patches_of
+from perception.places.visits import Visit, patches_of
 from perception.readers.scans import Pose, RobotLog
 from ssh_abduction.data.closure import Closure
-from ssh_abduction.data.odometry import Covariance, Odometry, displacement_between, moved
+from ssh_abduction.data.odometry import (
+    Covariance,
+    Odometry,
+    displacement_between,
+    moved,
+    radians_between,
+)
 from ssh_abduction.data.star import Gateway
 from ssh_abduction.data.trace import Action, Step, Trace
 
@@ -115,7 +121,7 @@ def _headings(visit: Visit, track: Track) -> list[float]:
     """
     came = [] if visit.arrived is None else [wrapped(visit.ways[visit.arrived].bearing + math.pi)]
     went = [] if visit.left is None else [visit.ways[visit.left].bearing]
-    if came and went and apart(came[0], went[0]) < AHEAD:
+    if came and went and radians_between(came[0], went[0]) < AHEAD:
         went = []
     return [*came, *went] or [float(track.poses[visit.scan, 2])]
 

@@ -75,8 +75,3 @@ def patches_of(visits: Sequence[Visit]) -> list[PackedPatch]:
             "those of find_visits or stream_visits"
         )
     return found
-
-
-def apart(a: float, b: float) -> float:
-    """Compute the angle between two directions in radians, from 0 to pi."""
-    return abs((a - b + math.pi) % (2 * math.pi) - math.pi)

@@ -229,6 +229,11 @@ def displacement_between(start: Pose, end: Pose) -> Displacement:
     return cos * dx + sin * dy, cos * dy - sin * dx, math.remainder(end[2] - start[2], math.tau)
 
 
+def radians_between(a: float, b: float) -> float:
+    """Return the angle between two directions in radians, from 0 to pi."""
+    return abs((a - b + math.pi) % (2 * math.pi) - math.pi)
+
+
 def in_words(displacement: Displacement) -> str:
     """Describe a displacement in words: metres to the nearest 0.1, and whole degrees.
 
