@@ -11,6 +11,7 @@ facility location problem").
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 from typing import Any, TypeAlias
@@ -28,7 +29,7 @@ Array: TypeAlias = NDArray[np.float64]
 ROUNDS, ENOUGH, RETRIES = 40, 0.003, 3
 # Boxes first have half sides of these lengths, in metres, metres and radians. They are halved until
 # no facility in one saves more than TOLERANCE beyond its price, and at most BOXES are looked at.
-HALF, TOLERANCE, BOXES = (0.25, 0.25, 0.1), 0.01, 300_000
+HALF, TOLERANCE, BOXES = (0.25, 0.25, 0.1), 0.003, 300_000
 AT_ONCE = 2000
 TINY = 1e-9
 # A facility moves at most STEPS times, until it moves by less than STILL.
@@ -71,11 +72,15 @@ class Facilities:
         """Compute approximate shares, without a search of all space.
 
         Returns:
-            The shares, (n,), and what each point pays in the cheapest clustering, (n,). Clusters
-            may be taken in parts there.
+            The shares, (n,), and what each point pays for each of its coordinates in the cheapest
+            clustering, (n, d). Clusters may be taken in parts there.
         """
-        program = _Program(self.price, np.full(len(self.points), self.price))
-        return self._approximate(program, *self._starts()), program.pays()
+        program, pays = _Program(self.price, np.full(len(self.points), self.price)), 0 * self.points
+        shares = self._approximate(program, *self._starts())
+        for members, centre, part in program.clustering():
+            off = self.offsets(centre[None])[0, members]
+            pays[members] += part * off**2 / 2 / self.variances[members]
+        return shares, pays
 
     def _approximate(self, program: _Program, starts: Array, kinds: NDArray[np.int_]) -> Array:
         """Compute shares that hold for all facilities that are found from some starts."""
@@ -83,12 +88,12 @@ class Facilities:
         for _ in range(ROUNDS):
             look_at_clock()
             shares = program.solved()
-            saved, members, pays = self.climbed(shares, starts, kinds)[:3]
+            saved, members, paid, centres = self.climbed(shares, starts, kinds)
             scaled = shares * self.price / max(self.price, float(saved.max()))
             if scaled.sum() > best.sum():
                 best = scaled
             is_more = saved > self.price + 1e-6
-            added = program.add(members[is_more], pays[is_more])
+            added = program.add(members[is_more], paid[is_more], centres[is_more])
             if not added or best.sum() >= shares.sum() * (1 - ENOUGH):
                 break
         return best
@@ -120,8 +125,8 @@ class Facilities:
         """Move each of m facilities to the mean of the points that pay less there than their share.
 
         Returns:
-            What the points save there, (m,), which points these are, (m, n), what all points pay,
-            (m, n), and where the facility is, (m, d).
+            What the points save there, (m,), which points these are, (m, n), what they pay, (m,),
+            and where the facility is, (m, d).
         """
         centres, moving = centres.copy(), np.arange(len(centres))
         for _ in range(STEPS):
@@ -135,7 +140,7 @@ class Facilities:
                 break
         _, members, pays = self._members(shares, centres, kinds)
         saved = np.where(members, shares - pays, 0.0).sum(1)
-        return saved, members, pays, centres
+        return saved, members, np.where(members, pays, 0.0).sum(1), centres
 
     def _members(
         self, shares: Array, centres: Array, kinds: NDArray[np.int_]
@@ -178,27 +183,31 @@ class _Program:
     def __init__(self, price: float, most: Array) -> None:
         self._price, self._bounds = price, np.stack([np.zeros(len(most)), most], 1)
         self._clusters: list[tuple[int, ...]] = [(i,) for i in range(len(most))]
-        self._pays = [np.zeros(1)] * len(most)  # what each member of each cluster pays
+        self._costs = [price] * len(most)
+        self._centres: list[Array] = []  # of all clusters with several members
         self._parts = np.zeros(0)  # the part of each cluster in the cheapest clustering
         self._known: set[tuple[int, ...]] = set(self._clusters)
 
-    def add(self, members: NDArray[np.bool_], pays: Array) -> bool:
-        """Add clusters, given who their members are and what points pay. Say if one is new."""
+    def add(self, members: NDArray[np.bool_], paid: Array, centres: Array) -> bool:
+        """Add clusters: their members, what these pay, and the facility. Say if one is new."""
         before = len(self._clusters)
-        for row, paid in zip(members, pays, strict=True):
+        for row, pays, centre in zip(members, paid.tolist(), centres, strict=True):
             cluster = tuple(np.flatnonzero(row).tolist())
             if cluster not in self._known:
                 self._known.add(cluster)
                 self._clusters.append(cluster)
-                self._pays.append(paid[row])
+                self._costs.append(self._price + pays)
+                self._centres.append(centre)
         return len(self._clusters) > before
 
-    def pays(self) -> Array:
-        """Return what each point pays in the cheapest clustering, (n,)."""
-        total = np.zeros(len(self._bounds))
-        for cluster, paid, part in zip(self._clusters, self._pays, self._parts, strict=False):
-            total[list(cluster)] += part * paid
-        return total
+    def clustering(self) -> Iterator[tuple[list[int], Array, float]]:
+        """Yield the added clusters of the cheapest clustering: members, facility, and part."""
+        alone = len(self._bounds)
+        for cluster, centre, part in zip(
+            self._clusters[alone:], self._centres, self._parts[alone:], strict=False
+        ):
+            if part > TINY:
+                yield list(cluster), centre, float(part)
 
     def solved(self) -> Array:
         """Find the shares with the greatest sum."""
@@ -210,7 +219,7 @@ class _Program:
         result: Any = linprog(
             -np.ones(len(self._bounds)),
             A_ub=csr_array((np.ones(len(rows)), (rows, columns)), shape=shape),
-            b_ub=[self._price + paid.sum() for paid in self._pays],
+            b_ub=self._costs,
             bounds=self._bounds,
             method="highs",
         )

@@ -47,7 +47,7 @@ from ssh_abduction.solver.fit import Poses
 from ssh_abduction.theory.settle import Problem
 
 # The share of the error of position that is counted in the problem of places.
-PLACES = 0.3
+PLACES = 0.5
 # The number of errors of the track that are treated one by one. The rest adds to the scatter.
 MODES = 25
 # Points that are too far apart to share a facility, by this many standard deviations, are far.
@@ -59,10 +59,10 @@ FIRST, GROWTH, SLACK = 1.3, 1.15, 0.2
 UNPROVEN = 0.01
 # At most LARGEST other points are treated one by one for each point.
 LARGEST = 40
-# The prices of bending are found in 2 * SUBGRADIENTS steps. No c is more than MOST. A point is
+# The prices of bending are found in 2 * SUBGRADIENTS steps. Each c is SMALLEST to MOST. A point is
 # assumed to pay this share ALONE more than in the cheapest clustering: with a small c, other
 # clusterings would be cheaper.
-SUBGRADIENTS, MOST, ALONE = 150, 1e4, 0.3
+SUBGRADIENTS, SMALLEST, MOST, ALONE = 150, 0.03, 1e4, 0.2
 TINY = 1e-12
 
 
@@ -219,14 +219,14 @@ class _MovedPoints(Facilities):
         """Return the points of one piece for each kind: the piece with the greatest shares.
 
         If points pay fees, it is one piece for all kinds. Also return approximate shares of the
-        points, and what each point pays in the cheapest clustering.
+        points, and what each point pays for its position and for its heading.
         """
-        shares, pays = np.zeros(len(self.points)), np.zeros(len(self.points))
+        shares, pays = np.zeros(len(self.points)), np.zeros((len(self.points), 2))
         for piece in np.unique(self.piece):
             inside = self.piece == piece
-            shares[inside], pays[inside] = (
-                self.only(inside).stretched(np.full(inside.sum(), FIRST)).first_shares()
-            )
+            part = self.only(inside)
+            shares[inside], paid = part.stretched(np.full((1, 2), FIRST)).first_shares()
+            pays[inside] = np.stack([paid[:, :2].sum(1), paid[:, 2:].sum(1)], 1)
         group = np.where(np.isfinite(self.fees).any(), 0, self.kinds)
         kept = np.zeros(len(shares), dtype=bool)
         for kind in np.unique(group):
@@ -235,18 +235,20 @@ class _MovedPoints(Facilities):
         return self.only(kept), shares[kept], pays[kept]
 
     def near_loss(self, i: int, others: NDArray[np.bool_]) -> Array:
-        """Return twice what a point loses against near points if c is 1, (k, k).
+        """Return twice what the position and the heading of a point lose if c is 1, (2, k, k).
 
         The cluster moves by a mean of the moves of its points, weighted by c over the variance. So
         all of its points together lose half of what each loses against each other one. Position
-        and heading have different weights, and means of their own.
+        and heading have numbers c and means of their own.
         """
         moved = (self.moves[i] - self.moves[others]) / np.sqrt(2 * self.variances[i])[:, None]
-        return _dominating(moved[:, :2]) + _dominating(moved[:, 2:])
+        return np.stack([_dominating(moved[:, :2]), _dominating(moved[:, 2:])])
 
     def stretched(self, factors: Array) -> _MovedPoints:
-        """Multiply the variances of each point."""
-        return replace(self, variances=self.variances * factors[:, None])
+        """Multiply the variances of position and heading of each point, by factors (n, 2)."""
+        return replace(
+            self, variances=self.variances * factors[:, [0, 0, 1][: self.points.shape[1]]]
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,8 +258,8 @@ class _Losses:
     Attributes:
         part: The points.
         most: No share of a point may be more than this, (n,).
-        near: Twice what each point loses against points that it may share a facility with, if c is
-            1, (n, k, k).
+        near: Twice what the position and the heading of each point lose against points that it may
+            share a facility with, if c is 1, (n, 2, k, k).
         far: Twice what each point loses against the other points, (n, k, k).
     """
 
@@ -299,8 +301,8 @@ class _Losses:
         return cls(part, most, np.array(near), np.array([far(i, o) for i, o in enumerate(is_far)]))
 
     def bound(self, c: Array) -> float:
-        """Return the sum of the shares for numbers c. Points whose c is 0 have no share."""
-        kept = c > 0
+        """Return the sum of the shares for numbers c, (n, 2). Points with c = 0 have no share."""
+        kept = c.min(1) > 0
         part = self.part.only(kept).stretched(1 + 1 / c[kept])
         return float(part.shares(self.most[kept]).sum()) if kept.any() else 0.0
 
@@ -308,42 +310,41 @@ class _Losses:
 def _best_numbers(shares: Array, pays: Array, near: Array, far: Array) -> tuple[float, Array]:
     """Find numbers c with which the losses are at most what bending costs.
 
-    A point with the number c has a share of about `shares - pays / (1 + c)`. The sum of these is
+    With numbers c, a point has a share less by about `pays / (1 + c)`. The sum of the shares is
     maximised by Lagrangian duality: a matrix Z is the price of bending, and is found by subgradient
     steps. Points that cost more than they are worth are left out: their c is 0.
 
     Args:
         shares: Approximate shares of all points, (n,).
-        pays: What each point pays in the cheapest clustering, (n,).
+        pays: What each point pays for its position and heading in the cheapest clustering, (n, 2).
         near: The losses against near points, as in `_Losses`.
         far: The losses against far points.
 
     Returns:
-        The estimated sum of the shares, and the numbers, (n,).
+        The estimated sum of the shares, and the numbers, (n, 2).
     """
-    size = near.shape[1]
-    pays = FIRST * pays + ALONE * shares
-    least = np.maximum(shares - pays / FIRST, 0.0)
+    size = near.shape[2]
+    pays = FIRST * pays + ALONE * shares[:, None]
+    least = np.maximum(shares - pays.sum(1) / FIRST, 0.0)
     unit = float(pays.sum()) / size / 2
-    price, sums, times = unit * np.identity(size), np.zeros(len(shares)), np.zeros(len(shares))
+    price, sums, times = unit * np.identity(size), 0 * pays, 0 * shares
     for step in range(2 * SUBGRADIENTS):
         look_at_clock()
-        of_near, of_far = (np.einsum("nij,ij->n", form, price) for form in (near, far))
-        c = np.clip(np.sqrt(pays / np.maximum(of_near, TINY)) - 1, 0.0, MOST)
-        kept = least + pays * c / (1 + c) > of_far + c * of_near
-        slope = (
-            np.identity(size) - np.tensordot(kept * c, near, 1) - np.tensordot(1.0 * kept, far, 1)
-        )
+        of_near, of_far = (np.einsum("...ij,ij->...", form, price) for form in (near, far))
+        c = np.clip(np.sqrt(pays / np.maximum(of_near, TINY)) - 1, SMALLEST, MOST)
+        kept = least + (pays * c / (1 + c) - c * of_near).sum(1) > of_far
+        slope = np.identity(size) - far[kept].sum(0) - np.tensordot(c[kept], near[kept], 2)
         size_of_slope = max(1.0, float(np.linalg.norm(slope)))
         price = _positive(price - 2 * unit / math.sqrt(1 + step) / size_of_slope * slope)
         if step >= SUBGRADIENTS:
-            sums, times = sums + kept * c, times + kept
-    c = np.where(times > SUBGRADIENTS / 2, sums / np.maximum(times, 1), 0.0)
-    left = 1.0 - _largest(far[c > 0].sum(0))
+            sums, times = sums + kept[:, None] * c, times + kept
+    kept = times > SUBGRADIENTS / 2
+    c = np.where(kept[:, None], sums / np.maximum(times, 1)[:, None], 0.0)
+    left = 1.0 - _largest(far[kept].sum(0))
     if left <= 0:
-        return 0.0, np.zeros(len(c))
-    c *= left / _largest(np.tensordot(c, near, 1))
-    return float((least + pays * c / (1 + c))[c > 0].sum()), c
+        return 0.0, np.zeros(c.shape)
+    c *= left / _largest(np.tensordot(c, near, 2))
+    return float((least + (pays * c / (1 + c)).sum(1))[kept].sum()), c
 
 
 def _divided(numbers: Array, losses: Sequence[_Losses]) -> list[Array]:
