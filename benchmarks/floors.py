@@ -7,7 +7,8 @@ Without a folder, a robot drives random routes through a tower of the simulator,
 noisy displacements. With a folder, the traces of the Open-RMF sites in it that use lifts are
 solved by the causal theory. No displacement leads from one floor to another. The script prints a
 table in Markdown with a row for each trace: whether the first map is true, and how many of the
-true floors are floors of the map. With `--pictures`, it draws each map.
+true floors are floors of the map. With `--pictures`, it draws each map. With `--beam`, only the
+beams of width 1 and of this width search, without a time limit.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from changes import cheapest
 from truth import NOISE, Known, is_true, with_truth, worlds
 
 from simulator.errors import SimulatorWarning
@@ -29,6 +31,7 @@ from simulator.tours import simulate
 from simulator.world import TrueDState, World
 from ssh_abduction import SSHMap, Theory, solve
 from ssh_abduction.data import Action
+from ssh_abduction.data.floors import with_floors
 from ssh_abduction.output import to_svg
 
 TURNS = {"right": -1, "left": 1, "around": 2}  # in quarters, counterclockwise
@@ -127,6 +130,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10, metavar="N")
     parser.add_argument("--first", type=int, default=0, metavar="SEED", help="the first seed")
     parser.add_argument("--limit", type=float, default=20, metavar="S", help="seconds for each")
+    parser.add_argument("--beam", type=int, metavar="WIDTH", help="search by beams alone")
     options = parser.parse_args()
     seeds = range(options.first, options.first + options.seeds)
     traces = (
@@ -138,7 +142,11 @@ def main() -> None:
         if options.folder:
             star = "alike" if known.trace.has_stars else "none"
             theory = Theory.causal().replace(star=star, weigh="cost")
-        ssh_map = solve(known.trace, theory, time_limit=options.limit).maps[0]
+        ssh_map = (
+            solve(known.trace, theory, time_limit=options.limit).maps[0]
+            if options.beam is None
+            else with_floors(cheapest(known.trace, theory, options.beam), known.trace)
+        )
         right, there = right_floors(ssh_map, known)
         print(
             f"| {known.name} | {len(known.trace)} | {len(set(known.dstates))} | "
