@@ -6,11 +6,12 @@ import pytest
 import truth
 from together import of_mazes
 
-from ssh_abduction import SSHMap, Theory, Trace, solve
+from ssh_abduction import SSHMap, Theory, Trace
 from ssh_abduction.checker.checker import violations
 from ssh_abduction.data import Odometry, together
 from ssh_abduction.solver.guesses.joining import Joining
 from ssh_abduction.solver.misfit import Misfit
+from ssh_abduction.solver.search import Search
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import Problem, settle
 
@@ -62,7 +63,7 @@ def test_a_drive_is_joined_where_no_later_step_contradicts_it() -> None:
     assert not [*violations(problem.trace, ssh_map, problem.theory)]
 
 
-def test_many_long_drives_have_a_map_within_a_short_limit() -> None:
-    (known,) = of_mazes(4, 40, [315], NOISE, drives=6)
-    solution = solve(known.trace, time_limit=20, max_maps=1)
-    assert truth.is_true(solution.maps[0], known)
+def test_the_search_joins_many_drives() -> None:
+    (known,) = of_mazes(4, 60, [315], NOISE, drives=6)
+    *_, ssh_map = Search(known.trace)._parts.candidates.joined()
+    assert truth.is_true(ssh_map, known)

@@ -17,6 +17,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations, pairwise
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,9 @@ from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import Problem
 
 Array = NDArray[np.float64]
+_Pair: TypeAlias = tuple[Part, Part]
+# Anchors: how good they are, and their two dstates.
+_Anchors: TypeAlias = dict[_Pair, list[tuple[float, int, int]]]
 
 # The width of the beam that maps each drive alone.
 ALONE = 4
@@ -44,6 +48,8 @@ TURNED, SHIFTED = 0.4, 0.4
 # Of the ways to lay a drive on the standing map, count the coincidences of the VOTED ways with the
 # most votes. Merge the dstates that coincide in the ANCHORS best ways.
 VOTED, ANCHORS = 64, 6
+# Begin with each of the STARTS pairs of drives that have the best anchors.
+STARTS = 3
 
 
 class Joining:
@@ -74,19 +80,30 @@ class Joining:
             (first, second): self._anchors(first, second)
             for first, second in combinations(alone, 2)
         }
+        starts = sorted(anchors, key=lambda pair: anchors[pair][:1], reverse=True)[:STARTS]
+        joined = [self._all_joined(alone, dict(anchors), start) for start in starts]
+        best = min(joined, key=lambda parts: sum(part.nats for part in parts), default=alone)
+        if len(best) < len(alone):
+            yield from self._beside(best)
+
+    def _all_joined(self, parts: list[Part], anchors: _Anchors, start: _Pair) -> list[Part]:
+        """Join maps, those with the best anchor first, until no more can be joined.
+
+        Args:
+            parts: The maps.
+            anchors: The anchors of each pair of them.
+            start: The pair that is joined first.
+        """
+        pair = start
         while anchors:
-            first, second = max(anchors, key=lambda pair: anchors[pair][:1])
-            ways = anchors.pop((first, second))
-            if (joined := self._joined(first, second, ways)) is None:
-                continue
-            alone = [part for part in alone if part not in (first, second)]
-            anchors = {
-                pair: ways for pair, ways in anchors.items() if not {first, second} & set(pair)
-            }
-            anchors |= {(joined, part): self._anchors(joined, part) for part in alone}
-            alone.append(joined)
-        if len(alone) < len(parts):
-            yield from self._beside(alone)
+            ways = anchors.pop(pair)
+            if (joined := self._joined(*pair, ways)) is not None:
+                parts = [part for part in parts if part not in pair]
+                anchors = {two: ways for two, ways in anchors.items() if not {*two} & {*pair}}
+                anchors |= {(joined, part): self._anchors(joined, part) for part in parts}
+                parts.append(joined)
+            pair = max(anchors, key=lambda pair: anchors[pair][:1], default=start)
+        return parts
 
     def _beside(self, parts: Sequence[Part]) -> Iterator[SSHMap]:
         """Yield the map that has some parts as its pieces, unless it breaks an axiom."""
