@@ -33,6 +33,7 @@ from ssh_abduction import (
 from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.misfit import misfit
 from ssh_abduction.cli import main
+from ssh_abduction.cli.text import by_displacements
 from ssh_abduction.data import (
     Action,
     Fault,
@@ -472,6 +473,15 @@ def test_words_name_steps_by_their_drives(tmp_path: Path) -> None:
     assert joint.at(6) == "step tuesday:2"
 
 
+@pytest.mark.filterwarnings("ignore:traces 1 and 2 have the same steps")
+def test_between_drives_no_loop_closes() -> None:
+    """Nothing is known of how the first step of a drive relates to those of another one."""
+    there = Trace.from_steps("ab", ["travel"], displacements=[(5, 0, 0)], name="monday")
+    joint = together([there, replace(there, name="tuesday")], names=["monday", "tuesday"])
+    assert explain_pair(joint, 0, 2).loop is None
+    assert explain_pair(joint, 2, 3).loop == "the loop of 5 m closes 5.0 m off"
+
+
 def test_verbs_take_the_trace_in_a_file_of_maps(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -503,3 +513,11 @@ def test_a_step_of_a_drive_is_a_number_that_can_be_pickled() -> None:
     assert steps == tuple(range(8))
     assert [*map(str, pickle.loads(pickle.dumps(steps)))][3:5] == ["monday:3", "tuesday:0"]
     assert named_steps(drives_of(THERE), 4) == range(4)
+
+
+def test_at_most_twelve_weights_are_printed() -> None:
+    there = Trace.from_steps("ab", ["travel"], displacements=[(5, 0, 0)])
+    solution = solve(there)
+    many = replace(solution, maps=solution.maps * 20)
+    told = "\n".join(by_displacements(many))
+    assert told.endswith(f"{', '.join(['0.05'] * 12)}, and 8 more")

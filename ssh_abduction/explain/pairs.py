@@ -157,15 +157,22 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
         )
 
     def _loop(self) -> str | None:
-        """Say how far off the loop between the steps closes; None without displacements."""
+        """Say how far off the loop between the steps closes; None if that is not known.
+
+        It is unknown without displacements, and if one is missing in the loop: where a drive
+        starts, or after a lift.
+        """
         evidence = displacement_of(self.problem)
         if evidence is None:
             return None
-        closing = evidence.returns_of(self.trace).closing(self.first, self.second)
-        loop = f"the loop of {closing.way:.0f} m closes {closing.size:.1f} m off"
+        said = []
+        way = self.trace.steps[self.first + 1 : self.second + 1]
+        if all(step.displacement is not None for step in way):
+            closing = evidence.returns_of(self.trace).closing(self.first, self.second)
+            said.append(f"the loop of {closing.way:.0f} m closes {closing.size:.1f} m off")
         pair = self.first, self.second
-        match = next((c for c in self.trace.closures if (c.first, c.last) == pair), None)
-        return loop if match is None else f"{loop}, and {match_in_words(match, *pair)}"
+        said += [match_in_words(c, *pair) for c in self.trace.closures if (c.first, c.last) == pair]
+        return ", and ".join(said) or None
 
     def _verdict(self) -> Verdict:
         """Return the verdict, by what is known about both sides so far."""
