@@ -5,6 +5,9 @@ is there, but the robot decided something. The drive shows it: closures say how 
 drive lie relative to each other. Where two stretches lead apart and no place is near, there is a
 place. Each stretch that passes it has a visit.
 
+The relations also show visits whose middles are nearly the same. The junction in their local maps
+was found at slightly different points. They get one middle, so that they are to one place.
+
 The second stretch may come long after the first one. So these visits are found when a drive ends.
 """
 
@@ -12,11 +15,13 @@ from __future__ import annotations
 
 import math
 from bisect import bisect
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.distance import cdist
+from scipy.cluster.hierarchy import fcluster, linkage
+from scipy.spatial.distance import cdist, pdist
 
 from perception.places.closures import VisitMatch
 from perception.places.stays import taken, with_ways_in_order
@@ -36,6 +41,8 @@ NEAR, BEYOND, ONE, PASS = 1.5, 0.5, 2.0, 4.0
 # The radius of the disc of a parting in metres. The robot crosses its rim at RIM metres, less than
 # BOW metres of trajectory away.
 RADIUS, RIM, BOW = 1.0, 1.5, 6.0
+# Visits whose middles are within AGREED metres of each other are to one place.
+AGREED = 1.0
 # Between visits at most MOST metres of trajectory apart, the track is as good as a closure. Two
 # stretches are LEAST metres of trajectory apart.
 MOST, LEAST = 32.0, 8.0
@@ -50,27 +57,26 @@ def with_partings(
 ) -> tuple[tuple[Visit, ...], list[VisitMatch]]:
     """Add a visit for each pass of a place where stretches of a drive lead apart.
 
+    Visits whose middles are nearly the same get the same middle.
+
     Args:
         track: Trajectory of the robot.
         visits: The visits, in order. Each has its local map.
         closings: The closures between them.
 
     Returns:
-        All visits, in order, and the closures between them. An added visit has the local map of the
-        nearest other one.
+        All visits, in order, and the closures between their middles. An added visit has the local
+        map of the nearest other one.
     """
     drive = _DrivePoints(track, visits)
-    relations = [*_closed(drive, closings), *_tracked(drive)]
-    places: list[list[_Pass]] = []
-    for one in relations:
-        for pair in drive.partings(one):
-            known = [old for place in places for old in place]
-            if any(drive.is_near(some) or _is_known(some, known) for some in pair):
-                continue
-            place = _passes(drive, pair, relations)
-            if not any(map(drive.is_near, place)):
-                places.append(place)
-    every = [*visits, *(drive.visit(*some) for place in places for some in place)]
+    moves = _agreed(drive, [*_closed(drive, closings), *_tracked(drive)])
+    visits = [*map(_moved, visits, moves)]
+    closings = [
+        replace(one, match=replace(one.match, shift=one.match.shift + _change(one, moves)))
+        for one in closings
+    ]
+    drive = _DrivePoints(track, visits)
+    every = [*visits, *(drive.visit(*some) for some in _added(drive, closings))]
     order = sorted(range(len(every)), key=lambda k: every[k].scan)
     number = {k: n for n, k in enumerate(order)}
     return tuple(every[k] for k in order), [
@@ -116,6 +122,7 @@ class _DrivePoints:
         points: (n, 2) positions, PACE metres apart.
         visits: The visits.
         ways: (v,) metres driven up to each visit.
+        middles: (v, 2) middles of their places in metres.
     """
 
     def __init__(self, track: Track, visits: Sequence[Visit]) -> None:
@@ -126,7 +133,7 @@ class _DrivePoints:
         self.visits = visits
         self.ways = self._way[[visit.scan for visit in visits]]
         self._reaches = np.array([max(NEAR, visit.radius + BEYOND) for visit in visits])
-        self._middles = np.array([visit.middle for visit in visits]).reshape(-1, 2)
+        self.middles = np.array([visit.middle for visit in visits]).reshape(-1, 2)
         self._cuts = [0.0, *(float(self._way[cut]) for cut in track.cuts), float(self._way[-1])]
 
     def stretch(self, way: float, reach: float = REACH) -> range:
@@ -153,7 +160,7 @@ class _DrivePoints:
     def is_near(self, some: _Pass) -> bool:
         """Whether some visit is near enough to a pass to be to the same place."""
         soon = np.abs(self.ways - some[0]) <= PASS
-        return bool((soon & (np.hypot(*(self._middles - some[1]).T) <= self._reaches)).any())
+        return bool((soon & (np.hypot(*(self.middles - some[1]).T) <= self._reaches)).any())
 
     def visit(self, way: float, middle: Array) -> Visit:
         """Make the visit of a pass."""
@@ -162,7 +169,7 @@ class _DrivePoints:
         ways: list[Way] = []
         sides = (range(here - 1, part.start - 1, -1), range(here, part.stop))
         arrived, left = (self._crossed(side, middle, ways) for side in sides)
-        far = np.hypot(*(self._middles - middle).T) + np.abs(self.ways - way)
+        far = np.hypot(*(self.middles - middle).T) + np.abs(self.ways - way)
         patch = self.visits[int(far.argmin())].patch
         return with_ways_in_order(
             Visit(scan, middle, scan, scan, RADIUS, tuple(ways), arrived, left, patch=patch)
@@ -192,6 +199,87 @@ def _tracked(drive: _DrivePoints) -> Iterator[_Alignment]:
         first, last = np.searchsorted(drive.ways, (way, way + MOST))
         for other in drive.ways[first:last].tolist():
             yield _Alignment(way, other, 0.0, np.zeros(2), np.zeros(2))
+
+
+def _added(drive: _DrivePoints, closings: Sequence[VisitMatch]) -> list[_Pass]:
+    """List the passes of partings that are at no place."""
+    relations = [*_closed(drive, closings), *_tracked(drive)]
+    found: list[_Pass] = []
+    for one in relations:
+        for pair in drive.partings(one):
+            if not any(drive.is_near(some) or _is_known(some, found) for some in pair):
+                place = _passes(drive, pair, relations)
+                found += [] if any(map(drive.is_near, place)) else place
+    return found
+
+
+def _agreed(drive: _DrivePoints, relations: Sequence[_Alignment]) -> Array:
+    """Compute moves after which visits whose discs have nearly one middle have the same middle.
+
+    Returns:
+        (v, 2) metres.
+    """
+    links = _links(drive, relations)
+    moves, done = np.zeros_like(drive.middles), set[int]()
+    for root in range(len(drive.middles)):
+        if root in done:
+            continue
+        # For each visit, the rotation from its axes to those of the root, and its middle there.
+        group = {root: (0.0, np.zeros(2))}
+        for k in (queue := [root]):  # The list grows.
+            turn, at = group[k]
+            for n, more, off in links[k]:
+                if n not in group:
+                    group[n] = turn + more, at + points_turned(turn, off)
+                    queue.append(n)
+        done |= group.keys()
+        if len(group) < 2:
+            continue
+        at = np.array([point for _, point in group.values()])
+        parts = fcluster(linkage(pdist(at), "complete"), AGREED, "distance")
+        for n, part in zip(group, parts, strict=True):
+            turn, point = group[n]
+            moves[n] = points_turned(-turn, at[parts == part].mean(axis=0) - point)
+    return moves
+
+
+def _links(
+    drive: _DrivePoints, relations: Sequence[_Alignment]
+) -> dict[int, list[tuple[int, float, Array]]]:
+    """For each visit, the visits with nearly the same middle, and how they lie relative to it.
+
+    Returns:
+        The number of each visit, the rotation from its axes in radians, and its middle in metres.
+    """
+    links: dict[int, list[tuple[int, float, Array]]] = defaultdict(list)
+    for one in relations:
+        first, last = (
+            np.flatnonzero(np.abs(drive.ways - way) <= REACH) for way in (one.first, one.last)
+        )
+        theirs = one.moved(drive.middles[last])
+        far = cdist(drive.middles[first], theirs)
+        for i, j in zip(*np.nonzero(far <= AGREED), strict=True):
+            off = theirs[j] - drive.middles[first[i]]
+            links[int(first[i])].append((int(last[j]), one.turn, off))
+            links[int(last[j])].append((int(first[i]), -one.turn, points_turned(-one.turn, -off)))
+    return links
+
+
+def _moved(visit: Visit, move: Array) -> Visit:
+    """Move the middle of the place of a visit. Its ways cross the rim of the disc as before."""
+    if not move.any():
+        return visit
+    rim = visit.radius + BEYOND
+    ways = []
+    for way in visit.ways:
+        x, y = rim * math.cos(way.bearing) - move[0], rim * math.sin(way.bearing) - move[1]
+        ways.append(replace(way, bearing=math.atan2(y, x)))
+    return with_ways_in_order(replace(visit, middle=visit.middle + move, ways=tuple(ways)))
+
+
+def _change(one: VisitMatch, moves: Array) -> Array:
+    """How the shift of a closure changes if the middles of its visits move."""
+    return np.asarray(points_turned(one.match.turn, moves[one.last]) - moves[one.first])
 
 
 def _passes(

@@ -13,10 +13,12 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial.distance import cdist
 
 from ssh_abduction.data.maps import SSHMap
@@ -55,36 +57,29 @@ def edges_of(trace: Trace, ssh_map: SSHMap) -> dict[int, int]:
 def grouped(travels: Iterable[tuple[Any, Any, Array]]) -> list[int]:
     """Number the edges of travels, each given by its first and last place and its course.
 
-    The places can be compared. A course is (n, 2) metres, with points STEP apart. An edge has the
-    course of its first travel.
+    The places can be compared. A course is (n, 2) metres, with points STEP apart. Any two travels
+    on one edge are close together.
     """
-    known: dict[tuple[Any, Any], list[Array]] = defaultdict(list)
-    numbers: dict[tuple[Any, Any, int], int] = {}
-    found = []
-    for first, last, course in travels:
+    between: dict[tuple[Any, Any], list[tuple[int, Array]]] = defaultdict(list)
+    for k, (first, last, course) in enumerate(travels):
         ends = min(first, last), max(first, last)
-        way = course if first == ends[0] else course[::-1]
-        edge = *ends, _nearest(known[ends], way, first == last)
-        found.append(numbers.setdefault(edge, len(numbers)))
-    return found
+        between[ends].append((k, course if first == ends[0] else course[::-1]))
+    edges: dict[int, tuple[Any, ...]] = {}
+    for ends, alike in between.items():
+        far = [
+            _apart(one, other, loop=ends[0] == ends[1])
+            for (_, one), (_, other) in combinations(alike, 2)
+        ]
+        parts = fcluster(linkage(far, "complete"), APART, "distance") if far else [1]
+        edges |= {k: (*ends, part) for (k, _), part in zip(alike, parts, strict=True)}
+    numbers: dict[tuple[Any, ...], int] = {}
+    return [numbers.setdefault(edges[k], len(numbers)) for k in sorted(edges)]
 
 
-def _nearest(known: list[Array], course: Array, loop: bool) -> int:
-    """The number of the known course that is nearest to a course. If none is near, add it.
-
-    Args:
-        known: Courses between the same two places, from the same one of them.
-        course: (n, 2) metres.
-        loop: Whether both ends are at one place, so that the direction says nothing.
-    """
-    far = [
-        min(frechet(way, other) for way in ([course, course[::-1]] if loop else [course]))
-        for other in known
-    ]
-    if not far or min(far) > APART:
-        known.append(course)
-        return len(known) - 1
-    return int(np.argmin(far))
+def _apart(one: Array, other: Array, loop: bool) -> float:
+    """The distance of two courses in metres. That of loops does not depend on their directions."""
+    far = frechet(one, other)
+    return min(far, frechet(one[::-1], other)) if loop else far
 
 
 def _laid(trace: Trace, ssh_map: SSHMap, t: int) -> Array:
