@@ -80,3 +80,9 @@ def test_steps_that_contradict_a_sketch_are_searched_for_a_clash() -> None:
     assert (found.first, found.last) == (10, 13)
     faulty = Theory(misread=1.0)
     assert clash_in(trace, settle(trace, faulty).theory, [clash], maps_of) is None
+
+
+def test_steps_that_are_said_to_be_at_one_place_are_searched_for_a_clash() -> None:
+    around = Trace.from_steps("abcd" * 24, ["right", "travel"] * 47 + ["right"])
+    solution = solve(around, Theory(same_place=((0, 4),)), time_limit=0.5)
+    assert (solution.status, len(solution.maps)) == (Status.UNSATISFIABLE, 0)

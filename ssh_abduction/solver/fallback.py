@@ -93,7 +93,9 @@ def clash_in(
 def late_clash(
     parts: Parts, maps_of: Callable[[Trace, Theory], tuple[Sequence[SSHMap], bool]]
 ) -> range | None:
-    """Look for a clash before the steps that contradicted a sketch, if a stopped search has no map.
+    """Look for a short clash if a stopped search has no map.
+
+    It may end at a step that contradicted a sketch, or at one that is said to be another step.
 
     Args:
         parts: The parts of the search. Its `known` gets the status if there is a clash.
@@ -102,7 +104,9 @@ def late_clash(
     known, task, clash = parts.known, parts.task, None
     if known.best is not None or not known.stopped or known.status is not Status.UNKNOWN:
         return None
-    stretches = _stretches_before(parts.candidates.contradicting, len(task.trace))
+    said = (*task.theory.same, *task.theory.same_place)
+    ends = dict.fromkeys((*parts.candidates.contradicting, *(max(pair) for pair in said)))
+    stretches = _stretches_before(ends, len(task.trace))
     part = Watch().part(CLASHING, time.thread_time)
     with suppress(LimitError, KeyboardInterrupt), heeding(part.check):
         clash = clash_in(task.trace, task.theory, stretches, maps_of)
@@ -166,4 +170,4 @@ def _stretches_before(ends: Iterable[int], steps: int) -> Iterator[range]:
         steps: The number of steps of the trace. Each stretch has fewer.
     """
     for length in STRETCHES:
-        yield from (range(t + 1 - length, t + 1) for t in ends if length <= min(t + 1, steps - 1))
+        yield from (range(max(t + 1 - length, 0), t + 1) for t in ends if length < steps)
