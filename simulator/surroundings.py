@@ -209,8 +209,8 @@ class Place:
 
     Attributes:
         streets: Streets that lead away, clockwise from straight behind the robot.
-        fixed: Fixed point as a complex number: metres ahead, and metres to the left. None if a
-            street just goes straight on, or no wall ends it; then this is no place.
+        fixed: Where hill-climbing would stop, as a complex number: metres ahead, and metres to the
+            left. None where the robot just passes: a street goes straight on, or no wall ends it.
     """
 
     streets: tuple[Street, ...]

@@ -175,7 +175,7 @@ def test_a_rival_with_more_dstates_that_nothing_tells_apart_is_said() -> None:
     assert (found.ending, found.is_unique, found.is_true) == ("inseparable", True, False)
     assert found.rival is not None
     assert (len(found.solution.maps[0].dstates), len(found.rival.dstates)) == (2, 4)
-    assert "a map with 2 dstates more explains all, too" in found.sentence
+    assert "a map with 2 more dstates explains all, too" in found.sentence
     assert found.to_dict()["rival"]["labels"] == list(found.rival.labels)
 
 

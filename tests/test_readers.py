@@ -777,7 +777,7 @@ def test_paths_and_formats_that_cannot_be(tmp_path: Path) -> None:
         (tmp_path / "a.log", {"format": "g2o"}, "expected vertices"),
         (tmp_path / "a.log", {"format": "ros1"}, "cannot be opened"),
         (tmp_path / "a.log", {"format": "mcap"}, "cannot be opened"),
-        (tmp_path / "a.log", {"scan_topic": "/scan"}, "expected a bag, as a topic is named"),
+        (tmp_path / "a.log", {"scan_topic": "/scan"}, "expected a bag, because topics are given"),
         (tmp_path, {"format": "carmen"}, "got a folder"),
     ):
         with pytest.raises(LogError, match=text):

@@ -407,7 +407,7 @@ def test_limits_that_make_no_sense(choices: dict[str, int], name: str) -> None:
             "prefer: expected names out of dstates, paths, places, excuses, auto, got 'streets'",
         ),
         ({"prefer": ("dstates", "dstates")}, "prefer: expected each name once"),
-        ({"prefer": ("excuses",)}, "prefer: expected no excuses with boundary=strict"),
+        ({"prefer": ("excuses",)}, "prefer: expected boundary=defeasible with excuses, got strict"),
         ({"without": ("gravity",)}, "without: expected names out of"),
         ({"level": "causal"}, "boundary: expected none with level=causal"),
         ({"next_place": 1}, "next_place: expected true or false"),

@@ -473,7 +473,7 @@ def test_maps_of_another_trace_are_named(tmp_path: Path) -> None:
     ):
         Solution.load(tmp_path / "maps.json", other)
     solve(IMPOSSIBLE).save(tmp_path / "none.json")
-    with pytest.raises(MapError, match="steps: expected those of a trace of 23 steps, got 4"):
+    with pytest.raises(MapError, match="steps: expected maps of a trace of 23 steps, got 4"):
         Solution.load(tmp_path / "none.json", ACES)
 
 

@@ -218,7 +218,7 @@ def _reading(
         if found in LINES:
             if topics or odom_topic is not None:
                 raise LogError(
-                    f"{named(path)}: expected a bag, as a topic is named, got the format "
+                    f"{named(path)}: expected a bag, because topics are given, got the format "
                     f"{found}; leave the topics out"
                 )
             yield carmen.read(file, named(path), format)

@@ -239,8 +239,8 @@ def _messages(
         if laser.mount not in mounted:
             if mounted:
                 raise LogError(
-                    f"scan {number}: expected one mount of the laser in a bag, got another; "
-                    "write two bags"
+                    f"scan {number}: expected the laser where it was mounted before, got another "
+                    "mount; write two bags"
                 )
             mounted.add(laser.mount)
             yield "/tf_static", time, make.transform(BASE, LASER, laser.mount)

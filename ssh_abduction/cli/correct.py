@@ -17,11 +17,11 @@ HELPS = {
     "different": "steps I and J are different dstates",
     "elsewhere": "steps I and J are at different places",
     "same_place": "steps I and J are at one place",
-    "open": "a gateway is open, named as with --closed",
-    "closed": (
-        "a gateway is closed: a place and a direction on the drawn map, such as 'p4 north', or a "
+    "open": (
+        "a gateway is open: a place and a direction on the drawn map, such as 'p4 north', or a "
         "step and a direction from the robot, such as 'monday:12 left'"
     ),
+    "closed": "a gateway, named as with --open, is closed",
 }
 
 
@@ -49,7 +49,9 @@ def add_parser(verbs: Verbs) -> None:
     )
     add_map(parser)
     parser.set_defaults(run=run)
-    parser.epilog = "Each correction may be given again. Without any, print the corrections so far."
+    parser.epilog = (
+        "Each option may be given several times. Without any, print the corrections so far."
+    )
 
 
 def run(options: argparse.Namespace) -> int:

@@ -242,7 +242,8 @@ def compared(found: Comparison) -> Iterator[str]:
                 if option.answers[choice.questions.index(question)]
                 for i in option.maps
             ]
-            yield f"    {number[question]}. {question}: in {_numbered(sorted(yes), len(found.ids))}"
+            shown = _numbered(sorted(yes), len(found.ids))
+            yield f"    question {number[question]}: {question}: in {shown}"
         if len(asked) > SHOWN_QUESTIONS:
             yield (
                 f"    and {counted(len(asked) - SHOWN_QUESTIONS, 'more questions')}; --json has "

@@ -70,8 +70,8 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_setting("open", "whether to open the page in the browser (default: true)", True)
     parser.set_defaults(run=run)
     parser.epilog = (
-        "The page is one file that works without a network. Without --serve, it shows commands "
-        "that answer its questions."
+        "The page is one file that works without a network. Without --serve, it cannot ask the "
+        "solver. It shows the commands that do."
     )
 
 

@@ -78,7 +78,7 @@ class Action:
         ):
             raise TraceError(
                 f"action.gateway: expected 1 or more, for a turn right or left, "
-                f"got {brief(self.gateway)}; count the gateways to that side"
+                f"got {brief(self.gateway)}; give the number of the gateway on that side, from 1 on"
             )
 
     def _turn_of_bearing(self) -> TurnDirection:

@@ -354,7 +354,7 @@ class _Sort:
 
     @property
     def count(self) -> int | None:
-        """The number of things that the map has at the counted steps; None if it has none."""
+        """How many different things the map has at the judged steps; None if it has none."""
         return len(self.of_map) or None
 
     @cached_property

@@ -134,7 +134,7 @@ class Exploration:
         if self.is_unique and self.rival:
             more = len(self.rival.dstates) - len(self.solution.maps[0].dstates)
             why = (
-                f"a map with {counted(more, 'dstates')} more explains all, too, "
+                f"a map with {counted(more, 'more dstates')} explains all, too, "
                 "and nothing that the robot can do tells them apart"
             )
         unique = "" if self.is_unique else "not "

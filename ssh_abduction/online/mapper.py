@@ -233,7 +233,7 @@ class OnlineMapper:
         if action.starts:
             raise TraceError(
                 f"step {number - 1}: action: expected an action of the robot, got the start "
-                "of a drive; solve several traces together when the robot has stopped"
+                "of a drive; a mapper takes one drive, so solve the traces of all drives together"
             )
         known = self._actions.get(action.name, action)
         if known != action:

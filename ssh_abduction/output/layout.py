@@ -8,7 +8,7 @@ paths: first each path gets a heading (`headings`), then places are put along th
 
 A map with the fewest paths may contain a path that is not straight in the world. If turns would
 therefore go to a wrong side, or streets would bend, only the segments of each path are drawn
-straight: the parts whose places the robot's travels join.
+straight. The robot travelled between the places of a segment.
 """
 
 from __future__ import annotations

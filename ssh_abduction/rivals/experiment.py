@@ -247,10 +247,10 @@ def _untried_in_words(untried: Untried | None) -> str:
         return "known links lead to no untried action"
     way = f", after {_acts(untried.way)}" if untried.way else ""
     if untried.pairs:
-        return f"the most informative untried action is {printable(untried.action)}{way}"
+        return f"the most informative untried action is '{printable(untried.action)}'{way}"
     several = sum(len(expectation.rivals) for expectation in untried.expects) > 1
     none = "they expect the same of every untried action; " if several else ""
-    return f"{none}the nearest untried action is {printable(untried.action)}{way}"
+    return f"{none}the nearest untried action is '{printable(untried.action)}'{way}"
 
 
 def _acts(actions: Sequence[str]) -> str:

@@ -97,7 +97,8 @@ class AnsweredQuestion:
     Attributes:
         question: The question.
         column: The answer of each map.
-        steps: For each sort, the later steps of all questions with the same or opposite answers.
+        steps: For each sort of question, the later step of each question of this sort that all maps
+            answer as they answer this one, or all the other way round.
     """
 
     question: Question

@@ -5,8 +5,7 @@ together are one edge. Places show their disc and their gateways. Places that th
 always between the same two neighbours, are drawn as dots. Each of several drives has its colour.
 
 Each drive of a joint map has a frame of its own. It is moved and turned so that the places that it
-shares with drives before it lie on each other. A drive that shares no place is put beside the
-others.
+shares with earlier drives coincide. A drive that shares no place is put beside the others.
 """
 
 from __future__ import annotations

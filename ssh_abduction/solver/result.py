@@ -471,8 +471,8 @@ def _check_steps(
         check_of_trace(maps, checked_trace(trace), where, views="functional_view" in theory.hard)
         if steps != len(trace):
             raise MapError(
-                f"{where}: steps: expected those of a trace of {len(trace)} steps, got {steps}; "
-                "give the trace of these maps"
+                f"{where}: steps: expected maps of a trace of {len(trace)} steps, got {steps}; "
+                "give the trace from which these maps were made"
             )
 
 

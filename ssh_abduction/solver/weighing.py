@@ -205,7 +205,7 @@ class Weighing:
                 yield candidate.map, Cost.of(candidate.map).preferred_by(theory)
 
     def _with_other_paths(self, ssh_map: SSHMap) -> tuple[tuple[SSHMap, ...], bool]:
-        """List all maps that differ from a map only in its paths, and have as few of them.
+        """List all maps that differ from a map only in their paths, and have as many paths.
 
         They cost the same and have the same wrong displacements, but may have other faults. Also
         return whether these are proven to be all.

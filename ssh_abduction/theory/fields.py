@@ -137,7 +137,7 @@ def normalise(theory: Theory) -> None:
         _check_weigh(theory)
     if "excuses" in theory.prefer and theory.boundary != "defeasible":
         raise TheoryError(
-            f"prefer: expected no excuses with boundary={theory.boundary}; take "
+            f"prefer: expected boundary=defeasible with excuses, got {theory.boundary}; take "
             f"{choice('boundary', 'defeasible')}"
         )
 

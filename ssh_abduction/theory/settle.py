@@ -45,9 +45,9 @@ class Problem:
 
     @cached_property
     def pairs(self) -> Pairs:
-        """Which steps are one dstate, different dstates, or at different places, by all evidence.
+        """Which steps are one dstate, different dstates, or at different places, by the evidence.
 
-        Evidence that a fault may excuse is left out.
+        Evidence that may be wrong, because the theory allows a fault of it, is left out.
         """
         return pairs_of(self.trace, self.theory, self.evidence)
 

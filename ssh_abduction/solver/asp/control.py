@@ -73,9 +73,9 @@ class Control(clingo.Control):
     once would wait for each other at each symbol and take three times as long.
 
     Attributes:
-        preparing: What clasp needs to prepare the program, as PREPARING: multiples of the time and
-            of the memory that grounding took.
-        seconds: The seconds that clingo has grounded since it last began to solve.
+        preparing: The time and the memory that clasp needs to prepare the program, as multiples of
+            what grounding took. The default is PREPARING.
+        seconds: How many seconds grounding took since clingo last solved.
         mebibytes: The memory in MiB that this grounding added.
     """
 

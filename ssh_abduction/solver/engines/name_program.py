@@ -186,7 +186,7 @@ class NameProgram:
     def more_links(self) -> list[Link]:
         """List links that clingo lacks: all of them, or `MORE_LINKS` if the trace is long.
 
-        In a long trace, the links whose ends may have the fewest names come first.
+        In a long trace, the links come first for whose ends clingo has the fewest choices.
         """
         known = self._known
         left = [link for link in self.chart.links if link not in known.links]

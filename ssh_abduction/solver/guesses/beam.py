@@ -72,8 +72,8 @@ class _Extension:
         nats: The cost of the extended hypothesis.
         place: The known place at which the new step is; None for a new place.
         dstate: The known dstate at which the new step is; None for a new dstate.
-        of: The hypothesis to extend. Its robot has moved already: the last three entries of its
-            means are the pose at the new step.
+        of: The hypothesis to extend. In it the robot has moved already: the last three entries of
+            its mean vector are the pose at the new step.
     """
 
     nats: float

@@ -105,8 +105,9 @@ def _facing(
     """Find which way each dstate faces at its place, by the stars or by its heading in radians.
 
     Returns:
-        The slots and the pairs of dstates that face opposite ways; empty for a theory without
-        frames. None if no frame fits the stars.
+        The slot of each dstate (the number of its direction in the frame of its place), and the
+        pairs of dstates that face opposite ways. Both are empty for a theory without frames. None
+        if no frame fits the stars.
     """
     if theory.star == "gateways":
         return gateways.facing(trace, ssh_map, theory.axioms, bool(theory.changed))

@@ -90,7 +90,7 @@ def said_by(
 def pairs_of(trace: Trace, theory: Theory, evidence: Iterable[Evidence] | None = None) -> Pairs:
     """Return which pairs of steps the evidence shows to be equal or different.
 
-    Evidence that a fault may excuse is left out.
+    Evidence that may be wrong, because the theory allows a fault of it, is left out.
 
     Args:
         trace: The trace.

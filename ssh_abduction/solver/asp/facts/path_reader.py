@@ -193,7 +193,7 @@ class _Choices:
 
 
 def _literals(control: Control, name: str) -> dict[tuple[int, int, int], int]:
-    """Return the literals of all atoms of a predicate with three arguments, by its arguments."""
+    """Return the literal of each atom of a predicate, by the three arguments of the atom."""
     found = {}
     for atom in control.symbolic_atoms.by_signature(name, 3):
         a, b, c = read_atom(atom.symbol)[1]

@@ -140,7 +140,7 @@ def settled_facts(
 
 
 def stretch_facts(trace: Trace, theory: Theory, labels: Iterable[int]) -> str:
-    """Return the facts that say on which stretches between lifts the dstates of steps are.
+    """Return the facts that say on which stretch, between two rides in lifts, each dstate is.
 
     Args:
         trace: The trace.
