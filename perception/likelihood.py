@@ -120,8 +120,8 @@ class ImageLikelihood:
             images: (n, d) images as the recogniser takes them.
 
         Yields:
-            For each image an array, (c,): p(o|x) / p(o|nowhere), from 0 to c + 1, for each of
-            `classes`.
+            For each image an array, (c,): the ratio p(o|x) / p(o|nowhere) for each of `classes`.
+            A ratio is between 0 and c + 1.
         """
         features = self._features(images)
         for some in np.array_split(features, max(1, math.ceil(len(features) / AT_ONCE))):
@@ -165,7 +165,7 @@ class ImageLikelihood:
         if table.ndim != 2 or table.shape[1] != beams:
             raise PerceptionError(
                 f"images: expected {beams} ranges each, as the recogniser learnt, got a table "
-                f"of shape {table.shape}; take its own images"
+                f"of shape {table.shape}; give images of the same laser"
             )
         try:
             features = np.asarray(

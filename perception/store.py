@@ -87,7 +87,7 @@ class Stored:
             if is_whole(learnt) and learnt != table.shape[1]:
                 raise PerceptionError(
                     f"images: expected {learnt} ranges, as the recogniser learnt, got "
-                    f"{table.shape[1]}; take its own images"
+                    f"{table.shape[1]}; give images of the same laser"
                 )
             found = np.asarray(self.model.predict(table))
             labels = [int(label) for label in found]

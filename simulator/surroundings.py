@@ -251,7 +251,7 @@ class Place:
         ]
 
     def heading(self, about: float) -> float:
-        """Find the heading of a dstate that is nearest to a heading, both in radians."""
+        """Find, among the headings of dstates here, the one nearest to `about`, in radians."""
         return min(self.headings, key=lambda heading: radians_between(heading, about))
 
     def beside(self, heading: float, side: int) -> float | None:

@@ -274,9 +274,13 @@ def _distance(middle: Array, radius: float, junction: Junction) -> float | None:
 
 
 def _stays(far: Array, radius: float) -> Iterator[tuple[int, int]]:
-    """Yield the first and last index of each part of a trajectory, (n,) metres, in a disc.
+    """Yield the first and last index of each stay in a disc.
 
-    The robot stays until it is LEFT metres outside.
+    A stay ends where the robot is more than `LEFT` metres outside of the disc.
+
+    Args:
+        far: (n,) distances of the robot from the middle of the disc in metres.
+        radius: Radius of the disc in metres.
     """
     begin = None
     for i, distance in enumerate(far.tolist()):

@@ -4,7 +4,8 @@ The scans pass through one at a time. What stays of them is the track, the visit
 maps, and about 400 bytes a scan for the checks at the end.
 
 The first scans wait until the units of the odometry are recognised. Then the scans are checked as
-those of a whole log are, in stretches of 1,600: when a stretch has 200, 400, 800 and 1,600 scans.
+those of a whole log are. The checks see stretches of 1,600 scans. Each stretch is checked four
+times: when it has 200, 400, 800 and 1,600 scans.
 """
 
 from __future__ import annotations

@@ -214,7 +214,7 @@ def _added(drive: _DrivePoints, closings: Sequence[VisitMatch]) -> list[_Pass]:
 
 
 def _agreed(drive: _DrivePoints, relations: Sequence[_Alignment]) -> Array:
-    """Compute moves after which visits whose discs have nearly one middle have the same middle.
+    """Compute shifts of visits. Visits whose discs have nearly one middle then have the same one.
 
     Returns:
         (v, 2) metres.

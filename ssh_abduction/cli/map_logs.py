@@ -52,9 +52,9 @@ def add_parser(verbs: Verbs) -> None:
         type=float,
         metavar="S",
         help=(
-            "seconds for the search. By default, the import, the search and the ladder together "
-            "take a twentieth of the time that the robot drove, and the search takes at least 30 "
-            "s. If it has found no map by then, it goes on"
+            "seconds for the search. By default, the whole command takes a twentieth of the time "
+            "that the robot drove, and the search at least 30 s. If it has found no map by then, "
+            "it goes on"
         ),
     )
     parser.add_setting(
@@ -80,10 +80,7 @@ def add_parser(verbs: Verbs) -> None:
     add_reading(parser)
     add_theory(
         parser,
-        default=(
-            "topological; without stars and sides if doors are the places, if walls do not meet "
-            "at right angles, or if no map fits the stars"
-        ),
+        default=("topological without stars, sides and paths, which a log does not show surely"),
     )
     parser.set_defaults(run=run)
 

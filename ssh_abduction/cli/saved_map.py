@@ -209,7 +209,7 @@ class SavedMap:
         if abs(degrees - 90 * quarter) > 30:
             raise MapError(
                 f"gateway: expected a direction ahead, right, back or left of the robot, got "
-                f"{brief(text)}, which is between two; say it by a step, such as 'monday:12 left'"
+                f"{brief(text)}, which is between two; give a step, such as 'monday:12 left'"
             )
         return 90.0 * (quarter % 4)
 

@@ -97,12 +97,12 @@ def add_parser(verbs: Verbs) -> None:
             None,
             {"metavar": "X,Y,DEGREES"},
         ),
-        ("reach", "the distance from a wall at which the robot follows it", None, METRES),
+        ("reach", "the distance at which the robot follows a wall", None, METRES),
         (
             "odometry_noise",
             "standard deviation of the odometry, as a share of each motion (default: 0.02); with "
-            "--format, standard deviation after one metre (default: 0.05); other errors grow with "
-            "it",
+            "--format, standard deviation in metres after one metre (default: 0.05); the errors "
+            "of headings grow with it",
             None,
             SHARE,
         ),

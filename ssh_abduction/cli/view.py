@@ -53,8 +53,8 @@ def add_parser(verbs: Verbs) -> None:
         help="output of localise --json for the trace of --run, or for TRACE",
     )
     serve = (
-        "serve the page, on this computer only, so that it can explain pairs of steps and solve "
-        "again with assumptions; needs TRACE. Ctrl-C ends the server"
+        "serve the page, on this computer only, so that it can explain why two steps are one "
+        "dstate or not, and solve again with assumptions; needs TRACE. Ctrl-C ends the server"
     )
     parser.add_argument("--serve", action="store_true", help=serve)
     parser.add_argument(
@@ -190,13 +190,13 @@ def _with_beliefs(followed: Trace, file: str, data: Any) -> Run:
     maps, number = maps_of(data, "maps"), record.get("map", 1)
     if not is_whole(number) or not 1 <= number <= len(maps):
         raise MapError(
-            f"{named(file)}: map: expected 1 to {len(maps)}, got {brief(number)}; localise in "
-            "these maps"
+            f"{named(file)}: map: expected 1 to {len(maps)}, got {brief(number)}; run localise "
+            "with these maps"
         )
     if record.get("dstates", count := len(maps[number - 1].dstates)) != count:
         raise MapError(
             f"{named(file)}: dstates: expected {count}, as map {number} has, got "
-            f"{brief(record['dstates'])}; localise in these maps, and not in others"
+            f"{brief(record['dstates'])}; run localise with these maps"
         )
     if len(beliefs) != len(followed):
         raise MapError(

@@ -179,8 +179,8 @@ def of_actions(values: Iterable[Any] | None, name: str, actions: int) -> list[An
     found = [None] * actions if values is None else as_list(values, name)
     if len(found) != actions:
         raise TraceError(
-            f"trace: expected one of {name} for each action, got {len(found)} and {actions} "
-            f"actions; give None where one is not known"
+            f"trace: expected as many {name} as actions, got {len(found)} and {actions} actions; "
+            "give None where one is not known"
         )
     return [None, *found]
 

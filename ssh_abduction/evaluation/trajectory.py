@@ -102,7 +102,7 @@ class Trajectory:
         except ValueError as error:  # also for bytes that are no text
             raise TraceError(
                 f"{named(source)}: expected a trajectory in TUM format, got another file "
-                f"({error}); give a text"
+                f"({error}); give a text of lines: time x y z qx qy qz qw"
             ) from None
         found: list[tuple[float, Pose]] = []
         heights: list[float] = []

@@ -173,7 +173,7 @@ def _belief(belief: dict[str, Any], count: int) -> list[Any]:
     except (KeyError, TypeError, ValueError):
         raise MapError(
             f"beliefs: expected verdict, nowhere and probabilities of dstates 0 to {count - 1}, as "
-            f"localise --json prints them, got something else; localise in these maps again"
+            f"localise --json prints them, got something else; run localise with these maps"
         ) from None
     return [
         verdict,

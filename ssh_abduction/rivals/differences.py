@@ -183,7 +183,7 @@ def difference(
         first: A map.
         other: Another map.
         names: What to call the two maps in words.
-        drives: The drives of the trace, which name steps in words; empty if they are unknown.
+        drives: The drives of the trace, to call a step "monday:12"; empty if they are unknown.
 
     Returns:
         The difference. Its `same` is True if the maps are the same up to renaming.

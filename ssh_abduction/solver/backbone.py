@@ -205,7 +205,7 @@ class _Reasoning:
             size = self._settle_prefix(engine, size)
 
     def _first_size(self) -> int:
-        """Return the size of the shortest prefix from which the known classes replay to the end.
+        """Return the length of the shortest prefix that determines the classes of all later steps.
 
         A shorter prefix cannot be enough for a proof.
         """
@@ -264,7 +264,10 @@ class _Reasoning:
         yield from self._doubts_of_classes(size)
 
     def _doubts_of_classes(self, size: int) -> Iterator[Doubt]:
-        """Yield the doubts about pairs of classes. Each class is given by its first step."""
+        """Yield a doubt for each two classes of steps that are apart, or one, in all known maps.
+
+        Each class is given by its first step.
+        """
         sharing = self._sharing
         firsts = [t for t in sharing.firsts() if t < size]
         for sort in sharing.sorts():

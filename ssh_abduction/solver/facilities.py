@@ -105,7 +105,7 @@ class Facilities:
         return off
 
     def _starts(self) -> tuple[Array, NDArray[np.int_]]:
-        """Return points to search from: all points, and the middles of near points of one kind."""
+        """Return where searches begin: at all points, and midway between like ones nearby."""
         off = self.offsets(self.points)
         both = self.variances[None] + self.variances[:, None]
         more = self._more(self.kinds)

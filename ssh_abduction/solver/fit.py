@@ -426,7 +426,10 @@ class Poses:
         return int((np.linalg.eigvalsh(form) < 1e-6 * max(float(form.diagonal().max()), 1.0)).sum())
 
     def _poses(self, unknown: Array) -> tuple[Pose, ...]:
-        """Compute the pose and covariance of each dstate, relative to the first one of its part."""
+        """Compute the pose and covariance of each dstate.
+
+        They are relative to the first dstate of its connected part of the map.
+        """
         at, heading = (
             unknown[: 2 * self._positions].reshape(-1, 2),
             unknown[2 * self._positions : -2],

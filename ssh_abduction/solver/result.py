@@ -65,7 +65,8 @@ class Solution(MapSequence):
             it asks for.
         theory: The theory. Each "auto" in it is replaced by the value that was used.
         steps: The number of steps of the trace.
-        effort: What the search did: time, grounding, prefix, and evidence.
+        effort: Figures about the search: its time, the size of the grounding, how many first steps
+            clingo was given, and what evidence was used.
         stopped: Why the search ended before it was complete; None if it did not.
         partial: A map of the first steps, if no map of the whole trace was found; else None.
         within: The number of dstates above the minimum that a listed map may have.

@@ -119,7 +119,7 @@ class Backbone:
             no paths.
         proven: Whether this holds for all minimal maps. If not, it holds only for the known ones,
             and further maps may differ more.
-        drives: The drives of the trace, which name steps in words; empty if they are unknown.
+        drives: The drives of the trace, to call a step "monday:12"; empty if they are unknown.
     """
 
     dstates: Shared

@@ -67,7 +67,7 @@ class Weighed:
         excess: The misfit of the best map, divided by the misfit that the standard deviations
             predict. Costs are divided by it before they become probabilities.
         doubt: Why the costs cannot be trusted, such as "the track is unreliable"; None if they can.
-        drives: The drives of the trace, which name steps in words; empty if they are unknown.
+        drives: The drives of the trace, to call a step "monday:12"; empty if they are unknown.
     """
 
     bound: float

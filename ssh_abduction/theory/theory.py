@@ -63,8 +63,8 @@ class Theory:
             and paths).
         boundary: Whether the axioms about left and right of a path hold. none: they do not. strict:
             without exception. defeasible: with exceptions for pairs of paths, each at a cost.
-        symmetric_sides: Whether two paths cross at a turn from one to the other. If they do, a
-            branch on the right in one direction is on the left in the other.
+        symmetric_sides: Whether two paths cross where the robot turns from one onto the other. If
+            they do, a branch that is on the right of a robot is on its left on the way back.
         path_order: Order of the places of a path. partial: some pairs may stay unordered. total:
             every two places are ordered.
         next_place: Whether a travel leads to the next place of its path, with no place between.
@@ -72,7 +72,8 @@ class Theory:
         star: How to use stars (the gateways seen at a place). none: not at all. alike: a dstate has
             one star, within tolerance. pattern: the stars of a place are one star, rotated. frame:
             the stars of a place agree when rotated by the headings, and paths go straight on.
-            gateways: like frame, in any directions, within tolerance. auto: frame if the trace has
+            gateways: like frame, but gateways lie in any directions, which agree within a
+            tolerance. auto: frame if the trace has
             stars, else none. If stars or turns do not fit right angles, frame becomes gateways.
         displacement: Whether displacements are evidence; auto uses them if the trace has any.
         reject: Significance level: the largest probability of rejecting the true map because of
@@ -88,10 +89,10 @@ class Theory:
             carried; 0 forbids it.
         changed: Cost in dstates of a gateway that differs between two drives; 0 forbids it.
         planar: Whether paths meet only at places. Then the map can be drawn in the plane without a
-            crossing, with right turns to the right.
-        prefer: What to minimise, most important first, out of dstates, paths, places and excuses.
-            Counts that are not named are not minimised. auto is dstates,places,paths if
-            displacements are used, else dstates,paths,places.
+            crossing and without mirroring.
+        prefer: What to minimise, most important first, out of dstates, paths, places and excuses
+            (exceptions of boundary=defeasible). Counts that are not named are not minimised. auto
+            is dstates,places,paths if displacements are used, else dstates,paths,places.
         without: Names of axioms to leave out, to see what they do.
         rules: Your own rules: paths of files that use the predicates of the encodings, or Rules.
         unknown_views: Whether the view of some step is unknown. It is set from the trace.
@@ -103,8 +104,8 @@ class Theory:
         same_place: Pairs of steps known to be at one place. They switch off the fast engines.
         weigh: How to compare maps. count: by the counts in `prefer`. cost: by their cost in nats:
             the prices of their dstates, places, paths and faults, plus half of the chi-square of
-            their misfit to the displacements. auto: cost if displacements are used and the theory
-            allows it.
+            their misfit to the displacements. auto: cost if displacements are used, dstates come
+            first in `prefer`, and there are no excuses.
         prices: Three numbers: the prices of a dstate, a place and a path in nats (natural
             logarithms of odds). Used only if maps are compared by cost.
     """

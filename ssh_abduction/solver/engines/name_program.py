@@ -378,7 +378,7 @@ class NameProgram:
         ]
 
     def _not_given(self, trail: _Trail) -> Iterator[tuple[Link, None]]:
-        """Yield the links on a trail that clingo lacks, as keys for a dict."""
+        """Yield those links on a trail that clingo was not given yet, as keys for a dict."""
         while trail is not None:
             link, trail = trail
             if link not in self._known.links:

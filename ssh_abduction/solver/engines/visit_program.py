@@ -45,8 +45,8 @@ class _GivenVisits:
 
     Attributes:
         visits: The visits.
-        place_of: For each node, its position in the order of choice.
-        ends: The visits for which the control has the action that ends them.
+        place_of: For each node, its number in the order in which clingo decides nodes.
+        ends: The visits that end in the steps given to the control so far.
         turns: The turns, as (node, direction, node).
         fits: The pairs of visits that may be at one place.
         joined: The pairs of visits that are at one place, as the user says.
@@ -182,8 +182,8 @@ class VisitProgram:
     def add_rules(self, rules: str, part: str | None = None, number: int = 0) -> None:
         """Give clingo more rules.
 
-        This does not check any limits: if it stopped halfway, a core would be relaxed without the
-        rule that limits its members.
+        This does not check the limits of time and memory. If it stopped halfway, clingo would have
+        relaxed an unsatisfiable core without the rule that bounds how many members are violated.
 
         Args:
             rules: The rules.

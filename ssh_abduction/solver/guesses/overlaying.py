@@ -218,9 +218,9 @@ class Overlay:
         )
 
     def _lay(self, old: int, new: int) -> None:
-        """Turn and shift the drive so that one of its dstates has the pose of another one.
+        """Turn and shift the new drive so that its dstate `new` has the pose of the dstate `old`.
 
-        The covariance says that the frame of the drive is unknown.
+        All poses of the drive get a large common covariance, as the pose of its frame is unknown.
         """
         both, state = self._both, self._state
         headings = both.heading[self._old[0] :]

@@ -244,7 +244,7 @@ class Loops:
         return self._white(np.zeros_like(every), every, there, there).reshape(-1, 9)
 
     def noise(self, first: Steps, last: Steps) -> Array:
-        """Return the covariances of closings from the noise of displacements, m x 3 x 3.
+        """Return the covariances of loop closings that noisy displacements cause, m x 3 x 3.
 
         Args:
             first: The steps at which the loops begin, m.
@@ -253,7 +253,7 @@ class Loops:
         return self._white(first, last, last, last)
 
     def repeated(self, first: Steps, last: Steps) -> Array:
-        """Return the covariances of closings from a wrong scale and a steady drift, m x 3 x 3."""
+        """Return those that a wrong scale and a steady drift cause, m x 3 x 3."""
         return self._repeated((first, last), (first, last))
 
 
