@@ -229,6 +229,12 @@ def test_probabilities_are_of_steps_of_the_trace(weighed_route: Solution) -> Non
     counted = solve(Trace.from_steps("aba", ["travel", "travel"]))
     with pytest.raises(SolverError, match="nothing observed says how probable"):
         counted.probability(0, 2)
+    assert weighed_route.weighed is not None
+    doubted = replace(weighed_route.weighed, doubt="the track is unreliable")
+    with pytest.raises(SolverError, match="got doubts, as the track is unreliable; mend the trace"):
+        replace(
+            weighed_route, support=replace(weighed_route.support, weighed=doubted)
+        ).probability(0, 12)
 
 
 def test_costs_are_written_and_read(weighed_route: Solution, tmp_path: Path) -> None:
@@ -347,6 +353,7 @@ def test_costs_in_doubt_make_no_map_sure() -> None:
     assert sure.confidence > 0.99
     assert doubted.confidence == 0.0
     assert doubted.sentence == "no probability is given, as the track is unreliable"
+    assert ([join[:2] for join in sure.joins], doubted.joins) == ([(0, 2)], ())
     read = FieldReader("here")
     assert Weighed.from_dict(read, doubted.to_dict(), 3) == doubted
     with pytest.raises(MapError, match=r"weighed.doubt: expected a text, got 3"):

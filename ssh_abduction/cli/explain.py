@@ -203,7 +203,9 @@ class _InMap:
         weighed = listing.weighed
         return cls(
             at[0] == at[1],
-            None if weighed is None else weighed.probability(first, second, "place"),
+            None
+            if weighed is None or weighed.doubt is not None
+            else weighed.probability(first, second, "place"),
             None if weighed is None else weighed.nats_if_other(first, second),
         )
 

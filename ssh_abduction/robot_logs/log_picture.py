@@ -118,7 +118,7 @@ def doubtful_joins(solution: Solution) -> list[tuple[int, int, float]]:
         The two steps of each join, and its probability; none if the costs are in doubt.
     """
     weighed = solution.weighed
-    joins = weighed.joins if weighed and not weighed.doubt else ()
+    joins = weighed.joins if weighed else ()
     return sorted((join for join in joins if join[2] < SURE), key=lambda join: join[2])
 
 

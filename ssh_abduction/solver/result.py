@@ -209,12 +209,18 @@ class Solution(MapSequence):
             A number from 0 to 1. It sums the weights of the rival maps that say so.
 
         Raises:
-            SolverError: A step does not exist, or maps were counted and not weighed.
+            SolverError: A step does not exist, maps were counted and not weighed, or their costs
+                cannot be trusted.
         """
         if self.weighed is None:
             raise SolverError(
                 "probability: expected a trace with displacements, whose maps are compared by "
                 "cost, got one whose maps are counted; nothing observed says how probable they are"
+            )
+        if self.weighed.doubt is not None:
+            raise SolverError(
+                f"probability: expected costs that can be trusted, got doubts, as "
+                f"{self.weighed.doubt}; mend the trace or its noise model"
             )
         one_of("of", of, ("dstate", "place"), SolverError)
         mend = f"the trace has steps 0 to {self.steps - 1}"

@@ -150,8 +150,11 @@ class Weighed:
         """The joins of the best map, each with its probability, the least probable one first.
 
         A join is two steps at one place, with steps elsewhere in between. In a causal map the two
-        steps are at one dstate.
+        steps are at one dstate. If there is a `doubt`, no join has a probability, and none is
+        listed.
         """
+        if self.doubt is not None:
+            return ()
         best = self.rivals[0]
         at, of = (best.places, "place") if best.places else (best.dstates, "dstate")
         last: dict[int, int] = {}
