@@ -69,7 +69,7 @@ def figure(log: RobotLog, imported: Imported, solution: Solution) -> str:
         marks += _map_marks(sheet, imported, solution)
     else:
         marks += [_dot(sheet.on_page(p), 4, "#d55e00") for p in sheet.spots]
-    picture = page(marks, sheet.points or [(0.0, 0.0)], margin=20)
+    picture = page(marks, sheet.points or [(0.0, 0.0)], margin=60)
     poses = (
         "corrected poses of the log, which were not read for the map"
         if sheet.is_corrected
@@ -217,13 +217,13 @@ def _map_marks(sheet: _Sheet, imported: Imported, solution: Solution) -> Iterato
             f'<path d="{_line(map(sheet.on_page, course))}" stroke="{colour}" stroke-width="4" '
             'stroke-opacity=".8" stroke-linejoin="round" fill="none"/>'
         )
-    for place, seen in visits.items():
-        at = sheet.on_page(middles[place])
-        if place in hidden:
-            yield _dot(at, 4, EDGE, f"place {place}")
-        else:
-            yield from _place(sheet, imported, at, seen)
-            yield from _number(at, str(place), doubts.get(place))
+    at = {place: sheet.on_page(middle) for place, middle in middles.items()}
+    yield from (_dot(at[place], 4, EDGE, f"place {place}") for place in visits if place in hidden)
+    for place in shown:
+        yield from _place(sheet, imported, at[place], visits[place])
+    # Numbers come last, so that nothing covers them.
+    for place in shown:
+        yield from _number(at[place], str(place), doubts.get(place))
 
 
 def _bands(
