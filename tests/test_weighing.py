@@ -232,9 +232,9 @@ def test_probabilities_are_of_steps_of_the_trace(weighed_route: Solution) -> Non
     assert weighed_route.weighed is not None
     doubted = replace(weighed_route.weighed, doubt="the track is unreliable")
     with pytest.raises(SolverError, match="got doubts, as the track is unreliable; mend the trace"):
-        replace(
-            weighed_route, support=replace(weighed_route.support, weighed=doubted)
-        ).probability(0, 12)
+        replace(weighed_route, support=replace(weighed_route.support, weighed=doubted)).probability(
+            0, 12
+        )
 
 
 def test_costs_are_written_and_read(weighed_route: Solution, tmp_path: Path) -> None:
