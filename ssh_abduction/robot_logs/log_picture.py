@@ -206,7 +206,7 @@ def _map_marks(sheet: _Sheet, imported: Imported, solution: Solution) -> Iterato
     shown = {place: middle for place, middle in middles.items() if place not in hidden}
     path_of = {state.id: state.path for state in ssh_map.dstates}
     colourful = paths_mean_something(solution)
-    edges = list(_edges(sheet, imported, ssh_map, visit_of, shown))
+    edges = list(_edges(sheet, imported, ssh_map, visit_of, middles))
     yield from _bands(sheet, ssh_map, middles, [(places[t], places[t + 1], c) for t, c in edges])
     for step, course in edges:
         path = path_of[ssh_map.dstate_at[step]] or 0
@@ -254,7 +254,7 @@ def _edges(
     """Yield the edges: the step at which the robot first set out, and the course, (n, 2) metres.
 
     An edge that several drives took comes once for each drive. Edges lead to the `middles` of
-    places. At other places, they follow the course of the robot through the place.
+    places.
     """
     places, drawn = place_of_steps(ssh_map), set[tuple[int, int]]()
     for t, edge in edges_of(imported.trace, ssh_map).items():
