@@ -14,7 +14,8 @@ With --plans, the robots drive through each floor plan of a folder. Stars are th
 doors. Some doors are closed on one of the two drives: on the second one if the seed is even.
 
 With --beam, only the beams of width 1 and of this width search, without a time limit. So the load
-of the machine does not matter. Their cheapest map is judged.
+of the machine does not matter. Their cheapest map is judged. With --join, the maps of the two
+drives are joined, too.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import argparse
 import math
 import random
 import sys
+import time
 from collections import Counter
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
@@ -42,6 +44,7 @@ from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.data import Action, Odometry, Step
 from ssh_abduction.data.star import Gateway as Sighted
 from ssh_abduction.solver.guesses.beam import Beam
+from ssh_abduction.solver.guesses.joining import Joining
 from ssh_abduction.solver.misfit import Misfit
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import settle
@@ -261,8 +264,8 @@ def named(ssh_map: SSHMap, known: Known) -> Iterator[Gateway]:
         yield (x, y), ((fault.gateway or 0) - slot + heading) % 4
 
 
-def cheapest(trace: Trace, theory: Theory, width: int) -> SSHMap:
-    """The map of least cost that beams of width 1 and of another width find."""
+def cheapest(trace: Trace, theory: Theory, widths: Collection[int], joins: bool) -> SSHMap:
+    """The map of least cost that beams of some widths find, and that joins the drives."""
     problem = settle(trace, theory)
     log, misfit = Log(trace, problem.theory, problem.pairs), Misfit(problem)
     dstate, place, _ = theory.prices
@@ -271,7 +274,8 @@ def cheapest(trace: Trace, theory: Theory, width: int) -> SSHMap:
         dstates = len(found.dstates) + sum(fault.cost for fault in found.faults)
         return dstate * dstates + place * len(found.places) + misfit.of_map(found) / 2
 
-    return min((m for w in {1, width} for m in Beam(problem, log, w).maps()), key=nats)
+    found = [ssh_map for width in widths for ssh_map in Beam(problem, log, width).maps()]
+    return min([*found, *(Joining(problem, log).maps() if joins else ())], key=nats)
 
 
 def main() -> None:
@@ -287,15 +291,18 @@ def main() -> None:
     parser.add_argument("--limit", type=float, default=20, metavar="S", help="seconds for each")
     parser.add_argument("--plans", type=Path, metavar="FOLDER", help="tours of floor plans")
     parser.add_argument("--beam", type=int, metavar="WIDTH", help="search by beams alone")
+    parser.add_argument("--join", action="store_true", help="join the maps of the drives")
     options = parser.parse_args()
     plans = sorted(options.plans.glob("*.xml")) if options.plans else []
+    widths = {1, options.beam} if options.beam else set[int]()
     theory = Theory(changed=options.price, star="frame")
     if plans:
         theory = Theory(changed=options.price, star="gateways", boundary="none")
-    print("| changes | true maps | changed gateways | named | others named | maps that name none |")
-    print("|---|---|---|---|---|---|")
+    head = ("changes", "true maps", "changed gateways", "named", "others named")
+    print(f"| {' | '.join((*head, 'maps that name none', 'CPU s'))} |\n|{'---|' * 7}")
     for changes in range(options.least, options.most + 1):
         true = changed = found = others = none = 0
+        began = time.process_time()
         seeds = range(options.first, options.first + options.seeds)
         rows = [*product([Plan.load(path) for path in plans] or [None], seeds)]
         for plan, seed in rows:
@@ -307,8 +314,8 @@ def main() -> None:
             trace = one.known.trace
             best = (
                 solve(trace, theory, time_limit=options.limit).maps[0]
-                if options.beam is None
-                else cheapest(trace, theory, options.beam)
+                if not widths and not options.join
+                else cheapest(trace, theory, widths, options.join)
             )
             said = {
                 *(named(best, one.known) if plan is None else named_doors(best, one.known, plan))
@@ -322,7 +329,8 @@ def main() -> None:
             others += len(said - one.changed)
             none += not said
         print(
-            f"| {changes} | {true} of {len(rows)} | {changed} | {found} | {others} | {none} |",
+            f"| {changes} | {true} of {len(rows)} | {changed} | {found} | {others} | {none} "
+            f"| {time.process_time() - began:.0f} |",
             flush=True,
         )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import changes
 import pytest
 import truth
 from together import of_mazes
@@ -41,6 +42,39 @@ def test_the_joint_map_costs_no_more_than_the_true_one(known: truth.Known, stars
     places = [best.dstates[label].place for label in best.dstate_at]
     found = nats(best.dstate_at, truth.partition(places))
     assert found <= nats(truth.partition(known.dstates), truth.partition(known.places)) + 1e-6
+
+
+@pytest.mark.parametrize("seed", [513, 514, 515])
+def test_the_joint_map_names_the_gateways_that_changed(seed: int) -> None:
+    case = changes.case(4, 60, seed, 3, 8)
+    problem = settle(case.known.trace, Theory(changed=1.2, star="frame"))
+    *_, best = joined(problem)
+    assert truth.is_true(best, case.known)
+    assert case.changed
+    assert {*changes.named(best, case.known)} == case.changed
+    assert not [*violations(problem.trace, best, problem.theory)]
+
+
+def test_a_gateway_that_closes_and_opens_again_changes_twice() -> None:
+    end = [(1, 0, 1, 0)]
+    drives = [
+        Trace.from_steps(
+            "abcde"[:length],
+            ["travel"] * (length - 1),
+            displacements=[(5.0, 0.0, 0.0)] * (length - 1),
+            stars=[(1, is_open, 1, 0)] + end * (length - 1),
+        )
+        for is_open, length in ((1, 5), (0, 5), (1, 4))
+    ]
+    problem = settle(together(drives), Theory(changed=1.2))
+    *_, ssh_map = joined(problem)
+    assert ssh_map.dstate_at == (*range(5), *range(5), *range(4))
+    assert [(fault.step, fault.place, fault.gateway) for fault in ssh_map.faults] == [
+        (5, 0, 1),
+        (10, 0, 1),
+    ]
+    *_, ssh_map = joined(settle(together(drives), Theory()))
+    assert len(ssh_map.dstates) == 6  # without changes, the first place is two
 
 
 def test_drives_that_show_other_things_stay_apart() -> None:

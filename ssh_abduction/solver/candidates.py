@@ -111,10 +111,11 @@ class Candidates:
     def joined(self) -> Iterator[SSHMap]:
         """Yield maps that join the maps of single drives, if the checker accepts them.
 
-        Without displacements, or if faults or lifts are allowed, there are none.
+        Without displacements, or if lifts or faults within a drive are allowed, there are none.
         """
         theory = self._task.theory
-        if self.beam(1) is None or not theory.several_drives or theory.has_faults or theory.lifts:
+        trusts_drives = not (theory.lifts or theory.replace(changed=0.0).has_faults)
+        if self.beam(1) is None or not theory.several_drives or not trusts_drives:
             return
         from ssh_abduction.solver.guesses.joining import Joining  # loads numpy
 

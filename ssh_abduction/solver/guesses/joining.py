@@ -32,6 +32,7 @@ from ssh_abduction.solver.guesses.completing import completed
 from ssh_abduction.solver.guesses.overlaying import Overlay, Part
 from ssh_abduction.solver.guesses.sights import Sights
 from ssh_abduction.solver.steps.chart import numbered
+from ssh_abduction.solver.steps.faults import with_changes
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import Problem
 
@@ -116,9 +117,8 @@ class Joining:
     def _alone(self, drive: Drive) -> Part | None:
         """Map a drive alone; None if no map is found."""
         trace = self._problem.trace[drive.first : drive.stop]
-        theory = replace(
-            self._problem.theory.of_steps(drive.first, len(trace)), several_drives=False
-        )
+        theory = self._problem.theory.of_steps(drive.first, len(trace))
+        theory = replace(theory, several_drives=False, changed=0.0)
         problem = Problem.of(trace, theory)
         beam = Beam(problem, Log(trace, theory, problem.pairs), ALONE)
         if next(beam.maps(), None) is None or beam.best is None:
@@ -165,7 +165,7 @@ class Joining:
             look_at_clock()
             if len(found) == ANCHORS:
                 break
-            overlay = Overlay(first, second, self._problem)
+            overlay = Overlay(first, second, self._problem, self._sights)
             if overlay.merge(s, x):
                 found.append(overlay.part())
         found.sort(key=lambda joined: joined.nats)
@@ -178,9 +178,8 @@ class Joining:
         order = list(dict.fromkeys(labels))  # of first visits
         places, facing = numbered(part.places[s] for s in order), part.poses[1][order].tolist()
         ssh_map = completed(trace, self._bare, numbered(labels), places, facing)
-        if ssh_map is None or next(violations(trace, ssh_map, self._bare), None):
-            return None
-        return ssh_map
+        found = None if ssh_map is None else with_changes(ssh_map, trace, self._bare)
+        return None if found is None or next(violations(trace, found, self._bare), None) else found
 
     def _of(self, part: Part) -> tuple[Trace, list[int]]:
         """Return the trace of the drives of a part, and the labels of its steps."""

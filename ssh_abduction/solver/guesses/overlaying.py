@@ -3,13 +3,14 @@
 A *part* is a map of some drives, with the joint Gaussian distribution of its poses. An `Overlay`
 has two parts whose frames are unrelated at first. Merging two dstates fixes the frames to each
 other. From then on the two places that most surely coincide are merged first, and the poses are
-conditioned on each merge. What two merged dstates lead to by one action is merged, too.
+conditioned on each merge. What two merged dstates lead to by one action is merged, too. If gateways
+may change between drives, places that saw different gateways may be merged at the price of these.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from statistics import median
@@ -17,11 +18,10 @@ from statistics import median
 import numpy as np
 from numpy.typing import NDArray
 
-from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.equations import spreads_of
 from ssh_abduction.solver.guesses.reckoning import BLUR, Hypothesis, conditioned
-from ssh_abduction.solver.guesses.sights import Sights, agree
+from ssh_abduction.solver.guesses.sights import Sight, Sights
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import Problem
 
@@ -46,7 +46,7 @@ class Part:
         places: The place of each dstate.
         seen: For each dstate, what its steps show, as numbers.
         links: For each (dstate, action) with a link, the dstate that it leads to.
-        sights: For each place, what a step there shows of it.
+        sights: For each place, what each drive saw of it.
         position: For each place, the index of its x in the means.
         heading: For each dstate, the index of its heading in the means.
         mean: The means of the poses.
@@ -58,7 +58,7 @@ class Part:
     places: list[int]
     seen: list[frozenset[int]]
     links: Mapping[tuple[int, int], int]
-    sights: list[Star | tuple[bool, ...] | None]
+    sights: Sequence[Mapping[int, Sight]]
     position: NDArray[np.int_]
     heading: NDArray[np.int_]
     mean: Array
@@ -71,10 +71,10 @@ class Part:
         labels = {first + t: label for t, label in enumerate(found.labels)}
         seen: list[set[int]] = [set() for _ in found.places]
         links: dict[tuple[int, int], int] = {}
-        shown = list(found.sights)
+        shown: list[dict[int, Sight]] = [{} for _ in found.sights]
         for t, label in labels.items():
             seen[label].add(sights.seen[t])
-            shown[found.places[label]] = sights.shown[t]
+            shown[found.places[label]][sights.drive[t]] = sights.shown[t]
             if t + 1 in labels:
                 links[label, log.actions[t]] = labels[t + 1]
         kept = np.array([*(i + k for i in found.position for k in (0, 1)), *found.heading])
@@ -130,6 +130,7 @@ class _State:
     Attributes:
         dstate: For each dstate, the first dstate that it is merged with.
         place: For each place, the first place that it is merged with.
+        sights: For each first place, what each drive saw of it.
         links: For each first dstate, where its actions lead to.
         mean: The means of the poses.
         covariance: The covariance of these.
@@ -138,6 +139,7 @@ class _State:
 
     dstate: list[int]
     place: list[int]
+    sights: list[Mapping[int, Sight]]
     links: list[dict[int, int]]
     mean: Array
     covariance: Array
@@ -145,7 +147,7 @@ class _State:
 
     def copy(self) -> _State:
         """Copy everything that a merge changes in place."""
-        return replace(self, links=[dict(links) for links in self.links])
+        return replace(self, sights=[*self.sights], links=[dict(links) for links in self.links])
 
 
 class _ClashError(Exception):
@@ -155,9 +157,10 @@ class _ClashError(Exception):
 class Overlay:
     """Merges the dstates and places of a standing map with those of a drive."""
 
-    def __init__(self, standing: Part, drive: Part, problem: Problem) -> None:
+    def __init__(self, standing: Part, drive: Part, problem: Problem, sights: Sights) -> None:
         theory, both = problem.theory, standing.beside(drive)
-        self._both, self._old = both, (len(standing.places), len(standing.sights))
+        self._both, self._sights = both, sights
+        self._old = len(standing.places), len(standing.sights)
         self._has_places = theory.level == "topological"
         self._prices = theory.prices[0], theory.prices[1] if self._has_places else 0.0
         slack = SLACK * both.usual_travel(problem.trace)
@@ -168,13 +171,16 @@ class Overlay:
         self._state = _State(
             [*range(len(both.places))],
             [*range(len(both.sights))],
+            [*both.sights],
             links,
             both.mean,
             both.covariance,
             both.nats,
         )
-        # Pairs of different places that may be one.
-        self._open = np.triu([[agree(p, q) for q in both.sights] for p in both.sights], 1)
+        # The cost of changed gateways if two places are one; inf if they cannot be.
+        self._changes = np.full(2 * (len(both.sights),), math.inf)
+        for (p, seen), (q, others) in combinations(enumerate(both.sights), 2):
+            self._changes[p, q] = sights.merged(seen, others)
 
     def merge(self, old: int, new: int) -> bool:
         """Merge a dstate of the standing map with one of the drive, and then all that coincide.
@@ -188,7 +194,7 @@ class Overlay:
             return False
         while pair := self._surest():
             if not self._tried([], pair):
-                self._open[pair] = False
+                self._changes[pair] = math.inf
         return True
 
     def part(self) -> Part:
@@ -209,7 +215,7 @@ class Overlay:
                 for s in dstates
                 for action, x in state.links[s].items()
             },
-            [both.sights[p] for p in places],
+            [state.sights[p] for p in places],
             2 * np.arange(len(places)),
             n + np.arange(len(dstates)),
             state.mean[kept],
@@ -259,8 +265,8 @@ class Overlay:
         size = np.maximum(a * d - b * b, BLUR**2)
         x, y = off[..., 0], off[..., 1]
         squares = (d * x * x - 2 * b * x * y + a * y * y) / size
-        unlikely = squares + np.log(size)
-        unlikely[(squares > FAR) | ~self._open[np.ix_(places, places)]] = math.inf
+        unlikely = squares + np.log(size) + 2 * self._changes[np.ix_(places, places)]
+        unlikely[squares > FAR] = math.inf
         i, j = np.unravel_index(np.argmin(unlikely), unlikely.shape)
         return None if math.isinf(unlikely[i, j]) else (int(places[i]), int(places[j]))
 
@@ -315,14 +321,16 @@ class Overlay:
     def _merge_places(self, p: int, q: int, heading: tuple[int, int] | None) -> None:
         """Merge two places, and perhaps two headings there. Raises _ClashError."""
         state, position = self._state, self._both.position
-        if not agree(self._both.sights[p], self._both.sights[q]):
+        changes = self._sights.merged(state.sights[p], state.sights[q])
+        if math.isinf(changes):
             raise _ClashError
+        state.sights[p] = {**state.sights[p], **state.sights[q]}
         state.place = [p if i == q else i for i in state.place]
         same = [(position[p], position[q]), (position[p] + 1, position[q] + 1)]
         if heading is None:
-            self._condition(same, self._prices[1])
+            self._condition(same, self._prices[1] - changes)
         else:
-            self._condition([*same, heading], sum(self._prices))
+            self._condition([*same, heading], sum(self._prices) - changes)
 
     def _condition(self, same: list[tuple[int, int]], saved: float) -> None:
         """Condition the poses on equal entries of the means, which saves some nats."""

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
+from collections.abc import Mapping
 from functools import lru_cache
-from itertools import combinations, product
+from itertools import combinations, pairwise, product
+from typing import TypeAlias
 
 from ssh_abduction.data.drives import starts_of
 from ssh_abduction.data.star import Frame, Star
@@ -15,6 +17,9 @@ from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.solver.steps.frames import rotation_bits
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.theory import Theory
+
+# What a step shows of its place.
+Sight: TypeAlias = Star | tuple[bool, ...] | None
 
 # Do not extend a hypothesis in a way that costs this many nats more than its cheapest extension.
 DEAREST = 20.0
@@ -59,10 +64,32 @@ class Sights:
             place: The place.
             t: The step.
         """
-        sight, own = found.sights[place], self.shown[t]
+        before, now = found.drives[place], self.drive[t]
+        return self._between(found.sights[place], self.shown[t], is_one_drive=before == now)
+
+    def merged(self, first: Mapping[int, Sight], second: Mapping[int, Sight]) -> float:
+        """Return by how many nats changed gateways cost more if two places are one.
+
+        Args:
+            first: What each drive saw at the first place, as `shown`.
+            second: The same for the second place.
+
+        Returns:
+            The cost; inf if the two cannot be one place.
+        """
+        if any(not agree(first[drive], second[drive]) for drive in first.keys() & second.keys()):
+            return math.inf
+        return self._along({**first, **second}) - self._along(first) - self._along(second)
+
+    def _along(self, seen: Mapping[int, Sight]) -> float:
+        """Return the cost in nats of the changes from each drive to the next at one place."""
+        between = pairwise(seen[drive] for drive in sorted(seen))
+        return sum(self._between(was, now, is_one_drive=False) for was, now in between)
+
+    def _between(self, sight: Sight, own: Sight, *, is_one_drive: bool) -> float:
+        """Return the cost in nats of the changes between two sights of a place."""
         if self._misreads or agree(sight, own):
             return 0.0
-        is_one_drive = found.drives[place] == self.drive[t]
         if not self._price or is_one_drive:
             return math.inf
         if isinstance(sight, Star) and isinstance(own, Star):
@@ -82,7 +109,7 @@ def right_view(seen: dict[int, float]) -> int:
     return max(seen, key=lambda number: seen[number])
 
 
-def _shown(step: Step, star: str) -> Star | tuple[bool, ...] | None:
+def _shown(step: Step, star: str) -> Sight:
     """Return the star of a step in a form that all steps at its place share; None without stars."""
     if star == "gateways":
         return step.gateways or Star(())
@@ -90,7 +117,7 @@ def _shown(step: Step, star: str) -> Star | tuple[bool, ...] | None:
     return None if seen is None else min(seen[k:] + seen[:k] for k in range(4))
 
 
-def agree(first: Star | tuple[bool, ...] | None, second: Star | tuple[bool, ...] | None) -> bool:
+def agree(first: Sight, second: Sight) -> bool:
     """Whether two steps that show these stars may be at one place."""
     if isinstance(first, Star) and isinstance(second, Star):
         return _may_fit(first, second)
