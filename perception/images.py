@@ -107,7 +107,7 @@ def _sidecar(trace: Trace) -> NDArray[np.float64]:
     except OSError as error:
         raise PerceptionError(
             f"{path}: expected a .npy or .npz file of images: {error.strerror or error}; "
-            "check the header's images"
+            "check the field images in the header of the trace"
         ) from None
     except PerceptionError:
         raise

@@ -173,15 +173,15 @@ def test_what_a_person_says_is_obeyed_at_each_later_solve(
     ]
     assert main(solving(folder)) == 0
     told = capsys.readouterr()
-    assert "obeying 2 sentences of" in told.err
+    assert "obeying 2 corrections of" in told.err
     assert "optimal: 6 dstates" in told.out
     assert "(kitchen)" in told.out
     # With a third drive, all stays. Without Tuesday, what was said about Tuesday has no effect.
     replace(TUESDAY, name="again").save(folder / "again.jsonl")
     assert main([*solving(folder, "monday", "tuesday", "again")]) == 0
-    assert "obeying 2 sentences of" in capsys.readouterr().err
+    assert "obeying 2 corrections of" in capsys.readouterr().err
     assert main(solving(folder, "monday")) == 0
-    assert "obeying 1 sentence of" in (told := capsys.readouterr()).err
+    assert "obeying 1 correction of" in (told := capsys.readouterr()).err
     assert "1 are of drives that are not solved" in told.err
     elsewhere = ["solve", *solving(folder)[1:4], "--corrections", building, "--json"]
     assert main(elsewhere) == 0
@@ -282,7 +282,7 @@ def test_verbs_with_the_recorded_trace_obey_what_was_said_of_its_stars(
     pair = ["explain", trace, "monday:0", "tuesday:0"]
     for words in (["check", maps, trace], ["view", maps, trace, "-o", page]):
         assert main(words) == 0
-        assert "obeying 1 sentence of" in capsys.readouterr().err
+        assert "obeying 1 correction of" in capsys.readouterr().err
     assert f"--corrections {file}" in Path(page).read_text()
     for given in (["--theory", maps], ["--corrections", str(file)]):
         assert main([*pair, *given]) == 0

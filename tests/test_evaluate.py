@@ -439,7 +439,7 @@ def solved(tmp_path: Path) -> str:
 def test_the_shell_prints_a_table(solved: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["evaluate", solved, ACES]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == "none of 4 maps is the true one"
+    assert lines[0] == "4 maps: none is the true one"
     assert (
         lines[1] == "the truth, known at 23 of 23 steps: 22 dstates, 9 places; "
         "13 % of the pairs of dstates share a view"
@@ -466,7 +466,7 @@ def test_the_shell_says_which_map_is_true(
     assert main(["evaluate", *files]) == 0
     out = capsys.readouterr().out
     assert out.startswith(
-        "map 1 is the true one, of 1 map\nthe truth, known at 25 of 25 steps: 8 dstates; 14 % of"
+        "1 map: map 1 is the true one\nthe truth, known at 25 of 25 steps: 8 dstates; 14 % of"
     )
     assert (
         re.sub(r" +", " ", out.splitlines()[-1]) == " 1 yes 8 right – – 1.000 – – – – 1.000 1.000"
@@ -475,12 +475,12 @@ def test_the_shell_says_which_map_is_true(
     (tmp_path / "map.json").write_text(json.dumps(cut))
     assert main(["evaluate", *files]) == 0
     assert capsys.readouterr().out.startswith(
-        "none of 1 map is the true one, and there may be more\n"
+        "1 map, and there may be more: none is the true one\n"
     )
     told(trace, [{"place": name} for name in names]).save(tmp_path / "trace.jsonl")
     assert main(["evaluate", *files]) == 0
     assert capsys.readouterr().out.startswith(
-        "unknown which map is the true one, of 1 map, and there may be more: the truth names"
+        "1 map, and there may be more: unknown which is the true one, as the truth names"
     )
 
 

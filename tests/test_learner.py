@@ -608,7 +608,7 @@ def test_from_simulation_to_recognition_in_the_shell(
     assert main(["evaluate", path("maps.json"), path("views.jsonl")]) == 0
     told = capsys.readouterr().out
     assert told.startswith(
-        "map 1 is the true one, of 1 map\nthe truth, known at 48 of 48 steps: 8 dstates, 4 "
+        "1 map: map 1 is the true one\nthe truth, known at 48 of 48 steps: 8 dstates, 4 "
         "places, 4 paths; 14 % of"
     )
     assert (

@@ -183,7 +183,7 @@ def test_maps_of_logs_obey_what_a_person_says(
     capsys.readouterr()
     main(["map", *logs, *settings])
     told = capsys.readouterr()
-    assert "obeying 2 sentences of" in told.err
+    assert "obeying 2 corrections of" in told.err
     assert "done already" not in told.out
     solution = Solution.load(Path(building) / "maps.json")
     assert solution.theory.different == ((first, joined),)

@@ -497,6 +497,6 @@ def test_a_solution_without_the_maps_that_were_found_is_not_written(tmp_path: Pa
     first = next(kept := iter(search))
     assert len(list(kept)) == 3
     for some in ((), (first,)):
-        with pytest.raises(MapError, match="maps: expected the 4 that the search gave"):
+        with pytest.raises(MapError, match="maps: expected all 4 that the search found"):
             search.solution(some).save(tmp_path / "maps.json")
     assert not list(tmp_path.iterdir())

@@ -69,7 +69,7 @@ def run(options: argparse.Namespace) -> int:
         print("\n".join(map(printable, sentences_of(said))) or "nothing was said")
         return 0
     file = saved.save(said)
-    sentences = counted(sum(1 for _ in sentences_of(said)), "sentences")
+    sentences = counted(sum(1 for _ in sentences_of(said)), "corrections")
     print(printable(f"{named(file)}: {sentences}; {_how_to_obey(saved.file)}"))
     return 0
 

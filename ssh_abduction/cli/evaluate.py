@@ -215,13 +215,12 @@ def _pairs(pairs: MapPairs | None) -> list[object]:
 
 def _headline(found: Evaluation, may_be_more: bool) -> str:
     """Say which map is the true one. `may_be_more`: not all minimal maps are listed."""
-    of = f"of {counted(len(found.maps), 'maps')}{', and there may be more' if may_be_more else ''}"
+    of = f"{counted(len(found.maps), 'maps')}{', and there may be more' if may_be_more else ''}"
     if found.rank is not None:
-        return f"map {found.rank} is the true one, {of}"
+        return f"{of}: map {found.rank} is the true one"
     if all(one.isomorphic is None for one in found.maps):
-        return f"unknown which map is the true one, {of}: the truth names places or paths only"
-    number, more = counted(len(found.maps), "maps"), ", and there may be more"
-    return f"none of {number} is the true one{more if may_be_more else ''}"
+        return f"{of}: unknown which is the true one, as the truth names places or paths only"
+    return f"{of}: none is the true one"
 
 
 def _truth(found: Evaluation, steps: int) -> str:

@@ -56,8 +56,8 @@ def add_parser(verbs: Verbs) -> None:
         "--trace",
         type=trace_path,
         metavar="TRACE",
-        help="the trace that was mapped; from its steps localise estimates how reliable views "
-        "and links are",
+        help="the trace that was mapped; its steps are used to estimate how reliable views and "
+        "links are",
     )
     parser.add_argument(
         "--recogniser",

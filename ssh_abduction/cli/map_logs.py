@@ -52,9 +52,9 @@ def add_parser(verbs: Verbs) -> None:
         type=float,
         metavar="S",
         help=(
-            "seconds for the search. By default, the whole command takes a twentieth of the time "
-            "that the robot drove, and the search at least 30 s. If it has found no map by then, "
-            "it goes on"
+            "seconds for the search (default: so many that the whole command takes a twentieth of "
+            "the time that the robot drove, but at least 30). Without this option, a search that "
+            "has no map by then goes on until it has one"
         ),
     )
     parser.add_setting(
@@ -80,7 +80,10 @@ def add_parser(verbs: Verbs) -> None:
     add_reading(parser)
     add_theory(
         parser,
-        default=("topological without stars, sides and paths, which a log does not show surely"),
+        default=(
+            "topological, but without the axioms of stars, sides and paths, which a log does not "
+            "show reliably"
+        ),
     )
     parser.set_defaults(run=run)
 

@@ -12,8 +12,8 @@ from ssh_abduction.data.errors import named, printable
 def add_parser(verbs: Verbs) -> None:
     text = (
         "Name a place, a path or a region of a map. The name is written to corrections.yaml beside "
-        "the map. It is stored with a step of a drive. Solving again may renumber places, but the "
-        "name stays with the place of its step."
+        "the map. It belongs to a step of a drive at this place: solving again may renumber "
+        "places, but the name stays with the place of its step."
     )
     parser = verbs.add_parser("name", help="name a place, path or region", description=text)
     add_maps(parser)

@@ -60,12 +60,12 @@ def as_corrected(
 
 
 def say_obeyed(said: Corrections, trace: Trace) -> None:
-    """Print on stderr how many sentences of the corrections are about drives of this trace."""
+    """Print on stderr how many corrections are about drives of this trace."""
     here, all_of_them = (
         sum(1 for _ in sentences_of(some)) for some in (said.known_in(drives_of(trace)), said)
     )
     aside = f"; {all_of_them - here} are of drives that are not solved" * (here < all_of_them)
-    text = f"obeying {counted(here, 'sentences')} of {named(said.source)}{aside}"
+    text = f"obeying {counted(here, 'corrections')} of {named(said.source)}{aside}"
     print(printable(text), file=sys.stderr)
 
 
@@ -110,7 +110,7 @@ class Obeying:
         return with_names(self.corrections, solution, self.trace)
 
     def blamed(self, explanation: Explanation | None) -> list[str]:
-        """List the sentences of the person without which the trace may have a map.
+        """List the corrections without which the trace may have a map.
 
         Sentences are left out one by one, as long as the stretch of the explanation has no map.
         """

@@ -30,8 +30,8 @@ RULES = (
 MAPS, TRACE, RUN = "maps.json", "trace.jsonl", "run.json"
 
 MAPS_SAID = (
-    "file of maps that solve -o wrote, a file of a single map, or a folder that the verb map "
-    "wrote; - for standard input"
+    "file of maps that solve -o wrote, a file of a single map, or a folder that the command "
+    "'map' wrote; - for standard input"
 )
 
 Verbs = Any  # the return type of argparse's add_subparsers is private

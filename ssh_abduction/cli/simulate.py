@@ -97,7 +97,7 @@ def add_parser(verbs: Verbs) -> None:
             None,
             {"metavar": "X,Y,DEGREES"},
         ),
-        ("reach", "the distance at which the robot follows a wall", None, METRES),
+        ("reach", "the distance that the robot keeps from a wall that it follows", None, METRES),
         (
             "odometry_noise",
             "standard deviation of the odometry, as a share of each motion (default: 0.02); with "

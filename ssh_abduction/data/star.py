@@ -114,7 +114,7 @@ class Frame:
         return order[number - 1] if number <= len(order) else None
 
     def faces(self, slot: int) -> bool:
-        """Whether the gateway with this slot is straight ahead of the robot."""
+        """Whether the gateway with this number (slot) is straight ahead of the robot."""
         is_ahead = abs((self.bearings[slot] + 180) % 360 - 180) <= self.spreads[slot] + ROUNDING
         return is_ahead and not self.is_closed(slot)
 

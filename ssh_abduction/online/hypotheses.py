@@ -64,7 +64,7 @@ class ExtendedMap:
 
     @classmethod
     def of(cls, ssh_map: SSHMap, trace: Trace, theory: Theory) -> ExtendedMap:
-        """Make a rival of a map.
+        """Make the hypothesis that a map stands for.
 
         Args:
             ssh_map: A map of the trace or of its first steps.
@@ -206,7 +206,7 @@ class ExtendedMap:
         """Extend this rival by a step at the dstate `there`.
 
         `link` names the action if the step adds a link. `new` is the view and star of a new dstate.
-        `tenths` is the cost of the faults that it adds, in tenths of dstates.
+        `tenths` is the cost of the faults that the step adds; 10 is the cost of one dstate.
         """
         tenths += DSTATE if new else 0
         return ExtendedMap(

@@ -10,11 +10,11 @@ steps decide which map is right. A dstate (distinctive state) is a place and a h
 ...     _ = mapper.observe(("right", "travel")[(t - 1) % 2], f"v{t % 4}" if t != 17 else "v3")
 ...     if t >= 16:
 ...         print(t, mapper.standing)  # doctest: +NORMALIZE_WHITESPACE
-16 certain: nothing else is disbelieved; the robot is at dstate 0 of 4
+16 certain: nothing new is taken as wrong; the robot is at dstate 0 of 4
 17 uncertain, most likely: the view at step 17 is misread: v3, expected v1; the robot is at
    dstate 1 of 4; step 17: seen v3, expected v1 at dstate 1: misread, slipped, or the map is wrong
 18 certain: the view at step 17 is misread: v3, expected v1; the robot is at dstate 2 of 4
-19 certain: nothing else is disbelieved; the robot is at dstate 3 of 4
+19 certain: nothing new is taken as wrong; the robot is at dstate 3 of 4
 
 The paper's own future work is "robust error-recovery during exploration, by falling back from
 logical inference to Markov localisation when low-probability events violate the abstraction, until

@@ -182,7 +182,7 @@ class Confidence:
         """Describe a rival: its new faults since the mapper was certain, and the robot's dstate."""
         excused = set(self.known.faults) if self.known else set()
         new = sorted(set(rival.faults) - excused, key=lambda fault: fault.step)
-        faults = ", ".join(str(fault) for fault in new) or "nothing else is disbelieved"
+        faults = ", ".join(str(fault) for fault in new) or "nothing new is taken as wrong"
         return f"{faults}; the robot is at dstate {rival.here} of {len(rival.shows)}"
 
     def _locate(self, lead: ExtendedMap, trace: Trace) -> Belief:

@@ -53,7 +53,7 @@ class Layout:
 
         Returns:
             Keys: `places`, a list of [id, [x, y]]; `dstates`, a list of [x, y, heading or None];
-            and `metric`.
+            and `metric`, whether the positions are in metres.
         """
         return {
             "metric": self.metric,

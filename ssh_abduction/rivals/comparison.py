@@ -15,9 +15,9 @@ steps 17–18 and 21 are at the place of step 14
 
 Questions distinguish maps, for example: are steps 3 and 7 one dstate? (`rivals/questions.py`). A
 few questions decide: their answers fix the answers to all others (`rivals/factors.py`). Deciding
-questions are asked in the order of causes: faults, dstates, places, paths, directions. A choice is
-a set of deciding questions that depend on each other. Its options are the ways to answer them. Each
-combination of one option per choice is a map.
+questions are asked so that causes come first: faults, dstates, places, paths, directions. A choice
+is a set of deciding questions that depend on each other. Its options are the ways to answer them.
+Each combination of one option per choice is a map.
 """
 
 from __future__ import annotations

@@ -12,12 +12,14 @@ trace. Each minimal map, cut to the prefix, is such a map (`prefixes.py`). So a 
 replays to the end of the trace is minimal. If a found map does not replay to the end, the prefix
 grows. Steps that are one dstate in all known maps form a *class*. If no doubt about the prefix is
 left, the steps of each class are one dstate in all minimal maps. Actions are deterministic, so the
-classes replay like a map. If they replay to the end, each later step is in the class of a step of
-the prefix in every minimal map, and no doubt about that step is left. Otherwise the prefix grows.
+classes replay like a map. If they replay to the end, then in every minimal map each later step is
+one dstate with a class of the prefix, and no doubt about that step is left. Otherwise the prefix
+grows.
 
 *Labels.* An engine that finds dstates before places and paths can list the labels (the dstate of
-each step) of all minimal maps. Even thousands of maps have only a few different labellings. So
-there are no doubts about dstates. Doubts about places and paths are resolved for each labelling.
+each step) of all minimal maps. Even thousands of maps have few different labellings. So all
+labellings are listed, and there are no doubts about dstates. Doubts about places and paths are
+resolved for each labelling.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ class _Time:
     seconds: float
 
     def end(self, share: float) -> float:
-        """Return the time on the clock, in seconds, at which a share of the time is used up."""
+        """Return what the clock will show, in seconds, when a share of the limit is used up."""
         return self.begun + share * self.seconds
 
 

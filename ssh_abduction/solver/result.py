@@ -346,8 +346,8 @@ class Solution(MapSequence):
         given = sum(level.count for level in self.levels)
         if (self.cost is not None or given) and (not self.maps or given not in (0, len(self.maps))):
             raise MapError(
-                f"maps: expected the {max(given, 1)} that the search gave, got {len(self.maps)}; "
-                "give them to Search.solution"
+                f"maps: expected all {max(given, 1)} that the search found, got {len(self.maps)}; "
+                "give all of them to Search.solution"
             )
         maps = [
             written_map(m, cost if self.within else None)

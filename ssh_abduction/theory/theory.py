@@ -70,11 +70,11 @@ class Theory:
         next_place: Whether a travel leads to the next place of its path, with no place between.
         all_on_paths: Whether every dstate is on a path, even one where no travel starts or ends.
         star: How to use stars (the gateways seen at a place). none: not at all. alike: a dstate has
-            one star, within tolerance. pattern: the stars of a place are one star, rotated. frame:
-            the stars of a place agree when rotated by the headings, and paths go straight on.
-            gateways: like frame, but gateways lie in any directions, which agree within a
-            tolerance. auto: frame if the trace has
-            stars, else none. If stars or turns do not fit right angles, frame becomes gateways.
+            one star, within tolerance. pattern: the stars of a place are equal up to some rotation.
+            frame: they are equal when each is rotated by the heading of its dstate, and paths go
+            straight on. gateways: like frame, but gateways may lie at any angles, which are
+            compared within a tolerance. auto: frame if the trace has stars, else none. If stars or
+            turns do not fit right angles, frame becomes gateways.
         displacement: Whether displacements are evidence; auto uses them if the trace has any.
         reject: Significance level: the largest probability of rejecting the true map because of
             its displacements.
@@ -89,7 +89,7 @@ class Theory:
             carried; 0 forbids it.
         changed: Cost in dstates of a gateway that differs between two drives; 0 forbids it.
         planar: Whether paths meet only at places. Then the map can be drawn in the plane without a
-            crossing and without mirroring.
+            crossing, with the gateways around each place in their order.
         prefer: What to minimise, most important first, out of dstates, paths, places and excuses
             (exceptions of boundary=defeasible). Counts that are not named are not minimised. auto
             is dstates,places,paths if displacements are used, else dstates,paths,places.

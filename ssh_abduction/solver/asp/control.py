@@ -319,7 +319,7 @@ class Asker:
         conflicts: int,
         on_bound: Callable[[Sequence[int]], None] | None = None,
     ) -> Iterator[clingo.SolveHandle]:
-        """Run a search of clingo in its own thread. It ends with this context.
+        """Run a search of clingo in its own thread. Leaving the context stops the search.
 
         Arguments are as for `Asker.answers`. `project` is clingo's option of that name.
         """

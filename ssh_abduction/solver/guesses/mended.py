@@ -1,4 +1,6 @@
-"""A sketch that pays for faults: where a step contradicts it, the trace is mended there.
+"""Guess a map with faults: a step that contradicts the guess so far counts as a fault.
+
+The map is a *sketch*: it is made without a search.
 
 >>> from ssh_abduction import Theory, Trace
 >>> from ssh_abduction.solver.guesses.mended import mended_sketch
@@ -11,7 +13,8 @@
 >>> [(fault.step, fault.kind) for fault in wrong.faults]
 [(2, 'slipped')]
 
-The sketch begins anew after each fault. It seldom has the fewest faults.
+After each fault the sketch is made again from the first step. It often has more faults than
+necessary.
 """
 
 from __future__ import annotations

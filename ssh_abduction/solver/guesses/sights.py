@@ -100,7 +100,10 @@ class Sights:
 
 
 def nats_of_misread(seen: dict[int, float]) -> float:
-    """Return the cost of misread views at a dstate, in nats. The dearest observation is right."""
+    """Return the cost in nats of the misread views at a dstate.
+
+    The view that would cost most to call misread is taken as right, and the others as misread.
+    """
     return sum(seen.values()) - max(seen.values())
 
 

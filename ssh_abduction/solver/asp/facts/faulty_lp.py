@@ -124,7 +124,7 @@ def faulty_batch(
 
 
 def not_all_one(equalities: Collection[Equality]) -> str:
-    """Return the rule that some equalities of steps do not all hold. Clingo must have the steps."""
+    """Return the rule that some equalities of steps do not all hold. Their steps must be ground."""
     body = (f"is({e.first},S{k}), is({e.second},S{k})" for k, e in enumerate(equalities))
     return f":- {', '.join(body)}."
 

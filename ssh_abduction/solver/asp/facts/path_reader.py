@@ -116,7 +116,7 @@ class PathReader:
         )
 
     def _ordered(self, model: Model, path: int, places: Collection[int]) -> list[int]:
-        """Sort the places of a path. Begin with their order in the last answer, to ask less."""
+        """Sort the places of a path. Their order in the last answer saves questions to clingo."""
         order = list(
             dict.fromkeys([*(p for p in self._order.get(path, ()) if p in places), *places])
         )

@@ -73,8 +73,8 @@ def paths_frameless_facts(
         links: Triples of a dstate, the number of an action, and the dstate that it leads to.
         actions: The actions by number.
         far: Sets of pairs of dstates. In each set, at least one pair is at different places.
-        single: Whether to merge only places and segments that have to be one. This is solved
-            faster.
+        single: Whether to merge only those places, and those segments of paths, that the axioms
+            force to be one. This is solved faster.
     """
     facts = [
         sides_framed_facts(theory),
@@ -124,8 +124,8 @@ def settled_facts(
         chart: The chart of the nodes.
         labels: The dstate of each node.
         nodes: The nodes whose labels to use.
-        single: Whether to merge only places and segments that have to be one. This is solved
-            faster.
+        single: Whether to merge only those places, and those segments of paths, that the axioms
+            force to be one. This is solved faster.
     """
     facts = [
         settled_labels((node, labels[node]) for node in nodes),
