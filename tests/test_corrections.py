@@ -401,5 +401,5 @@ def test_steps_said_to_be_at_one_place(tmp_path: Path, capsys: pytest.CaptureFix
     assert main(solving_it) == 0
     assert main(["correct", str(tmp_path), "--same-place", "walk:0,walk:3"]) == 0
     assert main(solving_it) == 0
-    assert "obeying 1 sentence" in capsys.readouterr().err
+    assert "obeying 1 correction" in capsys.readouterr().err
     assert main([*solving_it, "--same-place", "0,3"]) == 0
