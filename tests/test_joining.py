@@ -9,8 +9,10 @@ from together import of_mazes
 
 from ssh_abduction import SSHMap, Theory, Trace
 from ssh_abduction.checker.checker import violations
-from ssh_abduction.data import Odometry, together
+from ssh_abduction.data import Odometry, Step, together
+from ssh_abduction.data.star import Gateway, Star
 from ssh_abduction.solver.guesses.joining import Joining
+from ssh_abduction.solver.guesses.sights import Sights
 from ssh_abduction.solver.misfit import Misfit
 from ssh_abduction.solver.search import Search
 from ssh_abduction.solver.steps.log import Log
@@ -75,6 +77,27 @@ def test_a_gateway_that_closes_and_opens_again_changes_twice() -> None:
     ]
     *_, ssh_map = joined(settle(together(drives), Theory()))
     assert len(ssh_map.dstates) == 6  # without changes, the first place is two
+
+
+@pytest.mark.parametrize(
+    ("bearings", "changed", "is_one"),
+    [
+        ((0.4, 5.3, 90.0), 0.0, True),
+        ((355.0, 0.0, 85.0), 1.2, False),  # turned to the next gateway
+        ((0.4, 90.3), 0.0, False),
+        ((0.4, 90.3), 1.2, True),  # a gateway is closed
+        ((0.4, 90.3, 200.0), 1.2, True),  # and another one is open
+        ((0.4, 90.3, 200.0, 300.0), 1.2, False),  # too many changes
+    ],
+)
+def test_a_dstate_sees_gateways_at_its_own_bearings(
+    bearings: tuple[float, ...], changed: float, is_one: bool
+) -> None:
+    stars = [Star(tuple(Gateway(b, 0.75) for b in seen)) for seen in ((0.0, 5.0, 90.0), bearings)]
+    trace = together([Trace((Step("a", star=star.gateways),)) for star in stars])
+    theory = settle(trace, Theory(changed=changed, star="gateways", boundary="none")).theory
+    sights = Sights(trace, theory, Log(trace, theory), misreads=False)
+    assert sights.are_alike(*sights.shown) == is_one
 
 
 def test_drives_that_show_other_things_stay_apart() -> None:

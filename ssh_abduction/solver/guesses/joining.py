@@ -46,9 +46,8 @@ ALONE = 4
 # Two dstates may coincide if their headings differ by less than this many radians, and their
 # positions by less than this share of a usual travel.
 TURNED, SHIFTED = 0.4, 0.4
-# Of the ways to lay a drive on the standing map, count the coincidences of the VOTED ways with the
-# most votes. Merge the dstates that coincide in the ANCHORS best ways.
-VOTED, ANCHORS = 64, 6
+# Try the VOTED ways with the most votes to lay a map on another one.
+VOTED = 64
 # Begin with each of the STARTS pairs of drives that have the best anchors.
 STARTS = 3
 
@@ -134,9 +133,10 @@ class Joining:
         """
         look_at_clock()
         alike = np.array([[bool(seen & other) for other in second.seen] for seen in first.seen])
-        s, x = np.nonzero(alike)
-        if not len(s):
+        ways = [(s, x) for s, x in np.argwhere(alike) if self._may_be_one(first, s, second, x)]
+        if not ways:
             return []
+        s, x = np.array(ways).T
         (at, facing), (there, turned) = first.poses, second.poses
         near = SHIFTED * second.usual_travel(self._problem.trace)
         turn = facing[s] - turned[x]
@@ -156,6 +156,13 @@ class Joining:
             found.append((float(good), int(s[i]), int(x[i])))
         return sorted(found, reverse=True)
 
+    def _may_be_one(self, first: Part, s: int, second: Part, x: int) -> bool:
+        """Whether the stars let dstate s of a map and dstate x of another one be one dstate."""
+        places = first.sights[first.places[s]], second.sights[second.places[x]]
+        return self._sights.merged(*places) < math.inf and self._sights.are_alike(
+            first.stars[s], second.stars[x]
+        )
+
     def _joined(
         self, first: Part, second: Part, ways: Sequence[tuple[float, int, int]]
     ) -> Part | None:
@@ -163,8 +170,6 @@ class Joining:
         found: list[Part] = []
         for _, s, x in ways:
             look_at_clock()
-            if len(found) == ANCHORS:
-                break
             overlay = Overlay(first, second, self._problem, self._sights)
             if overlay.merge(s, x):
                 found.append(overlay.part())

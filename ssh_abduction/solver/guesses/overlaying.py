@@ -45,6 +45,7 @@ class Part:
         labels: The dstate of each step of these drives.
         places: The place of each dstate.
         seen: For each dstate, what its steps show, as numbers.
+        stars: For each dstate, the star of its last step.
         links: For each (dstate, action) with a link, the dstate that it leads to.
         sights: For each place, what each drive saw of it.
         position: For each place, the index of its x in the means.
@@ -57,6 +58,7 @@ class Part:
     labels: Mapping[int, int]
     places: list[int]
     seen: list[frozenset[int]]
+    stars: list[Sight]
     links: Mapping[tuple[int, int], int]
     sights: Sequence[Mapping[int, Sight]]
     position: NDArray[np.int_]
@@ -70,10 +72,12 @@ class Part:
         """Make a part of a hypothesis about a drive that begins with step `first` of a log."""
         labels = {first + t: label for t, label in enumerate(found.labels)}
         seen: list[set[int]] = [set() for _ in found.places]
+        stars: list[Sight] = [None for _ in found.places]
         links: dict[tuple[int, int], int] = {}
         shown: list[dict[int, Sight]] = [{} for _ in found.sights]
         for t, label in labels.items():
             seen[label].add(sights.seen[t])
+            stars[label] = sights.shown[t]
             shown[found.places[label]][sights.drive[t]] = sights.shown[t]
             if t + 1 in labels:
                 links[label, log.actions[t]] = labels[t + 1]
@@ -83,6 +87,7 @@ class Part:
             labels,
             list(found.places),
             [frozenset(numbers) for numbers in seen],
+            stars,
             links,
             shown,
             2 * np.arange(n),
@@ -113,6 +118,7 @@ class Part:
             {**self.labels, **{t: dstates + s for t, s in other.labels.items()}},
             [*self.places, *(len(self.sights) + p for p in other.places)],
             [*self.seen, *other.seen],
+            [*self.stars, *other.stars],
             {**self.links, **{(dstates + s, a): dstates + x for (s, a), x in other.links.items()}},
             [*self.sights, *other.sights],
             np.concatenate([self.position, n + other.position]),
@@ -210,6 +216,7 @@ class Overlay:
             {t: number[state.dstate[s]] for t, s in both.labels.items()},
             [place[state.place[both.places[s]]] for s in dstates],
             [both.seen[s] for s in dstates],
+            [both.stars[s] for s in dstates],
             {
                 (number[s], action): number[state.dstate[x]]
                 for s in dstates
@@ -286,13 +293,26 @@ class Overlay:
             elif places:
                 dstates = [(self._dstates_at(places[0])[0], self._dstates_at(places[1])[0])]
             touched |= self._merge_dstates(dstates)
-            while pairs := [pair for p in touched for pair in self._coinciding(p)]:
-                touched |= self._merge_dstates([min(pairs)[1]])
+            self._merge_coinciding(touched)
         except _ClashError:
             self._state = before
         if self._state.nats >= before.nats:
             self._state = before
         return self._state is not before
+
+    def _merge_coinciding(self, places: set[int]) -> None:
+        """Merge dstates at some places that coincide, unless what follows is a clash."""
+        refused: set[tuple[int, int]] = set()
+        while pairs := [
+            found for p in places for found in self._coinciding(p) if found[1] not in refused
+        ]:
+            before, (_, nearest) = self._state, min(pairs)
+            self._state = before.copy()
+            try:
+                places = places | self._merge_dstates([nearest])
+            except _ClashError:
+                self._state = before
+                refused.add(nearest)
 
     def _merge_dstates(self, pairs: list[tuple[int, int]]) -> set[int]:
         """Merge pairs of dstates, and what the same actions lead to. Return their places."""
@@ -301,7 +321,7 @@ class Overlay:
             s, x = sorted(state.dstate[i] for i in pairs.pop())
             if s == x:
                 continue
-            if not self._both.seen[s] & self._both.seen[x]:
+            if not self._look_alike(s, x):
                 raise _ClashError
             for action, there in state.links[x].items():
                 if action in state.links[s]:
@@ -350,6 +370,13 @@ class Overlay:
             if s == first and state.place[self._both.places[s]] == place
         ]
 
+    def _look_alike(self, s: int, x: int) -> bool:
+        """Whether two dstates show the same, but for gateways that changed."""
+        both = self._both
+        return bool(both.seen[s] & both.seen[x]) and self._sights.are_alike(
+            both.stars[s], both.stars[x]
+        )
+
     def _coinciding(self, place: int) -> list[tuple[float, tuple[int, int]]]:
         """List pairs of dstates at a place that show the same and may face the same way.
 
@@ -362,6 +389,6 @@ class Overlay:
             off = math.remainder(self._state.mean[i] - self._state.mean[j], math.tau)
             square = off * off / (c[i, i] + c[j, j] - 2 * c[i, j] + self._spreads[2])
             is_one_way = abs(off) < TURNED and square < 2 * self._prices[0]
-            if is_one_way and self._both.seen[s] & self._both.seen[x]:
+            if is_one_way and self._look_alike(s, x):
                 found.append((float(square), (s, x)))
         return found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from itertools import combinations, pairwise, product
 from typing import TypeAlias
@@ -14,7 +14,7 @@ from ssh_abduction.data.star import Frame, Star
 from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.solver.guesses.reckoning import Hypothesis
 from ssh_abduction.solver.steps.chart import numbered
-from ssh_abduction.solver.steps.frames import rotation_bits
+from ssh_abduction.solver.steps.frames import may_face, rotation_bits
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.theory import Theory
 
@@ -81,6 +81,12 @@ class Sights:
             return math.inf
         return self._along({**first, **second}) - self._along(first) - self._along(second)
 
+    def are_alike(self, first: Sight, second: Sight) -> bool:
+        """Whether two steps that see these stars, not turned, may be at one dstate of a place."""
+        if not isinstance(first, Star) or not isinstance(second, Star):
+            return True  # the views, and the stars of four, are compared as `seen`
+        return _may_face_alike(first, second, CHANGES if self._price else 0)
+
     def _along(self, seen: Mapping[int, Sight]) -> float:
         """Return the cost in nats of the changes from each drive to the next at one place."""
         between = pairwise(seen[drive] for drive in sorted(seen))
@@ -145,9 +151,7 @@ def _fewest_closed(first: Star, second: Star) -> float:
         (
             count
             for count in range(1, CHANGES + 1)
-            for less in range(count + 1)
-            for frame, other in product(_smaller(first, less), _smaller(second, count - less))
-            if _turns(frame, other)
+            if any(_turns(*frames) for frames in _without(first, second, count))
         ),
         math.inf,
     )
@@ -173,14 +177,47 @@ def _smaller(star: Star, less: int) -> tuple[Frame, ...]:
     )
 
 
+@lru_cache(maxsize=2**14)
+def _may_face_alike(first: Star, second: Star, changes: int) -> bool:
+    """Whether a robot may face the same way where it sees two stars of one place.
+
+    Args:
+        first: The first star.
+        second: The second star.
+        changes: How many gateways may have changed.
+    """
+    return any(
+        "alike" in may_face(frame, other, shift)
+        for frame, other in _equally_large(first, second)
+        for shift in range(max(frame.slots, 1))
+    ) or any(
+        rotation_bits(frame, other, shift) & 1
+        for count in range(1, changes + 1)
+        for frame, other in _without(first, second, count)
+        for shift in range(max(frame.slots, 1))
+    )
+
+
+def _without(first: Star, second: Star, count: int) -> Iterator[tuple[Frame, Frame]]:
+    """Yield frames of equal size of two stars, without some gateways, `count` in all."""
+    for less in range(count + 1):
+        for frame, other in product(_smaller(first, less), _smaller(second, count - less)):
+            if frame.slots == other.slots:
+                yield frame, other
+
+
+def _equally_large(first: Star, second: Star) -> Iterator[tuple[Frame, Frame]]:
+    """Yield the pairs of frames of two stars that have equally many gateways."""
+    pairs = product(first.frames, second.frames)
+    return ((frame, other) for frame, other in pairs if frame.slots == other.slots)
+
+
 def _turns(frame: Frame, other: Frame) -> bool:
     """Whether two frames agree with some shift of their gateways."""
-    return frame.slots == other.slots and any(
-        rotation_bits(frame, other, shift) for shift in range(max(frame.slots, 1))
-    )
+    return any(rotation_bits(frame, other, shift) for shift in range(max(frame.slots, 1)))
 
 
 @lru_cache(maxsize=2**14)
 def _may_fit(first: Star, second: Star) -> bool:
     """Whether two stars agree with some shift of their gateways."""
-    return any(_turns(frame, other) for frame, other in product(first.frames, second.frames))
+    return any(_turns(*frames) for frames in _equally_large(first, second))
