@@ -55,9 +55,9 @@ def sideways(scans: Scans) -> Scans:
     return with_poses(scans, lambda x, y, heading: (x, y, heading + math.pi / 2))
 
 
-def kidnapped(scans: Scans) -> Scans:
+def kidnapped(scans: Scans, begin: int = 100, end: int = 170) -> Scans:
     """The robot is carried while neither the odometer nor the clock goes on."""
-    first, last = scans[:100], scans[170:230]
+    first, last = scans[:begin], scans[end : end + 60]
     poses = [first[-1].odometry]
     for one, other in pairwise(last):
         poses.append(moved(poses[-1], displacement_between(one.odometry, other.odometry)))
@@ -90,6 +90,10 @@ def of_two_clocks(scans: Scans) -> Scans:
         (lambda scans: sideways(scans[:100]), "headings are wrong: write them in radians"),
         (in_blocks, "So does a log that is not in the order of the drive"),
         (kidnapped, "before and after scan 100 (line or message 171) contradict each other"),
+        (
+            lambda scans: kidnapped(scans, 120, 160),
+            "before and after scan 120 (line or message 161)",
+        ),
         (of_two_lasers, "The laser changes before scan 60"),
         (of_two_clocks, "The clock starts anew before scan 60"),
         (

@@ -43,8 +43,10 @@ NEAR, DRIFT, AWAY = 3.0, 0.02, 15.0
 # A scan contradicts the scans before it if less than the share POORLY of its points matches, and
 # more than the share INTRUDING of the points of either side lies in the free space of the other, at
 # least MARGIN metres from walls. BESIDE scans on each side are compared. In good logs, scans that
-# match so badly have at most 27 % of their points there.
+# match so badly have at most 27 % of their points there. If the share that matches is by WORSE less
+# than in all but RARELY percent of the scans of the log, the share INTRUDING_RARELY suffices.
 INTRUDING, MARGIN, POORLY, BESIDE = 0.3, 0.4, 0.6, 3
+INTRUDING_RARELY, WORSE, RARELY = 0.15, 0.25, 1.0
 # Beams that meet walls are at most this many metres long, in the median of a log. Good logs have up
 # to 3 m.
 FAR_WALLS = 50.0
@@ -308,6 +310,7 @@ def _returns(track: Track) -> bool:
 def _contradictions(log: RobotLog, track: Track) -> list[int]:
     """Find the scans that match badly and lie in the free space of the scans before them."""
     found: list[int] = []
+    rare = float(np.percentile(track.shares, RARELY)) - WORSE
     for i in np.flatnonzero(track.shares < POORLY).tolist():
         pairs = [
             pair
@@ -318,7 +321,7 @@ def _contradictions(log: RobotLog, track: Track) -> list[int]:
         if not pairs or track.cuts_between(i - BESIDE, i):
             continue
         inside, seen = np.sum([_intruding(log, track, *pair) for pair in pairs], axis=0)
-        if inside > INTRUDING * seen:
+        if inside > (INTRUDING_RARELY if track.shares[i] < rare else INTRUDING) * seen:
             found.append(i)
     return found
 
