@@ -158,7 +158,7 @@ def test_a_log_whose_scans_do_not_match_is_refused(
     scans: tuple[Scan, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log = RobotLog(scans[::20], source="drive")
-    with pytest.raises(LogError, match="% do not; take all scans of the drive"):
+    with pytest.raises(LogError, match="% of them do not; take all scans of the drive"):
         import_log(log)
     # The laser of a robot whose beams are mirrored sees what the odometry contradicts.
     monkeypatch.setattr(log_checks, "SPARSE", 1e9)
