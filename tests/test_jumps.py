@@ -70,6 +70,7 @@ def test_an_odometer_that_starts_anew_is_cut_there(
     assert track.way[-1] == pytest.approx(metres, abs=3)
     assert f"The odometry jumps {'once' if len(at) == 1 else '3 times'} in {COUNT} scans" in notes
     assert "starts anew from 0" in notes
+    assert "Map both parts together if they are of one building" in notes
 
 
 def test_no_displacement_leads_across_a_cut_and_solver_and_checker_agree(

@@ -47,6 +47,10 @@ LATELY = 100
 NO_RANGE = 25.0
 # A step to within this many metres of the origin means that the odometer restarted.
 ANEW = 1.0
+TWO_DRIVES = (
+    " If a second drive begins there, cut the log there. Map both parts together if they are of "
+    "one building, and each alone otherwise."
+)
 
 
 def keep_one_source(log: RobotLog) -> tuple[RobotLog, list[str]]:
@@ -168,6 +172,7 @@ def describe_cuts(log: RobotLog, track: Track, turned: list[tuple[int, float]]) 
             + ". Nothing is known of how the robot moved there, so the trace has no displacement "
             "across. An odometer that is started anew, or a second program that publishes the same "
             "odometry, jumps like this. So does a log that is not in the order of the drive."
+            + (TWO_DRIVES if anew else "")
         )
     if still:
         notes.append(
