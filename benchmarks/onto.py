@@ -1,10 +1,13 @@
 """What does it cost to add a drive to an existing map?
 
     python benchmarks/onto.py [--cells 5] [--steps 100] [--drives 20] [--seeds 3] [--looks 8]
+    python benchmarks/onto.py --displacements [--cells 6] [--steps 100] [--drives 20] [--seeds 3]
 
 Robots walk at random through a maze, each from an unknown start. The first drive is solved alone.
 Each later one is added to the existing map. The script prints a row for each maze: the CPU
 seconds of the second and the last drive, their ratio, and whether the last map is the true one.
+
+Without displacements, each cell has one of some looks. With them, the stars alone are seen.
 """
 
 from __future__ import annotations
@@ -22,22 +25,32 @@ from ssh_abduction.data import Odometry
 from ssh_abduction.data.errors import SolverError
 
 
-def walks(cells: int, steps: int, drives: int, seed: int, looks: int) -> Iterator[Known]:
-    """Yield random walks through one maze, in which each cell has one of some looks.
+def walks(
+    cells: int, steps: int, drives: int, seed: int, looks: int | None = None
+) -> Iterator[Known]:
+    """Yield random walks through one maze.
 
-    Displacements are left out: they would be matched with all old steps (docs/how-to/correct.md).
+    Args:
+        cells: Width and height of the maze.
+        steps: Steps of a drive.
+        drives: The number of drives.
+        seed: Seed of the maze and of all walks.
+        looks: Each cell has one of so many looks, and there are no displacements. If None, there
+            are displacements.
     """
     noise = Noise(Odometry(**NOISE))
     rng = np.random.default_rng(seed)
-    look = rng.integers(looks, size=(cells, cells))
+    look = rng.integers(looks or 1, size=(cells, cells))
     for drive in range(drives):
         walk = random_walk(cells, steps, seed, noise, drive)
-        trace = walk.trace.without_displacements()
-        views = [
-            f"{step.view} {look[place]}"
-            for step, place in zip(trace.steps, walk.places, strict=True)
-        ]
-        trace = replace(trace.with_views(views), name=f"drive {drive + 1}")
+        trace = walk.trace
+        if looks is not None:
+            views = [
+                f"{step.view} {look[place]}"
+                for step, place in zip(trace.steps, walk.places, strict=True)
+            ]
+            trace = trace.without_displacements().with_views(views)
+        trace = replace(trace, name=f"drive {drive + 1}")
         yield Known(walk.name, trace, walk.dstates, walk.places)
 
 
@@ -65,12 +78,14 @@ def main() -> None:
     numbers = {"cells": 5, "steps": 100, "drives": 20, "seeds": 3, "first": 0, "looks": 8}
     for name, default in numbers.items():
         parser.add_argument(f"--{name}", type=int, default=default, metavar="N")
+    parser.add_argument("--displacements", action="store_true", help="give displacements, no looks")
     parser.add_argument("--limit", type=float, default=60, metavar="S", help="seconds a drive")
     options = parser.parse_args()
     print("| maze | dstates | second drive, s | last drive, s | ratio | true |")
     print("|---|--:|--:|--:|--:|---|")
     for seed in range(options.first, options.first + options.seeds):
-        known = list(walks(options.cells, options.steps, options.drives, seed, options.looks))
+        looks = None if options.displacements else options.looks
+        known = list(walks(options.cells, options.steps, options.drives, seed, looks))
         try:
             seconds, ssh_map = costs(known, Theory(), options.limit)
         except SolverError as error:

@@ -37,6 +37,9 @@ from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import ALL, Speedups, row
 from ssh_abduction.theory.theory import Theory, checked_theory
 
+# If the time limit is over, a search gets this many seconds to find any map.
+LEAST_SECONDS = 1e-9
+
 
 @renamed_parameters("limit", "maps", "memory")
 def solve(
@@ -90,12 +93,16 @@ def solve(
         Kuipers & Beeson 2002, "Bootstrap Learning for Place Recognition", step 2.
     """
     joint = together(trace) if isinstance(trace, list | tuple | Iterator) else checked_trace(trace)
+    check_limit("time_limit", "seconds", time_limit)
+    check_limit("memory_limit", "MiB", memory_limit)
+    watch = Watch(time_limit, memory_limit)
+    watch.start()
 
     def find(trace: Trace, theory: Theory) -> Solution:
         search = Search(
             trace,
             theory,
-            time_limit=time_limit,
+            time_limit=None if time_limit is None else max(watch.left(), LEAST_SECONDS),
             max_maps=max_maps,
             within=within,
             memory_limit=memory_limit,
@@ -105,7 +112,7 @@ def solve(
         return search.solution(tuple(search))
 
     if onto is not None:
-        return solve_onto(joint, onto, theory, corrections, Solving(find, speedups))
+        return solve_onto(joint, onto, theory, corrections, Solving(find, speedups, watch))
     theory = checked_theory(theory)
     theory.check_steps(joint)
     if corrections is None:

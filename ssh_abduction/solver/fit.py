@@ -141,6 +141,21 @@ class Poses:
         squares = float((self._residuals(unknown) ** 2).sum())
         return squares, unknown, self._covariance(unknown, fixed, wanted)
 
+    def gaussian(self) -> tuple[list[int], Array, Array]:
+        """Find the poses of the dstates and their covariance, relative to a dstate of each part.
+
+        Returns:
+            The part of the map of each dstate, the means, and their covariance: of x and y of each
+            place, in the order in which dstates name it first, and of the heading of each dstate.
+        """
+        place, facing = self._place[: self._dstates], 2 * self._positions
+        part = self._parts()[place].tolist()
+        first = [part.index(number) for number in dict.fromkeys(part)]
+        fixed = [k for s in first for k in (2 * place[s], 2 * place[s] + 1, facing + s)]
+        entries = [*range(2 * int(place.max()) + 2), *range(facing, facing + self._dstates)]
+        _, unknown, covariance = self.settled(None, fixed, entries)
+        return part, unknown[entries], covariance
+
     def _best(self, start: Array | None = None, still: float = STILL) -> Array:
         """Find the unknowns with the least sum of squares.
 
@@ -461,11 +476,8 @@ class Poses:
         Args:
             origins: Dstates whose poses count as known.
         """
-        fixed = [
-            int(k)
-            for s in origins
-            for k in (2 * self._place[s], 2 * self._place[s] + 1, 2 * self._positions + s)
-        ]
+        at = 2 * self._place[list(origins)]
+        fixed = [*at.tolist(), *(at + 1).tolist(), *(2 * self._positions + s for s in origins)]
         places = np.unique(self._place[: self._dstates])
         wanted = np.stack([2 * places, 2 * places + 1], 1).ravel().tolist()
         whole = self._covariance(unknown, fixed, wanted)

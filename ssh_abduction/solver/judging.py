@@ -107,14 +107,23 @@ class Judging:
 
         The result is also False if some axioms cannot be checked.
         """
-        accepted = (
-            self.can_accept
-            and next(violations(self._trace, ssh_map, self._theory), None) is None
-            and not self.why_refused(ssh_map)
-            and keeps_own_rules(self._problem, ssh_map)
-        )
+        accepted = self.accepts_grown(ssh_map, 0)
         self._accepted = ssh_map if accepted else self._accepted
         return accepted
+
+    def accepts_grown(self, ssh_map: SSHMap, since: int) -> bool:
+        """Whether a map of the whole trace satisfies all axioms and agrees with all evidence.
+
+        Args:
+            ssh_map: The map.
+            since: The number of first steps that the evidence has already accepted.
+        """
+        return (
+            self.can_accept
+            and next(violations(self._trace, ssh_map, self._theory), None) is None
+            and self.allows_grown(self._trace, ssh_map, since)
+            and keeps_own_rules(self._problem, ssh_map)
+        )
 
     def pass_map(self, ssh_map: SSHMap, prefix: int, elapsed: float) -> None:
         """Check a map of the whole trace before it is given, as far as there is time.

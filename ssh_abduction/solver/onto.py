@@ -1,12 +1,13 @@
 """Add a drive to the map of old drives, in about the time that solving the new drive takes.
 
 The map of the old drives is the *existing map*: the joint map must keep its dstates and places. The
-solver does not get the old drives. It gets a *digest*: a trace in which each link of the existing
-map occurs once. Axioms are about links and observations, so a map of the digest and the new drive
-is a map of all drives. Steps of the digest at different dstates or places are asserted to be
-different. If the best maps also have its equal steps at one dstate, they are the best of all maps
-that keep the existing map. If not, equal steps are asserted to be equal, too, if the traces are
-short enough.
+solver does not get the old drives. It gets a digest of them (`digest.py`). Steps of the digest at
+different dstates or places are asserted to be different. If the best maps also have its equal steps
+at one dstate, they are the best of all maps that keep the existing map. If not, equal steps are
+asserted to be equal, too, if the traces are short enough.
+
+With displacements, a long drive is laid on the existing map (`laying.py`). If that fails, or if the
+drives are short, the solver gets all old steps.
 
 >>> from ssh_abduction import Trace, solve
 >>> monday = Trace.from_steps("abcd", ["travel", "around", "travel"], name="monday")
@@ -20,22 +21,25 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
 
-from ssh_abduction.data.action import Action
 from ssh_abduction.data.checks import an_instance
 from ssh_abduction.data.corrections import Corrections
 from ssh_abduction.data.drives import drives_of, starts_of, step_name, together
 from ssh_abduction.data.errors import SolverError
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.step import Step
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted
+from ssh_abduction.runtime.clock import heeding
+from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.choosing import READABLE
+from ssh_abduction.solver.digest import Digest
 from ssh_abduction.solver.guesses.gated import sketch_beyond
 from ssh_abduction.solver.guesses.mended import first_contradiction
 from ssh_abduction.solver.judging import Judging
+from ssh_abduction.solver.laying import can_lay, laid
 from ssh_abduction.solver.obeying import obeyed, with_names
 from ssh_abduction.solver.recorded import Support
 from ssh_abduction.solver.result import Solution
@@ -55,52 +59,12 @@ class Solving:
     Attributes:
         solve: Solves a trace under a theory.
         speedups: The speed-ups that are on.
+        watch: The clock and the limits of all solving.
     """
 
     solve: Callable[[Trace, Theory], Solution]
     speedups: Speedups
-
-
-@dataclass(frozen=True)
-class Digest:
-    """A short trace that the solver gets instead of the old drives.
-
-    Attributes:
-        trace: The trace.
-        labels: For each of its steps, the dstate in the existing map.
-    """
-
-    trace: Trace
-    labels: tuple[int, ...]
-
-    @classmethod
-    def of(cls, trace: Trace, ssh_map: SSHMap, *, short: bool) -> Digest:
-        """Make a digest of the drives of a map.
-
-        Args:
-            trace: The drives.
-            ssh_map: Their map.
-            short: Whether each link occurs only once. If False, the digest has all steps.
-        """
-        if not short:
-            return cls(trace, ssh_map.dstate_at)
-        shown = _observations(trace, ssh_map)
-        actions = {action.name: action for action in trace.actions}
-        steps: list[Step] = []
-        labels: list[int] = []
-        for trail in _trails(ssh_map):
-            if steps:
-                steps[-1] = replace(steps[-1], action=Action(f"standing {len(steps)}", "start"))
-            for s, action in trail:
-                done = None if action is None else actions[action]
-                steps.append(replace(shown[s][0], action=done))
-                labels.append(s)
-        for s, seen in shown.items():
-            for step in seen[1:]:
-                steps[-1] = replace(steps[-1], action=Action(f"standing {len(steps)}", "start"))
-                steps.append(replace(step, action=None))
-                labels.append(s)
-        return cls(Trace(tuple(steps), drive="standing"), tuple(labels))
+    watch: Watch
 
 
 def solve_onto(
@@ -131,6 +95,11 @@ def solve_onto(
         joint, theory = obeyed(corrections, joint, theory)
         old, trace = joint[: len(old)], joint[len(old) :]
     in_use = settle(joint, theory).theory
+    if solving.speedups.greedy and len(joint) > READABLE and can_lay(in_use):
+        with suppress(LimitError), heeding(solving.watch.check):
+            on_map = laid(old, ssh_map, trace, Problem.of(joint, in_use), solving.watch)
+            if on_map is not None:
+                return on_map if corrections is None else with_names(corrections, on_map, joint)
     short = solving.speedups.that_hold_for(in_use).digest and in_use.displacement == "none"
     digest = Digest.of(old, ssh_map, short=short)
     with warnings.catch_warnings():  # a digest may have the steps of the new drive
@@ -142,7 +111,12 @@ def solve_onto(
     ended = found.stopped in _LIMITS
     if not kept and not ended and found.status is not Status.UNSATISFIABLE:
         found, kept = _with_assertions(part, pinned, digest, ssh_map, found, solving)
-    maps = tuple(_of_all(m, digest, ssh_map, joint) for m in kept)
+    maps = tuple(
+        replace(
+            m, dstate_at=digest.labels_of_all(m, ssh_map), starts=starts_of(joint), names=()
+        ).renumbered()
+        for m in kept
+    )
     if not maps and ended and (grown := _grown(ssh_map, old, joint, in_use)):
         found, maps = replace(found, status=Status.FEASIBLE, cost=Cost.of(grown)), (grown,)
     if not maps:
@@ -194,48 +168,6 @@ def _existing(existing: object) -> tuple[Trace, SSHMap]:
             "together"
         )
     return solution.trace, solution.maps[0]
-
-
-def _observations(trace: Trace, ssh_map: SSHMap) -> dict[int, list[Step]]:
-    """For each dstate, list the different observations made there, those with a view first."""
-    shown: dict[int, dict[object, Step]] = {s.id: {} for s in ssh_map.dstates}
-    for step, label in zip(trace.steps, ssh_map.dstate_at, strict=True):
-        shown[label].setdefault((step.view, step.star), step)
-    return {
-        s: sorted(
-            (Step(view=step.view, star=step.star) for step in seen.values()),
-            key=lambda step: step.view is None,
-        )
-        for s, seen in shown.items()
-    }
-
-
-def _trails(ssh_map: SSHMap) -> list[list[tuple[int, str | None]]]:
-    """Cover the links of a map by few trails.
-
-    Returns:
-        The trails: lists of pairs of a dstate and the action that leads to the next dstate, None
-        at the end. Each link is in one trail. A dstate without links is a trail of its own.
-    """
-    leaving: dict[int, list[tuple[str, int]]] = {s.id: [] for s in ssh_map.dstates}
-    excess = dict.fromkeys(leaving, 0)
-    for s, action, x in sorted(ssh_map.links, reverse=True):
-        leaving[s].append((action, x))
-        excess[s] += 1
-        excess[x] -= 1
-    trails: list[list[tuple[int, str | None]]] = []
-    # First start trails at dstates that more links leave than reach: a trail must start there.
-    for start in sorted(leaving, key=lambda s: -excess[s]):
-        while leaving[start]:
-            trail: list[tuple[int, str | None]] = []
-            here = start
-            while leaving[here]:
-                action, there = leaving[here].pop()
-                trail.append((here, action))
-                here = there
-            trails.append([*trail, (here, None)])
-    visited = {s for trail in trails for s, _ in trail}
-    return trails + [[(s, None)] for s in leaving if s not in visited]
 
 
 def _pinned(theory: Theory, digest: Digest, ssh_map: SSHMap, old: Trace, *, joins: bool) -> Theory:
@@ -335,15 +267,6 @@ def _with_assertions(
     if again.status is Status.UNSATISFIABLE:
         return found, ()
     return again, tuple(m for m in again.maps if _keeps(m, digest, ssh_map))
-
-
-def _of_all(found: SSHMap, digest: Digest, ssh_map: SSHMap, joint: Trace) -> SSHMap:
-    """Turn a map of a digest and a new drive into a map of all drives."""
-    number = dict(zip(digest.labels, found.dstate_at, strict=False))
-    new = found.dstate_at[len(digest.labels) :]
-    labels = (*(number[s] for s in ssh_map.dstate_at), *new)
-    whole = replace(found, dstate_at=labels, starts=starts_of(joint), names=())
-    return whole.renumbered()
 
 
 def _weighed(found: Solution, old: int, ssh_map: SSHMap) -> Weighed | None:

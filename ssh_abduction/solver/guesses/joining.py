@@ -4,7 +4,8 @@ Each drive has a map of its own: a hypothesis with the poses of its places and d
 is a dstate of one map and a dstate of another map that may be one. It says how one map lies on the
 other. An anchor is good if many other dstates then coincide with dstates that show the same. The
 two maps with the best anchor are joined first: `overlaying.py` merges the places and dstates that
-coincide. Then the joint map may be joined to others. Maps that no anchor joins stay pieces.
+coincide. Then the joint map may be joined to others. Maps that no anchor joins stay pieces. The
+pieces of a map that has to stand may be among these maps.
 
 Reference:
     Carpin 2008, "Fast and accurate map merging for multi-robot systems" (votes for a turn and a
@@ -53,7 +54,11 @@ STARTS = 3
 
 
 class Joining:
-    """Joins the maps of the drives of one trace."""
+    """Joins the maps of the drives of one trace.
+
+    Attributes:
+        sights: What the steps of the trace show.
+    """
 
     def __init__(self, problem: Problem, log: Log) -> None:
         """Prepare the search. `maps` does it.
@@ -64,21 +69,27 @@ class Joining:
         """
         self._problem, self._log = problem, log
         self._bare = problem.theory.replace(displacement="none", weigh="count")
-        self._sights = Sights(problem.trace, self._bare, log, misreads=False)
+        self.sights = Sights(problem.trace, self._bare, log, misreads=False)
 
-    def maps(self) -> Iterator[SSHMap]:
+    def maps(self, standing: Sequence[Part] = ()) -> Iterator[SSHMap]:
         """Yield a map in which no drives are joined, and one in which they are.
 
         The caller has to check them.
+
+        Args:
+            standing: The pieces of a map of the first drives, if this map has to stand.
         """
-        parts = [self._alone(drive) for drive in drives_of(self._problem.trace)]
-        alone = [part for part in parts if part is not None]
-        if len(alone) < len(parts):
+        first = sum(len(part.labels) for part in standing)
+        drives = [drive for drive in drives_of(self._problem.trace) if drive.first >= first]
+        parts = [self._alone(drive) for drive in drives]
+        alone = [*standing, *(part for part in parts if part is not None)]
+        if None in parts:
             return
         yield from self._beside(alone)
         anchors = {
             (first, second): self._anchors(first, second)
             for first, second in combinations(alone, 2)
+            if second not in standing
         }
         starts = sorted(anchors, key=lambda pair: anchors[pair][:1], reverse=True)[:STARTS]
         joined = [self._all_joined(alone, dict(anchors), start) for start in starts]
@@ -122,7 +133,7 @@ class Joining:
         beam = Beam(problem, Log(trace, theory, problem.pairs), ALONE)
         if next(beam.maps(), None) is None or beam.best is None:
             return None
-        return Part.of(beam.best, drive.first, self._log, self._sights)
+        return Part.of(beam.best, drive.first, self._log, self.sights)
 
     def _anchors(self, first: Part, second: Part) -> list[tuple[float, int, int]]:
         """List anchors of two maps, the best one first.
@@ -159,7 +170,7 @@ class Joining:
     def _may_be_one(self, first: Part, s: int, second: Part, x: int) -> bool:
         """Whether the stars let dstate s of a map and dstate x of another one be one dstate."""
         places = first.sights[first.places[s]], second.sights[second.places[x]]
-        return self._sights.merged(*places) < math.inf and self._sights.are_alike(
+        return self.sights.merged(*places) < math.inf and self.sights.are_alike(
             first.stars[s], second.stars[x]
         )
 
@@ -170,7 +181,7 @@ class Joining:
         found: list[Part] = []
         for _, s, x in ways:
             look_at_clock()
-            overlay = Overlay(first, second, self._problem, self._sights)
+            overlay = Overlay(first, second, self._problem, self.sights)
             if overlay.merge(s, x):
                 found.append(overlay.part())
         found.sort(key=lambda joined: joined.nats)

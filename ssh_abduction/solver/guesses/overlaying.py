@@ -5,6 +5,7 @@ has two parts whose frames are unrelated at first. Merging two dstates fixes the
 other. From then on the two places that most surely coincide are merged first, and the poses are
 conditioned on each merge. What two merged dstates lead to by one action is merged, too. If gateways
 may change between drives, places that saw different gateways may be merged at the price of these.
+Dstates and places of a map that has to stand are never merged with each other.
 """
 
 from __future__ import annotations
@@ -53,6 +54,7 @@ class Part:
         mean: The means of the poses.
         covariance: The covariance of these.
         nats: The cost.
+        kept: The dstates of a map that has to stand.
     """
 
     labels: Mapping[int, int]
@@ -66,35 +68,61 @@ class Part:
     mean: Array
     covariance: Array
     nats: float
+    kept: frozenset[int] = frozenset()
 
     @classmethod
     def of(cls, found: Hypothesis, first: int, log: Log, sights: Sights) -> Part:
         """Make a part of a hypothesis about a drive that begins with step `first` of a log."""
         labels = {first + t: label for t, label in enumerate(found.labels)}
-        seen: list[set[int]] = [set() for _ in found.places]
-        stars: list[Sight] = [None for _ in found.places]
+        poses = np.array([*(i + k for i in found.position for k in (0, 1)), *found.heading])
+        mean, covariance = found.mean[poses], found.covariance[np.ix_(poses, poses)]
+        return cls.of_steps(labels, found.places, (mean, covariance), found.nats, log, sights)
+
+    @classmethod
+    def of_steps(
+        cls,
+        labels: Mapping[int, int],
+        places: Sequence[int],
+        poses: tuple[Array, Array],
+        nats: float,
+        log: Log,
+        sights: Sights,
+    ) -> Part:
+        """Make a part of a map of some steps.
+
+        Args:
+            labels: The dstate of each of these steps.
+            places: The place of each dstate.
+            poses: The means and the covariance of x and y of each place, in metres, and then of the
+                heading of each dstate, in radians.
+            nats: The cost.
+            log: All steps.
+            sights: What they show.
+        """
+        seen: list[set[int]] = [set() for _ in places]
+        stars: list[Sight] = [None for _ in places]
         links: dict[tuple[int, int], int] = {}
-        shown: list[dict[int, Sight]] = [{} for _ in found.sights]
+        shown: list[dict[int, Sight]] = [{} for _ in range(max(places) + 1)]
         for t, label in labels.items():
             seen[label].add(sights.seen[t])
             stars[label] = sights.shown[t]
-            shown[found.places[label]][sights.drive[t]] = sights.shown[t]
+            shown[places[label]][sights.drive[t]] = sights.shown[t]
             if t + 1 in labels:
                 links[label, log.actions[t]] = labels[t + 1]
-        kept = np.array([*(i + k for i in found.position for k in (0, 1)), *found.heading])
-        n = len(found.position)
+        n = len(shown)
+        position, heading = 2 * np.arange(n), 2 * n + np.arange(len(places))
+        numbers = [frozenset(shows) for shows in seen]
         return cls(
             labels,
-            list(found.places),
-            [frozenset(numbers) for numbers in seen],
+            list(places),
+            numbers,
             stars,
             links,
             shown,
-            2 * np.arange(n),
-            2 * n + np.arange(len(found.heading)),
-            found.mean[kept],
-            found.covariance[np.ix_(kept, kept)],
-            found.nats,
+            position,
+            heading,
+            *poses,
+            nats,
         )
 
     @property
@@ -126,6 +154,7 @@ class Part:
             np.concatenate([self.mean, other.mean]),
             covariance,
             self.nats + other.nats,
+            self.kept | {dstates + s for s in other.kept},
         )
 
 
@@ -141,6 +170,9 @@ class _State:
         mean: The means of the poses.
         covariance: The covariance of these.
         nats: The cost.
+        kept: The dstates of a map that has to stand. A group with one of them is named by its
+            first dstate.
+        kept_places: The places of that map, in the same way.
     """
 
     dstate: list[int]
@@ -150,6 +182,8 @@ class _State:
     mean: Array
     covariance: Array
     nats: float
+    kept: frozenset[int]
+    kept_places: frozenset[int]
 
     def copy(self) -> _State:
         """Copy everything that a merge changes in place."""
@@ -182,6 +216,8 @@ class Overlay:
             both.mean,
             both.covariance,
             both.nats,
+            both.kept,
+            frozenset(both.places[s] for s in both.kept),
         )
         # The cost of changed gateways if two places are one; inf if they cannot be.
         self._changes = np.full(2 * (len(both.sights),), math.inf)
@@ -209,8 +245,9 @@ class Overlay:
         dstates, places = sorted(set(state.dstate)), sorted(set(state.place))
         number = {s: i for i, s in enumerate(dstates)}
         place = {p: i for i, p in enumerate(places)}
+        kept = frozenset(number[s] for s in state.kept)
         position = both.position[places]
-        kept = [*np.stack([position, position + 1], 1).ravel(), *both.heading[dstates]]
+        poses = [*np.stack([position, position + 1], 1).ravel(), *both.heading[dstates]]
         n = 2 * len(places)
         return Part(
             {t: number[state.dstate[s]] for t, s in both.labels.items()},
@@ -225,9 +262,10 @@ class Overlay:
             [state.sights[p] for p in places],
             2 * np.arange(len(places)),
             n + np.arange(len(dstates)),
-            state.mean[kept],
-            state.covariance[np.ix_(kept, kept)],
+            state.mean[poses],
+            state.covariance[np.ix_(poses, poses)],
             state.nats,
+            kept,
         )
 
     def _lay(self, old: int, new: int) -> None:
@@ -323,6 +361,7 @@ class Overlay:
                 continue
             if not self._look_alike(s, x):
                 raise _ClashError
+            state.kept = _merged(state.kept, s, x)
             for action, there in state.links[x].items():
                 if action in state.links[s]:
                     pairs.append((state.links[s][action], there))
@@ -344,6 +383,7 @@ class Overlay:
         changes = self._sights.merged(state.sights[p], state.sights[q])
         if math.isinf(changes):
             raise _ClashError
+        state.kept_places = _merged(state.kept_places, p, q)
         state.sights[p] = {**state.sights[p], **state.sights[q]}
         state.place = [p if i == q else i for i in state.place]
         same = [(position[p], position[q]), (position[p] + 1, position[q] + 1)]
@@ -388,7 +428,18 @@ class Overlay:
             c = self._state.covariance
             off = math.remainder(self._state.mean[i] - self._state.mean[j], math.tau)
             square = off * off / (c[i, i] + c[j, j] - 2 * c[i, j] + self._spreads[2])
+            may_be_one = not {s, x} <= self._state.kept and self._look_alike(s, x)
             is_one_way = abs(off) < TURNED and square < 2 * self._prices[0]
-            if is_one_way and self._look_alike(s, x):
+            if is_one_way and may_be_one:
                 found.append((float(square), (s, x)))
         return found
+
+
+def _merged(kept: frozenset[int], first: int, second: int) -> frozenset[int]:
+    """Name a group by its first member, if it has a member that is kept.
+
+    Raises _ClashError if both members are kept.
+    """
+    if {first, second} <= kept:
+        raise _ClashError
+    return kept - {second} | {first} if second in kept else kept

@@ -1,0 +1,91 @@
+"""Lay new drives on the map of old drives, without a search of the old steps.
+
+The solver does not get the old drives. It gets a *digest*: a trace in which each link of their map
+occurs once (`onto.py`). The displacements of the old drives are fitted to their map. The fit gives
+the joint Gaussian distribution of the poses, and each link of the digest gets the displacement
+between the poses of its ends. `joining.py` then joins the pieces of the map and the new drives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.trace import Trace
+from ssh_abduction.solver.fit import Poses
+from ssh_abduction.solver.guesses.joining import Joining
+from ssh_abduction.solver.guesses.overlaying import Part
+from ssh_abduction.solver.guesses.sights import Sights
+from ssh_abduction.solver.steps.chart import numbered
+from ssh_abduction.solver.steps.log import Log
+from ssh_abduction.theory.evidence.loops import vectors_turned
+from ssh_abduction.theory.settle import Problem
+
+
+class ExistingMap:
+    """The map of old drives, with the poses of its dstates and places."""
+
+    def __init__(self, old: Trace, ssh_map: SSHMap) -> None:
+        """Fit the poses.
+
+        Args:
+            old: The old drives.
+            ssh_map: Their map.
+        """
+        with threadpool_limits(1, user_api="blas"):
+            self._piece, self._mean, self._covariance = Poses.of_map(old, ssh_map).gaussian()
+        self._places = numbered(-1 - s.id if s.place is None else s.place for s in ssh_map.dstates)
+
+    def with_displacements(self, digest: Trace, labels: Sequence[int]) -> Trace:
+        """Give each link in a digest the displacement between the poses of its ends.
+
+        Args:
+            digest: The digest.
+            labels: The dstate of each of its steps.
+        """
+        positions = 2 * (max(self._places) + 1)
+        at = self._mean[:positions].reshape(-1, 2)[self._places][list(labels)]
+        facing = self._mean[positions:][list(labels)]
+        gone = vectors_turned(at[1:] - at[:-1], -facing[:-1])
+        turns = np.remainder(facing[1:] - facing[:-1] + np.pi, 2 * np.pi) - np.pi
+        moves = zip(*gone.T.tolist(), turns.tolist(), strict=True)
+        steps = [
+            step if action.starts else replace(step, displacement=move)
+            for step, action, move in zip(digest.steps[1:], digest.actions, moves, strict=True)
+        ]
+        return replace(digest, steps=(digest.steps[0], *steps))
+
+    def maps(self, problem: Problem, labels: Sequence[int]) -> Iterator[SSHMap]:
+        """Yield maps of a digest and new drives that keep this map, the one with most joins last.
+
+        The caller has to check them.
+
+        Args:
+            problem: The digest and then the new drives, with the theory.
+            labels: The dstate of each step of the digest.
+        """
+        log = Log(problem.trace, problem.theory, problem.pairs)
+        joining = Joining(problem, log)
+        pieces = dict.fromkeys(self._piece)
+        yield from joining.maps([self._part(i, labels, log, joining.sights) for i in pieces])
+
+    def _part(self, piece: int, labels: Sequence[int], log: Log, sights: Sights) -> Part:
+        """Make a part of a piece of the map. Its cost is 0, as the map stands."""
+        dstates = [s for s, other in enumerate(self._piece) if other == piece]
+        number = {s: i for i, s in enumerate(dstates)}
+        places = list(dict.fromkeys(self._places[s] for s in dstates))
+        first = 2 * (max(self._places) + 1)
+        entries = [2 * p + k for p in places for k in (0, 1)] + [first + s for s in dstates]
+        part = Part.of_steps(
+            {t: number[s] for t, s in enumerate(labels) if s in number},
+            numbered(self._places[s] for s in dstates),
+            (self._mean[entries], self._covariance[np.ix_(entries, entries)]),
+            0.0,
+            log,
+            sights,
+        )
+        return replace(part, kept=frozenset(number.values()))

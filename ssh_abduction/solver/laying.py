@@ -1,0 +1,135 @@
+"""Lay new drives on the map of old drives, in about the time that solving the new drives takes.
+
+This needs displacements. No search of all drives follows, so the joint map is not proven to be the
+one of least cost.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Iterator
+from dataclasses import replace
+
+from ssh_abduction.data.drives import drives_of, starts_of, together
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.trace import Trace
+from ssh_abduction.solver.asp.limits import Watch
+from ssh_abduction.solver.digest import Digest
+from ssh_abduction.solver.estimating import rival_of
+from ssh_abduction.solver.guesses.completing import completed
+from ssh_abduction.solver.judging import Judging
+from ssh_abduction.solver.ranking import Ranking, noise_warning, units_warning
+from ssh_abduction.solver.recorded import Support
+from ssh_abduction.solver.regions import Deriving
+from ssh_abduction.solver.result import Solution
+from ssh_abduction.solver.steps.chart import numbered
+from ssh_abduction.solver.values import Bound, Cost, Effort, Seconds, Status
+from ssh_abduction.solver.weighed import Weighed
+from ssh_abduction.theory.settle import Problem
+from ssh_abduction.theory.theory import Theory
+
+
+def can_lay(theory: Theory) -> bool:
+    """Whether new drives can be laid on a map, by a theory in which no field is "auto"."""
+    may_differ = theory.has_faults or theory.lifts or theory.unknown_views
+    return theory.weigh == "cost" and not may_differ
+
+
+def laid(
+    old: Trace, ssh_map: SSHMap, trace: Trace, problem: Problem, watch: Watch
+) -> Solution | None:
+    """Find a joint map of little cost that keeps the map of the old drives.
+
+    Args:
+        old: The old drives.
+        ssh_map: Their map.
+        trace: The new drives.
+        problem: All drives, and a theory that `can_lay`.
+        watch: The clock of the search.
+
+    Returns:
+        The solution with the cheaper of two maps: the new drives are joined to the old ones, or are
+        pieces of their own. None if neither satisfies the axioms.
+    """
+    joint, theory = problem.trace, problem.theory
+    ranking, judging = Ranking(joint), Judging(problem)
+    found = sorted(
+        map(ranking.fitted, _joint_maps(old, ssh_map, trace, problem)),
+        key=lambda m: _nats(m, theory),
+    )
+    while found and not judging.accepts_grown(found[0], len(old)):
+        del found[0]
+    if not found:
+        return None
+    best = Deriving(joint, theory).mapped(found[0])
+    weighed = Weighed(
+        bound=_without_paths(ssh_map if ssh_map.fit else Ranking(old).fitted(ssh_map), theory),
+        within=0.0,
+        rivals=tuple(
+            replace(rival_of(m, _nats(m, theory)), estimated=i > 0) for i, m in enumerate(found)
+        ),
+        drives=drives_of(joint),
+    )
+    return Solution(
+        status=Status.FEASIBLE,
+        maps=(best,),
+        cost=Cost.of(best),
+        bound=Bound(len(ssh_map.dstates), len(ssh_map.places)),
+        complete=False,
+        theory=theory,
+        steps=len(joint),
+        effort=Effort(0, Seconds(watch.elapsed(), 0.0, 0.0)),
+        stopped="no proof",
+        trace=joint,
+        support=Support(
+            odometry_warning=units_warning(joint) or noise_warning(best, joint),
+            weighed=weighed,
+            onto=tuple(drive.name for drive in drives_of(old)),
+        ),
+    )
+
+
+def _nats(ssh_map: SSHMap, theory: Theory) -> float:
+    """Compute the cost in nats of a map that has a fit."""
+    assert ssh_map.fit is not None
+    path = theory.prices[2]
+    return _without_paths(ssh_map, theory) + path * len(ssh_map.paths)
+
+
+def _without_paths(ssh_map: SSHMap, theory: Theory) -> float:
+    """Compute the cost in nats of a map that has a fit, without the price of its paths."""
+    assert ssh_map.fit is not None
+    dstate, place, _ = theory.prices
+    return dstate * len(ssh_map.dstates) + place * len(ssh_map.places) + ssh_map.fit.chi2 / 2
+
+
+def _joint_maps(old: Trace, ssh_map: SSHMap, trace: Trace, problem: Problem) -> Iterator[SSHMap]:
+    """Yield joint maps that keep the map of the old drives. The caller has to check them."""
+    from ssh_abduction.solver.guesses.existing import ExistingMap  # loads numpy
+
+    existing, digest = ExistingMap(old, ssh_map), Digest.of(old, ssh_map, short=True)
+    short = existing.with_displacements(digest.trace, digest.labels)
+    with warnings.catch_warnings():  # the digest may have the steps of the new drives
+        warnings.simplefilter("ignore")
+        part = together([replace(short, odometry=old.odometry), trace])
+    # The joint map is checked against what a user asserts, as that is about other step numbers.
+    free = problem.theory.replace(same=(), different=(), elsewhere=(), same_place=())
+    for found in existing.maps(Problem.of(part, free), digest.labels):
+        if whole := _of_all(found, digest.labels_of_all(found, ssh_map), problem):
+            yield whole
+
+
+def _of_all(found: SSHMap, labels: tuple[int, ...], problem: Problem) -> SSHMap | None:
+    """Make a map of all drives from a map of a digest; None if it breaks an axiom.
+
+    Args:
+        found: The map of the digest.
+        labels: For each step of all drives, its dstate in that map.
+        problem: All drives, and the theory.
+    """
+    order = [found.dstates[s] for s in dict.fromkeys(labels)]
+    facing = [-math.pi / 2 * (s.heading or 0) for s in order]  # only star=frame uses them
+    places = numbered(s.place for s in order)
+    whole = completed(problem.trace, problem.theory, numbered(labels), places, facing)
+    return replace(whole, starts=starts_of(problem.trace)) if whole else None

@@ -1,0 +1,87 @@
+"""A drive with displacements is laid on the map of old drives."""
+
+from __future__ import annotations
+
+from unittest.mock import patch
+
+import pytest
+import truth
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from onto import walks
+
+from ssh_abduction import Solution, Trace, check, solve
+from ssh_abduction.solver import Status, onto
+
+
+def test_drives_are_laid_on_the_map_one_by_one() -> None:
+    """The method was developed on seed 0."""
+    known = list(walks(6, 100, 4, seed=300))
+    solution: Solution | None = None
+    for number, walk in enumerate(known, 1):
+        before = solution
+        solution = solve(walk.trace, onto=solution, max_maps=1, time_limit=8)
+        if before is None:
+            continue
+        found, trace = solution[0], solution.trace
+        assert trace is not None
+        assert check(trace, found, solution.theory) == ()
+        old = before[0].dstate_at
+        assert found.dstate_at[: len(old)] == old
+        assert (solution.status, solution.stopped) == (Status.FEASIBLE, "no proof")
+        assert solution.effort.prefix == 0  # clingo got no step
+        assert solution.support.onto == tuple(drive.name for drive in before.drives)
+        states = [state for drive in known[:number] for state in drive.dstates]
+        assert truth.partition(found.dstate_at) == truth.partition(states)
+        assert solution.weighed is not None
+        assert 0 < solution.weighed.bound < solution.weighed.nats
+
+
+ROOM = "abcd"  # what a robot sees at the corners of a square room, facing along the wall ahead
+
+
+def around_the_room(first: int, corners: int, name: str, errors: list[float]) -> Trace:
+    """Make a drive along the walls of a square room of 5 m, from corner to corner.
+
+    Args:
+        first: The corner where the drive begins.
+        corners: How many further corners the robot comes to.
+        name: The name of the drive.
+        errors: The error of each travel, in metres.
+    """
+    views = [f"{ROOM[(first + (i + 1) // 2) % 4]}{i % 2}" for i in range(2 * corners + 1)]
+    moves = [
+        move for error in errors[:corners] for move in ((5.0 + error, 0.0, 0.0), (0.0, 0.0, 1.5708))
+    ]
+    return Trace.from_steps(views, ["travel", "left"] * corners, displacements=moves, name=name)
+
+
+ERRORS = st.lists(st.floats(-0.2, 0.2), min_size=3, max_size=3)
+
+
+@pytest.mark.filterwarnings("ignore:traces 1 and 2 have the same steps")
+@pytest.mark.filterwarnings("ignore:views. trace")
+@pytest.mark.filterwarnings("ignore:.*no view in common")
+@settings(max_examples=8)
+@given(
+    st.tuples(st.integers(0, 3), st.integers(1, 3), ERRORS),
+    st.tuples(st.integers(0, 3), st.integers(1, 3), ERRORS),
+)
+def test_the_cost_is_that_of_solving_all_drives_together(
+    monday: tuple[int, int, list[float]], tuesday: tuple[int, int, list[float]]
+) -> None:
+    """That is so if the best joint map has the map of the old drives."""
+    old = around_the_room(monday[0], monday[1], "monday", monday[2])
+    new = around_the_room(tuesday[0], tuesday[1], "tuesday", tuesday[2])
+    existing = solve(old)
+    assume(existing.status is Status.OPTIMAL)
+    all_together = solve([old, new])
+    assert all_together.weighed is not None
+    labels = all_together[0].dstate_at[: len(old)]
+    assume(all_together.weighed.proven and labels == existing[0].dstate_at)
+    with patch.object(onto, "READABLE", 0):
+        laid = solve(new, onto=existing)
+    assert laid.weighed is not None
+    assert laid.stopped == "no proof"
+    assert laid.weighed.nats == pytest.approx(all_together.weighed.nats, abs=1e-4)
+    assert laid.weighed.bound <= all_together.weighed.nats
