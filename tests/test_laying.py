@@ -85,3 +85,18 @@ def test_the_cost_is_that_of_solving_all_drives_together(
     assert laid.stopped == "no proof"
     assert laid.weighed.nats == pytest.approx(all_together.weighed.nats, abs=1e-4)
     assert laid.weighed.bound <= all_together.weighed.nats
+
+
+def test_an_interrupt_gives_the_new_drive_dstates_of_its_own() -> None:
+    monday, tuesday = (
+        around_the_room(0, corners, name, [0.0] * corners)
+        for corners, name in ((4, "monday"), (30, "tuesday"))
+    )
+    before = solve(monday)
+    with patch.object(onto, "laid", side_effect=KeyboardInterrupt):
+        solution = solve(tuesday, onto=before)
+    assert (solution.status, solution.stopped) == (Status.FEASIBLE, "interrupted")
+    (found,) = solution
+    assert found.dstate_at[: len(monday)] == before[0].dstate_at
+    assert solution.trace is not None
+    assert check(solution.trace, found, solution.theory) == ()

@@ -10,6 +10,7 @@ import math
 import warnings
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Literal
 
 from ssh_abduction.data.drives import drives_of, starts_of, together
 from ssh_abduction.data.maps import SSHMap
@@ -71,19 +72,43 @@ def laid(
         ),
         drives=drives_of(joint),
     )
+    return unproven(best, ssh_map, old, problem, watch, "no proof", weighed)
+
+
+def unproven(
+    found: SSHMap,
+    ssh_map: SSHMap,
+    old: Trace,
+    problem: Problem,
+    watch: Watch,
+    stopped: Literal["interrupted", "no proof"],
+    weighed: Weighed | None = None,
+) -> Solution:
+    """Make a solution of a joint map that was found without a search.
+
+    Args:
+        found: The joint map.
+        ssh_map: The map of the old drives, which it keeps.
+        old: The old drives.
+        problem: All drives, and their theory.
+        watch: The clock of the search.
+        stopped: Why there is no proof.
+        weighed: The cost of the map and of its rivals; None if they were not computed.
+    """
+    joint = problem.trace
     return Solution(
         status=Status.FEASIBLE,
-        maps=(best,),
-        cost=Cost.of(best),
+        maps=(found,),
+        cost=Cost.of(found),
         bound=Bound(len(ssh_map.dstates), len(ssh_map.places)),
         complete=False,
-        theory=theory,
+        theory=problem.theory,
         steps=len(joint),
         effort=Effort(0, Seconds(watch.elapsed(), 0.0, 0.0)),
-        stopped="no proof",
+        stopped=stopped,
         trace=joint,
         support=Support(
-            odometry_warning=units_warning(joint) or noise_warning(best, joint),
+            odometry_warning=units_warning(joint) or noise_warning(found, joint),
             weighed=weighed,
             onto=tuple(drive.name for drive in drives_of(old)),
         ),

@@ -39,7 +39,7 @@ from ssh_abduction.solver.digest import Digest
 from ssh_abduction.solver.guesses.gated import sketch_beyond
 from ssh_abduction.solver.guesses.mended import first_contradiction
 from ssh_abduction.solver.judging import Judging
-from ssh_abduction.solver.laying import can_lay, laid
+from ssh_abduction.solver.laying import can_lay, laid, unproven
 from ssh_abduction.solver.obeying import obeyed, with_names
 from ssh_abduction.solver.recorded import Support
 from ssh_abduction.solver.result import Solution
@@ -96,10 +96,16 @@ def solve_onto(
         old, trace = joint[: len(old)], joint[len(old) :]
     in_use = settle(joint, theory).theory
     if solving.speedups.greedy and len(joint) > READABLE and can_lay(in_use):
-        with suppress(LimitError), heeding(solving.watch.check):
-            on_map = laid(old, ssh_map, trace, Problem.of(joint, in_use), solving.watch)
-            if on_map is not None:
-                return on_map if corrections is None else with_names(corrections, on_map, joint)
+        problem, on_map = Problem.of(joint, in_use), None
+        try:
+            with suppress(LimitError), heeding(solving.watch.check):
+                on_map = laid(old, ssh_map, trace, problem, solving.watch)
+        except KeyboardInterrupt:
+            if (grown := _grown(ssh_map, old, joint, in_use)) is None:
+                raise
+            on_map = unproven(grown, ssh_map, old, problem, solving.watch, "interrupted")
+        if on_map is not None:
+            return on_map if corrections is None else with_names(corrections, on_map, joint)
     short = solving.speedups.that_hold_for(in_use).digest and in_use.displacement == "none"
     digest = Digest.of(old, ssh_map, short=short)
     with warnings.catch_warnings():  # a digest may have the steps of the new drive
