@@ -130,7 +130,7 @@ def _record(raw: bytes, where: str) -> dict[str, Any]:
         raise TraceError(f"{where}: line: expected text, got {error}; replace it") from None
     except ValueError as error:
         raise TraceError(
-            f"{where}: line: expected one JSON object, got broken JSON ({error}); correct this line"
+            f"{where}: line: expected one JSON object, got {error}; correct this line"
         ) from None
     if not isinstance(record, dict):
         raise TraceError(
