@@ -32,6 +32,7 @@ from ssh_abduction.solver.onto import Solving, solve_onto
 from ssh_abduction.solver.result import Solution
 from ssh_abduction.solver.search import Search
 from ssh_abduction.solver.sharing import Backbone, Sharing
+from ssh_abduction.solver.start import Limits
 from ssh_abduction.solver.values import Progress
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import ALL, Speedups, row
@@ -93,8 +94,7 @@ def solve(
         Kuipers & Beeson 2002, "Bootstrap Learning for Place Recognition", step 2.
     """
     joint = together(trace) if isinstance(trace, list | tuple | Iterator) else checked_trace(trace)
-    check_limit("time_limit (--time-limit)", "seconds", time_limit)
-    check_limit("memory_limit (--memory-limit)", "MiB", memory_limit)
+    Limits(time_limit, memory_limit)  # checks them
     watch = Watch(time_limit, memory_limit)
     watch.start()
 
@@ -155,8 +155,8 @@ def find_backbone(
         MapError: The maps are not of the given trace.
     """
     an_instance("solution", solution, Solution, SolverError, mend="take what solve returned")
-    check_limit("time_limit (--time-limit)", "seconds", time_limit)
-    check_limit("memory_limit (--memory-limit)", "MiB", memory_limit)
+    check_limit("time_limit", "seconds", time_limit)
+    check_limit("memory_limit", "MiB", memory_limit)
     trace = solution.trace if trace is None else checked_trace(trace)
     minimal, known = solution.minimal_maps, solution.backbone
     if known is None or known.proven or not minimal or solution.theory.weigh == "cost":
