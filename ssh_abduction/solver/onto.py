@@ -94,14 +94,15 @@ def solve_onto(
     if corrections is not None:
         joint, theory = obeyed(corrections, joint, theory)
         old, trace = joint[: len(old)], joint[len(old) :]
-    in_use = settle(joint, theory).theory
+    problem = settle(joint, theory)
+    in_use = problem.theory
     if solving.speedups.greedy and len(joint) > READABLE and can_lay(in_use):
-        problem, on_map = Problem.of(joint, in_use), None
+        on_map = None
         try:
             with suppress(LimitError), heeding(solving.watch.check):
                 on_map = laid(old, ssh_map, trace, problem, solving.watch)
         except KeyboardInterrupt:
-            if (grown := _grown(ssh_map, old, joint, in_use)) is None:
+            if (grown := _grown(ssh_map, old, problem)) is None:
                 raise
             on_map = unproven(grown, ssh_map, old, problem, solving.watch, "interrupted")
         if on_map is not None:
@@ -123,7 +124,7 @@ def solve_onto(
         ).renumbered()
         for m in kept
     )
-    if not maps and ended and (grown := _grown(ssh_map, old, joint, in_use)):
+    if not maps and ended and (grown := _grown(ssh_map, old, problem)):
         found, maps = replace(found, status=Status.FEASIBLE, cost=Cost.of(grown)), (grown,)
     if not maps:
         raise _contradiction(old, trace, ssh_map, digest, found)
@@ -146,17 +147,17 @@ def solve_onto(
     return solution if corrections is None else with_names(corrections, solution, joint)
 
 
-def _grown(ssh_map: SSHMap, old: Trace, joint: Trace, theory: Theory) -> SSHMap | None:
+def _grown(ssh_map: SSHMap, old: Trace, problem: Problem) -> SSHMap | None:
     """Make a map without a search: the existing map, and new places for the new drive.
 
     Returns:
         The map; None if a step contradicts it, or if the checker does not accept it.
     """
-    sketch = sketch_beyond(ssh_map, old, theory, homing=False)
-    if first_contradiction(sketch, joint) is not None:
+    sketch = sketch_beyond(ssh_map, old, problem.theory, homing=False)
+    if first_contradiction(sketch, problem.trace) is not None:
         return None
-    grown = replace(sketch.map(), starts=starts_of(joint), names=())
-    return grown if Judging(Problem.of(joint, theory)).accepts(grown) else None
+    grown = replace(sketch.map(), starts=starts_of(problem.trace), names=())
+    return grown if Judging(problem).accepts(grown) else None
 
 
 def _existing(existing: object) -> tuple[Trace, SSHMap]:

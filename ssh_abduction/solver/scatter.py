@@ -294,7 +294,7 @@ class _Losses:
 
         is_near, is_far = may_share & (apart < gap), may_share & (apart >= gap)
         near = [part.near_loss(i, others) for i, others in enumerate(is_near)]
-        # If two far points share a facility, one of them loses its share: that which loses more.
+        # If two far points share a facility, the point that loses more gives up its share.
         sizes = _each_largest(np.array([far(i, others) for i, others in enumerate(is_far)]))
         rank = np.argsort(np.argsort(sizes))
         is_far &= rank < rank[:, None]
