@@ -213,6 +213,8 @@ def test_dense_and_sparse_systems_have_one_solution() -> None:
     dense = least_squares(some, values, weights)
     assert dense == pytest.approx(least_squares(csr_array(some), values, weights), abs=1e-6)
     assert dense[3] == pytest.approx(dense[4])
+    nothing = csr_array((0, 5))  # as if all displacements may be wrong
+    assert (least_squares(nothing, np.zeros(0), np.zeros(0)) == 0).all()
     square, added = some.T @ some, np.full(5, 0.1)
     right = square @ np.arange(5.0) + 0.1 * np.arange(5.0)
     for matrix in (square, csr_array(square)):

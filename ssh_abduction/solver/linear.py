@@ -75,8 +75,9 @@ def least_squares(some: Any, values: Array, weights: Array) -> Array:
         return np.linalg.lstsq(system, values, rcond=1e-12)[0].astype(float)
     normal = system.T @ system
     scale = normal.diagonal()
-    # A little damping makes the matrix regular.
-    found: Array = system_solved(normal, DAMPING * (scale + scale.max()), system.T @ values)
+    # A little damping makes the matrix regular, even if there are no equations.
+    damping = DAMPING * (scale + (scale.max() or 1.0))
+    found: Array = system_solved(normal, damping, system.T @ values)
     return found
 
 
