@@ -122,9 +122,6 @@ def features_of(trace: Trace) -> ReciprocalTransformer | PanoramaTransformer:
         trace: Its images are panoramas if its header gives their shape, as
             `"panorama": [24, 180, 3]`. Otherwise, they are ranges.
 
-    Returns:
-        A PanoramaTransformer for panoramas, a ReciprocalTransformer for ranges.
-
     Raises:
         PerceptionError: The shape in the header is not three whole numbers of at least 1.
     """

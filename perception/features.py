@@ -72,7 +72,6 @@ def telling_features(
         labels: (n,) dstate of each image. Images of other dstates are ignored.
         a: Label of one dstate.
         b: Label of the other dstate.
-        random_state: Seed for shuffling.
 
     Returns:
         The share of each feature by three methods, and the share of images that are recognised.

@@ -143,7 +143,6 @@ def cloned(name: str, estimator: Any, *methods: str) -> Any:
 
     Args:
         name: Name of the setting, for the error message.
-        estimator: The estimator.
         *methods: Names of methods that it must have besides `fit` and `get_params`.
 
     Raises:
@@ -201,7 +200,6 @@ def learning_curve(
         y: (n,) label of each image.
         sizes: Numbers of images to learn from, each from 1 to n.
         folds: Number of folds, at least 2.
-        random_state: Seed for dividing the images.
         estimator: A scikit-learn classifier; None means `recogniser()`, for ranges in metres.
 
     Returns:

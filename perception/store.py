@@ -74,9 +74,6 @@ class Stored:
         Args:
             images: (n, d) images.
 
-        Returns:
-            The label of each image, a whole number.
-
         Raises:
             PerceptionError: The images have another length than the learnt ones, or the model is
                 damaged. `load` does not notice all damage of a file.
@@ -112,7 +109,6 @@ def save(model: Any, path: str | os.PathLike[str]) -> None:
 
     Args:
         model: The estimator or pipeline, of types of this package or of scikit-learn.
-        path: The file to write.
 
     Raises:
         PerceptionError: `load` would reject the model, or the file cannot be written.
@@ -164,9 +160,6 @@ def written(model: Any, name: str = "recogniser") -> bytes:
 
 def load(path: str | os.PathLike[str]) -> Stored:
     """Read a recogniser that `save` wrote, without running anything in the file.
-
-    Args:
-        path: The file.
 
     Raises:
         PerceptionError: The file is unreadable or has other content.

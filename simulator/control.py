@@ -144,7 +144,6 @@ def act(driver: Driver, action: str) -> None:
     """Do an action of a route, and climb to the dstate at its end.
 
     Args:
-        driver: The robot.
         action: "travel", "left", "right" or "around".
     """
     if action == "travel":
@@ -199,7 +198,6 @@ def climb(driver: Driver, turned: bool = False) -> None:
     """Climb to the fixed point: correct the position along and across the path, and the heading.
 
     Args:
-        driver: The robot.
         turned: Whether the action was a turn. Then the position across the path is not corrected,
             as the robot would have to drive back and approach again.
     """

@@ -37,7 +37,6 @@ def drive_along(driver: Driver, space: FreeSpace, way: Array) -> Iterator[int]:
     """Drive along a route.
 
     Args:
-        driver: The robot.
         space: Free space between known walls. Obstacles that the laser sees are marked in it.
         way: (n, 2) route in metres.
 

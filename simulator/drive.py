@@ -71,7 +71,6 @@ class RecordedDrive:
         Args:
             places: (x, y) in metres of each place, by name.
             scans: Name of the place of each scan; None between places.
-            more: Other fields of `truth`.
         """
         visits: list[dict[str, Any]] = []
         # Consecutive scans at a place form a visit.
@@ -175,8 +174,6 @@ class Recorder:
         trajectory.
 
         Args:
-            name: Name of the drive.
-            laser: The scanner.
             odometer: Noise of the odometry.
             seed: Seed of the noise of scans and odometry.
         """

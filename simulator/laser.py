@@ -42,7 +42,6 @@ class Laser:
         One call for many poses is faster than many calls.
 
         Args:
-            world: The world.
             poses: (m, 3) x and y in metres, heading in radians.
 
         Returns:
@@ -58,7 +57,6 @@ class Laser:
         """Compute the ranges with noise at some poses.
 
         Args:
-            world: The world.
             poses: (m, 3) x and y in metres, heading in radians.
             rng: Source of the noise.
 

@@ -78,9 +78,6 @@ class MapFile:
 def read_occupancy(path: Path) -> tuple[str, NDArray[np.float64]]:
     """Read the walls of an occupancy map.
 
-    Args:
-        path: The YAML file.
-
     Returns:
         The name of the map, which is that of the file, and its walls, (n, 4) in metres.
 

@@ -160,7 +160,6 @@ class Floor:
         """List the actions that lead through a gateway: a turn, unless it is ahead, and a travel.
 
         Args:
-            stand: State of the robot.
             goal: Index of the gateway of the room.
 
         Yields:

@@ -190,7 +190,6 @@ class Round:
         """Draw a round at random.
 
         Args:
-            rooms: Rooms and routes of the building.
             metres: Length after which the robot goes home.
             chance: Source of random choices.
 
@@ -272,12 +271,9 @@ def record_plan(
     """Drive rounds through a building, and return the scans with odometry and truth.
 
     Args:
-        plan: The plan of the building.
         tours: Number of times that the same round is driven.
         seed: Seed of the round and of the noise.
         metres: Length of the round after which the robot goes home.
-        laser: The scanner.
-        body: Errors of the robot.
         odometer: Noise of the odometry in the log.
         every: Metres between scans. In turns there is a scan every ten degrees.
 

@@ -121,7 +121,6 @@ def streets_of(
     """Find the streets between walls.
 
     Args:
-        walls: The walls.
         points: All points of the image. A street must be free of points near its midline.
         reach: Half the width of a street in metres.
         farther: Smallest distance from the robot to which a street must reach, in metres.

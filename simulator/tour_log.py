@@ -27,9 +27,6 @@ def noise_of(log: OdometryLog, world: World, body: Body, tolerance: Tolerance | 
     its own. Then the model has only systematic errors.
 
     Args:
-        log: The log of the drive.
-        world: The world.
-        body: Errors of the robot.
         tolerance: Precision of hill-climbing; None if images are not at dstates.
     """
     if world.angles == "any" and tolerance is not None:
@@ -58,7 +55,6 @@ class Eye:
         """Make the image of a step.
 
         Args:
-            driver: The robot.
             ranges: Ranges of the laser in metres.
             done: Number of actions that are done.
 
@@ -117,7 +113,6 @@ def noise_model(reports: Sequence[Report], body: Body, tolerance: Tolerance | No
 
     Args:
         reports: Motion by odometry from each step to the next.
-        body: Errors of the robot.
         tolerance: Precision of hill-climbing; None if displacements are not between fixed points.
     """
     ways = math.fsum(math.hypot(*r.displacement[:2]) ** 2 for r in reports)

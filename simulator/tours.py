@@ -139,11 +139,8 @@ def record(
     recorded logs.
 
     Args:
-        world: The world.
         tours: Number of tours.
         seed: Seed of all noise.
-        laser: The scanner.
-        body: Errors of the robot.
         odometer: Noise of the odometry in the log.
         every: Metres between scans. In turns there is a scan every ten degrees.
 

@@ -65,7 +65,6 @@ class DriveWatch:
 
         Args:
             number: Number of the action, counted on from tour to tour.
-            name: The action.
 
         Raises:
             SimulatorError: The action ends at a wrong place, or a tour does not end at its start.

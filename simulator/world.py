@@ -59,7 +59,6 @@ def checked_segments(name: str, value: object) -> Array:
 
     Args:
         name: Name of the value, for errors.
-        value: The value.
 
     Raises:
         SimulatorError: The value is something else, is empty, or has numbers that are not finite.

@@ -206,7 +206,6 @@ class WorldReader:
         Args:
             value: List of x and y of the centre, radius, and first and last direction. Directions
                 are degrees, counterclockwise.
-            name: Name of the field.
         """
         x, y, radius, first, last = self.numbers(value, 5, name)
         if not radius > 0 or not 0 < last - first <= 360:

@@ -117,9 +117,7 @@ def lazy_names(
     """Make the `__getattr__` and `__dir__` of a package that loads each name when it is first used.
 
     Args:
-        package: The package's `__name__`.
         homes: For each module of the package, the names to take from it.
-        exported: All names that the package exports.
 
     Returns:
         The function `__getattr__`, which loads and returns the value of a name, and the function

@@ -102,10 +102,6 @@ class Agreement:
 def agreement(log: RobotLog, track: Track) -> Agreement:
     """Compare the track of a log with its odometry.
 
-    Args:
-        log: The scans with odometry.
-        track: Poses by scan matching.
-
     Returns:
         The comparison. It ignores stretches across a cut of the track, where the motion is unknown.
         If the odometer hardly moved, it compares only lengths.
@@ -141,10 +137,6 @@ def agreement(log: RobotLog, track: Track) -> Agreement:
 
 def disagreement(log: RobotLog, track: Track) -> str | None:
     """Describe a disagreement between scan matching and odometry.
-
-    Args:
-        log: The scans with odometry.
-        track: Poses by scan matching.
 
     Returns:
         A note with the differences, likely causes, and the options that correct them; None if scans

@@ -65,7 +65,6 @@ def find_closures(
     was found corrects the poses after it.
 
     Args:
-        track: Trajectory of the robot.
         visits: The visits, in order.
         patches: The local map around the middle of each visit.
         apart: Two visits are matched if there are at least this many metres of way between them, so
@@ -249,7 +248,6 @@ def uncertainty(track: Track, first: int, last: int, end: Array) -> Array:
     """Compute the covariance of a point near a later scan relative to an earlier scan.
 
     Args:
-        track: Trajectory of the robot.
         first: Index of the earlier scan.
         last: Index of the later scan.
         end: (x, y) of the point in metres, in the frame of the track.
@@ -268,7 +266,6 @@ def relative(closing: VisitMatch, first: float, last: float) -> tuple[float, flo
     """Compute the pose at a later step relative to an earlier one from a closure.
 
     Args:
-        closing: The closure of the visits.
         first: Heading of the earlier step in radians, in the frame of the track.
         last: Heading of the later step.
 

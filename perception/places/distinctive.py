@@ -59,7 +59,6 @@ def find_visits(log: RobotLog, track: Track, width: float = WIDTH) -> tuple[Visi
 
     Args:
         log: The scans. Corrected poses are not read.
-        track: Their poses.
         width: Width of the robot in metres.
     """
     breaks = set(track.breaks)

@@ -80,7 +80,6 @@ def follow(log: RobotLog, trust: Trust | None = None) -> Track:
     Corrected poses are not read.
 
     Args:
-        log: The scans with odometry.
         trust: Errors of the odometer; None for those of a usual one.
     """
     steps = unknown_steps(log)

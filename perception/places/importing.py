@@ -104,9 +104,7 @@ def import_log(
     Corrected poses become the truth for evaluation; nothing else reads them.
 
     Args:
-        log: The log of one drive.
         width: Width of the robot in metres. It cannot pass narrower parts of the free space.
-        name: Name of the trace.
         tell: Takes each note on suspicious odometry as soon as it is known.
 
     Returns:
@@ -147,7 +145,6 @@ def import_live(
     Args:
         items: The scans with odometry, in order, for example those of `stream_log` or `live_log`.
         width: Width of the robot in metres.
-        name: Name of the trace.
         tell: Takes each note on suspicious scans and odometry as soon as it is known.
         show: Takes each visit when it is final, except those where stretches of the drive lead
             apart (`partings`).
@@ -262,7 +259,6 @@ def tracked(
     """Compute the trajectory of a robot from its log.
 
     Args:
-        log: The log of one drive.
         tell: Takes each note as soon as it is known.
 
     Returns:
@@ -338,7 +334,6 @@ def calibrated(track: Track, visits: Sequence[Visit], closings: Sequence[VisitMa
     """Return a track with covariances that agree with the closures.
 
     Args:
-        track: Trajectory of the robot.
         visits: The visits, in order.
         closings: The closures between them; with none, the track stays as it is.
     """

@@ -55,9 +55,6 @@ FAR_WALLS = 50.0
 def refuse_lengths(log: RobotLog) -> None:
     """Raise a LogError if the ranges of a log are too long to be metres.
 
-    Args:
-        log: The log.
-
     Raises:
         LogError: The ranges are not in metres.
     """
@@ -73,9 +70,6 @@ def refuse_lengths(log: RobotLog) -> None:
 
 def refuse_shuffled(log: RobotLog) -> None:
     """Raise a LogError if the scans of a log are in random order.
-
-    Args:
-        log: The log.
 
     Raises:
         LogError: The scans are in random order.
@@ -101,9 +95,6 @@ def refuse_shuffled(log: RobotLog) -> None:
 def checked(log: RobotLog) -> tuple[RobotLog, list[str], list[str]]:
     """Check whether a log is one drive in order, before its scans are matched.
 
-    Args:
-        log: The log.
-
     Returns:
         The log with the odometry of a single source, in metres and radians; notes on what was
         converted; and notes on what is wrong with the whole log.
@@ -125,13 +116,9 @@ def describe_drive(log: RobotLog, begin: int = 0, unseen: bool | None = None) ->
     Only the odometry, the clock and the laser are looked at, so that this can be said at once.
 
     Args:
-        log: The scans.
         begin: Number of the first scan.
         unseen: Whether the robot moves while its odometer stands still; None if the ranges of the
             scans show it.
-
-    Returns:
-        Notes for the user; none if nothing is wrong.
     """
     return [
         *_about_order(log),
@@ -209,8 +196,6 @@ def judged(log: RobotLog, track: Track, explained: bool) -> tuple[Track, list[st
     """Judge whether a track rests on poor matches, contradicts itself, or never returns.
 
     Args:
-        log: The scans with odometry.
-        track: Poses by scan matching.
         explained: Whether another note already gives a cause, so that none is suggested here.
 
     Returns:

@@ -19,7 +19,6 @@ def shrunk(mask: Bools, outside: bool = False) -> Bools:
     """Remove the cells of a mask, (rows, columns), that have a neighbour outside of it.
 
     Args:
-        mask: The mask.
         outside: Whether the cells beyond the border count as cells of the mask.
     """
     padded = np.pad(mask, 1, constant_values=outside)

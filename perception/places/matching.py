@@ -144,7 +144,6 @@ class Scene:
         """The area that both scenes observed, as a share of the smaller one.
 
         Args:
-            other: The other scene.
             turn: Its rotation in radians.
             shift: (x, y) of its middle in metres.
         """

@@ -60,9 +60,7 @@ def with_partings(
     Visits whose middles are nearly the same get the same middle.
 
     Args:
-        track: Trajectory of the robot.
         visits: The visits, in order. Each has its local map.
-        closings: The closures between them.
 
     Returns:
         All visits, in order, and the closures between their middles. An added visit has the local

@@ -39,7 +39,6 @@ class Recent:
         """Add the next scan.
 
         Args:
-            scan: The scan.
             pose: x, y in metres and heading in radians.
         """
         count = len(self._scans)

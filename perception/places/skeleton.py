@@ -75,7 +75,6 @@ def junctions(patch: Patch, room: float) -> list[Junction]:
     """Find the junctions and the bends of the skeleton of a local map.
 
     Args:
-        patch: The local map.
         room: Half the width of the robot in metres.
     """
     mask = passable(patch, room)
@@ -149,7 +148,6 @@ def passable(patch: Patch, room: float) -> Bools:
     """Find the cells that the middle of the robot can reach, as if there were no furniture.
 
     Args:
-        patch: The local map.
         room: Half the width of the robot in metres.
     """
     trail = grown(patch.trail)
@@ -202,7 +200,6 @@ def junctions_merged(graph: Graph, distance: Array) -> list[Fork]:
     """Merge junctions in one open space.
 
     Args:
-        graph: The skeleton.
         distance: (rows, columns) distance of each cell to the nearest obstacle, in cells.
 
     Returns:
@@ -261,7 +258,6 @@ def bends(graph: Graph, distance: Array, out: float) -> Iterator[Bend]:
     """Find the bends of a skeleton.
 
     Args:
-        graph: The skeleton.
         distance: (rows, columns) distance of each cell to the nearest obstacle, in cells.
         out: The direction of a line before and after a cell is measured at points that lie this far
             outside the disc of the cell, in cells. A line that ends nearer than that has no bend.

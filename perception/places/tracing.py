@@ -59,11 +59,7 @@ def to_trace(
     """Make the trace of a log, without views.
 
     Args:
-        log: The scans.
-        track: Their poses.
         visits: The visits, in order.
-        closings: The closures between them.
-        name: Name of the trace.
 
     Returns:
         A trace with one or two steps a visit. A step has an image, a star, the displacement from
@@ -174,9 +170,6 @@ def _course(track: Track, first: Visit, last: Visit, heading: float) -> list[lis
     The discs of both places are left out, and the last point is the middle of the next place.
 
     Args:
-        track: Trajectory of the robot.
-        first: The visit from which it comes.
-        last: The next visit.
         heading: The direction of the x-axis of the points, in radians. Their origin is the middle
             of the first place.
     """

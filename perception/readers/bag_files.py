@@ -62,7 +62,6 @@ def files_opened(path: Path, format: str) -> Iterator[Files]:
     """Open the files of a bag.
 
     Args:
-        path: The file or folder.
         format: Format of the file: `ros1`, `ros2` or `mcap`. It is ignored for a folder.
 
     Raises:

@@ -57,7 +57,6 @@ def transforms_of(bag: Bag, seen: set[str], damaged: list[Damage]) -> Frames:
     many joints of a robot are not needed.
 
     Args:
-        bag: The open bag.
         seen: Names of the frames of scans.
         damaged: Receives the messages that cannot be read.
 
@@ -141,10 +140,6 @@ def mount_of(
     """Compute how the laser is mounted on the robot.
 
     Args:
-        frames: Transforms of the bag.
-        odom: Name of the frame of the odometry.
-        base: Name of the frame of the robot.
-        frame: Name of the frame of the scans.
         notes: Receives notes on transforms that contradict each other.
         assumed: Receives, by the key "mount", a note if no transform leads to the laser. Then the
             laser is taken to be in the middle of the robot.

@@ -118,7 +118,6 @@ def bag_opened(path: str | os.PathLike[str], format: str) -> Iterator[Bag]:
     """Open a bag.
 
     Args:
-        path: The file or folder.
         format: Format of the file: `ros1`, `ros2` or `mcap`. It is ignored for a folder.
 
     Raises:

@@ -53,7 +53,6 @@ def read(bag: Bag, scan_topics: Sequence[str], odom_topic: str | None) -> Survey
     """Survey a bag, so that its scans can be read.
 
     Args:
-        bag: The open bag.
         scan_topics: Topics of the scans; if empty, the only topic with scans is read.
         odom_topic: Topic of the odometry. If None, the only topic with odometry is read or, if
             there is no such topic, the transforms.

@@ -87,11 +87,7 @@ MOST_WAITING = 100
 
 
 def looks_like(head: bytes) -> bool:
-    """Check whether one of the first lines of a file is a message that this reader knows.
-
-    Args:
-        head: First bytes of the file.
-    """
+    """Check whether one of the first lines of a file is a message that this reader knows."""
     return LINE_OF_A_LOG.search(head) is not None
 
 
@@ -99,7 +95,6 @@ def head_of(file: IO[bytes], scans: int) -> bytes:
     """Read the first lines of a log, up to a number of scans.
 
     Args:
-        file: The log.
         scans: The number.
     """
     head: list[bytes] = []
@@ -115,7 +110,6 @@ def read(
     """Survey a log in lines, so that its scans can be read.
 
     Args:
-        file: The log.
         source: Name of the log, for errors.
         format: `carmen` ignores vertices and edges; `g2o` requires vertices; None reads what is
             there.

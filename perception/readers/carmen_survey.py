@@ -155,9 +155,6 @@ class PoseGraph:
 
         Args:
             poses: Flat list of poses: x, y, heading, x, …
-
-        Returns:
-            A number from 0 to 1.
         """
         table: NDArray[np.float64] = np.reshape(poses, (-1, 3))
         last = len(self.vertices) - 1
@@ -239,7 +236,6 @@ def meaning_of(
     Args:
         found: Findings of the first pass.
         survey: Findings about the kind of lines that is read.
-        kind: That kind.
         source: Name of the log, for errors.
         notes: Receives notes for the user.
 
@@ -349,7 +345,6 @@ def reach_of(found: Findings, survey: Survey, kind: str, assumed: dict[str, str]
     Args:
         found: Findings of the first pass.
         survey: Findings about the kind of lines that is read.
-        kind: That kind.
         assumed: Receives, by the key "no_return", a note if the log does not say the range.
 
     Returns:
@@ -375,7 +370,6 @@ def survey_of(file: IO[bytes], source: str, with_graph: bool) -> Findings:
     """Read a log, and count the evidence for the meaning of its poses and ranges.
 
     Args:
-        file: The log.
         source: Name of the log, for errors.
         with_graph: Whether to read vertices and edges.
     """

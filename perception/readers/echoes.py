@@ -219,7 +219,6 @@ def interpret_scan(scan: Scan, options: LaserOptions) -> Scan:
 
     Args:
         scan: The scan, with ranges as the driver wrote them.
-        options: What the user says about the laser.
 
     Returns:
         The scan, in which ranges are infinite if nothing came back and NaN if nothing is known.

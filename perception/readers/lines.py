@@ -75,7 +75,6 @@ def copied(file: IO[bytes], copy: IO[bytes], source: str) -> None:
 
     Args:
         file: The file, from its current position.
-        copy: The temporary file.
         source: Name of the file, for errors.
 
     Raises:
@@ -89,11 +88,7 @@ def copied(file: IO[bytes], copy: IO[bytes], source: str) -> None:
 
 
 def no_room(source: str) -> LogError:
-    """Make the error that there is no room for temporary files.
-
-    Args:
-        source: Name of the file that was copied.
-    """
+    """Make the error that there is no room for temporary files."""
     where = tempfile.gettempdir()
     return LogError(
         f"{source}: expected room for a temporary copy in {where}, got a full disk; free "
@@ -138,7 +133,6 @@ def piped(stream: IO[bytes], source: str) -> IO[bytes]:
     """Read a pipe from its beginning, unpacking it if necessary.
 
     Args:
-        stream: The pipe.
         source: Name of the pipe, for errors.
     """
     first = stream.read(max(map(len, PACKERS)))
@@ -160,7 +154,6 @@ def unpacked(file: IO[bytes], source: str) -> IO[bytes]:
     """Read a file from its beginning, unpacking it if necessary.
 
     Args:
-        file: The file.
         source: Name of the file, for errors.
 
     Returns:
@@ -195,9 +188,6 @@ def damages(*others: type[Exception]) -> tuple[type[Exception], ...]:
 
     Args:
         *others: Errors to add to these.
-
-    Returns:
-        Classes of errors, as for an `except` clause.
     """
     zstd = zstd_module()
     return (
@@ -224,7 +214,6 @@ def lines(file: IO[bytes], source: str) -> Iterator[tuple[int, bytes | None]]:
     """Read the lines of a file from its beginning, unpacking it if necessary.
 
     Args:
-        file: The file.
         source: Name of the file, for errors.
 
     Yields:

@@ -145,7 +145,6 @@ def live_log(
         stream: The pipe, packed or not.
         source: Its name, for errors.
         fov: Degrees from the first beam to the last.
-        mount: Position of the laser on the robot.
         no_return: Metres from which a range means that nothing came back.
         zero_is: Meaning of ranges that are no measurement.
         tell: Takes each note on what the reader assumed or found out.

@@ -65,9 +65,6 @@ def words(raw: bytes | None) -> list[bytes]:
     Args:
         raw: The line; None for one that was too long to be read.
 
-    Returns:
-        The words; an empty list for an empty line or a comment.
-
     Raises:
         Damaged: The line is too long, or does not begin with the name of a message.
     """
@@ -83,9 +80,6 @@ def words(raw: bytes | None) -> list[bytes]:
 
 def scan_line(tokens: list[bytes]) -> ScanLine | None:
     """Parse a line with a scan; None for another kind of line.
-
-    Args:
-        tokens: Words of the line.
 
     Raises:
         Damaged: Words are missing or are no valid numbers.
@@ -172,9 +166,6 @@ def edge_of(tokens: list[bytes]) -> tuple[tuple[int, int], Pose]:
 
 def parameters_of(tokens: list[bytes]) -> dict[str, float]:
     """Parse a PARAM line of a CARMEN log.
-
-    Args:
-        tokens: The words of the line.
 
     Returns:
         A dict with one entry if the line has a parameter of the front laser: its short name, such

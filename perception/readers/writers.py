@@ -67,7 +67,6 @@ def write_carmen(
 
     Args:
         path: The file; it is gzipped if its name ends in .gz.
-        scans: Scans to write.
         parameters: Numbers by name, such as the noise of the odometry. They are written in PARAM
             lines at the beginning.
 
@@ -101,7 +100,6 @@ def write_bag(
     Args:
         path: File or folder to write. A name that ends in .bag makes a file of ROS 1, one in .mcap
             a file of MCAP, and any other a folder of ROS 2.
-        scans: Scans to write.
         covariances: (n, 3, 3) covariance of the pose by odometry (x, y, heading) at each scan. None
             writes zeros, which mean unknown.
 

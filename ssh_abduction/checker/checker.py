@@ -113,9 +113,6 @@ def violations(trace: Trace, ssh_map: SSHMap, theory: Theory) -> Iterator[Violat
         trace: What the robot saw and did, with views.
         ssh_map: Any map, even a malformed one.
         theory: The theory, with all its defaults resolved for this trace.
-
-    Yields:
-        Each violation, in the order of `check`.
     """
     reading = Reading(trace, ssh_map, theory)
     checks = [(COHERENCE, test) for test in coherence.CHECKS] + [

@@ -32,14 +32,10 @@ def false_claims(
 
     Args:
         answer: The answer as `solve --json` prints it (docs/reference/formats.md).
-        maps: The maps that the answer lists.
         steps: The number of steps of the trace.
         theory: The theory of the answer, with all defaults resolved.
         proven: The lower bound on dstates that the certificate of the answer proves. Numbers of
             dstates that clingo refuted, by the certificate, are included without a check.
-
-    Returns:
-        A sentence for each false claim.
     """
     claims = _Claims(answer, maps, steps, theory, proven)
     return tuple(
@@ -58,13 +54,9 @@ def contradictions(
 
     Args:
         answer: The answer, as for `false_claims`.
-        maps: The maps that the answer lists.
         steps: The number of steps of the trace.
         theory: The theory of the answer, with all defaults resolved. If it allows faults, costs and
             bounds are not compared.
-
-    Yields:
-        A sentence for each contradiction.
     """
     claims = _Claims(answer, maps, steps, theory, sys.maxsize)
     for check in (

@@ -114,8 +114,6 @@ def refused_returns(trace: Trace, ssh_map: SSHMap, theory: Theory) -> Iterator[R
     A return is a pair of steps that the map has at one dstate or at one place.
 
     Args:
-        trace: The whole trace.
-        ssh_map: A map of the trace.
         theory: The theory, resolved for the trace, so that it has the number of tests.
 
     Yields:

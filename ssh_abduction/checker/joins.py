@@ -76,12 +76,7 @@ def joins_by_minimality(
     directions.
 
     Args:
-        trace: The trace.
-        ssh_map: A map of the trace.
         theory: The theory, with each "auto" replaced; Theory.topological() if None.
-
-    Returns:
-        The joins, sorted by their second step.
 
     Raises:
         TraceError: The trace is not a trace.

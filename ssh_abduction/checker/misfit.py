@@ -78,13 +78,7 @@ def false_costs(
     """Check what an answer claims about the costs of its maps in nats.
 
     Args:
-        trace: The trace.
-        answer: The answer as `solve --json` prints it.
-        maps: The maps that it lists.
         theory: The theory of the answer, with all defaults resolved.
-
-    Yields:
-        A sentence for each false claim.
     """
     weighed = answer.get("weighed")
     if not isinstance(weighed, Mapping) or not maps:
@@ -286,9 +280,6 @@ def likely_moves(
         missing: The steps to which no displacement is known.
         dstates: The dstate of each step.
         places: The place of each step.
-
-    Yields:
-        A step of `missing`, and the displacement that probably leads there.
     """
     begins = [0, *sorted(missing)]
     stretch = [range(a, b) for a, b in pairwise([*begins, len(moved)])]

@@ -45,10 +45,6 @@ def check_bound(trace: Trace, certificate: Any) -> ProvenBound:
     certificate lists the words of pairs. If it has no words at all, the word of a pair is the
     actions that the trace has after both steps.
 
-    Args:
-        trace: The trace.
-        certificate: The certificate as `Certificate.to_dict` writes it.
-
     Returns:
         The bound, and the faults of the certificate.
 

@@ -97,7 +97,6 @@ def branches_right_of(
     """Find the places to the right of each course, each with the branch that leads to it.
 
     Args:
-        m: The reading.
         after: Returns the places after a place on a course.
     """
     excused = {frozenset(pair) for pair in m.map.excused if is_pair(pair)}

@@ -133,7 +133,6 @@ def unwritten(error: OSError, output: object) -> str:
     """Make the message for a file that cannot be written.
 
     Args:
-        error: The error of the system.
         output: The file, in case the error names none.
     """
     mend = MENDS.get(error.errno or 0, "check the path")
@@ -234,11 +233,7 @@ class _Output:
 
 
 def _failed(options: argparse.Namespace, message: str, output: _Output) -> int:
-    """Print an error on stderr. With --json, print it as JSON if stdout is empty.
-
-    Returns:
-        The exit code.
-    """
+    """Print an error on stderr. With --json, print it as JSON if stdout is empty."""
     print(f"ssh-abduction: {message}", file=sys.stderr)
     if getattr(options, "json", False) and not output.is_used:
         with contextlib.suppress(OSError, ValueError):

@@ -116,7 +116,6 @@ class SolveQuestion:
 
         Args:
             number: The index of the trace, which the answer repeats.
-            path: The file of the trace.
             trace: The trace if it was sent along; None to load it from the file.
             given_up: Returns whether the answer is not needed any more.
         """

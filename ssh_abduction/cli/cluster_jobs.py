@@ -35,8 +35,6 @@ def answers_on_cluster(
     """Yield answers from the workers of a Dask scheduler, in the order in which they are ready.
 
     Args:
-        question: The question.
-        paths: The files.
         address: The address of the scheduler, with a port.
         jobs: The largest number of files on the cluster at a time; None or -1 for twice the number
             of its cores.

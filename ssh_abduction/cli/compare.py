@@ -101,15 +101,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def differences(first: str, other: str) -> dict[str, tuple[Any, Any]]:
-    """Find the settings and results that differ between two runs of the verb `map`.
-
-    Args:
-        first: The folder of one run.
-        other: The folder of the other run.
-
-    Returns:
-        For each of these, by name, both values.
-    """
+    """Find the settings and results that differ between two runs of the verb `map`."""
     here, there = (_flat(read_json(Path(folder) / "run.json")) for folder in (first, other))
     names = {**here, **there}
     return {

@@ -66,7 +66,6 @@ class FileQuestion(Protocol):
 
         Args:
             number: The index of the file, which the answer repeats.
-            path: The file.
             content: The result of `load`; None to read the file here.
             given_up: Returns whether the answer is not needed any more.
         """
@@ -88,8 +87,6 @@ def answers_here(
     KeyboardInterrupt.
 
     Args:
-        question: The question.
-        paths: The files.
         jobs: The number of processes; -1 for one per core.
         stop: Ends the work early when it is set.
     """
@@ -117,7 +114,6 @@ def final_code(codes: Sequence[int], asked: int, stop: StopFlag, files: str) -> 
     """Compute the exit code for many files, and report interruptions and errors on stderr.
 
     Args:
-        codes: The exit codes of the answers.
         asked: The number of files.
         stop: Is set if the work was interrupted.
         files: The word for the files in messages, such as "traces".

@@ -140,7 +140,6 @@ class MapQuestion:
 
         Args:
             number: The index of the log, which the answer repeats.
-            path: The file or folder of the log.
             content: The content of the log if it was sent along; None to read it here.
             given_up: Returns whether the answer is not needed any more.
             answer_last: Takes the answer if the process has to end because clingo does not stop.

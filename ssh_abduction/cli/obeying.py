@@ -36,7 +36,6 @@ def as_corrected(
 
     Args:
         trace: The trace, as it was recorded or corrected already.
-        theory: The theory.
         maps: The file of maps; None for none.
         given: The file of corrections that the user names instead; None for none.
 

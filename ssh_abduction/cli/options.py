@@ -41,7 +41,6 @@ def add_theory(parser: Parser, default: str = "topological") -> None:
     """Add the options that choose a theory: a preset or a file, and options for single fields.
 
     Args:
-        parser: The parser of a verb.
         default: The words of the help for the theory that is used if the user names none.
     """
     group = parser.add_argument_group(
@@ -130,7 +129,6 @@ def write(trace: Trace, target: str, said: str) -> None:
     """Write a trace, and print a message about it.
 
     Args:
-        trace: The trace.
         target: The file from the option of `add_output`; "-" for standard output.
         said: The message. If the trace goes to standard output, it is printed on stderr.
     """
@@ -276,7 +274,6 @@ def check_number(number: int | None, maps: Sequence[object], where: str) -> None
 
     Args:
         number: The number of the map, from 1; None if the user gave none.
-        maps: The maps.
         where: The file of the maps, for the message.
     """
     if number is not None and not 1 <= number <= len(maps):
@@ -328,7 +325,6 @@ def theory_of(options: argparse.Namespace, found: Theory | None = None) -> Theor
     """Find the theory that the options ask for.
 
     Args:
-        options: The options of a verb with `add_theory`.
         found: The theory to use if the user names none; None for the default one.
 
     Returns:
@@ -398,7 +394,6 @@ def flags_of(theory: Theory, trace: Trace | None = None) -> list[str]:
     """List the words of the command line that choose a theory. This inverts `theory_of`.
 
     Args:
-        theory: The theory.
         trace: The trace that it is for; None if unknown. Fields to which this trace sets the
             default theory need no words.
     """

@@ -71,7 +71,6 @@ def given_by(search: Search, ssh_map: SSHMap) -> Given:
     """Pair a map with its cost, or with None if only maps of one cost are listed.
 
     Args:
-        search: The search.
         ssh_map: The map that the search found last.
     """
     return ssh_map, search.cost if search.limits.within else None
@@ -92,8 +91,6 @@ def answer_ending(
     """Make the fields of a solution's JSON that come after its maps, with all warnings.
 
     Args:
-        search: The search.
-        solution: The solution.
         explanation: Why there is no map; None if there is a map or it is unknown.
         maps: The number of maps that were written.
         backbone: What all minimal maps share; None if it is unknown.
@@ -144,7 +141,6 @@ def save_solution(solution: Solution, file: str | None) -> None:
     A solution without a map does not replace a file of maps. A warning says so.
 
     Args:
-        solution: The solution.
         file: The file; None for none.
 
     Raises:

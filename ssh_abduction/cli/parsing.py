@@ -127,7 +127,6 @@ class Parser(argparse.ArgumentParser):
 
         Args:
             name: The name, with underscores.
-            help_text: The help text.
             default: The value if the user does not give the setting.
             details: Other fields of Setting, by name.
         """

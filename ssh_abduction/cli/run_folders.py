@@ -80,10 +80,6 @@ def folders_of(logs: Sequence[str], folder: Path) -> tuple[dict[str, Path], dict
 
     So the order of the logs does not matter.
 
-    Args:
-        logs: The paths of the logs.
-        folder: The output folder.
-
     Returns:
         The folder of each log. And for each log that is left out, another log with the same
         content.
@@ -138,9 +134,6 @@ def folders_of(logs: Sequence[str], folder: Path) -> tuple[dict[str, Path], dict
 def distinct(logs: Sequence[str]) -> tuple[list[str], list[tuple[str, str]]]:
     """Find logs with the same content.
 
-    Args:
-        logs: The paths of the logs.
-
     Returns:
         The first log of each content; and each other log with the first one of its content.
     """
@@ -153,7 +146,6 @@ def is_done(folder: Path, logs: Sequence[str], settings: dict[str, Any]) -> bool
     """Whether a folder holds a finished run of these logs with the same settings.
 
     Args:
-        folder: The folder.
         logs: The log, or the logs that are mapped together.
         settings: The settings, from `MapQuestion.settings`.
     """

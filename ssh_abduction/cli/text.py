@@ -38,7 +38,6 @@ def headline(solution: Solution, count: int, explanation: Explanation | None) ->
     """Write one line about how a search ended.
 
     Args:
-        solution: The solution.
         count: The number of maps that the search found. The solution may hold fewer.
         explanation: Why there is no map; None if there is one, or if the reason is unknown.
     """
@@ -139,7 +138,6 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     """Write a table with aligned columns. Control characters are escaped.
 
     Args:
-        head: The titles of the columns.
         rows: The cells of each row.
     """
     cells = [[*head], *([printable(str(cell)) for cell in row] for row in rows)]

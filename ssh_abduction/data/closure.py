@@ -99,7 +99,6 @@ def match_in_words(closure: Closure, first: int, last: int) -> str:
     """Say how well the local maps of two steps match.
 
     Args:
-        closure: The closure.
         first: What to call the earlier step.
         last: What to call the later step.
     """
@@ -130,7 +129,6 @@ def checked_closures(value: Any, steps: int, source: str | None) -> tuple[Closur
     """Return closures, each pair of steps once, or raise TraceError.
 
     Args:
-        value: A sequence of Closure.
         steps: The number of steps of the trace.
         source: The file of the trace, for messages; None if there is none.
     """
@@ -162,7 +160,6 @@ def closures_among(closures: Sequence[Closure], steps: Sequence[int]) -> tuple[C
     """Return the closures between some steps of a trace, with the steps renumbered from 0.
 
     Args:
-        closures: The closures of the trace.
         steps: The steps that are kept, ascending.
     """
     number = {step: k for k, step in enumerate(steps)}

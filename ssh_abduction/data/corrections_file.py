@@ -100,7 +100,6 @@ def named_beside(
     If that file is of other drives, a warning says so.
 
     Args:
-        maps: The maps.
         drives: The drives of their trace, with fingerprints; empty if they are unknown.
         path: The file of the maps; None or "-" if there is none.
 
@@ -159,7 +158,6 @@ def from_yaml(text: str, source: str = "corrections") -> Corrections:
     """Read names and corrections from YAML.
 
     Args:
-        text: The text of the file.
         source: The name of the file, for messages.
 
     Raises:

@@ -159,7 +159,6 @@ def step_named(trace: Trace, name: str) -> int:
     """Return the number of a step, such as "14", or "tuesday:14" for step 14 of a drive.
 
     Args:
-        trace: The trace.
         name: The number of the step; or the name of a drive, a colon, and the number of the step in
             this drive, from 0.
 

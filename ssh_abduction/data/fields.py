@@ -54,8 +54,6 @@ class FieldReader:
         """Return the members of the list in a field, each converted by `read`.
 
         Args:
-            record: The object that has the field.
-            name: The field.
             read: Converts a member, given its value and its name in messages.
             optional: Whether the field may be missing.
         """
@@ -100,8 +98,6 @@ class FieldReader:
         """Return a view (a text or an integer), or None for an unknown one.
 
         Args:
-            value: The value of the field.
-            name: The field.
             expected: What messages say was expected.
         """
         is_view = isinstance(value, str | int | None) and not isinstance(value, bool)

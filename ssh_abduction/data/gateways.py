@@ -93,7 +93,6 @@ def sights_of(
 
     Args:
         trace: The trace, with stars.
-        ssh_map: A map of the trace.
         onward: Returns `Sight.onward` for a dstate.
         changes: Whether gateways may change between drives. Then each drive has sights of its own.
 
@@ -167,7 +166,6 @@ def allowed_headings(
 
     Args:
         sights: The sights, sorted by first step. Headings that their dstates have are ignored.
-        turns: The turns between sights at one place.
         axioms: Names of the axioms that hold.
 
     Returns:
@@ -271,8 +269,6 @@ def frames_that_fit(
     Of several solutions, it has the fewest gateways that change between drives.
 
     Args:
-        sights: The sights at one place.
-        turns: The turns between sights.
         axioms: Names of the axioms that hold.
         as_shown: Whether the headings that the dstates have must fit, too.
 
@@ -424,7 +420,6 @@ def changes_of(
 
     Args:
         sights: The sights of a map, with changes.
-        turns: The turns between sights at one place.
         axioms: Names of the axioms that hold.
     """
     for place, seen in by_place(sights).items():

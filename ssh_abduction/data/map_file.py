@@ -29,9 +29,7 @@ def write_map(
     """Write a map, or a picture of one, into a file.
 
     Args:
-        path: The file.
         text: The text to write, without the last line end.
-        what: The name of the text in messages.
         option: The name in messages of the parameter or option that gave the path.
 
     Raises:
@@ -144,7 +142,6 @@ def map_fields(data: Any, where: str) -> dict[str, Any]:
 
     Args:
         data: The parsed JSON.
-        where: The name of the map in messages.
 
     Returns:
         A dict from the names of the arguments to their values.

@@ -424,7 +424,6 @@ def maps_of(data: Any, where: str) -> list[SSHMap]:
 
     Args:
         data: The parsed JSON.
-        where: The name of the file in messages.
 
     Raises:
         MapError: If a field is wrong. The error names the field.
@@ -448,8 +447,6 @@ def check_of_trace(maps: Iterable[SSHMap], trace: Trace, where: str, *, views: b
     Steps with an unknown view or a fault are not checked.
 
     Args:
-        maps: The maps.
-        trace: The trace.
         where: The source of the maps, for messages.
         views: Whether to compare views. Some theories let a dstate have several views.
 

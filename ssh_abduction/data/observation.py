@@ -14,7 +14,6 @@ def checked_view(value: Any, where: str) -> View:
 
     Args:
         value: What the caller gave. Whole numbers of numpy are accepted.
-        where: The name of the value in messages.
     """
     if is_whole(value):
         value = int(value)
@@ -58,7 +57,6 @@ def checked_image(value: Any, where: str) -> tuple[float, ...] | int:
 
     Args:
         value: Finite numbers (ranges in metres), or an index into the sidecar file.
-        where: The name of the value in messages.
 
     Returns:
         A tuple of numbers, or the index.

@@ -132,7 +132,6 @@ def checked_displacement(value: Any, where: str) -> Displacement:
 
     Args:
         value: Metres ahead, metres to the left, and radians counterclockwise.
-        where: The name of the value in messages.
     """
     if hasattr(value, "tolist"):
         value = value.tolist()  # numpy's
@@ -165,7 +164,6 @@ def checked_covariance(value: Any, where: str) -> Covariance:
 
     Args:
         value: The covariance of (dx, dy, dtheta), symmetric and positive definite.
-        where: The name of the value in messages.
     """
     if hasattr(value, "tolist"):
         value = value.tolist()  # numpy's

@@ -60,7 +60,6 @@ def described(region: Region, called: Callable[[str, int], str]) -> str:
     """Say what the region is.
 
     Args:
-        region: The region.
         called: Returns words for a kind ("place", "region") and a number, as `SSHMap.called`.
     """
     places = f"place{'' if len(region.places) == 1 else 's'} {list_in_words(region.places)}"
@@ -117,8 +116,6 @@ def right_of(regions: Iterable[Region], path: int, direction: int) -> tuple[int,
     """Find the places that are known to lie right of a path in a direction.
 
     Args:
-        regions: The regions of a map.
-        path: The id of the path.
         direction: +1 or -1. The places left of the path in direction +1 are right of it in -1.
 
     Returns:
@@ -159,7 +156,6 @@ def renumbered(
     """Return the same regions with other numbers of places and paths, and their new numbers.
 
     Args:
-        regions: The regions.
         place: The new number of each place.
         path: The new number of each path.
         flipped: The old numbers of the paths whose directions are exchanged.

@@ -71,7 +71,6 @@ def turns_so(action: Action, before: Frame, found: frozenset[int]) -> bool:
     """Whether an action can turn the robot by one of some angles.
 
     Args:
-        action: The turn.
         before: The gateways that the robot saw before the turn.
         found: The angles in degrees, clockwise.
     """

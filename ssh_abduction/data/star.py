@@ -276,7 +276,6 @@ def with_gateway(star: Sequence[Entry], bearing: float, *, is_open: bool) -> tup
     """Return a star in which the gateway in some direction is open or closed.
 
     Args:
-        star: The star.
         bearing: The direction in degrees, clockwise from ahead.
         is_open: Whether the gateway is open. Then it is added if the star lacks it, else removed.
 
@@ -317,10 +316,6 @@ def near_quarter(bearing: float) -> int | None:
 
 def parse_star(value: Any, where: str) -> tuple[Entry, ...]:
     """Check a star and return its entries as a tuple.
-
-    Args:
-        value: What the trace or the caller gives.
-        where: The name of the value in messages.
 
     Returns:
         Four of 0, 1 or None; or bearings in degrees and Gateways.

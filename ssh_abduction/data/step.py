@@ -173,7 +173,6 @@ def of_actions(values: Iterable[Any] | None, name: str, actions: int) -> list[An
 
     Args:
         values: The values; None to make them all None.
-        name: The name of the values in messages.
         actions: The number of actions.
     """
     found = [None] * actions if values is None else as_list(values, name)

@@ -47,10 +47,6 @@ _HEADER_FIELDS = ("format", "version", "name", "images", "odometry", "drive", "c
 def read_trace(file: BinaryIO, source: str) -> dict[str, Any]:
     """Read a trace file.
 
-    Args:
-        file: The open file.
-        source: The name of the file in messages.
-
     Returns:
         A dict of arguments of Trace: steps, name, images, odometry, drive, closures and extra.
 

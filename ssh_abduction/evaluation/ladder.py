@@ -113,7 +113,6 @@ def rungs(trace: Trace, theory: Theory, stars: bool = True) -> Iterator[tuple[st
     """List the theories of the ladder. Each one adds a kind of evidence that the trace has.
 
     Args:
-        trace: The trace.
         theory: The theory to start from. Its stars, displacements and planarity are replaced.
         stars: Whether there is a rung for stars, if the trace has some.
 

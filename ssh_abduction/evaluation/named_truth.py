@@ -233,9 +233,6 @@ def _names_in(value: Any, where: str) -> dict[str, Hashable]:
 
     Names are converted to JSON texts, so that lists and objects can also be names.
 
-    Args:
-        value: The `truth` of the step.
-
     Returns:
         A dict from sorts (dstate, place, path, course) to names. Unknown names are None or missing.
 
@@ -275,7 +272,6 @@ def map_of_trace(ssh_map: object, where: str, trace: Trace) -> SSHMap:
     Args:
         ssh_map: Any value.
         where: The name of the map, for messages.
-        trace: The trace.
 
     Raises:
         MapError: The value is not an SSHMap, or its labels do not fit the trace.

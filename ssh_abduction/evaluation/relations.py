@@ -101,9 +101,6 @@ class Relations:
     def load(path: str | os.PathLike[str]) -> Relations:
         """Read a file of relations.
 
-        Args:
-            path: The file. The module describes its format.
-
         Raises:
             TraceError: A line is malformed, or there are no relations. The message names the line.
             OSError: The file cannot be read.

@@ -89,9 +89,6 @@ class Trajectory:
         Numbers are separated by spaces, tabs, commas or semicolons. Names of columns before the
         first pose are skipped.
 
-        Args:
-            path: The file.
-
         Raises:
             TraceError: A line is malformed. The message names the line.
             OSError: The file cannot be read.

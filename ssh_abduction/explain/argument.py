@@ -219,11 +219,7 @@ class Argument:
     # Which conclusions the argument needs
 
     def _written(self) -> tuple[tuple[Inference, ...], str]:
-        """Put the lines that are needed into words, each after its premises.
-
-        Returns:
-            The lines, and the summary.
-        """
+        """Put the lines that are needed into words, each after its premises."""
         last = self._lines[-1]
         goal = (
             None

@@ -82,7 +82,6 @@ class Axioms:
         """Ground the axioms.
 
         Args:
-            piece: The piece of a trace.
             stop: Called now and then. If it returns True, Interrupted is raised.
             relaxed: Whether each axiom can be switched on or off at each step. If not, all hold.
         """
@@ -159,11 +158,7 @@ class Axioms:
     def map_with(
         self, active: Sequence[clingo.Symbol] = (), assumed: Sequence[Assumption] = ()
     ) -> SSHMap | None:
-        """Find a map. Parameters as in `consistent`.
-
-        Returns:
-            The map, or None if there is none.
-        """
+        """Find a map. Parameters as in `consistent`."""
         while answer := self._answer(active, assumed):
             refused = self._refused(answer, {self._pairs[symbol] for symbol in active})
             if refused is None:
@@ -200,9 +195,6 @@ class Axioms:
             active: The `active` atoms of the axioms that hold.
             assumed: Pairs of an atom and whether it is true.
             known: Conclusions that are already known to hold in all these maps.
-
-        Returns:
-            The conclusions, including the known ones.
         """
         # Clingo's cautious reasoning loses atoms under assumptions. So each query asks for a model
         # in which at least one unproven conclusion fails, until there is none.
@@ -238,9 +230,6 @@ class Axioms:
             active: The `active` atoms of the axioms that hold.
             assumed: Pairs of an atom and whether it is true. The subset has early pairs rather than
                 late ones.
-
-        Returns:
-            The subset, or None if the assumptions are consistent with the axioms.
         """
         # Bisect for the shortest prefix of the assumptions that, with the assumptions in `needed`,
         # contradicts the axioms. Its last assumption is needed. Unsat cores shorten the prefix.
@@ -378,9 +367,6 @@ class Axioms:
 
         Args:
             clash: Pairs of an axiom and the number of a step in the piece.
-
-        Returns:
-            The sentences; empty if displacements do not take part in the clash.
         """
         displacement = displacement_of(self._problem)
         steps = [t for axiom, t in clash if displacement and axiom == displacement.axiom]

@@ -104,9 +104,6 @@ def explain(
         stop: Called now and then. If it returns True, Interrupted is raised.
         near: Consecutive steps that are tried first; None if nothing is known.
 
-    Returns:
-        The explanation, or None if the trace has a map.
-
     Raises:
         TraceError: As `solve` does.
         TheoryError: As `solve` does, and if the theory allows wrong displacements (`jumped`).

@@ -141,13 +141,8 @@ def changes_in_words(
     """Say what changed, and what a map costs without changes.
 
     Args:
-        changes: Some changes of a map.
-        cost: The cost of this map.
         nats: Its cost in nats; None if maps are not weighed.
         without: An ended search for the best map without any changes.
-
-    Returns:
-        A sentence for each change; and one for the map without changes.
     """
     said = [f"{change}; this change costs {change.cost:g} dstates" for change in changes]
     if without.status is Status.UNSATISFIABLE:

@@ -124,7 +124,6 @@ class Words:
         """Put into a clause why an axiom at a step gives some conclusions.
 
         Args:
-            axiom: The name of the axiom.
             t: The step, by its number in the piece.
             said: The conclusions, each a name and steps by their numbers in the piece.
             pair: The two steps that the argument is about, by their numbers in the piece.

@@ -49,7 +49,6 @@ def labels_of(
     false, or if `proven` is false.
 
     Args:
-        maps: Maps of one trace of n steps.
         choose: Index of the map to take, from 0; None takes the labels on which all maps agree.
         complete: Whether `maps` are all minimal maps.
         proven: Whether `maps` are proven minimal.
@@ -128,7 +127,6 @@ def fitting_best(
 
     Args:
         maps: Joint maps of n steps.
-        drives: The drives.
         vectors: (n, d) the vector of each image.
     """
     nearest = np.zeros(len(vectors), np.intp)
@@ -165,7 +163,6 @@ def labels_on(
     A dstate that no image looks like counts as unknown.
 
     Args:
-        ssh_map: The map.
         traces: Traces with n steps in all.
         views: The number of the view of each step, (n,); -1 if there is none.
         looks: The dstate that the image of each step looks like, (n,).

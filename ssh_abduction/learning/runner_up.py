@@ -68,7 +68,6 @@ def with_runner_up(trace: Trace, views: Iterable[View] | None) -> Trace:
     """Copy a trace with the runner-up's view in the field `runner_up` of each step.
 
     Args:
-        trace: The trace.
         views: A view for each step; None removes the field.
 
     Raises:
@@ -117,7 +116,6 @@ def second_map(
     Args:
         trace: A trace of the chosen views, perhaps with those of the runner-up.
         maps: The minimal maps of the chosen views.
-        theory: The theory of these maps.
         limit: Seconds for the search, at most SECONDS; None takes SECONDS.
         memory: MiB that the process may use, as in `solve`; None for no limit.
 
@@ -147,11 +145,7 @@ def second_map(
 def warn_of_second_map(
     trace: Trace, maps: Sequence[SSHMap], theory: Theory | None, limit: float | None
 ) -> SecondMap | None:
-    """Issue a RunnerUpWarning if the second best number of views gives another map.
-
-    Returns:
-        The result of `second_map`: None if there is nothing to warn of.
-    """
+    """Issue a RunnerUpWarning if the second best number of views gives another map."""
     found = second_map(trace, maps, theory, limit)
     if found:
         warnings.warn(found.sentence, RunnerUpWarning, stacklevel=3)

@@ -85,11 +85,9 @@ def solved(
     """Run `solve` on a trace and return the parts of its solution that are needed.
 
     Args:
-        trace: The steps so far.
         theory: The theory, in which no field is "auto".
         limit: Seconds for the search; None for no limit.
         maps: List at most this many maps; None lists all.
-        speedups: The speed-ups that are on.
         watch: Not used. It is here because `in_process` passes a watch as the last argument.
     """
     found = solve(
@@ -169,13 +167,9 @@ class FaultSolver:
         """Solve the trace within the time limit of a step, or in the background.
 
         Args:
-            trace: The steps so far.
             theory: The theory, in which no field is "auto".
             has_map: Whether some map is known. If so, and the last search was slow, the search runs
                 in the background.
-
-        Returns:
-            The result; None if the search runs in the background.
         """
         steps, options = len(trace), self._options
         limit = options.time_limit

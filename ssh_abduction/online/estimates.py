@@ -68,7 +68,6 @@ class Moves:
         """Return the move of an action.
 
         Args:
-            action: The action.
             turned: The angle in radians counterclockwise by which the robot turned, by odometry;
                 None takes it from the action.
         """

@@ -467,7 +467,6 @@ class Abilities:
         """Record the actions that the robot can do at the current step.
 
         Args:
-            seen: What the robot sees at this step.
             can: The actions, as objects or names.
         """
         self.here = {action.name: action for action in map(Action.of, can)}
@@ -481,9 +480,6 @@ class Abilities:
 
         The star is the set of openings that are seen. If the robot never saw this star with this
         view, the view alone decides.
-
-        Args:
-            seen: A view and a star.
         """
         names = self._names.get((seen.view, seen.star))
         return names or self._names.get((seen.view, None), set())

@@ -68,7 +68,6 @@ class ExtendedMap:
 
         Args:
             ssh_map: A map of the trace or of its first steps.
-            trace: The trace.
             theory: The theory, in which no field is "auto".
         """
         wrong = {fault.step for fault in ssh_map.faults if fault.kind != "slipped"}
@@ -121,7 +120,6 @@ class ExtendedMap:
         """Find the dstate that contradicts what is seen after an action.
 
         Args:
-            action: The name of the action.
             seen: The view and star after it.
 
         Returns:
@@ -161,8 +159,6 @@ class ExtendedMap:
 
         Args:
             action: The name of the action before the step.
-            step: The step.
-            seen: The view and star of the step.
             theory: The theory, in which no field is "auto".
         """
         t, there = len(self.labels), self.links.get((self.here, action))

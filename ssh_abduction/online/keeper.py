@@ -220,7 +220,6 @@ class IncrementalSolver:
         """Search for the minimal maps of a trace.
 
         Args:
-            trace: The steps so far.
             theory: The theory, in which no field is "auto".
             known: A map that is known to be minimal, so that only the others are searched for; None
                 if no minimal map is known.
@@ -300,18 +299,12 @@ class Drafts:
 
         Args:
             action: The action before the step.
-            step: The new step.
         """
         self._drafts = [draft for draft in self._drafts if draft.sketch.extend(action, step)]
         self._sketches = [draft for draft in self._sketches if draft.sketch.extend(action, step)]
 
     def add(self, ssh_map: SSHMap, trace: Trace) -> None:
-        """Make a draft of a map of the first steps, unless the later steps contradict it.
-
-        Args:
-            ssh_map: The map.
-            trace: All steps so far.
-        """
+        """Make a draft of a map of the first steps, unless the later steps contradict it."""
         if not self._may_sketch:
             return
         known = len(ssh_map.dstate_at)
@@ -330,7 +323,6 @@ class Drafts:
         Drafts that turn out to be inconsistent are dropped.
 
         Args:
-            trace: The steps so far.
             pairs: What the evidence says about pairs of these steps.
         """
         while self._drafts:

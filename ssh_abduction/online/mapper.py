@@ -299,12 +299,8 @@ class TheorySettler:
         """Choose the value of each field that is "auto", for the steps so far.
 
         Args:
-            trace: The steps so far.
             known: The result for fewer steps, to reuse the pairs of steps that its evidence found;
                 None without one.
-
-        Returns:
-            The trace and its theory, in which no field is "auto".
         """
         theory = self._theory
         if theory.displacement == "auto":
@@ -318,7 +314,6 @@ class TheorySettler:
 
         Args:
             problem: The steps before the last, and the theory that was chosen for them.
-            trace: All steps so far.
         """
         theory = problem.theory
         if theory.displacement == "none":
@@ -336,7 +331,6 @@ class TheorySettler:
         This holds for `star="auto"`.
 
         Args:
-            step: The step.
             number: The number of the step, for the message.
         """
         if self._refuses_stars and step.star is not None:

@@ -37,7 +37,6 @@ class ReplayedMap:
         Args:
             action: The name of the action before the step.
             seen: What the step shows, as `observation` returns it.
-            pairs: What evidence says about pairs of steps.
 
         Returns:
             Whether the map predicts the step, contradicts it, or has no link for the action.
@@ -125,8 +124,6 @@ class MinimalMaps:
         """Take the result of a search. Known minimal maps stay if it listed fewer.
 
         Args:
-            found: The maps that clingo found.
-            status: How much is proven.
             complete: Whether these are all minimal maps.
             cost: The counts of a minimal map; None if there is no map.
         """

@@ -45,7 +45,6 @@ class ReturnDoubts:
 
         Args:
             ssh_map: A minimal map.
-            trace: The steps so far.
         """
         if not self._margin:
             return
@@ -72,8 +71,6 @@ class ReturnDoubts:
         """Find the best map without a return. Without such a map, stop doubting the return.
 
         Args:
-            doubt: The two steps of the return.
-            trace: The steps so far.
             theory: The theory, in which no field is "auto".
             dstates: The number of dstates of a minimal map.
 

@@ -177,9 +177,6 @@ class RivalMaps:
         """Whether a result for fewer steps has no map, or maps cheaper than the proven minimum.
 
         Such a result is out of date. The answer is False if nothing is proven now.
-
-        Args:
-            found: The result.
         """
         if not self.is_proven:
             return False

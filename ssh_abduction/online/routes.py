@@ -403,8 +403,6 @@ def coarse_route(ssh_map: SSHMap, start: int, goal: int) -> tuple[Leg, ...]:
 
     Args:
         ssh_map: The map. Without regions, the route has no legs.
-        start: The place where the route starts.
-        goal: The place where it ends.
 
     Returns:
         The legs. Regions are left from the smallest on, and entered from the largest on.

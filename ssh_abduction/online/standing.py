@@ -130,7 +130,6 @@ class Confidence:
 
         Args:
             maps: The rivals (the possible maps) of the steps so far.
-            trace: The steps so far.
             listed: The maps of the solution, the best one first.
         """
         broke = tuple(sentence for _, sentence in self._broke)

@@ -94,7 +94,6 @@ def html_table(head: Sequence[str], rows: Iterable[Iterable[object]], more: str 
     """Make an HTML table of at most ROWS rows. If rows are left out, say how many below it.
 
     Args:
-        head: The names of the columns.
         rows: The cells of each row. They become plain text.
         more: The word for rows in the sentence below the table, such as "dstates".
     """

@@ -76,12 +76,7 @@ def svg_text(
     """Make a label that is centred at a point.
 
     Args:
-        x: The x coordinate of the centre.
-        y: The y coordinate of the centre.
         label: The plain text.
-        colour: The colour of the text.
-        size: The font size.
-        weight: The font weight.
         halo: Whether the text has a white outline, so that it can be read on top of lines.
     """
     return element(
@@ -102,8 +97,6 @@ def fault_mark(x: float, y: float, title: str, size: float = 1.0) -> str:
     """Make a red diamond with an exclamation mark, which shows a fault of a map.
 
     Args:
-        x: The x coordinate of the centre.
-        y: The y coordinate of the centre.
         title: The text that browsers show under the pointer.
         size: A factor for the size; 1 is 16 units across.
     """
@@ -147,7 +140,6 @@ def floor_marks(ssh_map: SSHMap, at: Sequence[Point]) -> tuple[list[str], list[P
     """Draw the names of floors and, in a map with places, lifts as dashed lines.
 
     Args:
-        ssh_map: The map.
         at: The point of each dstate on the page.
 
     Returns:
@@ -177,7 +169,6 @@ def page(marks: Sequence[str], points: Sequence[Point], margin: float = MARGIN) 
 
     Args:
         marks: The elements to draw, as SVG.
-        points: Points that the page has to include.
         margin: The width of the margin around these points.
     """
     xs, ys = [x for x, _ in points] or [0.0], [y for _, y in points] or [0.0]

@@ -65,7 +65,6 @@ def turns_between(
     They follow from the headings of dstates at one place, and from the actions of links.
 
     Args:
-        ssh_map: The map.
         degrees: For each action's name, the degrees clockwise that it turns, and their weight.
         spot: For each dstate, a number that is equal for dstates at one place.
     """
@@ -103,7 +102,6 @@ def headings_by(
     In each connected part of the map, the first dstate faces right.
 
     Args:
-        turns: The turns between dstates.
         courses: For each dstate, its course, and the angle in radians from the heading of the
             course to that of the dstate.
         robust: Whether to draw most turns exactly and a few of them very wrong if turns contradict

@@ -70,7 +70,6 @@ def layout(ssh_map: SSHMap, turns: Trace | Turns | None = None) -> Layout:
     """Choose positions for drawing a map: its poses if it has any, else computed ones.
 
     Args:
-        ssh_map: The map.
         turns: How actions turn, as in `to_svg`.
 
     Raises:

@@ -24,7 +24,6 @@ def region_marks(
     """Draw a band around the places of each region behind one place, with its name beside it.
 
     Args:
-        ssh_map: The map.
         spots: The point of each place on the page.
         width: The width of the innermost bands, in units of the page.
 
@@ -52,12 +51,7 @@ def region_marks(
 
 
 def banded(ssh_map: SSHMap, width: float) -> list[tuple[Region, float]]:
-    """List the regions behind one place, the largest first, each with the width of its band.
-
-    Args:
-        ssh_map: The map.
-        width: The width of the innermost bands.
-    """
+    """List the regions behind one place, the largest first, each with the width of its band."""
     regions = [r for r in ssh_map.regions or () if r.door is not None]
     return [(r, width * (1 + WIDER * _depth(r, regions))) for r in regions]
 

@@ -18,10 +18,6 @@ def pair_explained(
     """Explain why two steps are one dstate (a place and a heading), or why they are not.
 
     Args:
-        trace: The trace.
-        first: One step.
-        second: The other step.
-        theory: The theory.
         limit: Seconds for the answer; None for no limit.
         watch: Not used, as the server ends the process. Functions that run in a process take it.
     """
@@ -34,7 +30,6 @@ def solved_with(
     """Find the minimal maps by a theory with assumptions.
 
     Args:
-        trace: The trace.
         theory: The theory, with the pairs of steps that the user assumes to be one dstate or not.
         maps: List at most this many maps; None lists all.
         limit: Seconds for the answer; None for no limit.

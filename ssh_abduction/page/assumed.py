@@ -36,8 +36,6 @@ def assumptions(
 
     Args:
         listing: The minimal maps.
-        trace: Their trace.
-        theory: Their theory.
         seconds: The time limit. Pairs for which time runs out are missing in the result.
 
     Returns:

@@ -74,7 +74,6 @@ def overview(maps: Sequence[SSHMap], spots: Sequence[Spot]) -> dict[str, Any]:
     """Collect all dstates, places and travelled streets that any map has.
 
     Args:
-        maps: The maps.
         spots: The position and heading of each step.
 
     Returns:

@@ -62,7 +62,6 @@ def replays(
     """Make the replays for the slider of the page.
 
     Args:
-        maps: The maps.
         labelings: For each map, the number of its labeling (the dstates of all steps).
         trace: The trace that was mapped; None if it is unknown.
         run: A run that is localised in the maps; None for none.
@@ -190,7 +189,6 @@ def beams_of(trace: Trace, count: int) -> tuple[float, float]:
     straight to the right. The first of an even number is half a beam further to the left.
 
     Args:
-        trace: The trace.
         count: The number of beams.
 
     Returns:

@@ -22,9 +22,6 @@ export default { render({ model, el }) {
 def widget_of(html: str) -> Any:
     """Make a notebook widget that shows a page in an iframe of HTML.
 
-    Args:
-        html: The text of the page.
-
     Raises:
         MapError: The package anywidget is not installed.
     """

@@ -123,9 +123,6 @@ class Consequences:
     def sure_ends(self, actions: Sequence[Action]) -> tuple[tuple[int, str, int], ...]:
         """List the untried actions whose ends the axioms imply.
 
-        Args:
-            actions: The actions of the robot.
-
         Returns:
             Triples of a dstate, the name of an action, and the dstate that the action leads to.
         """

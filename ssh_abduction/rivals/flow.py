@@ -34,7 +34,6 @@ def shortest_walk(
     the walk. Among such moves, one with an unknown end comes first, as it is most informative.
 
     Args:
-        moves: All moves.
         start: The number of the stance where the robot is.
         due: Indices of the moves that the walk has to make.
         unseen: Numbers of the stances that the walk has to visit.
@@ -86,7 +85,6 @@ def shortest_flow(
     flow is solved again, as Dantzig, Fulkerson & Johnson (1954) did for the travelling salesman.
 
     Args:
-        moves: All moves.
         start: The number of the stance where the robot is.
         due: Indices of the moves that the walk has to make.
         unseen: Numbers of the stances that the walk has to visit.

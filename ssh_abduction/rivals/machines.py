@@ -242,7 +242,6 @@ def leads_of(ssh_map: SSHMap, number: int) -> dict[int, dict[str, int]]:
     """For each dstate, find the actions that were tried there and where they lead.
 
     Args:
-        ssh_map: The map.
         number: The index of the map, for messages.
 
     Returns:
@@ -282,9 +281,6 @@ def machine_of(
         start: The current dstate.
         links: For each dstate, a dict from actions to the dstates that they lead to.
         sights: For each dstate, the number of what is seen there.
-
-    Returns:
-        The machine, and the dstate of each of its states.
     """
     number, reached = {start: 0}, [start]
     ends: list[tuple[tuple[str, int], ...]] = []
@@ -322,7 +318,6 @@ class MachineTable:
         Args:
             group: The indices of the machines, shape (m,).
             rows: The joint states, shape (n, m): the state of each machine.
-            action: The index of the action.
 
         Returns:
             The joint states after the action, and the numbers of what is seen there, both of shape

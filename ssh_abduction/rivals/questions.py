@@ -112,8 +112,6 @@ def questions_of(
     """List all questions that distinguish maps, each once.
 
     Args:
-        table: The maps as arrays.
-        maps: The maps.
         same_places: Whether all maps have the same places.
 
     Returns:

@@ -57,7 +57,6 @@ def next_tour(
 
     Args:
         ssh_map: A minimal map of the trace.
-        trace: The trace.
         theory: The theory of the map; Theory.topological() if None.
         actions: Actions that the robot can do, in addition to those of the trace.
         can: A function from what the robot sees to the names of the actions that it can do there.
@@ -88,8 +87,6 @@ def with_doubted_returns(ssh_map: SSHMap, trace: Trace, margin: int) -> SSHMap:
     """Copy a map, with a new place for each doubted return and without paths.
 
     Args:
-        ssh_map: A map with places.
-        trace: The trace of the map.
         margin: A return is doubted until more than this many dstates are seen there.
     """
     believed: set[int] = set()

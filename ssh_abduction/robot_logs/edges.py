@@ -40,7 +40,6 @@ def edges_of(trace: Trace, ssh_map: SSHMap) -> dict[int, int]:
 
     Args:
         trace: The trace of a log. Its travels have a `course`. Others count as straight.
-        ssh_map: A map of the trace.
 
     Returns:
         The number of the edge of each travel, by the step at which it begins.

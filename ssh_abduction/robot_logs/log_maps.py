@@ -251,15 +251,7 @@ def seconds_left(log: RobotLog, imported: Imported) -> float:
 
 
 def how_it_ended(solution: Solution, allowed: float) -> str | None:
-    """Say why a search yielded no map, or no proof that no map costs less.
-
-    Args:
-        solution: What the search found.
-        allowed: Seconds that it had.
-
-    Returns:
-        A note with what to do; None if the map is proven.
-    """
+    """Say why a search yielded no map, or no proof that no map costs less."""
     if solution.status is Status.UNSATISFIABLE:
         return (
             "No map satisfies the axioms. Let some steps be wrong (--set misread=4), or ask why: "

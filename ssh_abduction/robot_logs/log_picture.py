@@ -55,12 +55,8 @@ def figure(log: RobotLog, imported: Imported, solution: Solution) -> str:
     """Draw the first map over the scans, with a caption.
 
     Args:
-        log: The robot's log.
         imported: The trace of the log, and how it was made.
         solution: The maps; without a map, the visits are drawn.
-
-    Returns:
-        A figure in HTML, with the picture as SVG.
     """
     drives = drives_of(imported.trace)
     sheet = _Sheet.of(log, imported, solution.maps[0] if solution.maps else None)

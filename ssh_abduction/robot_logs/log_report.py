@@ -52,7 +52,6 @@ def report(
         imported: The trace of the log, and how it was made.
         solution: The minimal maps.
         rungs: The rungs of the ladder, each with one more kind of evidence; empty without a ladder.
-        run: The contents of run.json.
     """
     name = imported.trace.name or "log"
     parts = [

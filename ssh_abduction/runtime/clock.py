@@ -67,7 +67,6 @@ def each_heeding(check: Callable[[], None], items: Iterator[Item]) -> Iterator[I
 
     Args:
         check: Raises if the work has to end, as in `heeding`.
-        items: The iterator.
     """
     while True:
         with heeding(check):

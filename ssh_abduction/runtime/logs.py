@@ -19,9 +19,5 @@ PROGRESS = logging.getLogger(f"{PACKAGE}.progress")
 
 
 def log_of(module: str) -> logging.Logger:
-    """Return the logger of a module of this package.
-
-    Args:
-        module: The module's `__name__`.
-    """
+    """Return the logger of a module of this package."""
     return logging.getLogger(module)

@@ -31,9 +31,6 @@ def command(module: str) -> list[str]:
     """Return the command line of a new Python process that calls the function `serve` of a module.
 
     The standard input of the process must begin with `search_path()`, pickled.
-
-    Args:
-        module: The dotted name of the module.
     """
     return [sys.executable, "-P", "-c", _START.format(module)]
 

@@ -126,12 +126,7 @@ def region_axioms() -> tuple[Axiom, ...]:
 
 
 def axioms_in(text: str, level: str) -> list[Axiom]:
-    """Read the axioms in the comments of an encoding.
-
-    Args:
-        text: The content of the encoding.
-        level: Its name.
-    """
+    """Read the axioms in the comments of an encoding."""
     found: list[Axiom] = []
     subject: tuple[str, ...] = ()
     for line in _unwrapped(text):
@@ -170,9 +165,6 @@ def needed_by(choices: Mapping[str, object]) -> tuple[str, ...]:
     """Return the names of the encodings that a theory needs, in the order to load them.
 
     An axiom that is left out (`without`) still needs its encoding.
-
-    Args:
-        choices: The fields of the theory.
     """
     return tuple(
         level

@@ -38,8 +38,6 @@ class Pairs:
 
         Args:
             apart: Steps at different dstates. Those of `elsewhere` are added.
-            elsewhere: Steps at different places.
-            one: Steps at one dstate.
         """
         away = list(elsewhere)
         return Pairs(_earlier([*apart, *away]), _earlier(away), _earlier(one))
@@ -70,7 +68,6 @@ class Pairs:
         """Whether the pairs of a step and earlier steps allow the step its label.
 
         Args:
-            step: The step.
             labels: The dstate of each step.
             place_of: The place of each dstate, if known. Without it, `elsewhere` is checked as
                 different dstates only.

@@ -223,7 +223,6 @@ def has_way(
 
     Args:
         start: The state before the first step.
-        steps: The steps.
         ways: Yields the states to which a step can lead from a state.
     """
     gone: list[Iterator[State]] = []

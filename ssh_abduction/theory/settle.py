@@ -70,7 +70,6 @@ def settle(trace: Trace, theory: Theory | None = None, known: Problem | None = N
     A step whose view is unknown may be at any dstate.
 
     Args:
-        trace: The trace.
         theory: The theory; Theory.topological() by default.
         known: A problem with the same trace, or with its first steps. The results of its evidence
             are reused.

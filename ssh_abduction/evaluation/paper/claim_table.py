@@ -191,7 +191,6 @@ def summary(name: str, runs: Sequence[SeedRun]) -> list[dict[str, Any]]:
     """Make a table of the claims about an experiment.
 
     Args:
-        name: The name of the experiment.
         runs: The runs, one for each seed.
 
     Returns:

@@ -244,9 +244,6 @@ def rate(
         labels: The label of each image to learn, (n,).
         truth: The true dstate of each image, (n,).
         seed: The seed of the folds.
-
-    Returns:
-        The share of images that are recognised, from 0 to 1.
     """
     found = []
     for train, test in StratifiedKFold(10, shuffle=True, random_state=seed).split(ranges, truth):

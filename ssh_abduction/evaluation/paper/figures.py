@@ -67,7 +67,6 @@ def draw_quality(
     """Draw M, and U if it is known, against the number of clusters k.
 
     Args:
-        path: The file to write.
         quality: M (separation of clusters) for each k.
         uncertainty: U (how well the dstate determines the view) for each k; empty if unknown.
         chosen: The chosen k, which is marked.
@@ -97,7 +96,6 @@ def draw_learning(path: str | Path, curves: Mapping[str, LearningCurve]) -> None
     """Draw the recognition rate against the number of images: mean and range over the folds.
 
     Args:
-        path: The file to write.
         curves: Learning curves by name, three at most.
     """
     figure, axes = _pyplot().subplots(figsize=(5.5, 3.2))
@@ -117,7 +115,6 @@ def draw_beliefs(path: str | Path, beliefs: Sequence[Mapping[str, Any]]) -> None
     Steps at which the robot was lost or nowhere are shaded.
 
     Args:
-        path: The file to write.
         beliefs: The belief after each step, as `Belief.to_dict` returns it.
     """
     pyplot = _pyplot()
@@ -169,8 +166,6 @@ def draw_world(path: str | Path, world: World, poses: Sequence[Sequence[float]])
     """Draw the walls, the clutter, the true dstates, and the poses at which images were taken.
 
     Args:
-        path: The file to write.
-        world: The world.
         poses: The poses (x, y, …) in metres.
     """
     figure, axes = _pyplot().subplots(figsize=(7, 4))
@@ -214,7 +209,6 @@ def draw_views(
     """Draw the images of each view on top of each other, as the robot sees them.
 
     Args:
-        path: The file to write.
         images: Ranges in metres, (n, d).
         views: The view of each image, (n,).
         truth: The true dstate of each image, (n,), for the titles.
@@ -258,7 +252,6 @@ def draw_telling(
     column.
 
     Args:
-        path: The file to write.
         ranges: Ranges in metres, (n, d), over the half circle ahead, the first at the right.
         labels: The dstate of each scan, (n,).
         found: For each pair of dstates, how much each beam helps to distinguish them.
@@ -302,10 +295,6 @@ def draw_map(path: str | Path, ssh_map: SSHMap) -> None:
     """Draw the places of a map, and its paths as lines through them.
 
     Places are at the poses of the map if it has poses. Otherwise a layout is computed.
-
-    Args:
-        path: The file to write.
-        ssh_map: The map.
     """
     _pyplot()
     figure = plot(ssh_map).figure
@@ -316,7 +305,6 @@ def draw_spread(path: str | Path, spread: Sequence[Sequence[float]]) -> None:
     """Draw the largest offset of a pose from the mean pose of its dstate, tour by tour.
 
     Args:
-        path: The file to write.
         spread: For each tour the largest offsets in x and y (metres) and heading (radians).
     """
     # Positions on the left axis, headings on the right one.
@@ -352,7 +340,6 @@ def draw_outcomes(
     """Draw k, U, the map and the recognition rate over the notch and the spread of poses.
 
     Args:
-        path: The file to write.
         outcomes: One for each pair of notch and scale. Results as in the paper get a frame.
         here: The depth of the notch in metres and the scale in the experiment. A cross marks them.
     """

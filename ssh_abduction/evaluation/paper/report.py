@@ -57,7 +57,6 @@ def reproduce(
     """Run an experiment for all seeds, and write everything into a folder.
 
     Args:
-        name: The name of the experiment.
         seeds: The seeds of all noise.
         folder: The folder to write into. It is made if it does not exist.
         jobs: The number of processes that work at once; -1 for one per processor.
@@ -66,9 +65,6 @@ def reproduce(
         on_done: Called with a sentence after each part of the work. `steps` counts the parts.
         on_table: Called with the table once all data is written, before anything is drawn. So no
             data is lost if a figure fails.
-
-    Returns:
-        The table of claims, as `claim_table.summary` makes it.
 
     Raises:
         AbductionError: There is no such experiment, no seed, or no matplotlib, or a process died.

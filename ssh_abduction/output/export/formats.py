@@ -140,7 +140,6 @@ def export_doubts(
     """Find reasons why a program may navigate wrongly by an exported map.
 
     Args:
-        ssh_map: The map.
         to: The format, as in `export_map`.
         level: What a node is, as in `export_map`.
         turns: How actions turn, as in `export_map`.
@@ -183,8 +182,6 @@ def nav2(roads: Roads, name: str, frame: str) -> str:
     """Write a map as the GeoJSON text of a route graph.
 
     Args:
-        roads: The map as stops and roads.
-        name: The name of the map.
         frame: The name of the coordinate frame of the positions.
     """
     # All ids must differ, so the ids of edges follow those of nodes.

@@ -111,7 +111,6 @@ class Roads:
         """Make the stops and roads of a map.
 
         Args:
-            ssh_map: The map.
             level: What a stop is. With "dstates", each link is a road. With "places", the robot's
                 travels between two places, in either direction, make a road in each direction.
             turns: How actions turn, as in `to_svg`.
@@ -172,9 +171,6 @@ class Roads:
 
         A stop stays if its roads do not lead to exactly two others, or if there is another road
         between these two.
-
-        Args:
-            hidden: The ids of stops.
         """
         stops, roads = {stop.id: stop for stop in self.stops}, list(self.roads)
         for stop in sorted(hidden):

@@ -30,7 +30,6 @@ def tmap2(roads: Roads, name: str, frame: str, updated: datetime | None = None) 
     """Write a map as the YAML text of a topological map.
 
     Args:
-        roads: The map as stops and roads.
         name: The name of the map and of its pointset.
         frame: The name of the coordinate frame of the positions.
         updated: The time when the map was made; None for now.

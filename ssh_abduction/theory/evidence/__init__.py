@@ -70,8 +70,6 @@ def said_by(
     """Count what each kind of evidence excluded.
 
     Args:
-        kinds: The evidence.
-        trace: The trace.
         refused: The number of rejected sets of equalities, by the name of the kind.
 
     Returns:
@@ -93,7 +91,6 @@ def pairs_of(trace: Trace, theory: Theory, evidence: Iterable[Evidence] | None =
     Evidence that may be wrong, because the theory allows a fault of it, is left out.
 
     Args:
-        trace: The trace.
         theory: The theory, in which no field is "auto".
         evidence: The evidence that this theory uses; by default it is made.
     """

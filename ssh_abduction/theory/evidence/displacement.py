@@ -103,8 +103,6 @@ class Displacement(Evidence):
         empty if no displacement may be wrong.
 
         Args:
-            trace: The trace.
-            returns: The returns.
             wrong: The steps whose displacements the map treats as wrong.
         """
         if not self.may_be_wrong:

@@ -94,7 +94,6 @@ class Loops:
         """Make the loops of a trace. First remove a steady drift of heading from its displacements.
 
         Args:
-            trace: The trace.
             bend: The drift, in radians a metre.
             drift: The standard deviation of the remaining drift; that of the odometry by default.
         """
@@ -272,7 +271,6 @@ class Reckoning:
         """Compute the poses and sums for each drift.
 
         Args:
-            trace: The trace.
             before: The reckoning of its first steps, if known.
         """
         self.odometry = trace.odometry or Odometry()

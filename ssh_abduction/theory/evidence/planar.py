@@ -422,11 +422,7 @@ def split(
 
     Args:
         labels: The dstate of each step.
-        steps: The steps.
         cross: Returns whether edges cross if the steps have some labels.
-
-    Returns:
-        The new labels.
     """
     new = max(labels.values()) + 1
     for step in steps:
@@ -445,7 +441,6 @@ def description(
     Args:
         labels: The dstate of each step.
         at: The place of each step.
-        steps: The steps.
         distinct: Whether to yield that dstates at one place are different.
     """
     first: dict[int, int] = {}  # the first step of each dstate

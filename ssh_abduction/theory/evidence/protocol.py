@@ -51,11 +51,7 @@ class Evidence(Protocol):
         ...
 
     def remembering(self, known: Any) -> Evidence:
-        """Return this evidence with results about traces from earlier evidence.
-
-        Args:
-            known: Earlier evidence of the same kind.
-        """
+        """Return this evidence with results about traces from earlier evidence."""
         return self
 
     def pairs(self, trace: Trace) -> Pairs:
@@ -69,7 +65,6 @@ class Evidence(Protocol):
         """Return further facts for the encoding of this kind, as a text for clingo.
 
         Args:
-            trace: The trace.
             start: The first step that the facts are about.
             stop: The step after the last one.
         """
@@ -79,7 +74,6 @@ class Evidence(Protocol):
         """Find equalities and inequalities of steps in a map that cannot all hold in any map.
 
         Args:
-            trace: The trace.
             ssh_map: A map of the first steps of the trace.
             since: The map of the first `since` steps is known to have no such set. So only later
                 steps need to be checked.

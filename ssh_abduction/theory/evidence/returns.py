@@ -52,7 +52,6 @@ class Returns:
 
         Args:
             evidence: The evidence that says how to test.
-            trace: The trace.
             before: The returns of the first steps of the trace, if known.
             reckoning: The dead reckoning of the trace, if known.
         """
@@ -258,7 +257,6 @@ class Returns:
         that are rejected most clearly.
 
         Args:
-            ssh_map: The map.
             since: The map of the first `since` steps is known to be accepted. So only returns that
                 end later are tested.
         """
@@ -328,7 +326,6 @@ class Returns:
         Args:
             labels: The dstate of each step.
             places: The place of each step.
-            step: The step.
         """
         elsewhere = [
             Equality(i, step, "place")
@@ -388,12 +385,7 @@ class Returns:
         return f"{named} are not one dstate: by the odometry they are {off} apart"
 
     def why_not_both(self, returns: Collection[Equality], names: Sequence[int]) -> str:
-        """Say in words why two returns cannot both be true.
-
-        Args:
-            returns: The two returns.
-            names: What to call the steps.
-        """
+        """Say in words why two returns cannot both be true."""
         ordered = sorted(returns, key=lambda e: (e.second, e.first, e.of))
         closings = [self.closing(e.first, e.second) for e in ordered]
         named = ", and ".join(f"steps {names[e.first]} and {names[e.second]}" for e in ordered)

@@ -88,9 +88,7 @@ class Together:
         """Choose the drift of heading that is tried first. No pair is tested yet.
 
         Args:
-            reckoning: The dead reckoning of the trace.
             thresholds: The chi-square above which a pair is rejected, by its degrees of freedom.
-            rows: The returns.
             before: The same for the first of these rows and steps, if known. Its results are
                 reused.
         """
@@ -286,7 +284,6 @@ def joint_squares(loops: Loops, these: Steps, others: Steps) -> Array:
     """Return the joint chi-square of each return with its partner.
 
     Args:
-        loops: The loops of the trace.
         these: Rows of returns, as in `Together.rows`.
         others: The row of the partner of each return.
     """
