@@ -38,6 +38,8 @@ from ssh_abduction.data import (
     together,
 )
 from ssh_abduction.explain import explain_place
+from ssh_abduction.page.content import content_of
+from ssh_abduction.robot_logs import log_report
 from ssh_abduction.solver.guesses.beam import Beam
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import settle
@@ -187,7 +189,13 @@ def test_a_change_has_a_name_and_a_place(
     maps = str(tmp_path / "maps.json")
     assert main(["solve", *files, "--together", "--set", "changed=1.5", "-o", maps]) == 0
     assert SAID in capsys.readouterr().out
+    assert main(["compare", maps]) == 0
+    assert f"  in the map, {SAID}\n" in capsys.readouterr().out
+    assert main(["compare", maps, "--json"]) == 0
     data = json.loads(Path(maps).read_text())["maps"][0]
+    assert json.loads(capsys.readouterr().out)["faults"] == data["faults"]
+    assert content_of(solution)["faults"] == [(4, SAID, "changed")]
+    assert SAID in log_report._faults(solution)
     assert data["faults"][0]["gateway"] == 1
     assert SSHMap.from_dict(data) == ssh_map
     data["faults"][0]["gateway"] = 4

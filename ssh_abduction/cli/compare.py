@@ -15,6 +15,7 @@ from ssh_abduction.data.map_file import read_json
 
 if TYPE_CHECKING:
     from ssh_abduction.rivals.comparison import Comparison
+    from ssh_abduction.rivals.listing import Listing
 
 # Values in run.json that differ between runs even if all settings and results are the same.
 UNSTEADY = ("seconds", "limit", "ladder", "drove", "log.source")
@@ -90,11 +91,14 @@ def run(options: argparse.Namespace) -> int:
     sides = shared_sides(listing)
     if sides is not None:
         record["sides"] = sides.to_dict()
+    if listing.faults:
+        record["faults"] = [fault.to_dict() for fault in listing.faults]
     if options.json:
         print(json_line({**record, **found.to_dict()}))
         return 0
-    differing = [f"  {sides}"] if sides is not None and sides.possible else []
-    print("\n".join([*_lines(found), *differing, *map(str, drives)]))
+    lines = [*_lines(found), *_faults(listing)]
+    lines += [f"  {sides}"] if sides is not None and sides.possible else []
+    print("\n".join([*lines, *map(str, drives)]))
     if listing.sureness:
         print(listing.sureness)
     return 0
@@ -135,6 +139,14 @@ def _flat(value: Any, name: str = "") -> dict[str, Any]:
         for part in value
         for key, v in _flat(value[part], f"{name}.{part}".lstrip(".")).items()
     }
+
+
+def _faults(listing: Listing) -> Iterator[str]:
+    """Yield a line for each fault that all listed maps have."""
+    where = "the map" if len(listing.maps) == 1 else "all maps"
+    if len(listing.maps) > 1 and not listing.complete:
+        where += " listed"
+    yield from (f"  in {where}, {printable(str(fault))}" for fault in listing.faults)
 
 
 def _lines(found: Comparison) -> Iterator[str]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
 
 from ssh_abduction.data.observation import View
 
@@ -124,6 +124,10 @@ class Fault:
         if self.kind == "jumped":
             return f"the displacement that leads to step {self.step} is wrong: {self.seen}"
         return f"the action at step {self.step} slipped: {self.seen}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fault as plain data, without what is None."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ import json
 import os
 import warnings
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -345,9 +345,7 @@ class SSHMap:
         if self.excused:
             data["excused"] = [list(pair) for pair in self.excused]
         if self.faults:
-            data["faults"] = [
-                {k: v for k, v in asdict(fault).items() if v is not None} for fault in self.faults
-            ]
+            data["faults"] = [fault.to_dict() for fault in self.faults]
         if self.regions is not None:
             data["regions"] = [region.to_dict() for region in self.regions]
         if self.fit:

@@ -98,7 +98,9 @@ def content_of(
         if ssh_map.fit:
             one["chi2"] = round(ssh_map.fit.chi2, 1)
         if ssh_map.faults:
-            one["faults"] = [faults.number((fault.step, str(fault))) for fault in ssh_map.faults]
+            one["faults"] = [
+                faults.number((fault.step, str(fault), fault.kind)) for fault in ssh_map.faults
+            ]
             one["cost"] = round(sum(fault.cost for fault in ssh_map.faults), 1)
         entries.append(one)
     layouts = _layouts(maps, entries, trace)

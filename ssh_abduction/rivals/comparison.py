@@ -206,7 +206,7 @@ class Comparison:
     def _differences(self) -> str:
         faults = self.variants.get("faults", 0) > 1
         return (
-            f"what they disbelieve differs ({self.variants['faults']} ways); " if faults else ""
+            f"their faults differ ({self.variants['faults']} ways); " if faults else ""
         ) + self.shared.sentence
 
     @property

@@ -15,7 +15,7 @@ compared in the same way.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import networkx as nx
@@ -159,10 +159,7 @@ class Difference:
             "links": [[list(link) for link in links] for links in self.links],
             "has_places": list(self.has_places),
             "sides": [[beside.to_dict() for beside in sides] for sides in self.sides],
-            "faults": [
-                [{k: v for k, v in asdict(fault).items() if v is not None} for fault in faults]
-                for faults in self.faults
-            ],
+            "faults": [[fault.to_dict() for fault in faults] for faults in self.faults],
             "words": list(self.lines),
         }
         if self.chi2:

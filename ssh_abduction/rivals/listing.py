@@ -23,6 +23,7 @@ from ssh_abduction.data.drives import Drive, with_named_faults
 from ssh_abduction.data.errors import MapError, brief, is_whole, named
 from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.data.map_file import read_json
+from ssh_abduction.data.map_parts import Fault
 from ssh_abduction.data.maps import ID_LENGTH, SSHMap, maps_of
 from ssh_abduction.data.trace import View
 from ssh_abduction.solver import Backbone, Solution, Status, Weighed, drives_in, joins_in, theory_in
@@ -61,6 +62,12 @@ class Listing:
     def steps(self) -> int:
         """The number of steps of the trace."""
         return len(self.maps[0].dstate_at)
+
+    @property
+    def faults(self) -> tuple[Fault, ...]:
+        """The faults that all listed maps have, such as gateways that changed between drives."""
+        first, *others = self.maps
+        return tuple(f for f in first.faults if all(f in ssh_map.faults for ssh_map in others))
 
     @property
     def sureness(self) -> str:

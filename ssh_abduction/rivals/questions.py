@@ -9,7 +9,7 @@ kept.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -86,7 +86,7 @@ class Question:
         }
         data |= attributes_of(self, "places") if self.places else {}
         if self.fault:
-            data["fault"] = {k: v for k, v in asdict(self.fault).items() if v is not None}
+            data["fault"] = self.fault.to_dict()
         return data
 
 

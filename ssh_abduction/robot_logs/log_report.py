@@ -66,7 +66,7 @@ def report(
         "<h2>Rival maps</h2>" + _paragraph(solution.summary or "There is no other minimal map.")
         if solution.maps
         else "",
-        "<h2>What the map treats as wrong</h2>" + _faults(solution) if solution.maps else "",
+        _faults(solution) if solution.maps else "",
         "<h2>Settings</h2>" + _settings(run),
         "<h2>Time</h2>" + _time(run),
         "<h2>The log</h2>" + _log(log, run),
@@ -167,18 +167,15 @@ def _doubts(solution: Solution) -> str:
 
 
 def _faults(solution: Solution) -> str:
-    """Make the table of the steps that the first map treats as wrong."""
-    faults = solution.maps[0].faults
-    if not faults:
-        allowed = solution.theory.misread or solution.theory.slipped or solution.theory.jumped
-        return _paragraph(
-            "Nothing."
-            if allowed
-            else "Nothing: the theory allows no faults (--set misread=4 would)."
-        )
-    return _table(
-        ("step", "what", "seen", "cost"), [(f.step, f.kind, f.seen, f.cost) for f in faults]
-    )
+    """List what changed between drives, or the steps that the first map treats as wrong."""
+    faults, theory = solution.maps[0].faults, solution.theory
+    rows = [(f.step, str(f), f.cost) for f in faults]
+    found = _table(("step", "what", "cost"), rows) if rows else _paragraph("Nothing.")
+    if theory.changed:
+        return "<h2>What changed between drives</h2>" + found
+    if not (theory.misread or theory.slipped or theory.jumped):
+        found = _paragraph("Nothing: the theory allows no faults (--set misread=4 would).")
+    return "<h2>What the map treats as wrong</h2>" + found
 
 
 def _settings(run: Mapping[str, Any]) -> str:

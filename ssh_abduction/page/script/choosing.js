@@ -68,17 +68,26 @@ function legend() {
       ]);
   if (figures.some((figure) => figure.layout?.ellipses?.length))
     rows.push(["ellipse", "", "two standard deviations of a position"]);
+  const changes = data.faults.some(([, , kind]) => kind === "changed");
   if (data.faults.length)
     rows.push([
       "fault",
       "",
-      state.mode === "one" ? "what the map disbelieves" : "what all disbelieve",
+      changes
+        ? "a gateway that changed between drives"
+        : state.mode === "one"
+          ? "what the map disbelieves"
+          : "what all disbelieve",
     ]);
   if (data.faults.length && state.mode !== "one")
     rows.push([
       "fault",
       "disputed",
-      state.mode === "two" ? "what the other map does not disbelieve" : "what some maps disbelieve",
+      changes
+        ? "a gateway that did not change in other maps"
+        : state.mode === "two"
+          ? "what the other map does not disbelieve"
+          : "what some maps disbelieve",
     ]);
   for (const [shape, kind, text] of rows) {
     const row = element("p", { class: "key" }, null, $("legend")),
@@ -116,6 +125,11 @@ function legend() {
   }
 }
 
+// The word before what a fault says. Faults of kind "changed" are no errors of the trace.
+function faultWord(kind) {
+  return kind === "changed" ? "Changed between drives" : "Disbelieved";
+}
+
 function about() {
   $("about").replaceChildren();
   if (state.mode === "overview") {
@@ -128,7 +142,8 @@ function about() {
     const counts = [counted(ssh.dstates.length, "dstate")];
     if (ssh.places.size) counts.push(counted(ssh.places.size, "place"), counted(paths, "path"));
     element("p", {}, `Map ${i + 1}: ${counts.join(", ")}`, $("about"));
-    for (const [, text] of ssh.faults) element("p", {}, `Disbelieved: ${text}`, $("about"));
+    for (const [, text, kind] of ssh.faults)
+      element("p", {}, `${faultWord(kind)}: ${text}`, $("about"));
   }
 }
 

@@ -35,12 +35,12 @@ function setStep(t) {
   $("seen").textContent = parts.join("; ");
   const wrong = replay().other
     ? []
-    : data.faults.map(([at, text], k) => [at, text, k]).filter(([at]) => at === t);
+    : data.faults.map((fault, k) => [...fault, k]).filter(([at]) => at === t);
   $("wrong").textContent = wrong
-    .map(([, text, k]) => {
+    .map(([, text, kind, k]) => {
       const count = data.maps.filter((told) => told.faults?.includes(k)).length;
       const some = count < data.maps.length ? ` in ${count} of ${data.maps.length} maps` : "";
-      return `Disbelieved${some}: ${text}`;
+      return `${faultWord(kind)}${some}: ${text}`;
     })
     .join("; ");
   $("wrong").hidden = !wrong.length;
