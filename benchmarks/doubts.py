@@ -27,7 +27,7 @@ from perception.errors import ImageWarning, PerceptionError
 from perception.images import images_of
 from perception.reciprocal import ReciprocalTransformer
 from perception.views import ViewClusterer
-from simulator.control import Tolerance
+from simulator.driver import Tolerance
 from simulator.laser import Laser
 from simulator.tours import simulate
 from simulator.world import World

@@ -41,7 +41,7 @@ from simulator.plans import Plan
 from ssh_abduction import SSHMap, Theory
 from ssh_abduction.data import Odometry, together
 from ssh_abduction.solver.guesses.beam import Beam
-from ssh_abduction.solver.guesses.joining import Joining
+from ssh_abduction.solver.guesses.joint_maps import Joining
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import settle
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from simulator.control import Driver
+from simulator.driver import Driver
 from simulator.errors import SimulatorError
 from simulator.freespace import CELL, Cells, FreeSpace
 from simulator.laser import BEARINGS

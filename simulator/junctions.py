@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simulator.control import LONGEST_TRAVEL, STILL, STRIDE, TRIES, Driver
+from simulator.driver import LONGEST_TRAVEL, STILL, STRIDE, TRIES, Driver
 from simulator.errors import SimulatorError
 from simulator.laser import BEARINGS
 from simulator.surroundings import (

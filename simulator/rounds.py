@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulator.buildings import Building
-from simulator.control import Driver
 from simulator.cruise import drive_along
 from simulator.drive import EVERY, RecordedDrive, Recorder
+from simulator.driver import Driver
 from simulator.errors import SimulatorError
 from simulator.freespace import CELL, FreeRectangle, FreeSpace
 from simulator.laser import Laser

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from simulator.control import Driver, Tolerance
+from simulator.driver import Driver, Tolerance
 from simulator.motion import DIGITS
 from simulator.panorama import Camera
 from simulator.robot import Body, Report, SimulatedRobot

@@ -10,9 +10,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from simulator.control import STILL, Corridors, Driver, Tolerance
 from simulator.cruise import drive_along
 from simulator.drive import EVERY, RecordedDrive, Recorder
+from simulator.driver import STILL, Corridors, Driver, Tolerance
 from simulator.errors import SimulatorError
 from simulator.freespace import FreeSpace
 from simulator.junctions import ACTIONS, Pilot

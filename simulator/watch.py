@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from simulator.control import TURNS, Driver
+from simulator.driver import TURNS, Driver
 from simulator.errors import SimulatorError, SimulatorWarning
 from simulator.laser import meetings
 from simulator.motion import Pose, displacement_between

@@ -15,9 +15,9 @@ from test_plans import SCHOOLS, plan_of, xml
 
 from perception.readers.logs import read_log
 from simulator.buildings import Building
-from simulator.control import Driver
 from simulator.cruise import drive_along
 from simulator.drive import Recorder
+from simulator.driver import Driver
 from simulator.errors import SimulatorError, SimulatorWarning
 from simulator.freespace import FreeSpace
 from simulator.laser import Laser

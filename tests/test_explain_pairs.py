@@ -22,7 +22,7 @@ from ssh_abduction.explain.pairs import explain_pair
 from ssh_abduction.explain.piece import Piece
 from ssh_abduction.explain.verdict import PairExplanation, Verdict
 from ssh_abduction.solver import Status
-from ssh_abduction.solver.asp.facts import derivation_lp, questions
+from ssh_abduction.solver.asp.facts import derivation_lp, further_rules
 from ssh_abduction.theory.encodings import axioms
 from ssh_abduction.theory.settle import settle
 
@@ -50,7 +50,7 @@ def possible(
     pair = piece.steps.index(derivation.first), piece.steps.index(derivation.second)
     active = [derivation_lp.active(axiom, piece.steps.index(step)) for axiom, step in links]
     return Axioms(piece, never, relaxed=True).consistent(
-        active, [(questions.are_one(*pair), not derivation.one)]
+        active, [(further_rules.are_one(*pair), not derivation.one)]
     )
 
 

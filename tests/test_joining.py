@@ -11,7 +11,7 @@ from ssh_abduction import SSHMap, Theory, Trace
 from ssh_abduction.checker.checker import violations
 from ssh_abduction.data import Odometry, Step, together
 from ssh_abduction.data.star import Gateway, Star
-from ssh_abduction.solver.guesses.joining import Joining
+from ssh_abduction.solver.guesses.joint_maps import Joining
 from ssh_abduction.solver.guesses.sights import Sights
 from ssh_abduction.solver.misfit import Misfit
 from ssh_abduction.solver.search import Search

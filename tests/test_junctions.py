@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from streets import drawn
 
-from simulator.control import Driver
+from simulator.driver import Driver
 from simulator.errors import SimulatorError
 from simulator.junctions import Pilot
 from simulator.laser import BEARINGS, Laser

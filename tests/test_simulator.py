@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from simulator.control import Driver, act, climb
+from simulator.driver import Driver, act, climb
 from simulator.errors import SimulatorError
 from simulator.laser import BEARINGS, Laser
 from simulator.motion import displacement_between, moved, reported

@@ -36,7 +36,7 @@ from ssh_abduction.solver.engines import (
     pinned,
     small_maps,
 )
-from ssh_abduction.solver.engines import naming as named
+from ssh_abduction.solver.engines import named_labels as named
 from ssh_abduction.solver.engines.name_search import NameSearch
 from ssh_abduction.solver.guesses import annealing
 from ssh_abduction.solver.guesses.annealing import annealed_steps

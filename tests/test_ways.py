@@ -21,7 +21,7 @@ from ssh_abduction.solver import Search, Start, Status, choosing
 from ssh_abduction.solver.asp.facts.readable import most_paths
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.engines import frameless_paths as ways
-from ssh_abduction.solver.engines import name_search, naming
+from ssh_abduction.solver.engines import name_search, named_labels
 from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.frameless import FramelessEngine
 from ssh_abduction.solver.engines.stepwise import StepEngine
@@ -71,7 +71,7 @@ def test_the_maps_of_the_plain_encoding(data: st.DataObject) -> None:
     if not expected.cost:
         return  # the engine is asked only where some map is known
     with (
-        patch.object(naming, "SPARES", spares),
+        patch.object(named_labels, "SPARES", spares),
         patch.multiple(name_search, PATIENCE=patience, CORES=cores),
         patch.object(ways, "CONTRARY", contrary),
     ):
@@ -134,7 +134,7 @@ def test_a_limit_while_labels_are_listed_is_a_limit() -> None:
     trace = maze(3, 3, steps=30, seed=0).trace
     theory = settle(trace).theory
     known = solve(trace, theory).maps[0].labels
-    with patch.object(naming, "SPARES", 0):
+    with patch.object(named_labels, "SPARES", 0):
         engine = FramelessEngine(Task.of(Problem.of(trace, theory)), known)
         engine.grow(len(trace))
         maps = engine.improving_maps()

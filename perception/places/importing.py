@@ -47,7 +47,7 @@ from perception.reciprocal import ReciprocalTransformer
 from perception.views import ViewClusterer
 from ssh_abduction.data.errors import named
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.runtime.logs import log_of
+from ssh_abduction.runtime.loggers import log_of
 
 _log = log_of("ssh_abduction.perception.places")
 

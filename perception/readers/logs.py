@@ -18,7 +18,7 @@ from perception.readers.scans import Damage, RobotLog, Scan, SurveyedLog
 from ssh_abduction.data.checks import a_list, a_path, a_text
 from ssh_abduction.data.errors import brief, named
 from ssh_abduction.data.odometry import Pose
-from ssh_abduction.runtime.logs import log_of
+from ssh_abduction.runtime.loggers import log_of
 
 _log = log_of("ssh_abduction.perception.readers")
 

@@ -45,7 +45,7 @@ from ssh_abduction.data.floors import floors_in_words
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.no_map import Explanation
-from ssh_abduction.runtime.logs import PROGRESS
+from ssh_abduction.runtime.loggers import PROGRESS
 from ssh_abduction.solver import (
     Backbone,
     Progress,

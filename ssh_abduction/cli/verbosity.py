@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator
 
 from ssh_abduction.data.errors import printable
-from ssh_abduction.runtime.logs import PACKAGE, PROGRESS
+from ssh_abduction.runtime.loggers import PACKAGE, PROGRESS
 
 # Seconds before the first line of progress, and between lines. Most commands end earlier.
 EVERY = 10.0

@@ -36,7 +36,7 @@ from ssh_abduction.learning.labels import (
 from ssh_abduction.learning.runner_up import RunnerUpWarning, warn_of_second_map
 from ssh_abduction.learning.traces import Traces
 from ssh_abduction.runtime.deprecated import renamed_parameters
-from ssh_abduction.runtime.logs import log_of
+from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver import solve
 from ssh_abduction.theory.theory import Theory, checked_theory
 

@@ -35,7 +35,7 @@ from ssh_abduction.evaluation.ladder import Rung, UnderWay, ladder, rungs
 from ssh_abduction.page.html import view_page
 from ssh_abduction.robot_logs.log_report import report
 from ssh_abduction.runtime.deprecated import renamed_parameters
-from ssh_abduction.runtime.logs import log_of
+from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver import Solution, Status, find_backbone, obeyed, with_names
 from ssh_abduction.theory.theory import Theory
 

@@ -30,7 +30,7 @@ from dataclasses import replace
 from itertools import combinations
 
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.runtime.logs import log_of
+from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError
 from ssh_abduction.solver.engines.base import Engine, LabellingEngine, Task
 from ssh_abduction.solver.engines.doubts import Doubt, Settled

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import heeding
-from ssh_abduction.runtime.logs import log_of
+from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver import choosing
 from ssh_abduction.solver.asp.facts import answer_maps
 from ssh_abduction.solver.asp.limits import LimitError, Watch, now
@@ -117,7 +117,7 @@ class Candidates:
         trusts_drives = not (theory.lifts or theory.replace(changed=0.0).has_faults)
         if self.beam(1) is None or not theory.several_drives or not trusts_drives:
             return
-        from ssh_abduction.solver.guesses.joining import Joining  # loads numpy
+        from ssh_abduction.solver.guesses.joint_maps import Joining  # loads numpy
 
         joining = Joining(self._task.problem, self._task.log)
         yield from filter(self._judging.accepts, map(self._with_unknown_views, joining.maps()))

@@ -10,7 +10,7 @@ from dataclasses import replace
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import each_looking, heeding
-from ssh_abduction.runtime.logs import log_of
+from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.answer import Answer
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.map_list import Priced, note

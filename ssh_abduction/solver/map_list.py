@@ -8,7 +8,7 @@ from typing import TypeAlias
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.words import counted
-from ssh_abduction.runtime.logs import log_of
+from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.near import NearMinimal, counted_first
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.values import Status

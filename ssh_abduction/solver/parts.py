@@ -6,7 +6,7 @@ import logging
 import math
 from collections.abc import Callable
 
-from ssh_abduction.runtime.logs import PROGRESS
+from ssh_abduction.runtime.loggers import PROGRESS
 from ssh_abduction.solver import prefixes
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.backbone import Rivals

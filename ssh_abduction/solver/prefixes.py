@@ -47,7 +47,7 @@ from dataclasses import replace
 
 from ssh_abduction.data.gateways import with_allowed_headings
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.runtime.logs import log_of
+from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.facts import readable
 from ssh_abduction.solver.asp.limits import LAST, LimitError, StageTimeError
 from ssh_abduction.solver.engines.base import Engine, Found, Task

@@ -24,7 +24,7 @@ from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.runtime.clock import each_heeding, heeding
 from ssh_abduction.runtime.deprecated import renamed_parameters
-from ssh_abduction.runtime.logs import log_of
+from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.runtime.threads import one_thread
 from ssh_abduction.solver.answer import Answer
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError, Stop, Watch, now

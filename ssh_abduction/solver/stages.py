@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.runtime.logs import log_of
+from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver import choosing, prefixes
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError
 from ssh_abduction.solver.choosing import may_name, takes_all

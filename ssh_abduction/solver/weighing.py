@@ -33,7 +33,7 @@ from ssh_abduction.data.drives import drives_of
 from ssh_abduction.data.maps import Fault, SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
-from ssh_abduction.runtime.logs import log_of
+from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.limits import LimitError
 from ssh_abduction.solver.beams import Beams
 from ssh_abduction.solver.choosing import READABLE, new_engine, takes_all

@@ -26,7 +26,7 @@ from perception.quality import uncertainty_coefficient
 from perception.reciprocal import ReciprocalTransformer
 from perception.recognition import LearningCurve, learning_curve, recogniser
 from perception.views import ViewClusterer
-from simulator.control import STILL
+from simulator.driver import STILL
 from simulator.laser import Laser
 from simulator.tours import simulate
 from simulator.world import World

@@ -15,7 +15,7 @@ from typing import Any
 from joblib import effective_n_jobs
 
 from perception.images import images_of
-from simulator.control import STILL, Tolerance
+from simulator.driver import STILL, Tolerance
 from simulator.laser import Laser
 from simulator.robot import Body
 from simulator.tours import simulate

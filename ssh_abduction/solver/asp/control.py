@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import clingo
 
-from ssh_abduction.runtime.logs import log_of
+from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.limits import POLL, LimitError, Watch, peak_memory
 from ssh_abduction.solver.values import Grounding
 from ssh_abduction.theory import encodings

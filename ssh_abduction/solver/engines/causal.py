@@ -1,7 +1,7 @@
 """The engine for the causal theory on long traces.
 
 It finds a map with the fewest dstates, proves that there are no fewer, and lists all such maps. The
-search for the dstate of each step is in `engines/naming.py`.
+search for the dstate of each step is in `engines/named_labels.py`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterator, Sequence
 from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.facts import answer_maps
 from ssh_abduction.solver.engines.base import Found, Task, next_charted_size
-from ssh_abduction.solver.engines.naming import NamedLabels
+from ssh_abduction.solver.engines.named_labels import NamedLabels
 from ssh_abduction.theory.evidence import Equality
 
 

@@ -16,7 +16,7 @@ import clingo
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.asp.control import Asker
-from ssh_abduction.solver.asp.facts import path_reader, questions
+from ssh_abduction.solver.asp.facts import further_rules, path_reader
 from ssh_abduction.solver.sharing import Sort
 
 Answer = TypeVar("Answer")
@@ -66,10 +66,10 @@ class Doubts:
         self._ground([doubt for doubt in doubts if doubt not in self._number_of])
         for doubt in self._open ^ doubts:
             self._control.assign_external(
-                questions.open_doubt(self._number_of[doubt]), doubt in doubts
+                further_rules.open_doubt(self._number_of[doubt]), doubt in doubts
             )
         self._open = doubts
-        assumed = [(questions.some_doubt(self._parts), True)]
+        assumed = [(further_rules.some_doubt(self._parts), True)]
         with closing(
             self._asker.answers(read, mode, 1, assumptions=assumed, control=self._control)
         ) as answers:
@@ -80,10 +80,12 @@ class Doubts:
         if not doubts:
             return
         self._parts += 1
-        rules = [questions.doubts_before(self._parts)]
+        rules = [further_rules.doubts_before(self._parts)]
         for sort, i, j, one in doubts:
             number = self._number_of[sort, i, j, one] = len(self._number_of)
-            rules.append(questions.doubt(number, self._parts, self._condition(sort, i, j), one=one))
+            rules.append(
+                further_rules.doubt(number, self._parts, self._condition(sort, i, j), one=one)
+            )
         part = f"doubts_{self._parts}"
         with self._asker.grounding_timed():
             self._control.add(part, [], "\n".join(rules))

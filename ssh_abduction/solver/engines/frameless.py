@@ -5,9 +5,10 @@ It lists all minimal maps, and proves its lower bound on the number of dstates.
 
 With the axioms of places and paths for each step, clingo only manages a few dozen steps of
 exploring. But these axioms are about dstates: the place of a dstate, and the path that it is along.
-So the dstates get names, as in the causal theory (`engines/naming.py`). sides_frameless.lp has the
-axioms of order and sides, which exclude some links between dstates (`engines/frameless_paths.py`).
-The number of its rules depends on the number of dstates, not on the number of steps.
+So the dstates get names, as in the causal theory (`engines/named_labels.py`). sides_frameless.lp
+has the axioms of order and sides, which exclude some links between dstates
+(`engines/frameless_paths.py`). The number of its rules depends on the number of dstates, not on the
+number of steps.
 
 *Claim.* Each map of the topological theory is an answer of names.lp and sides_frameless.lp, with
 the number of dstates as its cost.
@@ -15,7 +16,7 @@ the number of dstates as its cost.
 hold if its comment is true of the map. The rules of sides_frameless.lp then follow from the axioms
 for two or three dstates: a travel stays on its path and leads further along it, the order is
 transitive, and a turn stays at its place. The rules say nothing about the rest, the one name of all
-dstates that have no name of their own (`engines/naming.py`). ∎
+dstates that have no name of their own (`engines/named_labels.py`). ∎
 
 So the bounds hold. If places and paths fit some answer of least cost, then all minimal maps are
 among the answers of that cost, with the fewest places and paths. To find them, all labels with the

@@ -24,7 +24,7 @@ from ssh_abduction.solver.asp.facts.atoms import number_symbols
 from ssh_abduction.solver.engines.base import Found, Task
 from ssh_abduction.solver.engines.doubts import Settled
 from ssh_abduction.solver.engines.homes import fewest_paths, homes_of
-from ssh_abduction.solver.engines.naming import NamedLabels
+from ssh_abduction.solver.engines.named_labels import NamedLabels
 from ssh_abduction.solver.engines.paths import PREPARING
 from ssh_abduction.solver.engines.refusing import minimal_part
 from ssh_abduction.solver.steps.chart import Link

@@ -13,7 +13,7 @@ import clingo
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.asp.control import Asker
-from ssh_abduction.solver.asp.facts import answer_maps, questions, readable
+from ssh_abduction.solver.asp.facts import answer_maps, further_rules, readable
 from ssh_abduction.solver.asp.facts.atoms import number_symbols
 from ssh_abduction.solver.engines.base import Found, Task
 from ssh_abduction.solver.engines.doubts import Doubt, Doubts
@@ -45,7 +45,7 @@ class StepEngine:
         # and clingo cannot be stopped meanwhile.
         self._last_step = 0.0, 0.0
         control = self.asker.control
-        self._doubts = Doubts(self.asker, control, questions.steps_are_one)
+        self._doubts = Doubts(self.asker, control, further_rules.steps_are_one)
         for name in readable.encoding_names(task.theory):
             control.load(encodings.path(name))
         control.add("base", [], readable.theory_facts(task.theory, paths))
@@ -152,7 +152,7 @@ class StepEngine:
             count: What is counted: "dstates", "places" or "paths".
         """
         if self._number is not None:
-            self.asker.control.release_external(questions.of_number(*self._number))
+            self.asker.control.release_external(further_rules.of_number(*self._number))
         self._number = number, count
         self._tell_number()
 
@@ -161,14 +161,16 @@ class StepEngine:
         if self._number is None:
             return
         part = f"number_{self._number[0]}"
-        self.asker.control.add(part, [], questions.exactly(*self._number))
+        self.asker.control.add(part, [], further_rules.exactly(*self._number))
         self.asker.control.ground([(part, [])])
-        self.asker.control.assign_external(questions.of_number(*self._number), True)
+        self.asker.control.assign_external(further_rules.of_number(*self._number), True)
 
     def _give_forbidden(self, number: int) -> None:
         """Give clingo the rule that excludes a forbidden set of equalities, by its number."""
         part = f"forbidden_{number}"
-        self.asker.control.add(part, [], questions.forbidden_equalities(self._forbidden[number]))
+        self.asker.control.add(
+            part, [], further_rules.forbidden_equalities(self._forbidden[number])
+        )
         self.asker.control.ground([(part, [])])
 
     def _read(self, model: clingo.Model) -> Found:

@@ -6,11 +6,11 @@ direction. The framed engine uses this module. Clingo is asked which visits are 
 fewer, and lists all labels with that number of dstates. `engines/framed.py` checks them by the
 axioms of order and sides.
 
-Names, as in `engines/naming.py`, help little if there are many dstates with few visits: what clingo
-learns about one spare name, it has to learn again about the next one, and each node of the view may
-have each of the names. An equality of two visits, in contrast, is only about these two. A node is
-*first* if no node before it, in an order of choice, is at its dstate. So the number of dstates is
-the number of first nodes.
+Names, as in `engines/named_labels.py`, help little if there are many dstates with few visits: what
+clingo learns about one spare name, it has to learn again about the next one, and each node of the
+view may have each of the names. An equality of two visits, in contrast, is only about these two. A
+node is *first* if no node before it, in an order of choice, is at its dstate. So the number of
+dstates is the number of first nodes.
 
 *Order of choice.* A clique of nodes comes first, then the nodes that can share a dstate with few
 others. When the trace grows, new nodes are put last. So the rules that clingo has, and the clauses

@@ -3,7 +3,7 @@
 The solver does not get the old drives. It gets a *digest*: a trace in which each link of their map
 occurs once (`onto.py`). The displacements of the old drives are fitted to their map. The fit gives
 the joint Gaussian distribution of the poses, and each link of the digest gets the displacement
-between the poses of its ends. `joining.py` then joins the pieces of the map and the new drives.
+between the poses of its ends. `joint_maps.py` then joins the pieces of the map and the new drives.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.fit import Poses
-from ssh_abduction.solver.guesses.joining import Joining
+from ssh_abduction.solver.guesses.joint_maps import Joining
 from ssh_abduction.solver.guesses.overlaying import Part
 from ssh_abduction.solver.guesses.sights import Sights
 from ssh_abduction.solver.steps.chart import numbered

@@ -21,7 +21,7 @@ from ssh_abduction.solver.asp.facts.derivation_lp import (
     some_fail,
     told_of,
 )
-from ssh_abduction.solver.asp.facts.questions import are_one, forbidden_equalities, rests_on
+from ssh_abduction.solver.asp.facts.further_rules import are_one, forbidden_equalities, rests_on
 from ssh_abduction.solver.asp.facts.readable import (
     encoding_names,
     most_paths,
