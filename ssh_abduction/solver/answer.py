@@ -34,11 +34,11 @@ class Answer:
     def take_down(self, ssh_map: SSHMap, cost: tuple[int, ...]) -> None:
         """Record a map that was given to the caller.
 
-        It is counted in its level, which is the maps of one cost. Maps come level by level.
+        Count it in its level: the maps of one cost. Maps come level by level.
 
         Args:
             ssh_map: The map.
-            cost: The counts of the map that the theory minimises, the first preference first.
+            cost: The preferred counts of the map, the most important one first.
         """
         theory = self._parts.task.theory
         self._first, self._last = self._first or ssh_map, (ssh_map, cost)
@@ -47,9 +47,9 @@ class Answer:
         self._levels[-1] = replace(self._levels[-1], count=self._levels[-1].count + 1)
 
     def count_apart(self) -> None:
-        """Raise the lower bound on dstates to the size of a clique: pairwise distinct steps.
+        """Raise the lower bound on dstates to the size of a set of pairwise distinct steps.
 
-        A search that was stopped needs this, as its own bound may be smaller.
+        The bound that a stopped search has proven may be smaller.
         """
         known = self._parts.known
         self._basis = self._basis_of(len(self._parts.task.trace))
@@ -110,7 +110,8 @@ class Answer:
         """Sort the maps of each level into an order that is the same in each run.
 
         Return the maps unsorted if the caller did not keep all of them, or if the list of minimal
-        maps is incomplete. After sorting, each level gets the cost of its new first map.
+        maps is incomplete. Maps of a level may differ in counts that the theory does not minimise.
+        So each level then gets the cost of its new first map.
         """
         parts, theory = self._parts, self._parts.task.theory
         is_all = parts.known.complete or parts.rivals.listed

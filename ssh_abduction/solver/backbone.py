@@ -117,8 +117,8 @@ def prove_backbone(
     Args:
         task: The task of the search.
         judging: Says which maps the evidence rejects.
-        cost: The counts of minimal maps that the theory minimises, the first preference first.
-        sharing: What at least one minimal map shares. Each new map is added.
+        cost: The preferred counts of minimal maps, the most important one first.
+        sharing: What the known minimal maps share; at least one is known. Each new map is added.
         engine: The engine that proved the minimum; None if it is no longer available.
 
     Returns:
@@ -257,7 +257,8 @@ class _Reasoning:
     def _doubts(self, size: int) -> Iterator[Doubt]:
         """Yield the doubts about the first `size` steps, each as (sort, step, step, one).
 
-        `one` says what the doubt is: that the two steps are one (True), or that they are not.
+        `sort` is what the two steps may share, such as "dstates". `one` says what the doubt is:
+        that they are one (True), or that they are not.
         """
         firsts = self._sharing.firsts()
         yield from (
@@ -266,9 +267,10 @@ class _Reasoning:
         yield from self._doubts_of_classes(size)
 
     def _doubts_of_classes(self, size: int) -> Iterator[Doubt]:
-        """Yield a doubt for each two classes of steps that are apart, or one, in all known maps.
+        """Yield the doubts about classes of steps. Each class is given by its first step.
 
-        Each class is given by its first step.
+        Two classes that are one in all known maps may differ in another map, or the other way
+        round.
         """
         sharing = self._sharing
         firsts = [t for t in sharing.firsts() if t < size]

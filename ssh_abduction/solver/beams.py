@@ -59,7 +59,7 @@ class Beams:
         Args:
             parts: The parts of the search.
             add: Computes the cost of a map in nats, and keeps the map if the cost is small.
-            keep_best: Makes the map of least cost the best one of the search.
+            keep_best: Makes the cheapest known map the best map of the search.
         """
         self._parts, self._add, self._keep_best = parts, add, keep_best
         # The cost of the best map of the last broad beam, and the estimate of it by the beam.

@@ -80,15 +80,17 @@ class Candidates:
             self.offer(answer_maps.causal_map(self._task.log.merged(), self._task.trace))
 
     def beam(self, width: int) -> Beam | None:
-        """Return a beam of hypotheses about dstates and places, which goes on where it stopped.
+        """Return the beam of hypotheses about dstates and places that has this width.
+
+        Later calls return the same beam, which goes on where it stopped.
 
         Args:
             width: The number of hypotheses.
 
         Returns:
-            The beam. None without the speed-up `greedy`, or if the trace is long. Also None if the
-            trace has neither displacements nor stars at any angles, as `guesses/tree.py` makes
-            better maps of it.
+            The beam. None without the speed-up `greedy`, if the trace is long, or if the checker
+            cannot check all axioms. Also None if the trace has neither displacements nor stars at
+            any angles, as `guesses/tree.py` makes better maps of it.
         """
         theory = self._task.theory
         if (
@@ -269,7 +271,7 @@ class Candidates:
             self._task.watch.use_reserve()
 
     def _with_unknown_views(self, ssh_map: SSHMap) -> SSHMap:
-        """Undo what `_with_all_views` did to the trace, in a map of it."""
+        """Give each dstate of a map its view in the original trace, see `_with_all_views`."""
         if self._task.trace is self._trace:
             return ssh_map
         views = answer_maps.views_of(dict(enumerate(ssh_map.dstate_at)), self._trace)

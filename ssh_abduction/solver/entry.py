@@ -191,7 +191,7 @@ def _is_known_by_mending_alone(task: Task) -> bool:
 
 
 def _labelling_engine(task: Task, solution: Solution) -> Engine | None:
-    """Make an engine that finds dstates before places and paths, with the prefix of the solution.
+    """Make an engine that finds dstates before places and paths, for the prefix that was solved.
 
     Return None if the search needed no such engine, or the theory has none.
     """

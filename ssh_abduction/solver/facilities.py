@@ -2,8 +2,8 @@
 
 Each cluster has a *facility*, which has a price and may be at any point of space. Each point pays
 half of its squared distance to its facility, in standard deviations. The *shares* of the points are
-numbers with one property: wherever a facility is, the points that pay less than their share save at
-most its price, all together. So no clustering costs less than the sum of all shares. Linear
+numbers with one property: wherever a facility is, the points that pay less than their share there
+together save at most its price. So no clustering costs less than the sum of all shares. Linear
 programming finds the greatest shares (Cornuejols, Nemhauser & Wolsey 1990, "The uncapacitated
 facility location problem").
 """
@@ -57,7 +57,7 @@ class Facilities:
     price: float
 
     def shares(self, most: Array) -> Array:
-        """Compute the shares of the points, (n,), none more than its `most`, (n,)."""
+        """Compute the shares of the points, (n,). The share of each is at most its `most`, (n,)."""
         starts, kinds = self._starts()
         program = _Program(self.price, most)
         for _ in range(RETRIES):
@@ -73,7 +73,7 @@ class Facilities:
 
         Returns:
             The shares, (n,), and what each point pays for each of its coordinates in the cheapest
-            clustering, (n, d). Clusters may be taken in parts there.
+            clustering, (n, d). This clustering may use fractions of clusters.
         """
         program, pays = _Program(self.price, np.full(len(self.points), self.price)), 0 * self.points
         shares = self._approximate(program, *self._starts())
@@ -83,7 +83,7 @@ class Facilities:
         return shares, pays
 
     def _approximate(self, program: _Program, starts: Array, kinds: NDArray[np.int_]) -> Array:
-        """Compute shares that hold for all facilities that are found from some starts."""
+        """Compute shares that hold for all facilities that a search from some starts finds."""
         best = np.zeros(len(self.points))
         for _ in range(ROUNDS):
             look_at_clock()
@@ -105,7 +105,7 @@ class Facilities:
         return off
 
     def _starts(self) -> tuple[Array, NDArray[np.int_]]:
-        """Return where searches begin: at all points, and midway between like ones nearby."""
+        """Return where searches begin: at all points, and midway between points that are near."""
         off = self.offsets(self.points)
         both = self.variances[None] + self.variances[:, None]
         more = self._more(self.kinds)
@@ -185,11 +185,11 @@ class _Program:
         self._clusters: list[tuple[int, ...]] = [(i,) for i in range(len(most))]
         self._costs = [price] * len(most)
         self._centres: list[Array] = []  # of all clusters with several members
-        self._parts = np.zeros(0)  # the part of each cluster in the cheapest clustering
+        self._parts = np.zeros(0)  # the fraction of each cluster in the cheapest clustering
         self._known: set[tuple[int, ...]] = set(self._clusters)
 
     def add(self, members: NDArray[np.bool_], paid: Array, centres: Array) -> bool:
-        """Add clusters: their members, what these pay, and the facility. Say if one is new."""
+        """Add clusters: their members, what these pay, and the facility. Tell if one is new."""
         before = len(self._clusters)
         for row, pays, centre in zip(members, paid.tolist(), centres, strict=True):
             cluster = tuple(np.flatnonzero(row).tolist())
@@ -201,7 +201,7 @@ class _Program:
         return len(self._clusters) > before
 
     def clustering(self) -> Iterator[tuple[list[int], Array, float]]:
-        """Yield the added clusters of the cheapest clustering: members, facility, and part."""
+        """Yield the added clusters in the cheapest clustering: members, facility, and fraction."""
         alone = len(self._bounds)
         for cluster, centre, part in zip(
             self._clusters[alone:], self._centres, self._parts[alone:], strict=False

@@ -74,8 +74,8 @@ def clash_in(
         maps_of: Solves a trace. Returns some maps, and whether the answer is proven.
 
     Returns:
-        The first such stretch; None if there is none, or if the theory allows faults or has own
-        rules, which may hold for the whole trace alone.
+        The first such stretch; None if there is none, or if the theory allows faults. Also None if
+        it has rules of the user, which may hold only for the whole trace.
     """
     if theory.has_faults or theory.rules:
         return None
@@ -95,7 +95,8 @@ def late_clash(
 ) -> range | None:
     """Look for a short clash if a stopped search has no map.
 
-    It may end at a step that contradicted a sketch, or at one that is said to be another step.
+    The clash may end at a step that contradicted a sketch, or at a step that the theory asserts to
+    be at the dstate or place of an earlier one.
 
     Args:
         parts: The parts of the search. Its `known` gets the status if there is a clash.
@@ -117,7 +118,7 @@ def late_clash(
 
 def salvage(parts: Parts) -> None:
     """Use the reserved last part of the time limit to find any map of the whole trace by clingo."""
-    _log.info("in the last part of the time limit any map is sought")
+    _log.info("looking for any map in the last part of the time limit")
     known, watch = parts.known, parts.watch
     watch.use_reserve()
     watch.start()

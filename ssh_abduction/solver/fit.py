@@ -145,8 +145,8 @@ class Poses:
         """Find the poses of the dstates and their covariance, relative to a dstate of each part.
 
         Returns:
-            The part of the map of each dstate, the means, and their covariance: of x and y of each
-            place, in the order in which dstates name it first, and of the heading of each dstate.
+            The part of the map of each dstate; the means of x and y of each place, in the order of
+            the first dstates there, and of the heading of each dstate; and their covariance.
         """
         place, facing = self._place[: self._dstates], 2 * self._positions
         part = self._parts()[place].tolist()
@@ -285,7 +285,7 @@ class Poses:
         return form
 
     def _moves(self) -> Any:
-        """Make the matrix that maps one coordinate of all positions to that of displacements."""
+        """Make the matrix that maps x of all positions to x of all displacements, or y to y."""
         return self._differences(self._place[self._from], self._place[self._to], self._positions)
 
     def _graph(self, first: NDArray[np.int_], second: NDArray[np.int_], size: int) -> csr_array:

@@ -80,7 +80,7 @@ class Front:
 
     @property
     def prices(self) -> tuple[float, float] | None:
-        """For which costs of a fault the map at the knee costs least: between (low, high).
+        """The range (low, high) of the cost of a fault in which the map at the knee costs least.
 
         Costs are in dstates. None if there is no such cost, or no knee.
         """

@@ -32,7 +32,7 @@ from ssh_abduction.theory.theory import Theory
 
 
 def can_lay(theory: Theory) -> bool:
-    """Whether new drives can be laid on a map, by a theory in which no field is "auto"."""
+    """Whether a theory, in which no field is "auto", lets new drives be laid on a map."""
     may_differ = theory.has_faults or theory.lifts or theory.unknown_views
     return theory.weigh == "cost" and not may_differ
 

@@ -111,12 +111,12 @@ class Misfit:
 
         Args:
             returns: The returns.
-            least: A chi-square.
+            least: The chi-square that the misfit of the subset has to reach.
             wrong: The steps whose displacements are ignored.
 
         Returns:
-            The subset. If even the misfit of all returns is less: all returns. If the misfit
-            without any return is that large: an empty list.
+            The subset; all returns if even their misfit is less; an empty list if the misfit
+            without any return is that large.
         """
         if self.of_returns(returns, wrong) < least:
             return list(returns)

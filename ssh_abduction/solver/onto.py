@@ -1,10 +1,10 @@
 """Add a drive to the map of old drives, in about the time that solving the new drive takes.
 
 The map of the old drives is the *existing map*: the joint map must keep its dstates and places. The
-solver does not get the old drives. It gets a digest of them (`digest.py`). Steps of the digest at
-different dstates or places are asserted to be different. If the best maps also have its equal steps
-at one dstate, they are the best of all maps that keep the existing map. If not, equal steps are
-asserted to be equal, too, if the traces are short enough.
+solver does not get the old drives. It gets a digest of them (`digest.py`). Steps of the digest that
+are at different dstates or places of the existing map are asserted to be different. If the best
+maps also have the steps of each dstate at one dstate, they are the best of all maps that keep the
+existing map. If not, these steps are asserted to be equal, too, if the traces are short enough.
 
 With displacements, a long drive is laid on the existing map (`laying.py`). If that fails, or if the
 drives are short, the solver gets all old steps.
@@ -252,7 +252,9 @@ def _broken(
 def _with_assertions(
     part: Trace, pinned: Theory, digest: Digest, ssh_map: SSHMap, found: Solution, solving: Solving
 ) -> tuple[Solution, tuple[SSHMap, ...]]:
-    """Solve again, and assert which steps of the digest are one dstate, if it is short enough.
+    """Solve again, and assert which steps of the digest are at one dstate or place.
+
+    Do nothing if the trace is too long for that.
 
     Returns:
         The new solution, and its maps that keep the existing map; or the old solution `found` and

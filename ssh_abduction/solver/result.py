@@ -174,10 +174,11 @@ class Solution(MapSequence):
 
     @property
     def by_minimality(self) -> tuple[Join, ...]:
-        """The joins of the first map that rest on minimality alone and imply all others that do.
+        """The joins of the first map that rest on minimality alone.
 
-        A join is two steps at one place or one dstate (`ssh_abduction.checker.joins`). Empty if
-        maps were weighed, as then `probability` says how sure a join is.
+        A join is two steps at one place or one dstate (`ssh_abduction.checker.joins`). Joins that
+        follow from those listed are left out. Empty if maps were weighed, as then `probability`
+        says how sure a join is.
         """
         if self.support.recorded is not None:
             return self.support.recorded.joins

@@ -4,18 +4,19 @@ A visit lies some decimetres beside its place. Each map pays for this scatter, a
 track so that visits come nearer to each other.
 
 *A track that cannot bend.* Then a map is a clustering of known poses, and dstates and places are
-facilities with prices (`facilities.py`). One problem has the price of a place and PLACES of the
-error of position. Its points are the visits. Another problem has the price of a dstate and the rest
-of the error. Its points are the steps. The sum of their bounds is a bound of the cost.
+facilities with prices (`facilities.py`). There are two clustering problems. In the first, the
+points are the visits, a facility has the price of a place, and only the share PLACES of the error
+of position counts. In the second, the points are the steps, a facility has the price of a dstate,
+and the rest of the error counts. The sum of both bounds is a bound on the cost.
 
 *A track that bends.* Let z be the most important errors of the track, as independent standard
 normal variables. Bending costs |z|^2 / 2. It moves each point by some b against the other points of
 its cluster. For each c > 0, |a + b|^2 >= c / (1 + c) |a|^2 - c |b|^2. So multiply the variances of
-each point by 1 + 1 / c. Then its bound still holds, but for a loss of at most c |b|^2 / 2. Far
-points are too far apart to share a facility. If z brings two far points together, one of them loses
+each point by 1 + 1 / c. Then the bound holds except for a loss of at most c |b|^2 / 2. Far points
+are too far apart to share a facility. If z brings two far points together, one of them loses
 at most its share, and the other one nothing. All these losses are at most quadratic forms of z. The
-numbers c are so small that the sum of the forms is at most |z|^2 / 2. So bending costs more than it
-saves. A point whose losses are greater than its share is left out.
+numbers c are chosen so small that the sum of the forms is at most |z|^2 / 2. So bending costs more
+than it saves. A point whose losses are greater than its share is left out.
 
 *Pieces.* Displacements and closures tie some steps to each other. Steps that they do not tie, as
 those of two drives, may have any relative pose. A facility that serves several such pieces saves in
@@ -50,7 +51,7 @@ from ssh_abduction.theory.settle import Problem
 PLACES = 0.5
 # The number of errors of the track that are treated one by one. The rest adds to the scatter.
 MODES = 25
-# Points that are too far apart to share a facility, by this many standard deviations, are far.
+# Points are far if they are this many standard deviations too far apart to share a facility.
 GAPS = (4.0, 6.0, 8.0, 12.0)
 # Shares are first computed with variances multiplied by FIRST. Later, no share may be more than
 # GROWTH times the first one plus SLACK.
@@ -67,7 +68,7 @@ TINY = 1e-12
 
 
 def is_for(problem: Problem) -> bool:
-    """Say whether the bound holds for a trace and its theory, and is more than nothing."""
+    """Whether the bound holds for a trace and its theory, and may be above 0."""
     trace = problem.trace
     return len(trace) > 2 and bool(spreads_of(trace).any()) and not problem.theory.jumped
 
@@ -81,7 +82,8 @@ def least_cost(problem: Problem, visit: Sequence[int], most: float) -> float:
         most: The cost of some map, in nats.
 
     Returns:
-        The bound in nats, a little less than `most` at most; 0 if there is none.
+        The bound in nats. It is at most `most` minus UNPROVEN. If no points get shares, it is what
+        the misfit of the track costs.
     """
     track, within = _LinearTrack.of(problem), math.sqrt(2 * most)
     parts = [part.of_best_pieces() for part in _parts(problem, track, np.array(visit))]
@@ -204,7 +206,7 @@ class _MovedPoints(Facilities):
     moves: Array
 
     def only(self, chosen: NDArray[np.bool_]) -> _MovedPoints:
-        """Return some of the points."""
+        """Return the chosen points."""
         return replace(
             self,
             points=self.points[chosen],
@@ -237,9 +239,10 @@ class _MovedPoints(Facilities):
     def near_loss(self, i: int, others: NDArray[np.bool_]) -> Array:
         """Return twice what the position and the heading of a point lose if c is 1, (2, k, k).
 
-        The cluster moves by a mean of the moves of its points, weighted by c over the variance. So
-        all of its points together lose half of what each loses against each other one. Position
-        and heading have numbers c and means of their own.
+        The facility moves by a mean of the moves of its points, weighted by c over the variance. So
+        its points together lose half of a sum over them, of the mean loss of a point against the
+        others. No mean is more than the greatest of these losses. Position and heading have numbers
+        c and means of their own.
         """
         moved = (self.moves[i] - self.moves[others]) / np.sqrt(2 * self.variances[i])[:, None]
         return np.stack([_dominating(moved[:, :2]), _dominating(moved[:, 2:])])
@@ -275,8 +278,9 @@ class _Losses:
         Args:
             part: The points.
             first: Their approximate shares, (n,).
-            gap: Points that are too far apart by this many standard deviations count as far.
-            within: Bending by more than this is too expensive.
+            gap: Two points are far if they are this many standard deviations too far apart to share
+                a facility.
+            within: The greatest |z|. Bending more costs more than the known map.
         """
         most = np.minimum(part.price, GROWTH * first + SLACK)
         unit = np.sqrt(part.variances.max(0))
@@ -310,9 +314,9 @@ class _Losses:
 def _best_numbers(shares: Array, pays: Array, near: Array, far: Array) -> tuple[float, Array]:
     """Find numbers c with which the losses are at most what bending costs.
 
-    With numbers c, a point has a share less by about `pays / (1 + c)`. The sum of the shares is
+    With numbers c, the share of a point falls by about `pays / (1 + c)`. The sum of the shares is
     maximised by Lagrangian duality: a matrix Z is the price of bending, and is found by subgradient
-    steps. Points that cost more than they are worth are left out: their c is 0.
+    steps. A point whose losses exceed its share is left out: its c is 0.
 
     Args:
         shares: Approximate shares of all points, (n,).

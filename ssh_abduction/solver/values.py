@@ -165,7 +165,7 @@ class Effort:
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """The number of listed maps with one cost: the minimal cost, or the least for more dstates.
+    """How many listed maps have one cost: the minimal cost, or the least with more dstates.
 
     Attributes:
         cost: The cost of the first of these maps. All of them share the counts that the theory

@@ -13,8 +13,10 @@ that are left. The search ends when this bound reaches the cost of the best map.
 may be wrong, a misfit excludes only maps that believe the displacements that cause it.
 
 *Rivals.* A map is too expensive if it costs at least `WITHIN` nats more than the best one. So all
-cheaper maps are found, each with a probability proportional to exp(-cost). *Places* are not
-minimised first. Evidence gives their lower bound: steps that are pairwise at different places.
+cheaper maps are found, each with a probability proportional to exp(-cost).
+
+*Places* are minimised only after dstates, so clingo proves no lower bound on them. Evidence gives
+one: the size of a set of steps that are pairwise at different places.
 
 If the robot may be off the poses of its dstates, as in logs, `scatter.py` gives a better bound.
 """
@@ -102,7 +104,7 @@ class Weighing:
     """
 
     def __init__(self, parts: Parts) -> None:
-        """Prepare the search. `guess` and `search` do it."""
+        """Prepare the search. `guess` and `search` run it."""
         self._parts = parts
         self._misfit = Misfit(parts.task.problem)
         self._prices = _prices_of(parts.task.theory)
@@ -175,7 +177,7 @@ class Weighing:
         self.keep_best()
 
     def keep_best(self) -> None:
-        """Make the map of least cost the best map of the search, after weighing the latter."""
+        """Weigh the best map of the search. Then make the cheapest known map the best one."""
         known = self._parts.known
         if known.best is not None:
             self.add(known.best)
@@ -249,7 +251,7 @@ class Weighing:
         return nats
 
     def too_expensive(self, ssh_map: SSHMap) -> frozenset[Equality] | None:
-        """Add a map, and find equalities that exclude it, but no map that is still worth finding.
+        """Add a map. Find equalities to forbid, which exclude it but no map worth finding.
 
         Args:
             ssh_map: The map with the fewest dstates, places and paths of all maps left.
@@ -405,7 +407,10 @@ def _with(faults: Sequence[Fault], ssh_map: SSHMap) -> SSHMap:
 
 
 def _pinned(theory: Theory, ssh_map: SSHMap) -> Theory:
-    """Return a theory that counts, and asserts the dstates and the different places of a map."""
+    """Return a theory that weighs by counts, and asserts the dstates and places of a map.
+
+    Of the places it only asserts which dstates are at different ones.
+    """
     labels = ssh_map.dstate_at
     first = {label: labels.index(label) for label in dict.fromkeys(labels)}
     same = [(first[label], t) for t, label in enumerate(labels) if t != first[label]]
@@ -430,7 +435,10 @@ class _CostJudging(Judging):
         self._weighing = weighing
 
     def refusal(self, ssh_map: SSHMap) -> tuple[str, frozenset[Equality]] | None:
-        """Return the evidence that rejects a map, or "cost", and equalities; None to end."""
+        """Return what rejects a map: the name of evidence, or "cost", and equalities to forbid.
+
+        Return None if no map that is left is worth finding.
+        """
         if (found := super().refusal(ssh_map)) is not None:
             return found
         returns = self._weighing.too_expensive(ssh_map)
@@ -443,7 +451,7 @@ class _CostJudging(Judging):
 
 
 def _engine(task: Task, parts: Parts) -> Engine:
-    """Make a new engine for the whole trace, of the kind that found maps by counting."""
+    """Make a new engine for the whole trace, of the kind that minimises counts for it."""
     engine = new_engine(task)
     best = parts.known.best
     if isinstance(engine, StepEngine) and takes_all(task) and task.speedups.ways and best:

@@ -213,7 +213,7 @@ class Asker:
 
     @property
     def grounding(self) -> Grounding:
-        """The numbers of rules and atoms in the last search of clingo that ended; 0 before it.
+        """The numbers of rules and atoms in the last ended search of clingo; 0 before the first.
 
         This takes a millisecond, as clingo returns all its statistics.
         """

@@ -27,7 +27,7 @@ Stop: TypeAlias = Literal["time limit", "memory limit", "interrupted", "maps lim
 
 
 def now() -> float:
-    """Return the time of the clock that limits are about, in seconds."""
+    """Return the time in seconds, by the clock that time limits use."""
     return time.perf_counter()
 
 

@@ -329,7 +329,7 @@ def reply(answer: object) -> None:
 
 
 def _send(answer: object, *, ends: bool) -> None:
-    """Send an answer to the parent process, and whether this process ends behind it."""
+    """Send an answer to the parent process, and say whether this process ends after it."""
     pickle.dump((answer, ends), _outputs[0])
     _outputs[0].flush()
 

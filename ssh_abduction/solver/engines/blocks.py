@@ -13,8 +13,8 @@ has many such blocks. With many dstates only long blocks need a fault, but the d
 much.
 
 A block needs a fault if it would otherwise contain a clique of more than N steps. A clique is a set
-of steps that are pairwise different dstates (`steps/apart.py`). Faults of the known map may be too
-close to each other for a block each. Then clingo is asked whether a block around all of them has a
+of steps that are pairwise different dstates (`steps/apart.py`). Several faults of the known map
+may be too close for a block each. Then clingo is asked whether a block around all of them has a
 cheaper map with at most N dstates.
 """
 

@@ -93,7 +93,7 @@ class Doubts:
 
 
 class Settled:
-    """Questions about the best maps with one labelling, that is, with these dstates of all steps.
+    """Questions about the best maps with one labelling (the dstate of each step).
 
     Engines that find dstates before places and paths use it.
     """

@@ -82,7 +82,7 @@ def _map(
     faults: Sequence[tuple[int, str]] = (),
     theory: Theory | None = None,
 ) -> SSHMap:
-    """Make a map from the atoms of an answer. Steps name dstates and places: the first step there.
+    """Make a map from the atoms of an answer, which name a dstate or place by its first step.
 
     Args:
         course: The path and the direction of each step that is along a path.

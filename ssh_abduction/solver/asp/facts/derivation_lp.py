@@ -58,7 +58,7 @@ def read_argument(model: Model) -> tuple[frozenset[Symbol], frozenset[Symbol], f
 
 
 def picked(symbol: Symbol) -> Symbol:
-    """Return the external atom that picks a conclusion. Some picked conclusion has to fail."""
+    """Return the external atom that picks a conclusion for `some_fail`."""
     return Function("picked", [symbol])
 
 

@@ -124,7 +124,7 @@ def faulty_batch(
 
 
 def not_all_one(equalities: Collection[Equality]) -> str:
-    """Return the rule that some equalities of steps do not all hold. Their steps must be ground."""
+    """Return the rule that some equalities do not all hold, of steps that clingo was given."""
     body = (f"is({e.first},S{k}), is({e.second},S{k})" for k, e in enumerate(equalities))
     return f":- {', '.join(body)}."
 

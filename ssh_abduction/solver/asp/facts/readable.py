@@ -57,7 +57,7 @@ def own_rules(theory: Theory) -> str:
 
 
 def run_by_steps() -> Symbol:
-    """Return the external atom that allows answers: the parts of all steps are grounded."""
+    """Return the external atom that allows answers. Set it when the parts of steps are ground."""
     return Function("run_by_steps")
 
 

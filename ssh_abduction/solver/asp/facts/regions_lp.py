@@ -45,7 +45,7 @@ def members_in(control: Control) -> dict[Reason, set[int]]:
     """Return the places of each region, by the reason that makes them a region.
 
     Args:
-        control: A control that has grounded regions.lp. Grounding decides all atoms of it.
+        control: A control that has grounded regions.lp. Grounding decides all its atoms.
     """
     members: dict[Reason, set[int]] = {}
     reasons: dict[Symbol, Reason] = {}
@@ -58,7 +58,7 @@ def members_in(control: Control) -> dict[Reason, set[int]]:
 
 
 def _reason(term: Symbol, number: int) -> Reason:
-    """Return the reason for a region from its term. `number` differs for each term."""
+    """Return the reason for a region from its term. `number` tells terms apart."""
     first, *rest = term.arguments
     if term.name == "beside":
         return term.name, first.number, COURSE[rest[0].name]
