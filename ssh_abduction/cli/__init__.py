@@ -54,7 +54,7 @@ from ssh_abduction.cli import (
 from ssh_abduction.cli import reproduce as reproduction
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.outcome import warn
-from ssh_abduction.cli.parsing import Parser
+from ssh_abduction.cli.parsing import Parser, Verbs
 from ssh_abduction.cli.verbosity import add_verbosity, telling
 from ssh_abduction.data.errors import AbductionError, named, printable
 from ssh_abduction.data.files import json_line
@@ -115,7 +115,7 @@ def parser() -> Parser:
         ),
     )
     top.add_argument("--version", action="version", version=f"%(prog)s {version('ssh-abduction')}")
-    verbs = top.add_subparsers(metavar="VERB", dest="verb", required=True)
+    verbs = top.add_subparsers(action=Verbs, metavar="VERB", dest="verb", required=True)
     for modules in VERBS.values():
         for verb in modules:
             known = set(verbs.choices)

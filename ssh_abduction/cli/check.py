@@ -13,13 +13,13 @@ from ssh_abduction.checker.claims import false_claims
 from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.cli.obeying import as_corrected
 from ssh_abduction.cli.options import (
-    Verbs,
     add_maps,
     add_theory,
     add_trace,
     solved_trace,
     theory_of,
 )
+from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import MapError, brief, is_finite, printable
 from ssh_abduction.data.files import json_line
@@ -94,26 +94,21 @@ class _Judgement:
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = (
+    parser = verbs.add(
+        "check",
+        run,
+        "judge maps by the axioms",
         "Check maps against a trace and the axioms, without clingo. Reports each axiom that a "
-        "map breaks, and at which steps."
-    )
-    parser = verbs.add_parser("check", help="judge maps by the axioms", description=text)
-    add_maps(parser)
-    add_trace(parser)
-    parser.add_argument(
-        "--bound",
-        action="store_true",
-        help="also check the proof in the file that no map has fewer dstates",
-    )
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    add_theory(parser, default="the theory of the maps, or topological")
-    parser.set_defaults(run=run)
-    parser.epilog = (
+        "map breaks, and at which steps.",
         "Without --theory, the theory is that of the file of maps. The other options change "
         "single fields of it. Corrections in corrections.yaml beside the maps are obeyed. "
-        "docs/reference/formats.md describes the JSON."
+        "docs/reference/formats.md describes the JSON.",
     )
+    add_maps(parser)
+    add_trace(parser)
+    parser.add("--bound", "also check the proof in the file that no map has fewer dstates")
+    parser.add("--json", "print JSON")
+    add_theory(parser, default="the theory of the maps, or topological")
 
 
 def run(options: argparse.Namespace) -> int:

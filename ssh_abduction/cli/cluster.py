@@ -9,8 +9,9 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from ssh_abduction.cli.options import Verbs, add_output, check_picture, picture_file, seed, write
+from ssh_abduction.cli.options import add_output, check_picture, picture_file, seed, write
 from ssh_abduction.cli.outcome import warn
+from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import counted, table
 from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.trace import Trace
@@ -20,24 +21,23 @@ from ssh_abduction.theory.theory import Theory
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = (
+    parser = verbs.add(
+        "cluster",
+        run,
+        "cluster images into views",
         "Cluster the images of a trace into views, and write the trace with its views. The number "
         "of views k is chosen by M, the smallest distance between clusters divided by the largest "
         "distance within one: the largest M wins. If another number of views is about as good, "
-        "the trace also keeps those views, and a warning says whether they give another map."
+        "the trace also keeps those views, and a warning says whether they give another map.",
     )
-    parser = verbs.add_parser("cluster", help="cluster images into views", description=text)
-    parser.add_argument("trace", help="trace file with images, or - for standard input")
+    parser.add("trace", "trace file with images, or - for standard input")
     add_output(parser)
-    parser.add_argument(
-        "--k",
+    parser.add(
+        "--k K",
+        "number of views (default: the number that the measure M of the paper rates best)",
         type=int,
-        metavar="K",
-        help="number of views (default: the number that the measure M of the paper rates best)",
     )
-    parser.add_setting(
-        "k_max", "largest number of views to try (default: 20)", type=int, metavar="K"
-    )
+    parser.add_setting("k_max K", "largest number of views to try (default: 20)", type=int)
     parser.add_setting(
         "by",
         "choose k by M, or by trimmed M (default: M). Trimmed M uses medians instead of the "
@@ -45,17 +45,13 @@ def add_parser(verbs: Verbs) -> None:
         "M",
         choices=("M", "trimmed"),
     )
-    parser.add_argument("--seed", type=seed, default=0, help="random seed of k-means (default: 0)")
-    parser.add_argument(
-        "--plot",
+    parser.add("--seed", "random seed of k-means (default: 0)", type=seed, default=0)
+    parser.add(
+        "--plot PNG",
+        "draw the measure M against the number of views. If the truth is known, also draw U, "
+        "which says how well the views agree with the true dstates",
         type=picture_file,
-        metavar="PNG",
-        help=(
-            "draw the measure M against the number of views. If the truth is known, also draw U, "
-            "which says how well the views agree with the true dstates"
-        ),
     )
-    parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:

@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ssh_abduction.cli.options import MAPS_SAID, Verbs, maps_path
+from ssh_abduction.cli.options import MAPS_SAID, maps_path
+from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import compared, counted, depending
 from ssh_abduction.data.errors import brief, named, printable
 from ssh_abduction.data.files import json_line
@@ -22,33 +23,30 @@ UNSTEADY = ("seconds", "limit", "ladder", "drove", "log.source")
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = (
+    parser = verbs.add(
+        "compare",
+        run,
+        "show what rival maps share, and where they differ",
         "Compare the minimal maps of a trace. Reports what all of them share, where they "
-        "differ, and which questions about steps decide between them."
-    )
-    parser = verbs.add_parser(
-        "compare", help="show what rival maps share, and where they differ", description=text
-    )
-    parser.add_argument("maps", help=MAPS_SAID)
-    parser.add_argument(
-        "other",
-        nargs="?",
-        help=(
-            "other maps of the same trace; shows which maps are in both files, and how the first "
-            "maps of the files differ"
-        ),
-    )
-    diff = (
-        "only describe how maps I and J differ. Give each by its number, from 1, or its id. With "
-        "OTHER, map J is in that file"
-    )
-    parser.add_argument("--diff", nargs=2, metavar=("I", "J"), help=diff)
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.set_defaults(run=run)
-    parser.epilog = (
+        "differ, and which questions about steps decide between them.",
         "The questions that decide between the maps are chosen greedily. None can be left "
-        "out, but a shorter list may exist. docs/reference/formats.md describes the JSON."
+        "out, but a shorter list may exist. docs/reference/formats.md describes the JSON.",
     )
+    parser.add("maps", MAPS_SAID)
+    parser.add(
+        "other",
+        "other maps of the same trace; shows which maps are in both files, and how the first "
+        "maps of the files differ",
+        nargs="?",
+    )
+    parser.add(
+        "--diff",
+        "only describe how maps I and J differ. Give each by its number, from 1, or its id. With "
+        "OTHER, map J is in that file",
+        nargs=2,
+        metavar=("I", "J"),
+    )
+    parser.add("--json", "print JSON")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -5,25 +5,24 @@ from __future__ import annotations
 import argparse
 import re
 
-from ssh_abduction.cli.options import Verbs
+from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.data.errors import AbductionError
 
 SHELLS = ("bash", "zsh", "fish", "tcsh", "powershell")
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = (
+    parser = verbs.add(
+        "completion",
+        run,
+        "print completions for a shell",
         "Print the completion of verbs, options and files for a shell. Needs the package shtab: "
-        "pip install 'ssh-abduction[completion]'."
-    )
-    parser = verbs.add_parser("completion", help="print completions for a shell", description=text)
-    parser.add_argument("shell", choices=SHELLS, help="the shell that completes")
-    parser.set_defaults(run=run)
-    parser.epilog = (
+        "pip install 'ssh-abduction[completion]'.",
         'bash: eval "$(ssh-abduction completion bash)" in ~/.bashrc; zsh: write it to a file '
         "_ssh-abduction in a folder of $fpath; "
-        "fish: write it to ~/.config/fish/completions/ssh-abduction.fish"
+        "fish: write it to ~/.config/fish/completions/ssh-abduction.fish",
     )
+    parser.add("shell", "the shell that completes", choices=SHELLS)
 
 
 def run(options: argparse.Namespace) -> int:

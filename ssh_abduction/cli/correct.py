@@ -6,7 +6,8 @@ import argparse
 import shlex
 from pathlib import Path
 
-from ssh_abduction.cli.options import Verbs, add_map, add_maps, trace_beside
+from ssh_abduction.cli.options import add_map, add_maps, trace_beside
+from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.saved_map import SavedMap, sentences_of
 from ssh_abduction.data.corrections import PAIRS
 from ssh_abduction.data.errors import MapError, brief, named, printable
@@ -26,32 +27,27 @@ HELPS = {
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = (
+    parser = verbs.add(
+        "correct",
+        run,
+        "say what a map has wrong",
         "Correct a map. The corrections are saved in corrections.yaml beside the map. solve obeys "
         "them if it writes into that folder (solve --output) or is given the file "
-        "(solve --corrections)."
+        "(solve --corrections).",
+        "Each option may be given several times. Without any, print the corrections so far.",
     )
-    parser = verbs.add_parser("correct", help="say what a map has wrong", description=text)
     add_maps(parser)
     for name, words in HELPS.items():
         metavar = "I,J" if name in PAIRS else "GATEWAY"
-        parser.add_argument(
-            f"--{name.replace('_', '-')}", action="append", metavar=metavar, help=words
-        )
-    parser.add_argument(
+        parser.add(f"--{name.replace('_', '-')}", words, action="append", metavar=metavar)
+    parser.add(
         "--name",
+        "name a place, path or region (p4, path2, region3), or the place of a step (monday:12)",
         action="append",
         nargs=2,
         metavar=("WHAT", "NAME"),
-        help=(
-            "name a place, path or region (p4, path2, region3), or the place of a step (monday:12)"
-        ),
     )
     add_map(parser)
-    parser.set_defaults(run=run)
-    parser.epilog = (
-        "Each option may be given several times. Without any, print the corrections so far."
-    )
 
 
 def run(options: argparse.Namespace) -> int:

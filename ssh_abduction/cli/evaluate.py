@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from ssh_abduction.cli.options import Verbs, add_maps, add_trace, read_maps, trace_of
+from ssh_abduction.cli.options import add_maps, add_trace, read_maps, trace_of
 from ssh_abduction.cli.outcome import warn
+from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import counted, table
 from ssh_abduction.data.errors import MapError, named
 from ssh_abduction.data.files import json_line
@@ -47,43 +48,35 @@ HEAD = (
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = (
+    parser = verbs.add(
+        "evaluate",
+        run,
+        "compare maps with the truth",
         "Compare maps with the truth in the trace. Reports which map is true, and how far the "
-        "others are from it."
-    )
-    parser = verbs.add_parser("evaluate", help="compare maps with the truth", description=text)
-    add_maps(parser)
-    add_trace(parser, " with truth")
-    parser.add_setting(
-        "near",
-        "also judge by true poses; visits within this distance count as one place (default: 2)",
-        type=float,
-        metavar="METRES",
-    )
-    parser.add_setting(
-        "relations",
-        (
-            "also judge by hand-checked relative poses in this file: lines of time1 time2 x y z "
-            "roll pitch yaw"
-        ),
-        metavar="FILE",
-    )
-    parser.add_argument(
-        "--truth",
-        metavar="FILE",
-        help=(
-            "judge by the robot's true trajectory in this file, in TUM format: lines of timestamp "
-            "tx ty tz qx qy qz qw"
-        ),
-    )
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.set_defaults(run=run)
-    parser.epilog = (
+        "others are from it.",
         "The table gives two shares each for pairs of steps at one place, for edges, and for "
         "links: precision and recall. If steps have true poses but no true names, as in an "
         "imported log, visits near each other count as one place. docs/reference/formats.md "
-        "describes what is counted."
+        "describes what is counted.",
     )
+    add_maps(parser)
+    add_trace(parser, " with truth")
+    parser.add_setting(
+        "near METRES",
+        "also judge by true poses; visits within this distance count as one place (default: 2)",
+        type=float,
+    )
+    parser.add_setting(
+        "relations FILE",
+        "also judge by hand-checked relative poses in this file: lines of time1 time2 x y z "
+        "roll pitch yaw",
+    )
+    parser.add(
+        "--truth FILE",
+        "judge by the robot's true trajectory in this file, in TUM format: lines of timestamp "
+        "tx ty tz qx qy qz qw",
+    )
+    parser.add("--json", "print JSON")
 
 
 def run(options: argparse.Namespace) -> int:

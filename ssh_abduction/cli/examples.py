@@ -5,27 +5,24 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ssh_abduction.cli.options import Verbs, output
+from ssh_abduction.cli.options import output
+from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import AbductionError, named
 from ssh_abduction.data.files import shipped, write_file
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = (
+    parser = verbs.add(
+        "examples",
+        run,
+        "copy the examples into a folder",
         "Copy the examples of the package into a folder: traces, programs and a notebook. If a "
-        "file of the same name has other content, nothing is copied."
+        "file of the same name has other content, nothing is copied.",
     )
-    parser = verbs.add_parser("examples", help="copy the examples into a folder", description=text)
-    parser.add_argument(
-        "-o",
-        "--output",
-        type=output,
-        default="examples",
-        metavar="FOLDER",
-        help="folder to write (default: examples)",
+    parser.add(
+        "-o --output FOLDER", "folder to write (default: examples)", type=output, default="examples"
     )
-    parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.obeying import as_corrected
 from ssh_abduction.cli.options import (
-    Verbs,
     add_limits,
     add_theory,
     maps_path,
@@ -27,6 +26,7 @@ from ssh_abduction.cli.options import (
     trace_path,
 )
 from ssh_abduction.cli.outcome import on_ctrl_c
+from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.data.drives import step_named
 from ssh_abduction.data.errors import AbductionError, named
 from ssh_abduction.data.files import json_line
@@ -51,62 +51,48 @@ Answer: TypeAlias = PairExplanation | TraceExplanation | PlaceExplanation
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = (
+    parser = verbs.add(
+        "explain",
+        run,
+        "say why two steps are one dstate or two, or why there is no map",
         "Explain why two steps of a trace are one dstate in every map, or different dstates "
         "in every map, and name the axioms that force it. If maps differ in this, report which "
         "maps have one dstate and which have two, and the cost of either. Without steps, explain "
         "why the trace has no map, and which single observation could be wrong. With a place such "
         "as p7, and perhaps a path such as path2, say on which side of the path the place lies, "
-        "and which turn shows it."
+        "and which turn shows it.",
+        "Exit codes: 0 explained; 20 the trace has no map; 30 no explanation in time; 1, 2, 130 "
+        "and 143 as for the other verbs.",
     )
-    parser = verbs.add_parser(
-        "explain",
-        help="say why two steps are one dstate or two, or why there is no map",
-        description=text,
-    )
-    parser.add_argument(
+    parser.add(
         "trace",
-        help=(
-            "trace file (JSON Lines), or - for standard input; or a file of maps that solve -o "
-            "wrote, or a folder that map wrote, for its trace and the theory of its maps"
-        ),
+        "trace file (JSON Lines), or - for standard input; or a file of maps that solve -o "
+        "wrote, or a folder that map wrote, for its trace and the theory of its maps",
     )
-    parser.add_argument(
+    parser.add(
         "steps",
+        "the numbers of two steps, from 0, or DRIVE:STEP in a joint trace; leave them out to "
+        "learn why there is no map. Or a place and a path of the first minimal map: p7 path2; "
+        "or a place alone, for all paths and regions",
         nargs="*",
         default=(),
         metavar="step",
-        help=(
-            "the numbers of two steps, from 0, or DRIVE:STEP in a joint trace; leave them out to "
-            "learn why there is no map. Or a place and a path of the first minimal map: p7 path2; "
-            "or a place alone, for all paths and regions"
-        ),
     )
-    parser.add_argument(
-        "-n",
-        "--maps",
+    parser.add(
+        "-n --maps K",
+        "list at most K minimal maps, to count those in which the two steps are one dstate; "
+        "0 for all (default: 100)",
         type=int,
         default=100,
-        metavar="K",
-        help="list at most K minimal maps, to count those in which the two steps are one dstate; "
-        "0 for all (default: 100)",
     )
-    parser.add_argument("--json", action="store_true", help="print the explanation as JSON")
+    parser.add("--json", "print the explanation as JSON")
     add_limits(parser, "what is known")
-    parser.add_argument(
-        "--corrections",
-        metavar="FILE",
-        help=(
-            "obey the corrections in this file, or in corrections.yaml of this folder (default: "
-            "corrections.yaml beside the file of --theory, if both exist)"
-        ),
+    parser.add(
+        "--corrections FILE",
+        "obey the corrections in this file, or in corrections.yaml of this folder (default: "
+        "corrections.yaml beside the file of --theory, if both exist)",
     )
     add_theory(parser)
-    parser.epilog = (
-        "Exit codes: 0 explained; 20 the trace has no map; 30 no explanation in time; 1, 2, 130 "
-        "and 143 as for the other verbs."
-    )
-    parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:

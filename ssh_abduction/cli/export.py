@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 
-from ssh_abduction.cli.options import Verbs, add_map, add_maps, trace_path
+from ssh_abduction.cli.options import add_map, add_maps, trace_path
 from ssh_abduction.cli.outcome import warn
+from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.trace import Trace
 
@@ -14,44 +15,36 @@ FORMATS = ("nav2", "tmap2", "graphml", "dot", "svg", "networkx-json")
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = (
+    parser = verbs.add(
+        "export",
+        run,
+        "write a map for Nav2, tmap2, GraphML, DOT or networkx",
         "Write a map in the format of another program: a route graph for Nav2 (GeoJSON), a "
         "topological map for LCAS's topological_navigation (tmap2, YAML), GraphML, Graphviz "
-        "DOT, SVG, or JSON for networkx."
-    )
-    parser = verbs.add_parser(
-        "export", help="write a map for Nav2, tmap2, GraphML, DOT or networkx", description=text
+        "DOT, SVG, or JSON for networkx.",
+        "Positions are in metres from the first dstate if the map has poses. Otherwise they "
+        "come from a layout, and a warning says so. docs/reference/formats.md describes each "
+        "format.",
     )
     add_maps(parser)
-    parser.add_argument("--to", required=True, choices=FORMATS, help="the format to write")
+    parser.add("--to", "the format to write", required=True, choices=FORMATS)
     add_map(parser)
-    parser.add_argument(
-        "--trace",
+    parser.add(
+        "--trace TRACE",
+        "the trace that was mapped; its turns give a better layout of a map without poses",
         type=trace_path,
-        metavar="TRACE",
-        help=("the trace that was mapped; its turns give a better layout of a map without poses"),
     )
-    parser.add_argument(
-        "-o",
-        "--output",
-        default="-",
-        metavar="FILE",
-        help="file to write (default: standard output)",
-    )
+    parser.add("-o --output FILE", "file to write (default: standard output)", default="-")
     parser.add_setting(
         "level",
-        (
-            "what a node is: a place or a dstate (default: places for nav2 and tmap2 if the map "
-            "has places, else dstates)"
-        ),
+        "what a node is: a place or a dstate (default: places for nav2 and tmap2 if the map "
+        "has places, else dstates)",
         choices=("places", "dstates"),
     )
     parser.add_setting(
         "hide_undecided",
-        (
-            "whether to leave out each place that the robot only passed, always between the same "
-            "two neighbours (nav2 and tmap2 only; default: false)"
-        ),
+        "whether to leave out each place that the robot only passed, always between the same "
+        "two neighbours (nav2 and tmap2 only; default: false)",
         default=False,
     )
     parser.add_setting(
@@ -61,12 +54,6 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.add_setting(
         "frame", "the name of the coordinate frame in nav2 and tmap2 files (default: map)", "map"
-    )
-    parser.set_defaults(run=run)
-    parser.epilog = (
-        "Positions are in metres from the first dstate if the map has poses. Otherwise they "
-        "come from a layout, and a warning says so. docs/reference/formats.md describes each "
-        "format."
     )
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 import sys
 
-from ssh_abduction.cli.options import Verbs, add_theory, theory_of, trace_path
+from ssh_abduction.cli.options import add_theory, theory_of, trace_path
+from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.data.errors import printable
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver import facts as encoding
@@ -13,16 +14,16 @@ from ssh_abduction.theory.settle import settle
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = (
+    parser = verbs.add(
+        "facts",
+        run,
+        "print a trace as .lp facts",
         "Print a trace and a theory as facts for clingo, with the command that solves them with "
-        "the encodings of this package."
+        "the encodings of this package.",
     )
-    parser = verbs.add_parser("facts", help="print a trace as .lp facts", description=text)
-    parser.add_argument(
-        "trace", type=trace_path, help="trace file (JSON Lines), or - for standard input"
-    )
+    parser.add("trace", "trace file (JSON Lines), or - for standard input", type=trace_path)
     add_theory(parser)
-    parser.set_defaults(run=run, facts=True)
+    parser.set_defaults(facts=True)
 
 
 def run(options: argparse.Namespace) -> int:

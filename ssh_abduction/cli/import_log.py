@@ -10,8 +10,8 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ssh_abduction.cli.options import Verbs, add_output, write
-from ssh_abduction.cli.parsing import Parser
+from ssh_abduction.cli.options import add_output, write
+from ssh_abduction.cli.parsing import Parser, Verbs
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import AbductionError, named
 
@@ -35,81 +35,68 @@ MEANINGS = ("free", "unknown")
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = (
+    parser = verbs.add(
+        "import",
+        run,
+        "make a trace of a robot's log",
         "Read a robot's log of laser scans and odometry, find the distinctive places that it "
         "passed, and write a trace with views, stars, displacements and actions. Corrected "
-        "poses in the log become the truth for evaluate. No other command uses them."
+        "poses in the log become the truth for evaluate. No other command uses them.",
     )
-    parser = verbs.add_parser("import", help="make a trace of a robot's log", description=text)
-    parser.add_argument(
+    parser.add(
         "log",
-        help=(
-            "a CARMEN log, a g2o-style log with scans, a ROS 1 bag, a ROS 2 bag or MCAP; may be "
-            "compressed by gzip, bzip2, xz or zstd. '-' reads lines of CARMEN from standard input, "
-            "with little memory, and shows each place when it is final"
-        ),
+        "a CARMEN log, a g2o-style log with scans, a ROS 1 bag, a ROS 2 bag or MCAP; may be "
+        "compressed by gzip, bzip2, xz or zstd. '-' reads lines of CARMEN from standard input, "
+        "with little memory, and shows each place when it is final",
     )
     add_output(parser)
     add_reading(parser)
-    parser.set_defaults(run=run)
 
 
 def add_reading(parser: Parser) -> None:
     """Add the options that say how to read a log, and how wide the robot is."""
     group = parser.add_argument_group("reading logs")
-    group.add_argument(
-        "--format", choices=FORMATS, help="format of the log (default: guessed from its content)"
+    parser.add(
+        "--format",
+        "format of the log (default: guessed from its content)",
+        to=group,
+        choices=FORMATS,
     )
-    group.add_argument(
-        "--width",
+    parser.add(
+        "--width METRES",
+        f"width of the robot. It cannot pass narrower parts of the free space (default: {WIDTH:g})",
+        to=group,
         type=metres,
-        metavar="METRES",
-        help=(
-            "width of the robot. It cannot pass narrower parts of the free space (default: "
-            f"{WIDTH:g})"
-        ),
     )
     parser.add_setting(
-        "fov",
-        (
-            "the angle from the first to the last beam of the laser; negative for a laser mounted "
-            "upside down (default: from the log, else 180)"
-        ),
+        "fov DEGREES",
+        "the angle from the first to the last beam of the laser; negative for a laser mounted "
+        "upside down (default: from the log, else 180)",
         type=partial(_laser_value, "fov"),
-        metavar="DEGREES",
     )
     parser.add_setting(
-        "scan_topic",
+        "scan_topic TOPIC",
         "topic of the scans, if a bag has several; may be given again to read several lasers",
-        metavar="TOPIC",
         many=True,
     )
-    parser.add_setting("odom_topic", "topic of the odometry, if a bag has several", metavar="TOPIC")
+    parser.add_setting("odom_topic TOPIC", "topic of the odometry, if a bag has several")
     parser.add_setting(
-        "mount",
-        (
-            "where the laser is on the robot: metres ahead of the centre, metres to the left, and "
-            "degrees to the left of straight ahead (default: from the log, else 0,0,0)"
-        ),
+        "mount X,Y,DEGREES",
+        "where the laser is on the robot: metres ahead of the centre, metres to the left, and "
+        "degrees to the left of straight ahead (default: from the log, else 0,0,0)",
         type=partial(_laser_value, "mount"),
-        metavar="X,Y,DEGREES",
     )
     parser.add_setting(
-        "no_return",
-        (
-            "a range of at least this length means that the beam hit nothing (default: the "
-            "laser's maximum range, or a shorter range that often repeats and is no wall)"
-        ),
+        "no_return METRES",
+        "a range of at least this length means that the beam hit nothing (default: the "
+        "laser's maximum range, or a shorter range that often repeats and is no wall)",
         type=partial(_laser_value, "no_return"),
-        metavar="METRES",
     )
     parser.add_setting(
         "zero_is",
-        (
-            "how to read ranges that are NaN, at most 0, or below the laser's minimum: free means "
-            "that the beam hit nothing, unknown that nothing is known (default: free if the "
-            "neighbouring beams are long, else unknown)"
-        ),
+        "how to read ranges that are NaN, at most 0, or below the laser's minimum: free means "
+        "that the beam hit nothing, unknown that nothing is known (default: free if the "
+        "neighbouring beams are long, else unknown)",
         choices=MEANINGS,
     )
 

@@ -8,8 +8,9 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.options import Verbs, add_theory, theory_of, trace_path
+from ssh_abduction.cli.options import add_theory, theory_of, trace_path
 from ssh_abduction.cli.outcome import on_ctrl_c
+from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import table
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.trace import Trace
@@ -24,33 +25,26 @@ HEAD = ("", "minimal maps", "dstates", "places", "paths", "the true one", "accur
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = (
+    parser = verbs.add(
+        "ladder",
+        run,
+        "show how much each kind of evidence helps",
         "Solve a trace several times, to show what each kind of evidence is worth. Begin with "
         "views alone, then add one kind at a time: stars, pairs of steps that displacements "
         "distinguish, pairs of returns that displacements exclude together, planarity. Each time "
         "(a rung of the ladder), report the number and the size of the minimal maps; and, if the "
-        "trace has truth, which map is true."
+        "trace has truth, which map is true.",
     )
-    parser = verbs.add_parser(
-        "ladder", help="show how much each kind of evidence helps", description=text
-    )
-    parser.add_argument(
-        "trace", type=trace_path, help="trace file (JSON Lines), or - for standard input"
-    )
-    parser.add_argument(
-        "-n",
-        "--maps",
+    parser.add("trace", "trace file (JSON Lines), or - for standard input", type=trace_path)
+    parser.add(
+        "-n --maps K",
+        "list at most N maps on each rung; 0 for all (default: 100)",
         type=int,
         default=100,
-        metavar="K",
-        help="list at most N maps on each rung; 0 for all (default: 100)",
     )
-    parser.add_argument(
-        "--time-limit", type=float, metavar="S", help="limit in seconds for each rung"
-    )
-    parser.add_argument("--json", action="store_true", help="print one JSON object per rung")
+    parser.add("--time-limit S", "limit in seconds for each rung", type=float)
+    parser.add("--json", "print one JSON object per rung")
     add_theory(parser)
-    parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:

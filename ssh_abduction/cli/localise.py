@@ -10,7 +10,6 @@ from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.cli.options import (
-    Verbs,
     add_maps,
     check_number,
     check_picture,
@@ -18,12 +17,12 @@ from ssh_abduction.cli.options import (
     read_maps,
     trace_path,
 )
-from ssh_abduction.cli.text import table
+from ssh_abduction.cli.parsing import Verbs
+from ssh_abduction.cli.text import steps_in_words, table
 from ssh_abduction.data.errors import LocaliserError, MapError, named
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.maps import maps_of
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.solver import stretches
 
 if TYPE_CHECKING:
     from ssh_abduction.online.localiser import Localiser
@@ -34,35 +33,31 @@ NOWHERE = "–"
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = (
+    parser = verbs.add(
+        "localise",
+        run,
+        "follow a robot in a known map",
         "Find where in a known map the robot was at each step of another trace. Markov "
         "localisation computes a belief over dstates after each step. The robot may start "
-        "anywhere, be kidnapped, or leave the map."
+        "anywhere, be kidnapped, or leave the map.",
     )
-    parser = verbs.add_parser("localise", help="follow a robot in a known map", description=text)
     add_maps(parser)
-    parser.add_argument(
+    parser.add(
         "other",
+        "trace of a robot in the mapped world that uses the same names of views and actions; "
+        "- for standard input; or a folder that map wrote",
         type=trace_path,
-        help=(
-            "trace of a robot in the mapped world that uses the same names of views and actions; "
-            "- for standard input; or a folder that map wrote"
-        ),
     )
-    parser.add_argument(
-        "--map", type=int, metavar="I", help="the number of the map, from 1 (default: 1)"
-    )
-    parser.add_argument(
-        "--trace",
-        type=trace_path,
-        metavar="TRACE",
-        help="the trace that was mapped; its steps are used to estimate how reliable views and "
+    parser.add("--map I", "the number of the map, from 1 (default: 1)", type=int)
+    parser.add(
+        "--trace TRACE",
+        "the trace that was mapped; its steps are used to estimate how reliable views and "
         "links are",
+        type=trace_path,
     )
-    parser.add_argument(
-        "--recogniser",
-        metavar="FILE.skops",
-        help="recogniser that train wrote for this map, to use images instead of views",
+    parser.add(
+        "--recogniser FILE.skops",
+        "recogniser that train wrote for this map, to use images instead of views",
     )
     said = {
         "misread": "the robot sees a view or star of another dstate (default: 0.01)",
@@ -80,14 +75,10 @@ def add_parser(verbs: Verbs) -> None:
         "are then 0, and that of reentered is 1 (default: false)",
         default=False,
     )
-    parser.add_argument(
-        "--plot",
-        type=picture_file,
-        metavar="PNG",
-        help="draw how unsure the belief is at each step (its entropy)",
+    parser.add(
+        "--plot PNG", "draw how unsure the belief is at each step (its entropy)", type=picture_file
     )
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.set_defaults(run=run)
+    parser.add("--json", "print JSON")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -154,14 +145,10 @@ def _headline(beliefs: Sequence[Mapping[str, Any]]) -> str:
     steps: dict[str, list[int]] = {}
     for step, belief in enumerate(beliefs):
         steps.setdefault(belief["verdict"], []).append(step)
-    parts = [f"{verdict} at {_steps(some)}" for verdict, some in steps.items()]
+    parts = [f"{verdict} at {steps_in_words(some)}" for verdict, some in steps.items()]
     if collapses := [step for step, belief in enumerate(beliefs) if belief["collapsed"]]:
-        parts.append(f"the belief collapsed at {_steps(collapses)}")
+        parts.append(f"the belief collapsed at {steps_in_words(collapses)}")
     return "; ".join(parts)
-
-
-def _steps(steps: Sequence[int]) -> str:
-    return f"{'step' if len(steps) == 1 else 'steps'} {stretches(steps)}"
 
 
 def _row(step: int, belief: Mapping[str, Any], trace: Trace) -> list[object]:

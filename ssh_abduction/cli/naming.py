@@ -4,27 +4,29 @@ from __future__ import annotations
 
 import argparse
 
-from ssh_abduction.cli.options import Verbs, add_map, add_maps
+from ssh_abduction.cli.options import add_map, add_maps
+from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.saved_map import SavedMap
 from ssh_abduction.data.errors import named, printable
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = (
+    parser = verbs.add(
+        "name",
+        run,
+        "name a place, path or region",
         "Name a place, a path or a region of a map. The name is written to corrections.yaml beside "
         "the map. It belongs to a step of a drive at this place: solving again may renumber "
-        "places, but the name stays with the place of its step."
+        "places, but the name stays with the place of its step.",
     )
-    parser = verbs.add_parser("name", help="name a place, path or region", description=text)
     add_maps(parser)
-    parser.add_argument(
+    parser.add(
         "what",
-        help="a place such as p4, a path such as path2, a region such as region3, or a step such "
+        "a place such as p4, a path such as path2, a region such as region3, or a step such "
         "as monday:12, for its place",
     )
-    parser.add_argument("name", help='the name, such as "kitchen"')
+    parser.add("name", 'the name, such as "kitchen"')
     add_map(parser)
-    parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:

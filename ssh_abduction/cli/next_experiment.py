@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.options import (
-    Verbs,
     add_limits,
     add_maps,
     add_theory,
@@ -17,6 +16,7 @@ from ssh_abduction.cli.options import (
     theory_of,
 )
 from ssh_abduction.cli.outcome import on_ctrl_c, warn
+from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import table
 from ssh_abduction.data.errors import MapError, named, printable
 from ssh_abduction.data.files import json_line
@@ -39,27 +39,24 @@ HOW = {"link": "known", "implied": "implied", "expected": "expected", "open": "o
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = (
+    parser = verbs.add(
+        "next",
+        run,
+        "find the actions after which rival maps disagree",
         "Find the fewest actions, from where the robot is now, after which two maps predict "
         "different views. If there are more than two maps, find a plan: which actions come next "
         "depends on what the robot sees. If known links cannot distinguish the maps, find the "
-        "untried action that distinguishes most of them, and the way to it."
-    )
-    parser = verbs.add_parser(
-        "next", help="find the actions after which rival maps disagree", description=text
+        "untried action that distinguishes most of them, and the way to it.",
+        "The plan for two maps is as short as possible. The plan for more maps is greedy, "
+        "because finding the best one is PSPACE-complete (Lee & Yannakakis 1994). Exit codes: "
+        "0 done; 10 a limit ended the search, and a better plan may exist; 30 no plan in "
+        "time. docs/reference/formats.md describes the JSON.",
     )
     add_maps(parser)
     add_trace(parser)
     add_limits(parser, "the best plan so far")
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add("--json", "print JSON")
     add_theory(parser, default="the theory in the file of maps")
-    parser.set_defaults(run=run)
-    parser.epilog = (
-        "The plan for two maps is as short as possible. The plan for more maps is greedy, "
-        "because finding the best one is PSPACE-complete (Lee & Yannakakis 1994). Exit codes: "
-        "0 done; 10 a limit ended the search, and a better plan may exist; 30 no plan in "
-        "time. docs/reference/formats.md describes the JSON."
-    )
 
 
 def run(options: argparse.Namespace) -> int:

@@ -34,8 +34,6 @@ MAPS_SAID = (
     "'map' wrote; - for standard input"
 )
 
-Verbs = Any  # the return type of argparse's add_subparsers is private
-
 
 def add_theory(parser: Parser, default: str = "topological") -> None:
     """Add the options that choose a theory: a preset or a file, and options for single fields.
@@ -50,13 +48,11 @@ def add_theory(parser: Parser, default: str = "topological") -> None:
         "option but --theory may be given again.",
     )
     said = {**helps(), "rules": RULES}
-    group.add_argument(
-        "--theory",
-        metavar="PRESET|FILE",
-        help=(
-            f"a preset: {', '.join(PRESETS)}; or a .toml file with fields of a theory; or a file "
-            f"of maps, or a folder that map wrote, to use their theory (default: {default})"
-        ),
+    parser.add(
+        "--theory PRESET|FILE",
+        f"a preset: {', '.join(PRESETS)}; or a .toml file with fields of a theory; or a file "
+        f"of maps, or a folder that map wrote, to use their theory (default: {default})",
+        to=group,
     )
     for name, text in (
         ("same", "are one dstate"),
@@ -64,11 +60,11 @@ def add_theory(parser: Parser, default: str = "topological") -> None:
         ("elsewhere", "are at different places"),
         ("same_place", "are at one place"),
     ):
-        group.add_argument(
-            f"--{name.replace('_', '-')}",
+        parser.add(
+            f"--{name.replace('_', '-')} I,J",
+            f"assume that steps I and J {text}",
+            to=group,
             action="append",
-            metavar="I,J",
-            help=f"assume that steps I and J {text}",
         )
     for field in fields(Theory):
         if field.name in ASSERTIONS or field.name in SETTLED:
@@ -100,28 +96,23 @@ def helps() -> dict[str, str]:
     return {name: text[0].lower() + text[1:] for name, text in words.items()}
 
 
-def add_limits(parser: argparse.ArgumentParser, printed: str) -> None:
+def add_limits(parser: Parser, printed: str) -> None:
     """Add the options that limit a search. `printed` says what the verb prints at a limit."""
-    parser.add_argument(
-        "--time-limit", type=float, metavar="S", help=f"stop after S seconds and print {printed}"
-    )
-    parser.add_argument(
-        "--memory-limit",
+    parser.add("--time-limit S", f"stop after S seconds and print {printed}", type=float)
+    parser.add(
+        "--memory-limit MIB",
+        f"stop when the process has used this many MiB, and print {printed}",
         type=int,
-        metavar="MIB",
-        help=f"stop when the process has used this many MiB, and print {printed}",
     )
 
 
-def add_output(parser: argparse.ArgumentParser) -> None:
+def add_output(parser: Parser) -> None:
     """Add the option -o TRACE, which names the trace file to write."""
-    parser.add_argument(
-        "-o",
-        "--output",
+    parser.add(
+        "-o --output TRACE",
+        "trace file to write, or - for standard output",
         type=output,
         required=True,
-        metavar="TRACE",
-        help="trace file to write, or - for standard output",
     )
 
 
@@ -140,12 +131,12 @@ def write(trace: Trace, target: str, said: str) -> None:
         print(f"{said} in {named(target)}")
 
 
-def add_maps(parser: argparse.ArgumentParser) -> None:
+def add_maps(parser: Parser) -> None:
     """Add the argument `maps`: a file of maps, or a folder with one."""
-    parser.add_argument("maps", type=maps_path, help=MAPS_SAID)
+    parser.add("maps", MAPS_SAID, type=maps_path)
 
 
-def add_trace(parser: argparse.ArgumentParser, needs: str = "") -> None:
+def add_trace(parser: Parser, needs: str = "") -> None:
     """Add the argument `trace`, which may be left out after a folder that map wrote (`trace_of`).
 
     Args:
@@ -154,12 +145,12 @@ def add_trace(parser: argparse.ArgumentParser, needs: str = "") -> None:
             it is empty, that trace is enough (`solved_trace`).
     """
     by = "map" if needs else "solve -o or map"
-    parser.add_argument(
+    parser.add(
         "trace",
+        f"trace file (JSON Lines){needs}, or - for standard input (default: the trace that "
+        f"{by} wrote with the maps)",
         nargs="?",
         type=trace_path,
-        help=f"trace file (JSON Lines){needs}, or - for standard input (default: the trace that "
-        f"{by} wrote with the maps)",
     )
 
 
@@ -422,11 +413,6 @@ def flags_of(theory: Theory, trace: Trace | None = None) -> list[str]:
     return flags
 
 
-def add_map(parser: argparse.ArgumentParser) -> None:
+def add_map(parser: Parser) -> None:
     """Add the option that chooses one of the maps in a file."""
-    parser.add_argument(
-        "--map",
-        default="1",
-        metavar="I",
-        help="the number of the map, from 1, or its id (default: 1)",
-    )
+    parser.add("--map I", "the number of the map, from 1, or its id (default: 1)", default="1")

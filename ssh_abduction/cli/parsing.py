@@ -122,14 +122,37 @@ class Parser(argparse.ArgumentParser):
         self.settings: dict[str, Setting] = {}
         self.groups: dict[str, tuple[str, ...]] = {}
 
-    def add_setting(self, name: str, help_text: str, default: Any = None, **details: Any) -> None:
-        """Add a setting. Its value becomes the attribute `name` of the options.
+    def add(
+        self, spec: str, said: str, *, to: argparse._ArgumentGroup | None = None, **details: Any
+    ) -> None:
+        """Add an argument or an option.
 
         Args:
-            name: The name, with underscores.
+            spec: An argument such as "trace"; an option with a value such as "-n --maps K", or
+                with choices such as "--by"; or a flag such as "--json".
+            said: The help text.
+            to: The group in which the help lists it; None for none.
+            details: What argparse needs to know besides, by name.
+        """
+        names = [word for word in spec.split() if word.startswith("-")]
+        if not names:
+            names = [spec]
+        elif words := spec.split()[len(names) :]:
+            details["metavar"] = words[0]
+        elif not details:
+            details["action"] = "store_true"
+        (to or self).add_argument(*names, help=said, **details)
+
+    def add_setting(self, spec: str, said: str, default: Any = None, **details: Any) -> None:
+        """Add a setting. Its value becomes the attribute of this name of the options.
+
+        Args:
+            spec: The name, with underscores, and perhaps the word for its value: "near METRES".
+            said: The help text.
             default: The value if the user does not give the setting.
             details: Other fields of Setting, by name.
         """
+        name, _, metavar = spec.partition(" ")
         if not self.settings:
             self.add_argument(
                 "--set",
@@ -139,8 +162,10 @@ class Parser(argparse.ArgumentParser):
                 help="change one of the settings that are listed below; may be given again",
             )
         if isinstance(default, bool):
-            details |= {"type": true_or_false, "metavar": "true|false"}
-        self.settings[name] = Setting(name, help_text, **details)
+            details["type"], metavar = true_or_false, "true|false"
+        if metavar:
+            details["metavar"] = metavar
+        self.settings[name] = Setting(name, said, **details)
         self.set_defaults(**{name: default})
 
     def format_help(self) -> str:
@@ -287,6 +312,30 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Print the usage and a message, and exit with code 2."""
         super().error(printable(message))  # the message repeats what the user typed
+
+
+class Verbs(argparse._SubParsersAction):  # type: ignore[type-arg]
+    """The verbs of a program."""
+
+    def add(
+        self,
+        name: str,
+        run: Callable[[argparse.Namespace], int],
+        said: str,
+        description: str,
+        epilog: str | None = None,
+    ) -> Parser:
+        """Add a verb and return its parser.
+
+        Args:
+            run: Does what the options ask for, and returns the exit code.
+            said: The text for the list of verbs.
+            description: The text at the top of the help of this verb.
+            epilog: The text at its end.
+        """
+        parser: Parser = self.add_parser(name, help=said, description=description, epilog=epilog)
+        parser.set_defaults(run=run)
+        return parser
 
 
 def _exported(words: list[str], at: int, notes: list[str]) -> list[str]:

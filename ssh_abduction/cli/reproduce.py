@@ -8,7 +8,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from ssh_abduction.cli.options import Verbs, output
+from ssh_abduction.cli.options import output
+from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import table
 from ssh_abduction.data.errors import AbductionError, brief, named
 
@@ -17,28 +18,18 @@ MOST_SEEDS = 10_000
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = (
+    parser = verbs.add(
+        "reproduce",
+        run,
+        "run the paper's experiments",
         "Reproduce an experiment of Kuipers & Beeson (2002): simulate, cluster, abduce, learn. "
-        "Writes figures, data and a page into a folder."
+        "Writes figures, data and a page into a folder.",
     )
-    parser = verbs.add_parser("reproduce", help="run the paper's experiments", description=text)
-    parser.add_argument(
-        "experiment", choices=("notched-rectangle", "taylor-hall"), help="the experiment"
-    )
-    parser.add_argument(
-        "--seeds", default="0-19", help="random seeds, such as 0-19 or 1,5,7 (default: 0-19)"
-    )
-    parser.add_argument(
-        "--json",
-        action="store_true",
-        help="print each claim, with the paper's value and ours for each seed, as JSON",
-    )
-    parser.add_argument(
-        "--jobs",
-        type=int,
-        default=2,
-        metavar="N",
-        help="the number of processes; -1 for one per core (default: 2)",
+    parser.add("experiment", "the experiment", choices=("notched-rectangle", "taylor-hall"))
+    parser.add("--seeds", "random seeds, such as 0-19 or 1,5,7 (default: 0-19)", default="0-19")
+    parser.add("--json", "print each claim, with the paper's value and ours for each seed, as JSON")
+    parser.add(
+        "--jobs N", "the number of processes; -1 for one per core (default: 2)", type=int, default=2
     )
     parser.add_setting(
         "outcomes",
@@ -46,14 +37,7 @@ def add_parser(verbs: Verbs) -> None:
         "robot's poses, too (default: true)",
         True,
     )
-    parser.add_argument(
-        "-o",
-        "--output",
-        type=output,
-        metavar="FOLDER",
-        help="folder to write (default: out/EXPERIMENT)",
-    )
-    parser.set_defaults(run=run)
+    parser.add("-o --output FOLDER", "folder to write (default: out/EXPERIMENT)", type=output)
 
 
 def run(options: argparse.Namespace) -> int:

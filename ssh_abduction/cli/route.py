@@ -4,57 +4,49 @@ from __future__ import annotations
 
 import argparse
 
-from ssh_abduction.cli.options import Verbs, add_map, add_maps
+from ssh_abduction.cli.options import add_map, add_maps
+from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import course, table
 from ssh_abduction.data.errors import MapError, printable
 from ssh_abduction.data.files import json_line
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = (
+    parser = verbs.add(
+        "route",
+        run,
+        "find the actions that lead to a place",
         "Find the shortest route through a map: the actions from one dstate or place to "
         "another, and the views to expect on the way. If the map lists regions, say first which "
-        "regions the route leaves and enters, and which paths it passes."
-    )
-    parser = verbs.add_parser(
-        "route", help="find the actions that lead to a place", description=text
+        "regions the route leaves and enters, and which paths it passes.",
+        "ssh-abduction show lists the dstates and places of a map. docs/reference/formats.md "
+        "describes the JSON.",
     )
     add_maps(parser)
-    parser.add_argument(
-        "--from",
+    parser.add(
+        "--from A",
+        "start: the number of a dstate, or a place or region by number or name, such as p3, "
+        "region2 or kitchen (default: the robot's last dstate)",
         dest="start",
-        metavar="A",
-        help=(
-            "start: the number of a dstate, or a place or region by number or name, such as p3, "
-            "region2 or kitchen (default: the robot's last dstate)"
-        ),
     )
-    parser.add_argument(
-        "--to",
-        dest="goal",
-        metavar="B",
-        required=True,
-        help="goal: a dstate, place or region, named as for --from",
+    parser.add(
+        "--to B", "goal: a dstate, place or region, named as for --from", dest="goal", required=True
     )
-    parser.add_argument(
-        "--avoid",
+    parser.add(
+        "--avoid X",
+        "dstates, places and regions that the route must not visit",
         nargs="+",
         action="extend",
-        metavar="X",
-        help="dstates, places and regions that the route must not visit",
     )
-    by = (
+    parser.add(
+        "--by",
         "what to minimise: actions or metres, by moves that the robot did before; or places, by "
-        "all moves along the paths of the map, even if the robot never did them (default: actions)"
+        "all moves along the paths of the map, even if the robot never did them (default: actions)",
+        choices=("actions", "places", "metres"),
+        default="actions",
     )
-    parser.add_argument("--by", choices=("actions", "places", "metres"), default="actions", help=by)
     add_map(parser)
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.set_defaults(run=run)
-    parser.epilog = (
-        "ssh-abduction show lists the dstates and places of a map. docs/reference/formats.md "
-        "describes the JSON."
-    )
+    parser.add("--json", "print JSON")
 
 
 def run(options: argparse.Namespace) -> int:

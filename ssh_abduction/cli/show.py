@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from ssh_abduction.cli.options import Verbs, add_maps, check_number
+from ssh_abduction.cli.options import add_maps, check_number
+from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import describe
 from ssh_abduction.data.corrections_file import named_beside
 from ssh_abduction.data.fields import FieldReader
@@ -15,18 +16,14 @@ from ssh_abduction.solver import drives_in
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = "Print the dstates, places, paths, links and regions of maps."
-    parser = verbs.add_parser(
-        "show", help="print the dstates, places, paths and links of maps", description=text
+    parser = verbs.add(
+        "show",
+        run,
+        "print the dstates, places, paths and links of maps",
+        "Print the dstates, places, paths, links and regions of maps.",
     )
     add_maps(parser)
-    parser.add_argument(
-        "--map",
-        type=int,
-        metavar="I",
-        help="show only the map with this number, from 1 (default: all)",
-    )
-    parser.set_defaults(run=run)
+    parser.add("--map I", "show only the map with this number, from 1 (default: all)", type=int)
 
 
 def run(options: argparse.Namespace) -> int:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from ssh_abduction.cli.options import Verbs, add_output, seed, write
+from ssh_abduction.cli.options import add_output, seed, write
+from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import AbductionError, named, printable
 
@@ -43,36 +44,25 @@ def add_parser(verbs: Verbs) -> None:
         "log of scans and odometry, as a real robot records it, and a file with the "
         "truth beside it."
     )
-    parser = verbs.add_parser("simulate", help="drive a robot through a world", description=text)
-    parser.add_argument(
+    parser = verbs.add("simulate", run, "drive a robot through a world", text)
+    parser.add(
         "world",
-        help=(
-            f"the world: {', '.join(SHIPPED)}, a world file (.json), an occupancy map (.yaml), or "
-            "a floor plan (.xml)"
-        ),
+        f"the world: {', '.join(SHIPPED)}, a world file (.json), an occupancy map (.yaml), or "
+        "a floor plan (.xml)",
     )
-    parser.add_argument(
+    parser.add(
         "--format",
+        "write a robot's log instead of a trace: a CARMEN log, or a ROS bag (.bag, .mcap, or "
+        "a folder)",
         dest="log",
         choices=("carmen", "bag"),
-        help=(
-            "write a robot's log instead of a trace: a CARMEN log, or a ROS bag (.bag, .mcap, or "
-            "a folder)"
-        ),
     )
-    parser.add_argument(
-        "--tours", type=int, default=1, metavar="N", help="drive the route N times (default: 1)"
-    )
-    parser.add_argument(
-        "--seed", type=seed, default=0, help="random seed of all noise (default: 0)"
-    )
-    parser.add_argument(
-        "--route",
-        metavar="ACTIONS",
-        help=(
-            "drive this route instead of the world's own: actions (travel, right, left, around) "
-            "separated by commas"
-        ),
+    parser.add("--tours N", "drive the route N times (default: 1)", type=int, default=1)
+    parser.add("--seed", "random seed of all noise (default: 0)", type=seed, default=0)
+    parser.add(
+        "--route ACTIONS",
+        "drive this route instead of the world's own: actions (travel, right, left, around) "
+        "separated by commas",
     )
     for name, text, default, details in (
         (
@@ -141,7 +131,6 @@ def add_parser(verbs: Verbs) -> None:
     ):
         parser.add_setting(name, text, default, **details)
     add_output(parser)
-    parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:

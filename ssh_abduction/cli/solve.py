@@ -16,7 +16,6 @@ from typing import Any
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.obeying import Obeying
 from ssh_abduction.cli.options import (
-    Verbs,
     add_limits,
     add_theory,
     maps_path,
@@ -37,6 +36,7 @@ from ssh_abduction.cli.outcome import (
     warnings_of,
     why_no_map,
 )
+from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import by_displacements, compared, describe, describe_backbone, headline
 from ssh_abduction.data.drives import pieces_in_words, together
 from ssh_abduction.data.errors import AbductionError
@@ -67,61 +67,43 @@ HELD_DSTATES = 500_000
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = "Find the minimal maps of a trace. With several traces, the result of each is one line."
-    parser = verbs.add_parser(
-        "solve", help="find the minimal maps of a trace, or of many", description=text
+    parser = verbs.add(
+        "solve",
+        run,
+        "find the minimal maps of a trace, or of many",
+        "Find the minimal maps of a trace. With several traces, the result of each is one line.",
     )
-    parser.add_argument(
+    parser.add(
         "traces",
+        "trace file (JSON Lines), or - for standard input",
         nargs="+",
         metavar="trace",
         type=trace_path,
-        help="trace file (JSON Lines), or - for standard input",
     )
-    parser.add_argument(
-        "-n",
-        "--maps",
-        type=int,
-        default=100,
-        metavar="K",
-        help="list at most K maps; 0 for all (default: 100)",
+    parser.add(
+        "-n --maps K", "list at most K maps; 0 for all (default: 100)", type=int, default=100
     )
-    parser.add_argument(
-        "--json",
-        action="store_true",
-        help="print the solution as JSON; for many traces, one line each",
-    )
-    parser.add_argument(
-        "--together",
-        action="store_true",
-        help="the traces are drives through one building: find their joint maps",
-    )
-    parser.add_argument(
-        "-o", "--output", metavar="FILE", help="also write the solution to this file, as JSON"
-    )
-    parser.add_argument(
-        "--onto",
+    parser.add("--json", "print the solution as JSON; for many traces, one line each")
+    parser.add("--together", "the traces are drives through one building: find their joint maps")
+    parser.add("-o --output FILE", "also write the solution to this file, as JSON")
+    parser.add(
+        "--onto MAPS",
+        "add the trace to the first map in this file, which solve -o wrote, and keep its "
+        "dstates and places; takes about as long as solving the new trace alone",
         type=maps_path,
-        metavar="MAPS",
-        help=(
-            "add the trace to the first map in this file, which solve -o wrote, and keep its "
-            "dstates and places; takes about as long as solving the new trace alone"
-        ),
     )
-    parser.add_argument(
-        "--corrections",
-        metavar="FILE",
-        help=(
-            "obey the names and corrections in this file, or in corrections.yaml of this folder "
-            "(default: corrections.yaml beside the file of --output, if it exists)"
-        ),
+    parser.add(
+        "--corrections FILE",
+        "obey the names and corrections in this file, or in corrections.yaml of this folder "
+        "(default: corrections.yaml beside the file of --output, if it exists)",
     )
-    front = (
+    parser.add(
+        "--front K",
         "report the fewest dstates of a map with at most 0, 1, … K faults (steps that are treated "
         "as wrong), by the causal theory. If misread or slipped is set, only faults of these kinds "
-        "count. The report also names the knee: with more faults than that, few dstates are saved"
+        "count. The report also names the knee: with more faults than that, few dstates are saved",
+        type=int,
     )
-    parser.add_argument("--front", type=int, metavar="K", help=front)
     add_limits(parser, "the best answer so far")
     many = parser.add_argument_group(
         "many traces",
@@ -133,37 +115,34 @@ def add_parser(verbs: Verbs) -> None:
             "includes other threads of a Dask worker and, except on Linux, earlier traces."
         ),
     )
-    jobs = (
+    parser.add(
+        "--jobs N",
         "solve N traces at a time, each in its own process; -1 for one per core (default: 1; "
-        "with --scheduler, two per core of its workers)"
+        "with --scheduler, two per core of its workers)",
+        to=many,
+        type=int,
     )
-    many.add_argument("--jobs", type=int, metavar="N", help=jobs)
-    many.add_argument(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="solve on the workers of the Dask scheduler at this address, tcp://host:port",
+    parser.add(
+        "--scheduler ADDRESS",
+        "solve on the workers of the Dask scheduler at this address, tcp://host:port",
+        to=many,
     )
     add_theory(parser)
     parser.add_setting(
-        "within",
-        (
-            "also list maps with up to K dstates more than the minimum; for each number of "
-            "dstates, only the best maps (default: 0)"
-        ),
+        "within K",
+        "also list maps with up to K dstates more than the minimum; for each number of "
+        "dstates, only the best maps (default: 0)",
         default=0,
         type=int,
-        metavar="K",
     )
     parser.add_setting(
-        "joint_trace", "with --together: also write the joint trace to this file", metavar="FILE"
+        "joint_trace FILE", "with --together: also write the joint trace to this file"
     )
     parser.add_setting(
-        "without_speedups",
+        "without_speedups NAMES",
         f"speed-ups to turn off, separated by commas: {', '.join(SPEEDUPS)}",
         default="",
-        metavar="NAMES",
     )
-    parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:

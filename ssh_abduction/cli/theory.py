@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import argparse
 
-from ssh_abduction.cli.options import Verbs
+from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import table
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.theory import PRESETS
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = "List every axiom with its name, sentence and source, and the presets that include it."
-    parser = verbs.add_parser("theory", help="list the axioms", description=text)
-    parser.set_defaults(run=run)
+    verbs.add(
+        "theory",
+        run,
+        "list the axioms",
+        "List every axiom with its name, sentence and source, and the presets that include it.",
+    )
 
 
 def run(options: argparse.Namespace) -> int:

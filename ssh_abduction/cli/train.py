@@ -8,7 +8,6 @@ import sys
 from typing import Any
 
 from ssh_abduction.cli.options import (
-    Verbs,
     add_maps,
     add_trace,
     check_number,
@@ -19,6 +18,7 @@ from ssh_abduction.cli.options import (
     trace_of,
     trace_path,
 )
+from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import counted, table
 from ssh_abduction.data.errors import MapError, named
 from ssh_abduction.data.map_file import read_json
@@ -27,87 +27,60 @@ from ssh_abduction.data.trace import Trace
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = (
+    train = verbs.add(
+        "train",
+        run_train,
+        "train a recogniser on the labels of a map",
         "Train a nearest-neighbour recogniser on the images of a trace. The label of an image is "
-        "its dstate in a map."
+        "its dstate in a map.",
     )
-    train = verbs.add_parser(
-        "train", help="train a recogniser on the labels of a map", description=text
+    train.add(
+        "-o --output FILE.skops", "file for the trained recogniser", type=output, required=True
     )
-    train.add_argument(
-        "-o",
-        "--output",
-        type=output,
-        required=True,
-        metavar="FILE.skops",
-        help="file for the trained recogniser",
-    )
-    train.set_defaults(run=run_train)
-    text = (
-        "Compute the share of images that are recognised, for growing numbers of training images, "
-        "by cross-validation. The label of an image is its dstate in a map."
-    )
-    curve = verbs.add_parser(
+    curve = verbs.add(
         "learning-curve",
-        help="measure a recogniser with few and with many images",
-        description=text,
+        run_learning_curve,
+        "measure a recogniser with few and with many images",
+        "Compute the share of images that are recognised, for growing numbers of training images, "
+        "by cross-validation. The label of an image is its dstate in a map.",
     )
     curve.add_setting(
-        "folds", "number of folds of the cross-validation (default: 10)", 10, type=int, metavar="N"
+        "folds N", "number of folds of the cross-validation (default: 10)", 10, type=int
     )
-    curve.add_argument("--seed", type=seed, default=0, help="random seed of the folds (default: 0)")
-    curve.add_argument("--plot", type=picture_file, metavar="PNG", help="draw the learning curve")
-    curve.add_argument("--json", action="store_true", help="print JSON")
-    curve.set_defaults(run=run_learning_curve)
-    text = (
-        "Find the laser beams that distinguish two dstates that look alike, by default for each "
-        "pair of dstates with the same view."
-    )
-    apart = verbs.add_parser(
+    curve.add("--seed", "random seed of the folds (default: 0)", type=seed, default=0)
+    curve.add("--plot PNG", "draw the learning curve", type=picture_file)
+    curve.add("--json", "print JSON")
+    apart = verbs.add(
         "tell-apart",
-        help="find the laser beams that distinguish dstates with the same view",
-        description=text,
+        run_tell_apart,
+        "find the laser beams that distinguish dstates with the same view",
+        "Find the laser beams that distinguish two dstates that look alike, by default for each "
+        "pair of dstates with the same view.",
     )
-    apart.add_argument(
-        "--dstates",
-        type=pair,
-        metavar="I,J",
-        help="two dstates of the map (default: each pair that shares a view)",
+    apart.add(
+        "--dstates I,J", "two dstates of the map (default: each pair that shares a view)", type=pair
     )
-    apart.add_argument(
-        "--plot", type=picture_file, metavar="PNG", help="draw the beams over the scans"
-    )
-    apart.add_argument(
-        "--json",
-        action="store_true",
-        help="print how much each beam helps, by each method, as JSON",
-    )
-    apart.set_defaults(run=run_tell_apart)
+    apart.add("--plot PNG", "draw the beams over the scans", type=picture_file)
+    apart.add("--json", "print how much each beam helps, by each method, as JSON")
     for parser in (train, curve, apart):
         add_maps(parser)
         add_trace(parser, " with images")
-        parser.add_argument(
-            "--map",
+        parser.add(
+            "--map I",
+            "the number of the map that gives the labels, from 1 (default: use only labels on "
+            "which all maps agree)",
             type=int,
-            metavar="I",
-            help=(
-                "the number of the map that gives the labels, from 1 (default: use only labels on "
-                "which all maps agree)"
-            ),
         )
-    text = (
+    recognise = verbs.add(
+        "recognise",
+        run_recognise,
+        "recognise dstates from images",
         "Find the dstate at which each image of a trace was taken, or nowhere if the image looks "
-        "like no dstate that the recogniser knows."
+        "like no dstate that the recogniser knows.",
     )
-    recognise = verbs.add_parser(
-        "recognise", help="recognise dstates from images", description=text
-    )
-    recognise.add_argument("recogniser", help="file that train wrote")
-    recognise.add_argument("trace", type=trace_path, help="trace file with images")
-    recognise.add_argument(
-        "--json", action="store_true", help="print the dstates as a JSON list, null for nowhere"
-    )
-    recognise.set_defaults(run=run_recognise)
+    recognise.add("recogniser", "file that train wrote")
+    recognise.add("trace", "trace file with images", type=trace_path)
+    recognise.add("--json", "print the dstates as a JSON list, null for nowhere")
 
 
 def pair(text: str) -> tuple[int, int]:

@@ -8,7 +8,8 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ssh_abduction.cli.options import Verbs, add_maps, flags_of, trace_beside, trace_path
+from ssh_abduction.cli.options import add_maps, flags_of, trace_beside, trace_path
+from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.data.errors import AbductionError, MapError, brief, is_whole, named
 
 if TYPE_CHECKING:
@@ -23,56 +24,46 @@ ASSUMING = 3.0  # Seconds to compute the costs of assumptions that the page may 
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = (
+    parser = verbs.add(
+        "view",
+        run,
+        "see rival maps in the browser",
         "Show maps in the browser, on one page: what all maps share, where they differ, each "
-        "map alone, two maps side by side, and what happened at each step."
+        "map alone, two maps side by side, and what happened at each step.",
+        "The page is one file that works without a network. Without --serve, it cannot ask the "
+        "solver. It shows the commands that do.",
     )
-    parser = verbs.add_parser("view", help="see rival maps in the browser", description=text)
     add_maps(parser)
-    parser.add_argument(
+    parser.add(
         "trace",
+        "the trace that was mapped; adds actions and laser images, and is needed for --serve "
+        "(default: the trace in the folder of the maps, if map wrote it)",
         nargs="?",
         type=trace_path,
-        help=(
-            "the trace that was mapped; adds actions and laser images, and is needed for --serve "
-            "(default: the trace in the folder of the maps, if map wrote it)"
-        ),
     )
-    parser.add_argument(
-        "-o", "--output", metavar="FILE", help="write the page to this file and do not open it"
-    )
-    localised = (
+    parser.add("-o --output FILE", "write the page to this file and do not open it")
+    parser.add(
+        "--run RUN",
         "a second trace from the mapped world. The page replays it, with a belief about where the "
         "robot is at each step. It may be TRACE itself. Beliefs come from its views, or from the "
-        "file of --belief"
+        "file of --belief",
+        dest="followed",
+        type=trace_path,
     )
-    parser.add_argument("--run", dest="followed", type=trace_path, metavar="RUN", help=localised)
-    parser.add_argument(
-        "--belief",
-        metavar="FILE",
-        help="output of localise --json for the trace of --run, or for TRACE",
-    )
-    serve = (
+    parser.add("--belief FILE", "output of localise --json for the trace of --run, or for TRACE")
+    parser.add(
+        "--serve",
         "serve the page, on this computer only, so that it can explain why two steps are one "
-        "dstate or not, and solve again with assumptions; needs TRACE. Ctrl-C ends the server"
+        "dstate or not, and solve again with assumptions; needs TRACE. Ctrl-C ends the server",
     )
-    parser.add_argument("--serve", action="store_true", help=serve)
-    parser.add_argument(
-        "--time-limit",
+    parser.add(
+        "--time-limit S",
+        "with --serve, seconds for each answer (default: 30)",
         type=float,
         default=30.0,
-        metavar="S",
-        help="with --serve, seconds for each answer (default: 30)",
     )
-    parser.add_setting(
-        "port", "with --serve, the port (default: any free port)", 0, type=int, metavar="N"
-    )
+    parser.add_setting("port N", "with --serve, the port (default: any free port)", 0, type=int)
     parser.add_setting("open", "whether to open the page in the browser (default: true)", True)
-    parser.set_defaults(run=run)
-    parser.epilog = (
-        "The page is one file that works without a network. Without --serve, it cannot ask the "
-        "solver. It shows the commands that do."
-    )
 
 
 def run(options: argparse.Namespace) -> int:
