@@ -133,7 +133,7 @@ class FramedEngine:
         self._best = best.cost, namings
 
     def _first_with_paths(self) -> Fitted | None:
-        """Find labels with the fewest dstates and paths that fit; None if the prefix has no map."""
+        """Find a map with the fewest dstates, and its labels; None if the prefix has no map."""
         fitted: list[Fitted] = []
 
         def why_not(labels: list[int]) -> list[int] | None:
@@ -177,7 +177,7 @@ class FramedEngine:
         yield from islice(found, enough or None)
 
     def labellings(self, cost: tuple[int, ...]) -> Iterator[Settled]:
-        """Yield each labelling that maps of this cost have, once, with these maps."""
+        """Yield the maps of this cost, grouped by their labelling."""
         if not self._framed:
             return
         mode = _listing(cost)
@@ -187,13 +187,13 @@ class FramedEngine:
                 yield settled
 
     def _namings_of_cost(self, cost: tuple[int, ...]) -> Iterator[NodeLabels]:
-        """Yield the labels that maps of this cost have, known ones if there are any."""
+        """Yield the labels of maps of this cost, if known, or all with as many dstates."""
         if self._best and self._best[0] == cost:
             return iter(self._best[1])
         return self._all_with_paths(cost[0])
 
     def _all_with_paths(self, dstates: int, besides: Sequence[int] = ()) -> Iterator[NodeLabels]:
-        """Yield each labelling with this many dstates for which paths exist."""
+        """Yield all labels with this many dstates that some paths fit, except `besides`."""
         known: set[Hashable] = {tuple(besides)}
         fitted: dict[tuple[int, ...], Fitted] = {}
 

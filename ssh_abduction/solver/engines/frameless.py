@@ -140,7 +140,7 @@ class FramelessEngine:
                 yield settled
 
     def _all_that_fit(self, dstates: int, besides: Sequence[int] = ()) -> Iterator[list[int]]:
-        """Yield each labelling with this many dstates for which places and paths exist."""
+        """Yield all labels with this many dstates that places and paths fit, except `besides`."""
         return all_accepted(
             ask=lambda: self._named.all_of(dstates, 0),
             refuse=self._fitting.why_not,

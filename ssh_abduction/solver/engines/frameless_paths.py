@@ -146,7 +146,7 @@ class PlacesAndPaths:
             self._give_axioms([key for key in self.named.program.names() if key in grounded])
 
     def forbid_together(self, equalities: Collection[Equality]) -> None:
-        """Exclude maps in which all of these equalities hold, if one of them is of places.
+        """Exclude maps in which all of these equalities hold, if one of them is about places.
 
         Sets of equalities of dstates alone are forbidden by `named`.
         """
@@ -213,7 +213,7 @@ class PlacesAndPaths:
         return best
 
     def _best_at_home(self, labels: Sequence[int], control: Control, fewest: int) -> Found | None:
-        """Find the best map in which each place is one of its homes (`engines/homes.py`).
+        """Find the best map that merges each place with one of its homes (`engines/homes.py`).
 
         Args:
             fewest: A lower bound on the number of paths.

@@ -10,8 +10,8 @@ it takes clasp minutes.
 
 So this module finds a large clique of pairwise distinct places, which are called *fixed*. Suppose
 that a map has only as many places as there are fixed ones. Then each other place is one with a
-fixed place, its *home*. If a place comes after another along a path, then its home may come after
-the home of the other, too. This leaves few possible homes. In the corridor each place has only one.
+fixed place, its *home*. If a place comes after another along a path, its home comes after the home
+of the other. This leaves few possible homes. In the corridor each place has only one.
 
 Clingo then tries only these homes. If it finds a map, this map has the fewest places, and all
 minimal maps use these homes. If it finds none, the supposition was wrong, and clingo tries all ways
@@ -38,8 +38,8 @@ def homes_of(segments: Segments) -> Mapping[int, list[int]] | None:
         segments: The places and segments, and which of them are known to be different.
 
     Returns:
-        For each place, the fixed places that it may be. None if some place can be none of them, or
-        no places fit these dstates at all.
+        For each place, the fixed places that it may be. None if some place cannot be any of them,
+        or if no places fit these dstates at all.
     """
     if any(c == p for c, p in segments.elsewhere):
         return None  # the segments contradict each other: no places fit these dstates

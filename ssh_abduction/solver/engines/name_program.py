@@ -186,7 +186,7 @@ class NameProgram:
     def more_links(self) -> list[Link]:
         """List links that clingo lacks: all of them, or `MORE_LINKS` if the trace is long.
 
-        In a long trace, the links come first for whose ends clingo has the fewest choices.
+        In a long trace, links whose ends have the fewest possible names come first.
         """
         known = self._known
         left = [link for link in self.chart.links if link not in known.links]
@@ -280,7 +280,7 @@ class NameProgram:
     def _labels_by_view(self, labels: Sequence[int]) -> dict[int, list[int]]:
         """List the labels of a map that no pinned node has, by their views.
 
-        They are in the order in which clingo was given nodes with them.
+        Labels come in the order in which clingo was given the first node of each.
         """
         pinned = {labels[node] for node in self.pinned.clique}
         found: dict[int, dict[int, None]] = {}
@@ -290,7 +290,10 @@ class NameProgram:
         return {view: list(some) for view, some in found.items()}
 
     def literals_of(self, labels: Sequence[int]) -> list[int]:
-        """Return the literals that give nodes a map's labels. Label numbers may differ."""
+        """Return the literals that give nodes the names of their dstates in a map.
+
+        The name of a label is that of its pinned node, or a spare name of its view.
+        """
         name_of = {labels[node]: name for name, node in enumerate(self.pinned.clique)}
         for view, some in self._labels_by_view(labels).items():
             name_of |= dict(zip(some, self._known.spare[view], strict=False))

@@ -42,7 +42,7 @@ class SmallMaps:
         self._task, self._pinned = task, pinned
 
     def merged(self, check: Callable[[], None]) -> Iterator[list[int]]:
-        """Merge nodes by evidence, and yield the labels of the map; none without that speed-up."""
+        """Merge nodes by evidence, and yield the labels of the map; none without `greedy`."""
         if self._task.speedups.greedy:
             chart = self._pinned.chart
             yield merged(chart.apart(), chart.links, self._pinned.clique, check)
@@ -71,14 +71,14 @@ class SmallMaps:
             steps = min(2 * steps, most)
 
     def guessed(self, check: Callable[[], None]) -> Iterator[list[int]]:
-        """Yield the labels of a guessed map; none without that speed-up, or without a guess."""
+        """Yield the labels of a guessed map; none without `annealed`, or without a guess."""
         if self._task.speedups.annealed:
             near = self._map_of_guess(self._pinned, check)
             if near is not None:
                 yield dstates_merged(self._pinned.chart, near, check)
 
     def _map_of_guess(self, pinned: Pinned, check: Callable[[], None]) -> list[int] | None:
-        """Return labels of a map of these steps near a guess; None if there is no guess."""
+        """Guess dstates, and return the labels of a map near the guess; None without a guess."""
         guess = self._guessed(pinned, check)
         if guess is None:
             return None

@@ -118,8 +118,8 @@ class VisitProgram:
 
         Args:
             chart: The chart with all visits and nodes.
-            visits: The visits that clingo shall have, with those that it has already.
-            order: Nodes in the order of choice. Those new to clingo are put behind the others.
+            visits: The visits that clingo shall have, including those that it has already.
+            order: Nodes in the order of choice. Those new to clingo come after all others.
             fits: The pairs of these visits that may be at one place.
         """
         control, known = self._asker.control, self._known
@@ -182,8 +182,8 @@ class VisitProgram:
     def add_rules(self, rules: str, part: str | None = None, number: int = 0) -> None:
         """Give clingo more rules.
 
-        This does not check the limits of time and memory. If it stopped halfway, clingo would have
-        relaxed an unsatisfiable core without the rule that bounds how many members are violated.
+        This does not check the limits of time and memory. If it were stopped halfway, clingo might
+        have relaxed an unsat core, but lack the rule that limits how many members are violated.
 
         Args:
             rules: The rules.

@@ -23,9 +23,9 @@ stretch and the transitions of the last draw. This is forward filtering, backwar
 start, and so do pinned visits from which the visit is apart. No axiom says that travels are
 reversible. Still, each travel is counted in both directions.
 
-Places have names, as dstates have in `engines/causal.py`. Pairwise distinct visits are pinned to
-places of their own. Each kind of place has spare names. There have to be many spare names: with too
-few, different places are merged and do not separate again.
+Places have names, as dstates have in `engines/named_labels.py`. Pairwise distinct visits are pinned
+to places of their own. Each kind of place has spare names. There have to be many spare names: with
+too few, different places are merged and do not separate again.
 
 A causal trace with actions other than turns and travels is annealed in the same way. Each step is
 then a visit to a place in which the robot can stand in only one way.
@@ -211,7 +211,7 @@ def _step_options(chart: Chart, clique: Sequence[int], may_be: Sequence[Sequence
 
 
 def _spare(kinds: Sequence[_Kind], pinned: Sequence[int], spares: int) -> dict[_Kind, range]:
-    """Return the spare names of each kind of place. Pinned visits have the names before them.
+    """Return the spare names of each kind of place. Lower numbers are names of pinned visits.
 
     Args:
         spares: The least number of spare names of a kind.

@@ -91,7 +91,7 @@ class Beam:
     """
 
     def __init__(self, problem: Problem, log: Log, width: int) -> None:
-        """Prepare the search. `maps` does it.
+        """Prepare the search. `maps` runs it.
 
         Args:
             problem: The trace, the theory and the evidence.
@@ -187,8 +187,8 @@ class Beam:
         """Yield the hypotheses to keep: the first `width` that the options make.
 
         With several drives or floors, keep at most ALIKE hypotheses that join them in the same way,
-        and LOST times as many in all. Drop those that cost UNSURE more than the best.
-        The last two limits apply apart to hypotheses whose present piece is not joined yet
+        and at most LOST * ALIKE in all. Drop those that cost at least UNSURE more than the best.
+        The last two limits apply separately to hypotheses whose present piece is not joined yet
         (`Pieces.is_loose`), as they cost more until it is joined.
 
         Args:
@@ -303,7 +303,7 @@ class Beam:
         return None if next(violations(whole, ssh_map, theory), None) else ssh_map
 
     def _completed(self, found: Hypothesis, trace: Trace, theory: Theory) -> Iterator[SSHMap]:
-        """Yield the maps of a hypothesis that satisfy the axioms, one for each way it may face."""
+        """Yield the valid maps of a hypothesis, one for each way to turn its pieces."""
         ways = headings_by_turn(found)
         for facing in ways if theory.star == "frame" else islice(ways, 1):
             ssh_map = completed(trace, theory, found.labels, found.places, facing)

@@ -100,7 +100,7 @@ class Classes:
                 self.merge(first[label], node)
 
     def labels(self) -> list[int]:
-        """Return the number of the class of each step. The order of first steps numbers them."""
+        """Return the class of each step, as a number. Classes are numbered by first steps."""
         return numbered(self.root.tolist())
 
     def settle_all(self) -> None:
@@ -124,7 +124,7 @@ class Classes:
         return self._has_merged
 
     def make(self, a: int, b: int) -> None:
-        """Merge two classes, given by their roots. If they are one, make it a known dstate."""
+        """Merge two classes, given by their roots. If these are equal, make the class known."""
         if a == b:
             self.known[a] = True
         else:

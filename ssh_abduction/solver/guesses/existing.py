@@ -1,9 +1,10 @@
 """Lay new drives on the map of old drives, without a search of the old steps.
 
 The solver does not get the old drives. It gets a *digest*: a trace in which each link of their map
-occurs once (`onto.py`). The displacements of the old drives are fitted to their map. The fit gives
-the joint Gaussian distribution of the poses, and each link of the digest gets the displacement
-between the poses of its ends. `joint_maps.py` then joins the pieces of the map and the new drives.
+occurs once (`solver/digest.py`). The displacements of the old drives are fitted to their map. The
+fit gives the joint Gaussian distribution of the poses, and each link of the digest gets the
+displacement between the poses of its ends. `joint_maps.py` then joins the pieces of the map and the
+new drives.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ class ExistingMap:
         yield from joining.maps([self._part(i, labels, log, joining.sights) for i in pieces])
 
     def _part(self, piece: int, labels: Sequence[int], log: Log, sights: Sights) -> Part:
-        """Make a part of a piece of the map. Its cost is 0, as the map stands."""
+        """Make a part of a piece of the map. It costs nothing, as the map must be kept."""
         dstates = [s for s, other in enumerate(self._piece) if other == piece]
         number = {s: i for i, s in enumerate(dstates)}
         places = list(dict.fromkeys(self._places[s] for s in dstates))

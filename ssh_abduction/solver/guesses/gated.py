@@ -153,7 +153,7 @@ class GatewaySketch(Sketch):
         return frames_that_fit(*self._sights(grown), self._axioms, as_shown=False) is not None
 
     def _grown(self, place: int, there: int, t: int) -> _PlaceSights:
-        """Return the place with step t added, the present step, at a dstate there."""
+        """Return the place after step t, which is the present step and at the dstate `there`."""
         move = None
         if self._turn_made and self._last and self._states[self._last[0]].place == place:
             move = self._last, self._turn_made

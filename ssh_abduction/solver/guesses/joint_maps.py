@@ -4,8 +4,8 @@ Each drive has a map of its own: a hypothesis with the poses of its places and d
 is a dstate of one map and a dstate of another map that may be one. It says how one map lies on the
 other. An anchor is good if many other dstates then coincide with dstates that show the same. The
 two maps with the best anchor are joined first: `overlaying.py` merges the places and dstates that
-coincide. Then the joint map may be joined to others. Maps that no anchor joins stay pieces. The
-pieces of a map that has to stand may be among these maps.
+coincide. Then the joint map may be joined to others. Maps that no anchor joins stay pieces. Some
+of the maps may be the pieces of a map of old drives that must be kept.
 
 Reference:
     Carpin 2008, "Fast and accurate map merging for multi-robot systems" (votes for a turn and a
@@ -61,7 +61,7 @@ class Joining:
     """
 
     def __init__(self, problem: Problem, log: Log) -> None:
-        """Prepare the search. `maps` does it.
+        """Prepare the search. `maps` runs it.
 
         Args:
             problem: The trace, the theory and the evidence.
@@ -77,7 +77,7 @@ class Joining:
         The caller has to check them.
 
         Args:
-            standing: The pieces of a map of the first drives, if this map has to stand.
+            standing: The pieces of a map of the first drives that must be kept; empty if none must.
         """
         first = sum(len(part.labels) for part in standing)
         drives = [drive for drive in drives_of(self._problem.trace) if drive.first >= first]
@@ -139,8 +139,8 @@ class Joining:
         """List anchors of two maps, the best one first.
 
         Returns:
-            Triples: how many more dstates coincide that show the same than that do not, the dstate
-            of the first map, and that of the second one.
+            Triples: the number of coinciding dstates that show the same, minus the number of those
+            that do not; the dstate of the first map; and that of the second one.
         """
         look_at_clock()
         alike = np.array([[bool(seen & other) for other in second.seen] for seen in first.seen])

@@ -99,9 +99,9 @@ def _mended(trace: Trace, mended: Trace, sketch: Sketch, theory: Theory) -> Trac
 
 
 def _right(trace: Trace, sketch: Sketch, theory: Theory) -> Step | None:
-    """Return the step after a sketch with the view and star that do not contradict the sketch.
+    """Return the step after a sketch, with the view and star that the sketch predicts for it.
 
-    None if these are unknown.
+    None if the sketch predicts neither.
     """
     t, action = len(sketch.labels), trace.actions[len(sketch.labels) - 1]
     there = sketch.leads_to(action)

@@ -4,8 +4,8 @@ A *part* is a map of some drives, with the joint Gaussian distribution of its po
 has two parts whose frames are unrelated at first. Merging two dstates fixes the frames to each
 other. From then on the two places that most surely coincide are merged first, and the poses are
 conditioned on each merge. What two merged dstates lead to by one action is merged, too. If gateways
-may change between drives, places that saw different gateways may be merged at the price of these.
-Dstates and places of a map that has to stand are never merged with each other.
+may change between drives, places with different gateways may be merged, at a price for each change.
+Dstates and places of a map that must be kept are never merged with each other.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Part:
         mean: The means of the poses.
         covariance: The covariance of these.
         nats: The cost.
-        kept: The dstates of a map that has to stand.
+        kept: The dstates of a map that must be kept.
     """
 
     labels: Mapping[int, int]
@@ -170,7 +170,7 @@ class _State:
         mean: The means of the poses.
         covariance: The covariance of these.
         nats: The cost.
-        kept: The dstates of a map that has to stand. A group with one of them is named by its
+        kept: The dstates of a map that must be kept. A group with one of them is named by its
             first dstate.
         kept_places: The places of that map, in the same way.
     """
@@ -339,7 +339,7 @@ class Overlay:
         return self._state is not before
 
     def _merge_coinciding(self, places: set[int]) -> None:
-        """Merge dstates at some places that coincide, unless what follows is a clash."""
+        """Merge the coinciding dstates at some places, unless that leads to a clash."""
         refused: set[tuple[int, int]] = set()
         while pairs := [
             found for p in places for found in self._coinciding(p) if found[1] not in refused
@@ -411,7 +411,7 @@ class Overlay:
         ]
 
     def _look_alike(self, s: int, x: int) -> bool:
-        """Whether two dstates show the same, but for gateways that changed."""
+        """Whether two dstates show the same, except for gateways that changed."""
         both = self._both
         return bool(both.seen[s] & both.seen[x]) and self._sights.are_alike(
             both.stars[s], both.stars[x]

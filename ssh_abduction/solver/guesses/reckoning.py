@@ -59,7 +59,7 @@ class Hypothesis:
             drift, then positions and headings, and last the pose of the robot (x, y, heading).
         covariance: The covariance of these.
         nats: The cost.
-        changes: The part of it that is the price of gateways that changed between drives.
+        changes: The part of `nats` that is the price of gateways that changed between drives.
         faults: Pairs (step, kind): the steps at which an action "slipped" or a displacement
             "jumped".
         pieces: Which poses are in one frame.
@@ -86,8 +86,9 @@ class HypothesisPoses:
 
     Attributes:
         is_rough: Whether poses must be fitted anew now and then (`settled`), as the equations are
-            linear only near the means. This is so for one frame if the robot may be some way off
-            the poses of its dstates (`spreads_of`), and for several if headings may err by ROUGH.
+            linear only near the means. In a single frame, this is so if the robot may be off the
+            poses of its dstates (`spreads_of`). In several frames, it is so if the robot may not be
+            off them, and headings may err by ROUGH.
     """
 
     def __init__(self, trace: Trace) -> None:

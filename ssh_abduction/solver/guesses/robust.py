@@ -218,7 +218,7 @@ class Explainer:
         return best
 
     def _explained(self, machine: PartialMachine, labels: Sequence[int]) -> Explained:
-        """Make the explanation that given labels are: find their faults, and add up the cost.
+        """Make an explanation of given labels: find their faults, and add up the cost.
 
         Args:
             machine: The machine. Its dstates include all labels.

@@ -95,7 +95,8 @@ class _Transitions:
                 0.
 
         Returns:
-            Indices for `likely`: visits without the last x states x states of the next visit.
+            Indices for `likely`, as an array of visits (without the last) x states x states of the
+            next visit.
         """
         rows = self.rows(states[:-1], self._visits[:, None])
         rows[states[:-1] < 0] = self._states * self._actions

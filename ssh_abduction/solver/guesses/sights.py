@@ -199,7 +199,7 @@ def _may_face_alike(first: Star, second: Star, changes: int) -> bool:
 
 
 def _without(first: Star, second: Star, count: int) -> Iterator[tuple[Frame, Frame]]:
-    """Yield frames of equal size of two stars, without some gateways, `count` in all."""
+    """Leave out `count` gateways of two stars in all. Yield pairs of frames of equal size."""
     for less in range(count + 1):
         for frame, other in product(_smaller(first, less), _smaller(second, count - less)):
             if frame.slots == other.slots:

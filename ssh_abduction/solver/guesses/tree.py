@@ -29,7 +29,8 @@ A sketch may also begin with a map of some steps, and grow like a tree from ther
 on new paths, or on one known path, and contradict nothing. In three cases the sketch does not know
 whether it is still consistent:
 
-- A turn is the first one that shows how two known paths cross. That has to fit all their places.
+- A turn is the first one that shows how two known paths cross. The crossing has to fit all their
+  places.
 - Without frames, a turn leads from a dstate to itself. Then the dstate can be on no path.
 - Without frames, two turns to the right lead back. Then a new place ahead would be on both sides of
   a path.

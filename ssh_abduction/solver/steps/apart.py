@@ -47,9 +47,8 @@ class Continuations:
     """Compares the continuations of steps: the views and actions of the trace from each step on.
 
     The steps are sorted by their continuations, as in a suffix array (Manber, Myers 1993). For n
-    steps this takes time proportional to n log² n. The length of
-    the prefix that two steps share is the least length that neighbours between them share in this
-    order.
+    steps this takes time proportional to n log² n. The common prefix of two steps is as long as the
+    shortest common prefix of neighbours between them in this order.
     """
 
     def __init__(

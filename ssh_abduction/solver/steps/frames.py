@@ -5,8 +5,8 @@ is a gateway. A *frame* is a star after this is decided. The gateways of a frame
 clockwise; these numbers are its *slots*. All frames at a place have the same number N of slots.
 Slot K of a frame is slot (K+C) mod N of an earlier frame, for some *shift* C. A gateway is seen at
 some bearing, which may be off by a spread in degrees. So each shift allows only some rotations of
-the robot between the two frames. A set of rotations has whole degrees clockwise. Its ends are
-rounded outwards. If it is empty, the two frames are not seen at one place with this shift.
+the robot between the two frames. Rotations are whole degrees clockwise. The ends of a set of them
+are rounded outwards. If it is empty, the two frames are not seen at one place with this shift.
 
 >>> from ssh_abduction.data.star import Star
 >>> from ssh_abduction.solver.steps.frames import members, rotation_bits
@@ -101,8 +101,9 @@ def rotation_bits(first: Frame, then: Frame, shift: int) -> int:
 def may_face(first: Frame, then: Frame, shift: int) -> list[str]:
     """List how the robot may face in the later frame, compared to the earlier one.
 
-    Slots that the trace declares opposite belong to one path, at any angle. The robot also faces
-    alike if it faces the same direction of such a path in both frames, and so on.
+    Slots that the trace declares opposite belong to one path, at any angle. So the robot may face
+    the same way if it faces the same direction of such a path in both frames, and the opposite way
+    if it faces opposite directions of it.
 
     Arguments are as for `rotation_bits`.
 

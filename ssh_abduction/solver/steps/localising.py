@@ -102,8 +102,8 @@ class _VisitLocaliser:
     def _stretch_up_to(self, visit: int) -> Iterable[int]:
         """Find a short stretch of visits, up to this one, that the map cannot explain.
 
-        The map cannot explain a stretch if it fits none of the states of its first visit. Stretches
-        of 2, 3, 5, 9, … visits are tried, the shortest first.
+        The map explains a stretch if its links lead from some state of the first visit to states
+        that fit all other visits. Stretches of 2, 3, 5, 9, … visits are tried, the shortest first.
         """
         back = 1
         while True:
