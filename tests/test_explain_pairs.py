@@ -313,6 +313,18 @@ def test_a_limit_leaves_what_is_known() -> None:
     assert not explanation.proven
 
 
+def test_the_shell_says_that_a_limit_ended_the_search(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "trace.jsonl"
+    RECTANGLE.save(path)
+    assert main(["explain", str(path), "3", "399", "--time-limit", "0.05"]) == 30
+    assert "undecided within 0.05 s; --time-limit gives it more time" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        main(["explain", "--help"])
+    assert "(default: 60; inf for no limit)" in " ".join(capsys.readouterr().out.split())
+
+
 @pytest.mark.parametrize(
     ("first", "second", "said"),
     [

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from ssh_abduction.rivals.listing import Listing
 
 EXIT_NO_MAP, EXIT_UNKNOWN = 20, 30
+SECONDS = 60.0  # the default time limit: joint maps with changes may need hours for a proof
 # A place, and perhaps a path, in the words of the command line: "p7 path2".
 _PLACE = re.compile(r"p(\d+)(?: path(\d+))?")
 
@@ -86,7 +87,7 @@ def add_parser(verbs: Verbs) -> None:
         default=100,
     )
     parser.add("--json", "print the explanation as JSON")
-    add_limits(parser, "what is known")
+    add_limits(parser, "what is known", SECONDS)
     parser.add(
         "--corrections FILE",
         "obey the corrections in this file, or in corrections.yaml of this folder (default: "
@@ -131,7 +132,9 @@ def run(options: argparse.Namespace) -> int:
     if found and maps and options.steps and not of_place:
         listing = Listing.from_dict(data, named(maps)).named_beside(maps)
         pair = _InMap.of(listing, first, second)
-    written = partial(_as_json if options.json else _as_text, pair)
+    written = (
+        partial(_as_json, pair) if options.json else partial(_as_text, pair, options.time_limit)
+    )
 
     def last_words(why: Stop) -> tuple[str, int]:
         known = question.known(why)
@@ -209,8 +212,12 @@ class _InMap:
         return {"same_place": self.is_one_place, "probability": self.probability, "nats": self.nats}
 
 
-def _as_text(in_map: _InMap | None, explanation: Answer) -> str:
-    return f"{explanation}\n" + (f"{in_map}\n" if in_map else "")
+def _as_text(in_map: _InMap | None, seconds: float, explanation: Answer) -> str:
+    lines = [str(explanation), *([str(in_map)] if in_map else [])]
+    is_limited = explanation.stopped in (None, "time limit")
+    if is_limited and _exit_code(explanation) == EXIT_UNKNOWN:
+        lines.append(f"undecided within {seconds:g} s; --time-limit gives it more time")
+    return "\n".join(lines) + "\n"
 
 
 def _as_json(in_map: _InMap | None, explanation: Answer) -> str:

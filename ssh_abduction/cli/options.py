@@ -96,9 +96,20 @@ def helps() -> dict[str, str]:
     return {name: text[0].lower() + text[1:] for name, text in words.items()}
 
 
-def add_limits(parser: Parser, printed: str) -> None:
-    """Add the options that limit a search. `printed` says what the verb prints at a limit."""
-    parser.add("--time-limit S", f"stop after S seconds and print {printed}", type=float)
+def add_limits(parser: Parser, printed: str, seconds: float | None = None) -> None:
+    """Add the options that limit a search.
+
+    Args:
+        printed: What the verb prints at a limit.
+        seconds: The default time limit; None for no limit.
+    """
+    default = "" if seconds is None else f" (default: {seconds:g}; inf for no limit)"
+    parser.add(
+        "--time-limit S",
+        f"stop after S seconds and print {printed}{default}",
+        type=float,
+        default=seconds,
+    )
     parser.add(
         "--memory-limit MIB",
         f"stop when the process has used this many MiB, and print {printed}",
