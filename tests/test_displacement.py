@@ -290,14 +290,12 @@ def test_kilometres_are_noticed() -> None:
         return replace(trace, steps=tuple(steps), odometry=replace(WHITE, **noise))
 
     said = (
-        "the odometry tells no travel from standing still: the longest displacement of one is "
+        "the odometry cannot tell a travel from standing still: the longest travel is "
         "0.01 m, and its noise about 0.1 m; "
     )
     count = Theory(weigh="count")
     assert (solve(scaled(0.001), count).support.odometry_warning or "").startswith(said)
-    assert "the longest displacement of one is 0 m" in (
-        solve(scaled(0.0), count).support.odometry_warning or ""
-    )
+    assert "the longest travel is 0 m" in (solve(scaled(0.0), count).support.odometry_warning or "")
     assert units_warning(scaled(0.001, position=0.001)) is None
     assert units_warning(trace) is None
     assert units_warning(trace.without_displacements()) is None

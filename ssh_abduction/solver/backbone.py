@@ -86,7 +86,7 @@ class Rivals:
         """
         if self.listed or self._proven or not self.reasons or not self.sharing.maps:
             return
-        _log.info("what all minimal maps share is sought, from %d of them", self.sharing.maps)
+        _log.info("looking for what all minimal maps share, from %d of them", self.sharing.maps)
         with suppress(LimitError, StageTimeError, KeyboardInterrupt):
             self._proven = prove_backbone(
                 self._task, self._judging, self._cost, self.sharing, self.engine

@@ -135,7 +135,7 @@ def _joint_maps(old: Trace, ssh_map: SSHMap, trace: Trace, problem: Problem) -> 
 
     existing, digest = ExistingMap(old, ssh_map), Digest.of(old, ssh_map, short=True)
     short = existing.with_displacements(digest.trace, digest.labels)
-    with warnings.catch_warnings():  # the digest may have the steps of the new drives
+    with warnings.catch_warnings():  # ignore that a digest may equal the new drives
         warnings.simplefilter("ignore")
         part = together([replace(short, odometry=old.odometry), trace])
     # The joint map is checked against what a user asserts, as that is about other step numbers.

@@ -109,7 +109,7 @@ def solve_onto(
             return on_map if corrections is None else with_names(corrections, on_map, joint)
     short = solving.speedups.that_hold_for(in_use).digest and in_use.displacement == "none"
     digest = Digest.of(old, ssh_map, short=short)
-    with warnings.catch_warnings():  # a digest may have the steps of the new drive
+    with warnings.catch_warnings():  # ignore that a digest may equal the new drive
         warnings.simplefilter("ignore")
         part = together([digest.trace, trace.without_displacements() if short else trace])
     pinned = _pinned(theory, digest, ssh_map, old, joins=in_use.star == "frame")

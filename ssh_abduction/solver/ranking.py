@@ -196,9 +196,9 @@ def units_warning(trace: Trace) -> str | None:
     if not ways:
         return None
     return (
-        "the odometry tells no travel from standing still: the longest displacement of one is "
+        "the odometry cannot tell a travel from standing still: the longest travel is "
         f"{max(ways):.3g} m, and its noise about {max(sigmas):.2g} m; "
-        "give metres and not kilometres, or the noise that the odometry has"
+        "give metres and not kilometres, or correct the noise of the odometry"
     )
 
 

@@ -88,7 +88,7 @@ class Stages:
         ):
             _log.info("no minimum after %.1f s step by step", parts.watch.elapsed())
             if may_frame:
-                _log.info("maps in which places have frames are sought as candidates")
+                _log.info("looking for maps in which places have frames, as candidates")
                 parts.candidates.frame(parts.speedups)
             if may_settle:
                 self._settle_dstates_first()
@@ -105,7 +105,7 @@ class Stages:
 
         parts, known, most = self._parts, self._parts.known, self._parts.limits.most
         self.mends = True
-        _log.info("maps with faults are sought by mending the trace")
+        _log.info("looking for maps with faults by mending the trace")
         mending = Mending(parts.task, self._solve_mended)
         parts.watch.use_reserve()
         try:
@@ -159,7 +159,7 @@ class Stages:
             from ssh_abduction.solver.engines.frameless import FramelessEngine
 
             _log.info(
-                "dstates are settled before places and paths, from a map of %d dstates",
+                "finding dstates before places and paths, from a map of %d dstates",
                 len(parts.known.best.dstates),
             )
             parts.prefixes.go_on_with(FramelessEngine(parts.task, labels), len(parts.task.trace))

@@ -269,7 +269,7 @@ class Weighing:
         _log.debug("a map of %.1f nats, and all others cost at least %.1f", nats, least)
         task, returns, wrong = self._parts.task, self._misfit.returns_of(ssh_map), jumped(ssh_map)
         if nats >= self._most:
-            # The misfit of no returns is in `least` already.
+            # `least` already has the misfit that the track has without returns.
             enough = 2 * (self._most - least + self._base)
             returns = self._misfit.core(returns[::-1], enough, wrong)
         elif task.theory.has_faults:

@@ -44,7 +44,7 @@ def summary_of(solution: Solution, count: int, backbone: Backbone | None) -> str
     # A single map differs from no other one.
     if not (listed and minimal == 1):
         text += f": {backbone.sentence}" + (
-            "" if backbone.proven else ", as far as was found out: others may differ in more"
+            "" if backbone.proven else ", as far as is known: other maps may differ in more"
         )
     more = sum(level.count for level in solution.levels[1:])
     text += f"; and {more} with up to {solution.within} more" if more else ""

@@ -246,7 +246,7 @@ class Asker:
             assumptions: Literals that hold in each answer.
             conflicts: The number of conflicts after which the search ends; -1 for no limit.
             on_bound: Called with each lower bound that clingo proves.
-            control: The control to use instead of `self.control`; None for that one.
+            control: The control to use; None for `self.control`.
             until: Called now and then; the search ends once it returns True.
             ahead: Whether clingo searches for the next answer while the caller uses this one.
 

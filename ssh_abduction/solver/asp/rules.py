@@ -143,8 +143,8 @@ def _check(rules: Rules, others: tuple[Rules, ...], files: tuple[str, ...]) -> N
                 and all(_is_settled(a, parameter) for a in atom.arguments)
             ):
                 raise TheoryError(
-                    f"{where}: not {atom}: expected to be asked at a step, got a question that is "
-                    "asked before its steps are there; "
+                    f"{where}: not {atom}: expected to be asked at its last step, got a question "
+                    "that clingo answers before it has this step; "
                     f"write {parameter} = {atom.arguments[-1]}, "
                     f"not {name}(…,{parameter}), in the body"
                 )

@@ -50,9 +50,9 @@ from ssh_abduction.theory.theory import Theory
 CHECKED_EVERY = 8
 # If no hypothesis is left, search again with a beam that is this many times as wide.
 WIDER = 2
-# With several drives or floors, it is open how they are joined. So keep LOST times as many
-# hypotheses, but at most ALIKE that join them in the same way. Check the beam at once if it has
-# more than CROWDED times as many, so that false joins do not crowd out true ones.
+# With several drives or floors, it is open how they are joined. So keep up to LOST * ALIKE
+# hypotheses, of which at most ALIKE join them in the same way. Check the beam at once if it has
+# more than CROWDED times its width, so that false joins do not crowd out true ones.
 LOST, ALIKE, CROWDED = 32, 4, 16
 # Of each earlier checked beam, keep this many hypotheses.
 SPARE = 2

@@ -18,8 +18,8 @@ from ssh_abduction.solver.steps.apart import Matrix
 from ssh_abduction.solver.steps.chart import Link, numbered
 
 # The demands on the merge of a step with a known dstate, from strict to lenient. The first number
-# is the lead in evidence over the next best merge of the step that is needed. The second number is
-# how many known dstates may fit the step at most. The last demand allows almost anything.
+# is by how much its evidence has to exceed that for the next best merge of the step. The second
+# number is how many known dstates may fit the step at most. The last demand allows almost anything.
 DEMANDS = (
     (10, 1),
     (5, 1),
@@ -34,8 +34,8 @@ DEMANDS = (
     (0, 2),
     (0, 1000),
 )
-# When a map is thinned, the lead in evidence over the next best merge that a merge of two known
-# dstates needs. The numbers are tried in this order.
+# When a map is thinned, the evidence for a merge of two known dstates has to exceed that for the
+# next best merge by these numbers. They are tried in this order.
 THINNED = 10, 5, 3, 0
 
 
