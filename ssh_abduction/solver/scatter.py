@@ -240,8 +240,8 @@ class _MovedPoints(Facilities):
         """Return twice what the position and the heading of a point lose if c is 1, (2, k, k).
 
         The facility moves by a mean of the moves of its points, weighted by c over the variance. So
-        its points together lose half of a sum over them, of the mean loss of a point against the
-        others. No mean is more than the greatest of these losses. Position and heading have numbers
+        the loss of a cluster is half of the sum, over its points, of their mean loss against the
+        others. This mean is at most the greatest of these losses. Position and heading have numbers
         c and means of their own.
         """
         moved = (self.moves[i] - self.moves[others]) / np.sqrt(2 * self.variances[i])[:, None]
