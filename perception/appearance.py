@@ -118,12 +118,8 @@ class PanoramaTransformer(TransformerMixin, BaseEstimator):  # type: ignore[misc
 def features_of(trace: Trace) -> ReciprocalTransformer | PanoramaTransformer:
     """Make the transformer for the images of a trace; it is not fitted yet.
 
-    Args:
-        trace: Its images are panoramas if its header gives their shape, as
-            `"panorama": [24, 180, 3]`. Otherwise, they are ranges.
-
-    Raises:
-        PerceptionError: The shape in the header is not three whole numbers of at least 1.
+    Images are panoramas if the header gives their shape, as `"panorama": [24, 180, 3]`, and
+    else ranges. Raises PerceptionError if the shape is not three whole numbers of at least 1.
     """
     shape = trace.extra.get(FIELD)
     if shape is None:

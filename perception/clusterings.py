@@ -91,11 +91,7 @@ def single(fitted: Any, images: NDArray[np.float64], trim: float) -> tuple[Any, 
 
 
 def smallest_good(worth: dict[int, float]) -> int:
-    """The smallest k whose trimmed M is at least EQUAL times the largest.
-
-    Args:
-        worth: Trimmed M for each k.
-    """
+    """The smallest k whose trimmed M, its worth, is at least EQUAL times the largest."""
     return min(k for k in worth if not worth[k] < EQUAL * max(worth.values()))
 
 
@@ -109,14 +105,9 @@ def cluster_labels(fitted: Any, images: NDArray[np.float64]) -> NDArray[np.intp]
 def to_neighbour(
     images: NDArray[np.float64], among: NDArray[np.float64], itself: int
 ) -> NDArray[np.float64]:
-    """The distance from each image to its third nearest neighbour, (n,).
+    """The distance from each image, (n, d), to its third nearest in (m, d), or the farthest: (n,).
 
-    If there are fewer neighbours, it is the distance to the farthest of them.
-
-    Args:
-        images: (n, d) images.
-        among: (m, d) possible neighbours.
-        itself: 1 if `among` contains the images themselves, otherwise 0.
+    `itself` is 1 if `among` contains the images themselves, otherwise 0.
     """
     number = min(NEIGHBOURS + itself, len(among))
     distances, _ = (

@@ -26,12 +26,9 @@ class ImageWarning(UserWarning):
 
 
 def equal_length(images: Any) -> Any:
-    """Check that images have equal lengths, and return them unchanged.
+    """Return images unchanged, or raise PerceptionError if two differ in length.
 
     numpy would also reject unequal lengths, but with a message that is hard to understand.
-
-    Raises:
-        PerceptionError: Two images of a list or tuple differ in length.
     """
     if isinstance(images, list | tuple):
         lengths = [len(image) if hasattr(image, "__len__") else 0 for image in images]

@@ -18,16 +18,11 @@ LARGEST = 4 * 2**30
 
 
 def images_of(trace: Trace) -> NDArray[np.float64]:
-    """Collect the images of all steps.
+    """Collect the images of all steps: (n, d) ranges in metres, one row a step.
 
-    An image is in the trace itself or in its sidecar file. This is a .npy file, or a .npz file with
-    one array or with an array named `images`.
-
-    Returns:
-        (n, d) ranges in metres, one row a step.
-
-    Raises:
-        PerceptionError: A step has no image, lengths differ, or the sidecar file cannot be read.
+    An image is in the trace itself or in its sidecar file. This is a .npy file, or a .npz file
+    with one array or with an array named `images`. Raises PerceptionError if a step has no
+    image, lengths differ, or the sidecar file cannot be read.
     """
     for i, step in enumerate(trace.steps):
         if step.image is None:
@@ -52,13 +47,9 @@ def images_of(trace: Trace) -> NDArray[np.float64]:
 
 
 def images_held(trace: Trace) -> list[NDArray[np.float64] | None]:
-    """Collect the image of each step, if the step has one.
+    """Return the image of each step, (d,) ranges in metres; None if a step has none.
 
-    Returns:
-        For each step its image, (d,) ranges in metres; None for a step without an image.
-
-    Raises:
-        PerceptionError: The sidecar file cannot be read.
+    Raises PerceptionError if the sidecar file cannot be read.
     """
     held = [step.image for step in trace.steps]
     if not any(isinstance(image, int) for image in held):

@@ -80,8 +80,7 @@ class ImageLikelihood:
     def of(cls, recogniser: Any) -> ImageLikelihood:
         """Measure the distances between the images that a recogniser remembers.
 
-        Raises:
-            PerceptionError: The recogniser is of another kind, is not fitted, or has one image.
+        Raises PerceptionError if it is of another kind, is not fitted, or has one image.
         """
         nearest = _nearest(recogniser)
         if not isinstance(nearest, PlaceRecogniser):
@@ -116,12 +115,8 @@ class ImageLikelihood:
     def ratios(self, images: ArrayLike) -> Iterator[NDArray[np.float64]]:
         """Compute how much likelier each image is at a known place than at an unknown one.
 
-        Args:
-            images: (n, d) images as the recogniser takes them.
-
-        Yields:
-            For each image an array, (c,): the ratio p(o|x) / p(o|nowhere) for each of `classes`.
-            A ratio is between 0 and c + 1.
+        Yield for each image, as the recogniser takes it, (c,) ratios p(o|x) / p(o|nowhere),
+        from 0 to c + 1, for each of `classes`.
         """
         features = self._features(images)
         for some in np.array_split(features, max(1, math.ceil(len(features) / AT_ONCE))):
@@ -134,12 +129,8 @@ class ImageLikelihood:
     def labels(self, images: ArrayLike, unmapped: float = UNMAPPED) -> list[Any]:
         """Find the most probable place of each image, with equal priors for all known places.
 
-        Args:
-            images: (n, d) images as the recogniser takes them.
-            unmapped: Prior probability that an image is of no known place.
-
-        Returns:
-            For each image one of `classes`, or None if an unknown place is likelier.
+        It is one of `classes`, or None if an unknown place, with its prior `unmapped`, is
+        likelier.
         """
         found = []
         for ratios in self.ratios(images):
@@ -209,11 +200,9 @@ def _nearest(recogniser: Any) -> Any:
 def _within_places(images: NDArray[np.float64], labels: NDArray[Any]) -> NDArray[np.float64]:
     """Squared distance from each image to the nearest other image of its place.
 
-    If each place has one image, it is the distance to the nearest image of another place. That is
-    too large, so the densities differ less than they should, and a warning says so.
-
-    Raises:
-        PerceptionError: There is only one image.
+    If each place has one image, it is the distance to the nearest image of another place. That
+    is too large, so the densities differ less than they should, and a warning says so. Raises
+    PerceptionError if there is only one image.
     """
     squares = np.concatenate(
         [_to_nearest_other(images[labels == label]) for label in np.unique(labels)]

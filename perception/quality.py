@@ -82,13 +82,9 @@ class SpanningTree:
         return 1 + int(np.count_nonzero(self.lengths))
 
     def separation(self, labels: ArrayLike) -> float:
-        """Find the smallest distance between two images with different labels.
+        """Find the smallest distance between two images with different labels, (n,).
 
-        Args:
-            labels: (n,) label of each image.
-
-        Returns:
-            The distance; infinite if all labels are equal.
+        It is infinite if all labels are equal.
         """
         of = np.asarray(labels)
         crossing = of[self.edges[:, 0]] != of[self.edges[:, 1]]
@@ -184,14 +180,7 @@ def trimmed_quality(
 
 
 def sample_indices(count: int) -> Integers:
-    """Choose the images for quantiles of distances: all, or a fixed random sample of 2,000.
-
-    Args:
-        count: Number of images.
-
-    Returns:
-        Ascending indices of images.
-    """
+    """List the images for quantiles of distances: all, or a fixed random sample of 2,000."""
     if count <= SAMPLE:
         return np.arange(count)
     return np.sort(np.random.default_rng(0).choice(count, SAMPLE, replace=False))
@@ -249,17 +238,10 @@ def spanning_tree(X: ArrayLike) -> SpanningTree:
 
 
 def cluster_spread(X: ArrayLike, labels: ArrayLike) -> float:
-    """Find the largest distance between two images of one cluster.
+    """Find the largest distance between two images, (n, d), of one cluster, (n,).
 
     By the triangle inequality, the distance of two images is at most the sum of their distances
     from the centre. Pairs that cannot exceed the largest distance so far are skipped.
-
-    Args:
-        X: (n, d) images, finite.
-        labels: (n,) cluster of each image.
-
-    Returns:
-        The distance; 0 if the images within each cluster are equal.
     """
     images = check_array(equal_length(X), dtype=np.float64)
     clusters = _numbered(labels, len(images))

@@ -54,13 +54,9 @@ class ReciprocalTransformer(OneToOneFeatureMixin, TransformerMixin, BaseEstimato
         return self
 
     def transform(self, X: ArrayLike) -> NDArray[np.float64]:
-        """Compute the reciprocals of ranges.
+        """Compute the reciprocals, (n, d) in 1/m within [0, 1 / floor], of ranges in metres.
 
-        Args:
-            X: (n, d) ranges in metres; +inf or NaN means "nothing seen".
-
-        Returns:
-            (n, d) reciprocals in 1/m, within [0, 1 / floor].
+        A range that is +inf or NaN means "nothing seen".
         """
         check_is_fitted(self)
         ranges = validate_data(

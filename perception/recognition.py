@@ -85,11 +85,8 @@ class PlaceRecogniser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
     def distances(self, X: ArrayLike) -> NDArray[np.float64]:
         """Measure how far the nearest learnt image of each class is from each image.
 
-        Args:
-            X: (n, d) images, finite.
-
-        Returns:
-            (n, c) Euclidean distances, a column for each of `classes_`.
+        Images are (n, d), finite. Distances are (n, c), Euclidean, a column for each of
+        `classes_`.
         """
         remembered, labels = self.remembered()
         found = cdist(self._images(X), remembered)
@@ -103,11 +100,9 @@ class PlaceRecogniser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
     def learnt_again(self) -> PlaceRecogniser:
         """Make a new recogniser from the remembered images and labels. It gives the same answers.
 
-        This checks the remembered tables. scikit-learn's compiled search trusts its tables, so a
-        table that was damaged in a file could crash the process.
-
-        Raises:
-            PerceptionError, ValueError: The tables are damaged. numpy may raise other errors.
+        This checks the remembered tables. scikit-learn's compiled search trusts its tables,
+        so a table that was damaged in a file could crash the process. Damage raises
+        PerceptionError, ValueError, or other errors of numpy.
         """
         return PlaceRecogniser(self.n_neighbors).fit(*self.remembered())
 
@@ -139,14 +134,9 @@ def recogniser(floor: float = 0.05, n_neighbors: int = 1, features: Any = None) 
 
 
 def cloned(name: str, estimator: Any, *methods: str) -> Any:
-    """Clone a scikit-learn estimator.
+    """Clone the scikit-learn estimator of the setting `name`, or raise PerceptionError.
 
-    Args:
-        name: Name of the setting, for the error message.
-        *methods: Names of methods that it must have besides `fit` and `get_params`.
-
-    Raises:
-        PerceptionError: A method is missing.
+    It must have `fit`, `get_params` and the other methods.
     """
     wanted = ("fit", "get_params", *methods)
     if isinstance(estimator, type) or not all(hasattr(estimator, method) for method in wanted):

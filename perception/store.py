@@ -60,8 +60,7 @@ class Stored:
     def likelihood(self) -> ImageLikelihood | None:
         """Make the densities of images at the places that the model knows.
 
-        Returns:
-            The densities; None if the model is no recogniser of places or has one image.
+        None if the model is no recogniser of places or has one image.
         """
         try:
             return ImageLikelihood.of(self.model)
@@ -69,14 +68,10 @@ class Stored:
             return None
 
     def labels(self, images: ArrayLike) -> list[int]:
-        """Predict the label of each image.
+        """Predict the label of each image, (n, d).
 
-        Args:
-            images: (n, d) images.
-
-        Raises:
-            PerceptionError: The images have another length than the learnt ones, or the model is
-                damaged. `load` does not notice all damage of a file.
+        Raises PerceptionError if the images have another length than the learnt ones, or
+        the model is damaged. `load` does not notice all damage of a file.
         """
         table = np.asarray(images, np.float64)
         try:
@@ -107,11 +102,8 @@ class Stored:
 def save(model: Any, path: str | os.PathLike[str]) -> None:
     """Write a fitted estimator or pipeline to a file, completely or not at all.
 
-    Args:
-        model: The estimator or pipeline, of types of this package or of scikit-learn.
-
-    Raises:
-        PerceptionError: `load` would reject the model, or the file cannot be written.
+    Its types are of this package or of scikit-learn. Raises PerceptionError if `load` would
+    reject it, or the file cannot be written.
     """
     data = written(model, str(path))
     try:
@@ -127,14 +119,9 @@ def save(model: Any, path: str | os.PathLike[str]) -> None:
 
 
 def written(model: Any, name: str = "recogniser") -> bytes:
-    """Make the content of the file of a fitted estimator or pipeline.
+    """Make the content of the file, with this name, of a fitted estimator or pipeline.
 
-    Args:
-        model: The estimator or pipeline, of types of this package or of scikit-learn.
-        name: The name of the file, for errors.
-
-    Raises:
-        PerceptionError: `load` would reject the model.
+    Raises PerceptionError if `load` would reject it.
     """
     classes = np.asarray(getattr(model, "classes_", ())).tolist()
     versions = {
@@ -161,8 +148,7 @@ def written(model: Any, name: str = "recogniser") -> bytes:
 def load(path: str | os.PathLike[str]) -> Stored:
     """Read a recogniser that `save` wrote, without running anything in the file.
 
-    Raises:
-        PerceptionError: The file is unreadable or has other content.
+    Raises PerceptionError if the file is unreadable or has other content.
     """
     try:
         # Measure and check the types before reading any object.

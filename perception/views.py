@@ -364,17 +364,9 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
 
 
 def as_view_clusterer(clusterer: Any) -> ViewClusterer:
-    """Wrap a scikit-learn clusterer in a ViewClusterer.
+    """Wrap a scikit-learn clusterer, unless it is a ViewClusterer, in one. Raises PerceptionError.
 
-    Args:
-        clusterer: A scikit-learn clusterer, or a ViewClusterer.
-
-    Returns:
-        A ViewClusterer whose k is the number of clusters that the clusterer is set to. A
-        ViewClusterer is returned unchanged.
-
-    Raises:
-        PerceptionError: The argument is not a clusterer.
+    Its k is the number of clusters that the clusterer is set to.
     """
     if isinstance(clusterer, ViewClusterer):
         return clusterer

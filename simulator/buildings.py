@@ -42,13 +42,9 @@ class Opening:
     depth: float
 
     def frame(self, points: Array) -> Array:
-        """Convert points to coordinates along and across the wall, from the middle.
+        """Convert points, (n, 2) in metres, to metres along and across the wall, from the middle.
 
-        Args:
-            points: (n, 2) x and y in metres.
-
-        Returns:
-            (n, 2) metres along the wall, and across it to the left.
+        Across counts to the left.
         """
         cos, sin = math.cos(self.along), math.sin(self.along)
         off = points - np.array(self.middle)
@@ -59,9 +55,7 @@ class Opening:
     def point(self, along: float, across: float) -> tuple[float, float]:
         """Compute the point (x, y) at a distance in metres along the wall, and across it.
 
-        Args:
-            along: Metres along the wall from the middle.
-            across: Metres to the left of the direction of the wall.
+        Along counts from the middle, and across to the left of the direction of the wall.
         """
         cos, sin = math.cos(self.along), math.sin(self.along)
         return self.middle[0] + cos * along - sin * across, self.middle[

@@ -34,17 +34,10 @@ PATIENCE = 100
 
 
 def drive_along(driver: Driver, space: FreeSpace, way: Array) -> Iterator[int]:
-    """Drive along a route.
+    """Drive along a route, (n, 2) metres; yield the index of the point reached by each motion.
 
-    Args:
-        space: Free space between known walls. Obstacles that the laser sees are marked in it.
-        way: (n, 2) route in metres.
-
-    Yields:
-        After each motion, the index in `way` of the point that the robot has reached.
-
-    Raises:
-        SimulatorError: An obstacle blocks the route, or the robot is stuck or hits a wall.
+    `space` is the free space between known walls. Obstacles that the laser sees are marked in
+    it. Raises SimulatorError if one blocks the route, or the robot is stuck or hits a wall.
     """
     # Index in the given route of each point of the current route, which changes around obstacles.
     numbers = np.arange(len(way))

@@ -68,9 +68,8 @@ class RecordedDrive:
     ) -> RecordedDrive:
         """Copy the drive, with the truth by which its maps are evaluated.
 
-        Args:
-            places: (x, y) in metres of each place, by name.
-            scans: Name of the place of each scan; None between places.
+        `places` has (x, y) in metres of each place, by name, and `scans` the name of the
+        place of each scan; None between places.
         """
         visits: list[dict[str, Any]] = []
         # Consecutive scans at a place form a visit.
@@ -170,12 +169,8 @@ class Recorder:
     def drive(self, name: str, laser: Laser, odometer: Odometer, seed: int) -> RecordedDrive:
         """Make the drive from the recorded poses. A last scan is taken at its end.
 
-        Scans and odometry have random generators of their own, so their noise does not change the
-        trajectory.
-
-        Args:
-            odometer: Noise of the odometry.
-            seed: Seed of the noise of scans and odometry.
+        Scans and odometry have random generators of their own, with this seed, so their
+        noise does not change the trajectory.
         """
         if self.scans[-1][1][-1:] != [len(self.poses) - 1]:
             self.scans[-1][1].append(len(self.poses) - 1)

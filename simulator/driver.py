@@ -84,14 +84,7 @@ class Driver:
     recorder: Recorder | None = None
 
     def look(self, images: int = 1) -> Array:
-        """Take an image: the median of some scans, beam by beam.
-
-        Args:
-            images: Number of scans.
-
-        Returns:
-            (180,) ranges in metres, from right to left.
-        """
+        """Take an image, (180,) metres from right to left: the median of some scans by beam."""
         scans = self.laser.scan(self.world, np.repeat([self.robot.pose], images, axis=0), self.rng)
         return np.median(scans, axis=0) if images > 1 else scans[0]
 
@@ -100,11 +93,7 @@ class Driver:
         return sight(self.look(images), self.world.reach, self.laser.reach)
 
     def ride(self, name: str) -> None:
-        """Take the lift of this name to the place at its other end. The heading stays.
-
-        Raises:
-            SimulatorError: No such lift is here.
-        """
+        """Take a lift by its name to its other end. The heading stays. Raises SimulatorError."""
         x, y, heading = self.robot.pose
         lift = self.world.lift_at(name, x, y)
         if lift is None:
@@ -115,14 +104,9 @@ class Driver:
         self.robot.pose = x + lift.end[0] - lift.start[0], y + lift.end[1] - lift.start[1], heading
 
     def go(self, forward: float, turn: float = 0.0) -> None:
-        """Move the robot.
+        """Move the robot by metres forward or back, and turn it by radians counterclockwise.
 
-        Args:
-            forward: Metres forward; negative for back.
-            turn: Radians to turn on the way, counterclockwise.
-
-        Raises:
-            SimulatorError: The robot leaves the world or hits a wall.
+        Raises SimulatorError if the robot leaves the world or hits a wall.
         """
         self.robot.move(forward, turn)
         x, y, _ = self.robot.pose
@@ -141,11 +125,7 @@ class Driver:
 
 
 def act(driver: Driver, action: str) -> None:
-    """Do an action of a route, and climb to the dstate at its end.
-
-    Args:
-        action: "travel", "left", "right" or "around".
-    """
+    """Do "travel", "left", "right" or "around", and climb to the dstate at its end."""
     if action == "travel":
         travel(driver)
         climb(driver)
@@ -157,9 +137,8 @@ def act(driver: Driver, action: str) -> None:
 def travel(driver: Driver) -> None:
     """Follow the midline or the wall to the next distinctive place.
 
-    Raises:
-        SimulatorError: A wall is ahead, there is no place within LONGEST_TRAVEL metres, or the
-            robot hits a wall.
+    Raises SimulatorError if a wall is ahead, there is no place within LONGEST_TRAVEL metres, or
+    the robot hits a wall.
     """
     reach = driver.world.reach
     # A side street counts only after leaving the place where the robot started.
@@ -197,9 +176,8 @@ def _steer(seen: WallPositions, reach: float, stride: float) -> float:
 def climb(driver: Driver, turned: bool = False) -> None:
     """Climb to the fixed point: correct the position along and across the path, and the heading.
 
-    Args:
-        turned: Whether the action was a turn. Then the position across the path is not corrected,
-            as the robot would have to drive back and approach again.
+    After a turn, the position across the path is not corrected, as the robot would have to
+    drive back and approach again.
     """
     reach, tolerance = driver.world.reach, driver.tolerance
     for attempt in range(TRIES):
@@ -281,14 +259,10 @@ class Corridors:
             self._openings, self._facing = {2: True}, 0
 
     def star(self, image: Array) -> tuple[float, ...]:
-        """Find the star: which directions are open at this place, as seen since arrival.
+        """Find which directions (ahead, right, behind and left) are open here: 1 or 0.
 
-        Args:
-            image: (180,) ranges in metres. A direction is open if its wall is far.
-
-        Returns:
-            Four numbers, for ahead, right, behind and left: 1 if open, 0 if closed or unknown. The
-            image does not show what is behind; an earlier image may.
+        A direction is open if its wall is far in an image, (180,) metres. The image does
+        not show what is behind; an earlier image may. What is unknown counts as closed.
         """
         for slot, beams in ((0, image[82:98]), (1, image[:10]), (3, image[-10:])):
             is_far = bool(np.median(beams) > 1.8 * self.driver.world.reach)

@@ -64,14 +64,9 @@ class FreeSpace:
 
     @classmethod
     def of(cls, segments: Array, radius: float) -> FreeSpace:
-        """Make the free space between walls.
+        """Make the free space between walls, (n, 4), for a robot of this radius, in metres.
 
-        Args:
-            segments: (n, 4) walls in metres.
-            radius: Radius of the robot in metres.
-
-        Raises:
-            SimulatorError: The area is too large.
+        Raises SimulatorError if the area is too large.
         """
         ends = segments.reshape(-1, 2)
         corner = ends.min(0) - MARGIN
@@ -102,13 +97,9 @@ class FreeSpace:
         return cells
 
     def cells(self, points: Array) -> tuple[Cells, Cells]:
-        """Find the cells of points.
+        """Find the rows, (n,), and columns, (n,), of points, (n, 2) metres.
 
-        Args:
-            points: (n, 2) metres. A point outside the grid has the nearest cell.
-
-        Returns:
-            Rows, (n,), and columns, (n,).
+        A point outside the grid has the nearest cell.
         """
         columns, rows = np.floor((points - np.array(self.corner)) / CELL).astype(np.intp).T
         return rows.clip(0, self.occupied.shape[0] - 1), columns.clip(0, self.occupied.shape[1] - 1)
@@ -121,11 +112,9 @@ class FreeSpace:
         return found
 
     def part(self, points: Array, closed: Mask | None = None) -> FreeRectangle:
-        """Make a `FreeRectangle`: a rectangle of the grid around some points.
+        """Make a `FreeRectangle`: a rectangle of the grid around some points, (n, 2) metres.
 
-        Args:
-            points: (n, 2) metres.
-            closed: (rows, columns) mask of further cells that count as occupied.
+        `closed` is a mask, (rows, columns), of further cells that count as occupied.
         """
         rows, columns = self.cells(np.vstack([points.min(0) - MARGIN, points.max(0) + MARGIN]))
         window = slice(rows[0], rows[1] + 1), slice(columns[0], columns[1] + 1)
@@ -136,15 +125,10 @@ class FreeSpace:
         return FreeRectangle(corner, _clearance(occupied), self.least)
 
     def way(self, start: Point, goal: Point, closed: Mask | None = None) -> Array | None:
-        """Find the best route between two points, within the part of the grid around both.
+        """Find the best route, (n, 2) metres, within the part of the grid around both ends.
 
-        Args:
-            start: (x, y) in metres.
-            goal: (x, y) in metres.
-            closed: (rows, columns) mask of further cells that count as occupied.
-
-        Returns:
-            (n, 2) metres; None if there is no route. `FreeRectangle.way` says which route is best.
+        `closed` is as in `part`. None if there is no route. `FreeRectangle.way` says which
+        one is best.
         """
         return self.part(np.array([start, goal]), closed).way(start, goal)
 
@@ -164,14 +148,9 @@ class FreeRectangle:
     least: float
 
     def way(self, start: Point, goal: Point) -> Array | None:
-        """Find the best route between two points: short, and ROOM metres from walls if possible.
+        """Find a route between points (x, y): short, and ROOM metres from walls if possible.
 
-        Args:
-            start: (x, y) in metres.
-            goal: (x, y) in metres.
-
-        Returns:
-            (n, 2) metres, with a point in each cell; None if there is no route.
+        It is (n, 2) metres, with a point in each cell; None if there is no route.
         """
         (row, other_row), (column, other_column) = self._cells(np.array([start, goal]))
         cells = _shortest(
@@ -204,16 +183,10 @@ class FreeRectangle:
         return found
 
     def nearest(self, region: int, goal: Point, room: float) -> Point:
-        """Find the point of a region that is nearest to a goal.
+        """Find the point (x, y) of a region, by its number, that is nearest to a goal.
 
-        Args:
-            region: Number of the region.
-            goal: (x, y) in metres.
-            room: Smallest distance of the point from walls in metres, if the region has such
-                points. Otherwise, points as far from walls as possible are considered.
-
-        Returns:
-            (x, y) in metres.
+        It is `room` metres from walls, if the region has such points. Otherwise, points as
+        far from walls as possible are considered. Lengths are metres.
         """
         cells = np.argwhere(self.regions == region)
         clearance = self.clearance[tuple(cells.T)]
@@ -247,18 +220,11 @@ def _clearance(occupied: Mask) -> Array:
 def _shortest(
     clearance: Array, least: float, start: tuple[int, int], goal: tuple[int, int]
 ) -> Cells | None:
-    """The cells of the cheapest route.
+    """The cells, (n, 2) rows and columns, of the cheapest route between two cells, or None.
 
-    Args:
-        clearance: (rows, columns) distance in metres to the nearest occupied cell.
-        least: Smallest distance of the route from occupied cells, in metres. Near start and goal,
-            where the robot may be closer to obstacles than planned, a cell need only not touch an
-            occupied one.
-        start: Row and column of the first cell.
-        goal: Row and column of the last cell.
-
-    Returns:
-        (n, 2) rows and columns; None if there is no route.
+    `clearance` has metres to the nearest occupied cell, (rows, columns), and `least` the
+    smallest ones of the route. Near start and goal, where the robot may be closer to obstacles
+    than planned, a cell need only not touch an occupied one.
     """
     rows, columns = clearance.shape
     free = clearance >= least

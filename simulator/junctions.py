@@ -84,8 +84,7 @@ class Pilot:
     def begin(self) -> None:
         """Climb to the dstate (fixed position and heading) near the start.
 
-        Raises:
-            SimulatorError: There is no place near the start.
+        Raises SimulatorError if there is no place near the start.
         """
         if not self._climb():
             raise self._error(
@@ -96,11 +95,7 @@ class Pilot:
             )
 
     def act(self, action: str) -> None:
-        """Do an action of a route: "travel", "left", "right" or "around".
-
-        Raises:
-            SimulatorError: The action cannot be done.
-        """
+        """Do "travel", "left", "right" or "around" of a route. Raises SimulatorError."""
         if action == "travel":
             self._travel()
         elif action == "around":
@@ -117,13 +112,9 @@ class Pilot:
             self._face(self.here.heading + turn)
 
     def star(self, image: Array | None = None) -> tuple[float, ...]:
-        """Find the star: the bearings of the gateways of this place.
+        """Find the bearings of the gateways of this place, ascending degrees clockwise from ahead.
 
-        Args:
-            image: Ignored, as the panorama shows the gateways.
-
-        Returns:
-            Degrees clockwise from straight ahead, ascending.
+        The panorama shows the gateways. The image is not read.
         """
         bearings = (
             round(math.degrees(self.here.heading - street.bearing) % 360, 1) % 360

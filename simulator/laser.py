@@ -37,15 +37,10 @@ class Laser:
     dropouts: float = 0.001
 
     def exact(self, world: World, poses: Array) -> Array:
-        """Compute the ranges without noise at some poses.
+        """Compute the ranges without noise, (m, 180) metres from right to left, at some poses.
 
-        One call for many poses is faster than many calls.
-
-        Args:
-            poses: (m, 3) x and y in metres, heading in radians.
-
-        Returns:
-            (m, 180) metres, from right to left.
+        Poses are (m, 3) x and y in metres, heading in radians. One call for many poses is
+        faster than many calls.
         """
         poses = np.atleast_2d(poses)
         rows = max(1, _BLOCK // (BEAMS * len(world.segments)))
@@ -54,15 +49,7 @@ class Laser:
         )
 
     def scan(self, world: World, poses: Array, rng: np.random.Generator) -> Array:
-        """Compute the ranges with noise at some poses.
-
-        Args:
-            poses: (m, 3) x and y in metres, heading in radians.
-            rng: Source of the noise.
-
-        Returns:
-            (m, 180) metres, from right to left.
-        """
+        """Compute the ranges with noise at some poses, as `exact`."""
         ranges = self.exact(world, poses)
         ranges = ranges + rng.normal(0, self.noise, ranges.shape) * (ranges < self.reach)
         ranges[rng.random(ranges.shape) < self.dropouts] = self.reach
@@ -88,15 +75,10 @@ def _near(segments: Array, poses: Array, reach: float) -> Array:
 
 
 def meetings(segments: Array, poses: Array, bearings: Array) -> Array:
-    """Compute the distances from poses to walls along rays.
+    """Compute the distances in metres, (m, b, w), from poses to walls along rays.
 
-    Args:
-        segments: (w, 4) walls in metres.
-        poses: (m, 3) x and y in metres, heading in radians.
-        bearings: (b,) directions of the rays relative to the heading, in radians.
-
-    Returns:
-        (m, b, w) metres; infinite if the ray misses the wall.
+    Walls are (w, 4) metres, poses (m, 3) x and y in metres and heading in radians, and bearings
+    (b,) radians from the heading. A distance is infinite if the ray misses the wall.
     """
     angles = poses[:, 2, None] + bearings
     dx, dy = np.cos(angles)[:, :, None], np.sin(angles)[:, :, None]

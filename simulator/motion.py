@@ -29,17 +29,11 @@ def reported(
     scale: float = 0.0,
     bend: float = 0.0,
 ) -> Displacement:
-    """Add systematic errors and random noise to a displacement, as odometry reports it.
+    """Add systematic errors and random noise to a displacement, as odometry reports it, rounded.
 
-    Args:
-        displacement: The true displacement: metres ahead and to the left, and radians turned.
-        odometry: Model of the noise. The noise is drawn with its covariance.
-        rng: Source of the noise.
-        scale: Share by which reported distances are too long.
-        bend: Radians a metre by which the reported heading drifts to the left.
-
-    Returns:
-        The reported displacement, rounded.
+    It has metres ahead and to the left, and radians turned. The noise is drawn with the
+    covariance of the odometry. `scale` is the share by which reported distances are too long,
+    and `bend` by how many radians a metre the reported heading drifts to the left.
     """
     dx, dy, turned = displacement
     drift = bend * math.hypot(dx, dy)

@@ -76,14 +76,9 @@ class MapFile:
 
 
 def read_occupancy(path: Path) -> tuple[str, NDArray[np.float64]]:
-    """Read the walls of an occupancy map.
+    """Read the name of an occupancy map, which is that of the file, and its walls, (n, 4) metres.
 
-    Returns:
-        The name of the map, which is that of the file, and its walls, (n, 4) in metres.
-
-    Raises:
-        SimulatorError: The map cannot be read, or has no walls. The text names the file and the
-            field.
+    Raises SimulatorError, which names the file and the field.
     """
     fields = read_map_file(path)
     cells = _cells(fields, path)
@@ -113,11 +108,7 @@ def read_occupancy(path: Path) -> tuple[str, NDArray[np.float64]]:
 
 
 def read_map_file(path: Path) -> MapFile:
-    """Read the YAML file of an occupancy map. Its image is not read.
-
-    Raises:
-        SimulatorError: The file is unreadable or no YAML, or a field is missing or invalid.
-    """
+    """Read the YAML file of an occupancy map, but not its image. Raises SimulatorError."""
     try:
         fields = _fields(read_at_most(path, LARGEST_TEXT))
     except (OSError, ValueError) as error:
@@ -130,16 +121,10 @@ def read_map_file(path: Path) -> MapFile:
 
 
 def _fields(data: bytes) -> dict[str, str | list[str]]:
-    """Parse the fields of a YAML file.
+    """Parse the fields of a YAML file: a text or a list of texts for each.
 
-    Scalars stay texts, as in the parser of map_server. PyYAML would read 5e-2 as a text and 1:30 as
-    a number.
-
-    Returns:
-        For each field a text or a list of texts.
-
-    Raises:
-        ValueError: The file is no YAML, or a field has another form.
+    Scalars stay texts, as in the parser of map_server. PyYAML would read 5e-2 as a text and
+    1:30 as a number. Raises ValueError if the file is no YAML, or a field has another form.
     """
     import yaml  # Imported here because it loads slowly.
 

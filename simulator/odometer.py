@@ -67,11 +67,8 @@ class Odometer:
     def as_noisy_as(self, along: float) -> Odometer:
         """Copy the odometer, with noise of the default proportions, scaled to a value of `along`.
 
-        Args:
-            along: Standard deviation along the motion after one metre, in metres.
-
-        Raises:
-            SimulatorError: The value is not from 0 to 1.
+        That is the standard deviation along the motion after one metre, in metres, from 0
+        to 1, or SimulatorError is raised.
         """
         if not is_finite(along) or not 0 <= along <= WORST:
             raise SimulatorError(
@@ -93,14 +90,9 @@ class Odometer:
         return asdict(self)
 
     def reading(self, poses: Array, rng: np.random.Generator) -> Array:
-        """Compute what the odometer reads along a trajectory.
+        """Compute what the odometer reads along true poses, (n, 3) in metres and radians.
 
-        Args:
-            poses: (n, 3) true poses: x and y in metres, heading in radians.
-            rng: Source of the noise.
-
-        Returns:
-            (n, 3) poses by odometry. The first is (0, 0, 0).
+        The readings, (n, 3), begin at (0, 0, 0).
         """
         ahead, left, turned = _motions(poses)
         way = np.hypot(ahead, left)
@@ -121,16 +113,10 @@ class Odometer:
         return np.column_stack([x, y, np.remainder(heading + np.pi, 2 * np.pi) - np.pi])
 
     def covariances(self, readings: Array) -> Array:
-        """Estimate the covariance of the noise of each reading, relative to the first one.
+        """Estimate the covariances, (n, 3, 3), of the noise of readings, (n, 3), since the first.
 
-        The estimate is of first order. It does not include systematic errors, which a robot cannot
-        know.
-
-        Args:
-            readings: (n, 3) poses by odometry.
-
-        Returns:
-            (n, 3, 3) covariances of x, y and heading.
+        The estimate is of first order. It does not include systematic errors, which a robot
+        cannot know.
         """
         found = np.zeros((len(readings), 3, 3))
         for number, (start, ahead, left, turned) in enumerate(

@@ -58,13 +58,9 @@ class Door:
 
 
 def read_plan(path: str | os.PathLike[str]) -> tuple[str, tuple[Room, ...], tuple[Door, ...]]:
-    """Read a plan from an XML file.
+    """Read the name of a plan, which is that of the XML file, its rooms, and its doors.
 
-    Returns:
-        The name of the plan, which is that of the file; its rooms; and its doors.
-
-    Raises:
-        SimulatorError: The file cannot be read, or a part of the plan is wrong.
+    Raises SimulatorError if the file cannot be read, or a part of the plan is wrong.
     """
     path = a_path("path", path, SimulatorError)
     try:

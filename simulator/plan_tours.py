@@ -145,11 +145,9 @@ class Floor:
         return Step(_view(bearings), star=_star(self.plan, stand, bearings, self.spread))
 
     def ends(self, stand: Stand) -> dict[Action, Stand]:
-        """List what the robot can do in a state.
+        """List what the robot can do in a state, and the state that each action leads to.
 
-        Returns:
-            Dict from each action to the state that it leads to. An action is a turn to another
-            gateway, or a travel through the gateway ahead.
+        An action is a turn to another gateway, or a travel through the gateway ahead.
         """
         return dict(
             next(self.way_through(stand, goal))
@@ -157,13 +155,9 @@ class Floor:
         )
 
     def way_through(self, stand: Stand, goal: int) -> Iterator[tuple[Action, Stand]]:
-        """List the actions that lead through a gateway: a turn, unless it is ahead, and a travel.
+        """Yield the actions to the gateway `goal` of the room and through it, and their ends.
 
-        Args:
-            goal: Index of the gateway of the room.
-
-        Yields:
-            Each action, and the state that it leads to.
+        They are a turn, unless it is ahead, and a travel.
         """
         return _way_through(self.plan, stand, goal)
 

@@ -99,12 +99,7 @@ class SimulatedRobot:
         self._covariance = np.zeros((3, 3))
 
     def move(self, forward: float, turn: float) -> None:
-        """Drive and turn at once.
-
-        Args:
-            forward: Metres to drive forward; negative for back.
-            turn: Radians to turn on the way, counterclockwise.
-        """
+        """Drive metres forward or back, and turn radians counterclockwise at once."""
         e = self._rng.normal(size=5)
         body = self.body
         forward_done = forward * (1 + body.slip * e[0])

@@ -92,15 +92,9 @@ class Rooms:
         )
 
     def way(self, room: int, start: int | None, goal: int | None) -> Array:
-        """Plan the route within a room from one door to another.
+        """Plan the route, (n, 2) metres, within a room from one door to another.
 
-        Args:
-            room: Index of the room.
-            start: Index of the first door; None for the middle of the room.
-            goal: Index of the last door; None for the middle of the room.
-
-        Returns:
-            (n, 2) metres.
+        Room and doors are indices. None is the middle of the room.
         """
         if (room, start, goal) not in self._ways:
             ends = [
@@ -187,14 +181,9 @@ class Round:
 
     @classmethod
     def drawn(cls, rooms: Rooms, metres: float, chance: np.random.Generator) -> Round:
-        """Draw a round at random.
+        """Draw a round at random. After this many metres the robot goes home.
 
-        Args:
-            metres: Length after which the robot goes home.
-            chance: Source of random choices.
-
-        Raises:
-            SimulatorError: No two rooms are connected by doors that fit the robot.
+        Raises SimulatorError if no two rooms are connected by doors that fit the robot.
         """
         parts = sorted(
             nx.connected_components(rooms.graph), key=lambda part: (-len(part), min(part))

@@ -45,18 +45,11 @@ class WallPositions:
     right_street: float | None
 
     def to_go(self, reach: float, streets: bool = True) -> float | None:
-        """Measure how far ahead the fixed point of the next place is.
+        """Measure how far ahead the fixed point of the next place is, in metres.
 
-        The fixed point is `reach` before the wall ahead, or in the middle of a side street,
-        whichever is nearer.
-
-        Args:
-            reach: Half the width of a corridor in metres.
-            streets: Whether side streets count.
-
-        Returns:
-            Metres ahead; negative if the robot is beyond the point. None if neither a wall nor a
-            side street is near.
+        The fixed point is `reach`, half the width of a corridor, before the wall ahead, or
+        in the middle of a side street, if `streets` count, whichever is nearer. Negative if
+        the robot is beyond the point. None if neither a wall nor a side street is near.
         """
         marks = [self.front] if self.front is not None and self.front < 2.5 * reach else []
         if streets:
@@ -68,15 +61,11 @@ class WallPositions:
         return None if not marks else min(marks) - reach
 
     def offset(self, reach: float) -> float | None:
-        """Measure how far the robot is to the left of the line that it should follow.
+        """Measure how many metres the robot is to the left of the line that it should follow.
 
-        The line is the midline between two walls, or is `reach` away from the only wall.
-
-        Args:
-            reach: Half the width of a corridor in metres.
-
-        Returns:
-            Metres; negative if the robot is to the right. None without a wall on either side.
+        The line is the midline between two walls, or is `reach`, half the width of a
+        corridor, away from the only wall. Negative to the right. None without a wall on
+        either side.
         """
         near = 1.5 * reach
         left = self.left if self.left is not None and self.left < near else None
@@ -89,12 +78,9 @@ class WallPositions:
 
 
 def sight(image: Array, reach: float, farthest: float) -> WallPositions:
-    """Find the walls in an image.
+    """Find the walls in an image, (180,) metres from right to left.
 
-    Args:
-        image: (180,) ranges in metres, from right to left.
-        reach: Half the width of a corridor in metres.
-        farthest: Range in metres that means that nothing was seen.
+    `reach` is half the width of a corridor. The range `farthest` means that nothing was seen.
     """
     seen = image < farthest - 0.02
     met = image[seen, None] * AHEAD_AND_LEFT[seen]

@@ -90,27 +90,16 @@ class Street:
 def points_of(
     ranges: Array, bearings: Array, farthest: float
 ) -> tuple[NDArray[np.complex128], NDArray[np.intp]]:
-    """Compute the points that the beams of an image hit.
+    """Compute the points that beams, (b,) metres and radians, hit, and the indices of these beams.
 
-    Args:
-        ranges: (b,) metres.
-        bearings: (b,) radians.
-        farthest: Range in metres that means that nothing was seen.
-
-    Returns:
-        (n,) points as complex numbers in metres, and (n,) indices of their beams.
+    Points are (n,) complex numbers in metres. The range `farthest` means that nothing was seen.
     """
     seen = np.flatnonzero(ranges < farthest - 0.02)
     return ranges[seen] * np.exp(1j * bearings[seen]), seen
 
 
 def walls_of(points: NDArray[np.complex128], beams: NDArray[np.intp]) -> list[Wall]:
-    """Find the walls in points.
-
-    Args:
-        points: (n,) points as complex numbers, counterclockwise.
-        beams: (n,) index of the beam of each point. Missing beams end a wall.
-    """
+    """Find the walls in (n,) points, complex and counterclockwise. Missing beams end a wall."""
     breaks = np.flatnonzero(np.diff(beams) > GAP) + 1
     return [wall for stretch in np.split(points, breaks) for wall in _straight(stretch)]
 
@@ -118,16 +107,11 @@ def walls_of(points: NDArray[np.complex128], beams: NDArray[np.intp]) -> list[Wa
 def streets_of(
     walls: Sequence[Wall], points: NDArray[np.complex128], reach: float, farther: float
 ) -> list[Street]:
-    """Find the streets between walls.
+    """Find the streets between walls, clockwise from straight behind, in different directions.
 
-    Args:
-        points: All points of the image. A street must be free of points near its midline.
-        reach: Half the width of a street in metres.
-        farther: Smallest distance from the robot to which a street must reach, in metres.
-
-    Returns:
-        Streets in different directions, clockwise from straight behind. Of streets in about the
-        same direction, the longest is taken.
+    Of streets in about the same direction, the longest is taken. It must be free of points near
+    its midline. `reach` is half its width, and `farther` the smallest distance from the robot
+    to which it must reach, in metres.
     """
     found: list[Street] = []
     for street in sorted(
@@ -217,12 +201,10 @@ class Place:
 
     @classmethod
     def of(cls, ranges: Array, reach: float, farthest: float) -> Place:
-        """Find the place in a panorama.
+        """Find the place in a panorama, (360,) metres at each degree, or NaN.
 
-        Args:
-            ranges: (360,) range at each degree in metres; NaN if unknown.
-            reach: Half the width of a street in metres.
-            farthest: Range in metres that means that nothing was seen.
+        `reach` is half the width of a street. The range `farthest` means that nothing was
+        seen.
         """
         points, beams = points_of(np.nan_to_num(ranges, nan=farthest), AROUND, farthest)
         if not len(points):
@@ -254,14 +236,10 @@ class Place:
         return min(self.headings, key=lambda heading: radians_between(heading, about))
 
     def beside(self, heading: float, side: int) -> float | None:
-        """Measure the turn to the next street on a side.
+        """Measure the radians to turn to the next street on the left (side 1) or right (-1).
 
-        Args:
-            heading: Heading of the robot in radians.
-            side: 1 for the left, -1 for the right.
-
-        Returns:
-            Radians, negative to the right; None if no street is on that side.
+        They are negative to the right. None if no street is on that side. The heading is in
+        radians.
         """
         turns = [side * (street.bearing - heading) % math.tau for street in self.streets]
         return min(
@@ -346,15 +324,9 @@ class Panorama:
 def compass(ranges: Array, image: Array, about: float, turned: float) -> float:
     """Find the heading at which an image agrees best with known ranges.
 
-    Args:
-        ranges: (360,) known ranges in metres; NaN if unknown.
-        image: (180,) ranges in metres.
-        about: Expected heading in radians.
-        turned: Turn by odometry since the last known heading, in radians. After a larger turn, more
-            headings are tried, since the error of odometry is relative.
-
-    Returns:
-        Radians.
+    Ranges are (360,), or NaN, and the image (180,), in metres. All angles are radians. The
+    heading is expected `about` here. After a larger turn since the last known heading, `turned`
+    by odometry, more headings are tried, since the error of odometry is relative.
     """
     best = about
     for window, step in ((2 + OFF * math.degrees(abs(turned)), 0.5), (0.5, 0.05)):

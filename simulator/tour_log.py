@@ -21,13 +21,10 @@ Array = NDArray[np.float64]
 
 
 def noise_of(log: OdometryLog, world: World, body: Body, tolerance: Tolerance | None) -> Noise:
-    """Make the noise model that a trace states for its displacements.
+    """Make the noise model that a trace states for its displacements, as `noise_model`.
 
-    If streets meet at any angles, and images are at dstates, each displacement has a covariance of
-    its own. Then the model has only systematic errors.
-
-    Args:
-        tolerance: Precision of hill-climbing; None if images are not at dstates.
+    If streets meet at any angles, and images are at dstates, each displacement has a covariance
+    of its own. Then the model has only systematic errors.
     """
     if world.angles == "any" and tolerance is not None:
         return Noise(scale=abs(body.scale), bend=abs(body.bend))
@@ -52,14 +49,9 @@ class Eye:
     actions: int
 
     def image(self, driver: Driver, ranges: Array, done: int) -> tuple[float, ...]:
-        """Make the image of a step.
+        """Make the image of a step, after `done` actions.
 
-        Args:
-            ranges: Ranges of the laser in metres.
-            done: Number of actions that are done.
-
-        Returns:
-            Ranges in metres, or the pixels of a panorama, row by row.
+        It has ranges of the laser in metres, or the pixels of a panorama, row by row.
         """
         if self.camera is None:
             return tuple(round(float(r), 4) for r in ranges)
@@ -86,10 +78,9 @@ class OdometryLog:
     begun: bool = False
 
     def displacement(self) -> Displacement | None:
-        """Return the displacement from the last step by odometry; None at a floor's first step.
+        """Return metres ahead and to the left and radians turned since the last step by odometry.
 
-        Returns:
-            Metres ahead, metres to the left, and radians turned, rounded.
+        They are rounded. None at a floor's first step.
         """
         report = self.robot.report()
         if not self.begun:
@@ -101,19 +92,14 @@ class OdometryLog:
 
 
 def noise_model(reports: Sequence[Report], body: Body, tolerance: Tolerance | None = None) -> Noise:
-    """Make a noise model of displacements between dstates, from odometry and hill-climbing.
+    """Make a noise model of displacements between dstates, from reports of odometry and climbing.
 
     The error of each small motion is proportional to the motion, so the relative error of many
-    motions together is smaller. The relative errors of the model are chosen so that they reproduce
-    the mean covariance of the reports.
-
-    A map describes fixed points. Hill-climbing ends only within its tolerance of the fixed points
-    at both ends of a displacement. The model assumes a uniform distribution of this error. A wrong
-    heading at the beginning also moves the end sideways.
-
-    Args:
-        reports: Motion by odometry from each step to the next.
-        tolerance: Precision of hill-climbing; None if displacements are not between fixed points.
+    motions together is smaller. The relative errors of the model are chosen so that they
+    reproduce the mean covariance of the reports. A map describes fixed points. Hill-climbing
+    ends only within its tolerance of the fixed points at both ends of a displacement. The model
+    assumes a uniform distribution of this error. A wrong heading at the beginning also moves
+    the end sideways. The tolerance is None if displacements are not between fixed points.
     """
     ways = math.fsum(math.hypot(*r.displacement[:2]) ** 2 for r in reports)
     turns = math.fsum(r.displacement[2] ** 2 for r in reports)
@@ -141,16 +127,10 @@ def noise_model(reports: Sequence[Report], body: Body, tolerance: Tolerance | No
 
 
 def covariance_of(report: Report, tolerance: Tolerance, action: str) -> Covariance:
-    """Compute the covariance of a displacement between fixed points.
+    """Compute the covariance of a displacement between fixed points, reported by odometry.
 
     It includes the errors of odometry and of hill-climbing, which ends anywhere within its
-    tolerance.
-
-    Args:
-        report: The displacement by odometry, with its covariance.
-        tolerance: Precision of hill-climbing.
-        action: The action of the displacement. If it is a turn, both fixed points are the same, to
-            a millimetre.
+    tolerance. At both ends of a turn, the fixed point is the same, to a millimetre.
     """
     dx, dy, _ = report.displacement
     near = tolerance.close / math.sqrt(3) if action == "travel" else 0.001

@@ -51,8 +51,7 @@ class DriveWatch:
     def start(self) -> Iterator[None]:
         """Watch the robot on its way to its first dstate. Errors then name likely causes.
 
-        Raises:
-            SimulatorError: The robot does not reach a dstate.
+        Raises SimulatorError if the robot does not reach a dstate.
         """
         try:
             yield
@@ -61,13 +60,10 @@ class DriveWatch:
 
     @contextmanager
     def action(self, number: int, name: str) -> Iterator[None]:
-        """Watch one action, and check its end.
+        """Watch one action, by its number in all tours, and check its end.
 
-        Args:
-            number: Number of the action, counted on from tour to tour.
-
-        Raises:
-            SimulatorError: The action ends at a wrong place, or a tour does not end at its start.
+        Raises SimulatorError if it ends at a wrong place, or a tour does not end at its
+        start.
         """
         before = self.driver.robot.pose
         self._home = self._home or before

@@ -55,13 +55,9 @@ LARGEST = 64 * 2**20
 
 
 def checked_segments(name: str, value: object) -> Array:
-    """Check that a value is an array of segments, (n, 4), and return it.
+    """Return a value if it is an array of segments, (n, 4), finite and not empty.
 
-    Args:
-        name: Name of the value, for errors.
-
-    Raises:
-        SimulatorError: The value is something else, is empty, or has numbers that are not finite.
+    Raises SimulatorError, which names the value.
     """
     if (
         isinstance(value, np.ndarray)
@@ -78,14 +74,9 @@ def checked_segments(name: str, value: object) -> Array:
 
 
 def pose_of(name: str, value: object) -> tuple[float, float, float]:
-    """Check that a value is a pose (x, y, heading), and return it.
+    """Return a value if it is a pose (x, y, heading), in metres and radians.
 
-    Args:
-        name: Name of the value, for errors.
-        value: The value, in metres and radians.
-
-    Raises:
-        SimulatorError: The value is something else.
+    Raises SimulatorError, which names the value.
     """
     x, y, heading = numbers(
         name, value, SimulatorError, 3, "x, y and heading, in metres and radians"

@@ -85,11 +85,7 @@ class Clutter:
 
 
 def are_square(walls: Array) -> bool:
-    """Check whether nearly all walls, by length, have one of two perpendicular directions.
-
-    Args:
-        walls: (n, 4) metres.
-    """
+    """Check whether nearly all walls, (n, 4), by length, have one of two square directions."""
     ways = (walls[:, 2] - walls[:, 0]) + 1j * (walls[:, 3] - walls[:, 1])
     lengths = np.abs(ways)
     directions = np.angle(ways) * 4  # Makes perpendicular directions equal.
@@ -112,11 +108,7 @@ class WorldReader:
         self.where = where
 
     def fields(self, data: Any) -> dict[str, Any]:
-        """Read all fields of a world from a JSON object.
-
-        Returns:
-            The arguments of `World`, by name.
-        """
+        """Read the arguments of `World`, by name, from a JSON object."""
         if (
             not isinstance(data, Mapping)
             or data.get("format") != FORMAT
@@ -203,9 +195,8 @@ class WorldReader:
     def arc(self, value: Any, name: str) -> Array:
         """Read an arc, and approximate it by segments: (n, 4), metres.
 
-        Args:
-            value: List of x and y of the centre, radius, and first and last direction. Directions
-                are degrees, counterclockwise.
+        It lists x and y of the centre, radius, and first and last direction in degrees
+        counterclockwise.
         """
         x, y, radius, first, last = self.numbers(value, 5, name)
         if not radius > 0 or not 0 < last - first <= 360:
@@ -219,23 +210,16 @@ class WorldReader:
         return np.hstack([points[:-1], points[1:]])
 
     def occupancy(self, value: Any) -> Array:
-        """Read the walls of an occupancy map: (n, 4), metres.
-
-        Args:
-            value: Path of the YAML file, relative to the folder of the world file.
-        """
+        """Read the walls, (n, 4) metres, of an occupancy map in a file beside this one."""
         if not isinstance(value, str):
             raise self.wrong("occupancy", "the name of a YAML file", value)
         return read_occupancy(Path(self.where).parent / value)[1]
 
     def ragged(self, walls: Array, value: Any) -> Array:
-        """Make walls uneven: divide them into pieces, and shift the ends of the pieces at random.
+        """Divide walls, (n, 4) metres, into pieces, and shift the ends of the pieces at random.
 
         The shifts are always the same, so that a world looks the same on each drive.
-
-        Args:
-            walls: (n, 4) metres.
-            value: Standard deviation of the shifts in metres; 0 changes nothing.
+        `value` is their standard deviation in metres; 0 changes nothing.
         """
         if not is_finite(value) or not 0 <= value <= 1:
             raise self.wrong("ragged", "metres by which walls are uneven, 0 to 1", value)
@@ -314,13 +298,8 @@ class WorldReader:
     def angles(self, value: Any, walls: Array) -> Angles:
         """Return how streets meet: at right angles ("right") or at any angles ("any").
 
-        Args:
-            value: What the file says. With None the result is "right" if nearly all walls have one
-                of two perpendicular directions, else "any".
-            walls: (n, 4) metres.
-
-        Raises:
-            SimulatorError: The value is another one.
+        If the file says nothing (None), it is "right" if nearly all walls have one of two
+        perpendicular directions, else "any". Raises SimulatorError for another value.
         """
         if value not in (None, "right", "any"):
             raise self.wrong("angles", '"right" or "any"', value)

@@ -102,9 +102,8 @@ class Agreement:
 def agreement(log: RobotLog, track: Track) -> Agreement:
     """Compare the track of a log with its odometry.
 
-    Returns:
-        The comparison. It ignores stretches across a cut of the track, where the motion is unknown.
-        If the odometer hardly moved, it compares only lengths.
+    Stretches across a cut of the track, where the motion is unknown, are ignored. If the
+    odometer hardly moved, only lengths are compared.
     """
     odometry = np.array([scan.odometry for scan in log.scans])
     stretches = [
@@ -136,11 +135,9 @@ def agreement(log: RobotLog, track: Track) -> Agreement:
 
 
 def disagreement(log: RobotLog, track: Track) -> str | None:
-    """Describe a disagreement between scan matching and odometry.
+    """Note how scan matching and odometry differ, likely causes, and the options that mend it.
 
-    Returns:
-        A note with the differences, likely causes, and the options that correct them; None if scans
-        and odometry agree.
+    None if scans and odometry agree.
     """
     found = agreement(log, track)
     covers = None if found.is_good else field_of_view(log)
@@ -194,11 +191,9 @@ def disagreement(log: RobotLog, track: Track) -> str | None:
 
 
 def laser_direction(log: RobotLog) -> float | None:
-    """Estimate the direction of the laser, if the log gives a wrong one.
+    """Estimate the degrees to the left of ahead of the laser, if the log gives wrong ones.
 
-    Returns:
-        Degrees to the left of straight ahead. None if the direction in the log is right, if the
-        scans do not show the direction, or if there are several lasers.
+    None also if the scans do not show the direction, or if there are several lasers.
     """
     angles = {scan.laser.mount[2] for scan in log.scans}
     apart = _apart(log, np.radians(TURNS)) if len(angles) == 1 else None
@@ -211,11 +206,7 @@ def laser_direction(log: RobotLog) -> float | None:
 
 
 def field_of_view(log: RobotLog) -> float | None:
-    """Estimate the field of view of the laser, if the log gives a wrong one.
-
-    Returns:
-        Degrees. None if the field of view in the log is right, or if the scans do not show it.
-    """
+    """Estimate the degrees that the laser sees; None if the log, or no scan, shows it."""
     fov = _fov(log.scans[0])
     tried = [_apart(log, np.zeros(1), float(degrees) / fov) for degrees in FIELDS]
     now = _apart(log, np.zeros(1))

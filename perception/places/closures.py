@@ -60,15 +60,11 @@ def find_closures(
 ) -> list[VisitMatch]:
     """Find the closures between the visits of a log.
 
-    Each visit is matched with at most MATCHES earlier ones, so the time grows with the number of
-    visits, not with its square. They are the nearest ones by the track, in which each closure that
-    was found corrects the poses after it.
-
-    Args:
-        visits: The visits, in order.
-        patches: The local map around the middle of each visit.
-        apart: Two visits are matched if there are at least this many metres of way between them, so
-            that their local maps share no scans.
+    Each visit is matched with at most MATCHES earlier ones, so the time grows with the number
+    of visits, not with its square. They are the nearest ones by the track, in which each
+    closure that was found corrects the poses after it. `patches` has the local map of each
+    visit. Two visits are matched if there are at least `apart` metres of way between them, so
+    that their local maps share no scans.
     """
 
     @lru_cache(SCENES)
@@ -265,12 +261,8 @@ def uncertainty(track: Track, first: int, last: int, end: Array) -> Array:
 def relative(closing: VisitMatch, first: float, last: float) -> tuple[float, float, float]:
     """Compute the pose at a later step relative to an earlier one from a closure.
 
-    Args:
-        first: Heading of the earlier step in radians, in the frame of the track.
-        last: Heading of the later step.
-
-    Returns:
-        Metres ahead and to the left, and radians counterclockwise.
+    The headings of both steps are in radians, in the frame of the track. The pose is in metres
+    ahead and to the left, and radians counterclockwise.
     """
     x, y = closing.match.shift
     cos, sin = math.cos(first), math.sin(first)

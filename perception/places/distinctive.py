@@ -55,11 +55,9 @@ DELAY = 125.0
 
 
 def find_visits(log: RobotLog, track: Track, width: float = WIDTH) -> tuple[Visit, ...]:
-    """Find the visits to distinctive places in a log, in order.
+    """Find the visits to distinctive places in a log, in order. Corrected poses are not read.
 
-    Args:
-        log: The scans. Corrected poses are not read.
-        width: Width of the robot in metres.
+    The width of the robot is in metres.
     """
     breaks = set(track.breaks)
     poses = ((float(x), float(y), float(heading)) for x, y, heading in track.poses)
@@ -71,16 +69,10 @@ def find_visits(log: RobotLog, track: Track, width: float = WIDTH) -> tuple[Visi
 
 
 def visits_of(posed: Iterable[Followed], width: float = WIDTH) -> Iterator[Visit]:
-    """Find the visits to distinctive places while a robot drives.
+    """Find the visits to distinctive places while a robot drives. Yield each when it is final.
 
-    Each unbroken part of the track is searched separately.
-
-    Args:
-        posed: The scans with their poses, in order.
-        width: Width of the robot in metres.
-
-    Yields:
-        Each visit, in order, when it is final. Its scans are counted from 0 over all of `posed`.
+    Each unbroken part of the track is searched separately. The scans of a visit are counted
+    from 0 over all of `posed`. The width of the robot is in metres.
     """
     detector, begin = _Detector(width), 0
     for number, one in enumerate(posed):
@@ -275,11 +267,8 @@ def _distance(middle: Array, radius: float, junction: Junction) -> float | None:
 def _stays(far: Array, radius: float) -> Iterator[tuple[int, int]]:
     """Yield the first and last index of each stay in a disc.
 
-    A stay ends where the robot is more than `LEFT` metres outside of the disc.
-
-    Args:
-        far: (n,) distances of the robot from the middle of the disc in metres.
-        radius: Radius of the disc in metres.
+    A stay ends where the robot is more than `LEFT` metres outside of the disc. `far` has the
+    (n,) distances of the robot from its middle, in metres, as is the radius.
     """
     begin = None
     for i, distance in enumerate(far.tolist()):

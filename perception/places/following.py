@@ -77,10 +77,7 @@ ALIKE = 0.03
 def follow(log: RobotLog, trust: Trust | None = None) -> Track:
     """Compute the trajectory of a robot from its log, by odometry and scan matching.
 
-    Corrected poses are not read.
-
-    Args:
-        trust: Errors of the odometer; None for those of a usual one.
+    Corrected poses are not read. `trust` has the errors of the odometer; None takes usual ones.
     """
     steps = unknown_steps(log)
     follower = _Follower(log, trust or Trust(), steps)
@@ -147,16 +144,10 @@ class Followed:
 def poses_of_scans(
     scans: Iterable[Scan], doubt_of: Callable[[int, Pose], Doubt], trust: Trust
 ) -> Iterator[Followed]:
-    """Compute the pose of each scan from the scans before it.
+    """Compute the pose of each scan from the scans before it. The next one is not read before.
 
-    Args:
-        scans: The scans with odometry, in order.
-        doubt_of: Says for the index of a scan, and for the motion to it by odometry, how far the
-            odometry of this step can be trusted.
-        trust: Standard deviations of the errors of the odometer.
-
-    Yields:
-        Each scan with its pose. The next scan is not read before.
+    `doubt_of` says for the index of a scan, and for the motion to it by odometry, how far the
+    odometry of this step can be trusted. `trust` has the standard deviations of its errors.
     """
     recent: deque[tuple[Array, Array]] = deque(maxlen=RECENT)
     last: Followed | None = None
@@ -281,11 +272,7 @@ def _carried(log: RobotLog, track: Track) -> list[int]:
 
 
 def turned_wrongly(log: RobotLog, track: Track) -> list[tuple[int, float]]:
-    """Find scans that match well but turned differently from the odometry.
-
-    Returns:
-        The index of each such scan, and its turn minus that of the odometry, in radians.
-    """
+    """Yield scans that match well but whose turn differs from the odometry, by which radians."""
     found: list[tuple[int, float]] = []
     for i in range(1, len(log)):
         measured = displacement_between(log.scans[i - 1].odometry, log.scans[i].odometry)[2]
@@ -296,11 +283,7 @@ def turned_wrongly(log: RobotLog, track: Track) -> list[tuple[int, float]]:
 
 
 def surfaces(scan: Scan) -> tuple[Array, Array]:
-    """Find the points of a scan that lie on a smooth surface, and the normals of the surface.
-
-    Returns:
-        (m, 2) points in metres and (m, 2) unit normals, in the frame of the robot.
-    """
+    """Find points on smooth surfaces, (m, 2) metres, and unit normals, in the robot's frame."""
     laser, ranges = scan.laser, scan.ranges
     good = np.isfinite(ranges) & (ranges < min(FARTHEST, laser.reach))
     r = np.where(good, ranges, 0.0)

@@ -101,17 +101,10 @@ def import_log(
 ) -> Imported:
     """Import a log as a trace.
 
-    Corrected poses become the truth for evaluation; nothing else reads them.
-
-    Args:
-        width: Width of the robot in metres. It cannot pass narrower parts of the free space.
-        tell: Takes each note on suspicious odometry as soon as it is known.
-
-    Returns:
-        The trace, and the trajectory, visits and notes that it was made from.
-
-    Raises:
-        LogError: The robot passed no distinctive place or hardly moved, or the scans do not match.
+    Corrected poses become the truth for evaluation; nothing else reads them. The width of the
+    robot is in metres. It cannot pass narrower parts of the free space. `tell` takes each note
+    on suspicious odometry as soon as it is known. Raises LogError if the robot passed no
+    distinctive place or hardly moved, or the scans do not match.
     """
     seconds: dict[str, float] = {}
     if not any(((scan.ranges > 0) & (scan.ranges < scan.laser.reach)).any() for scan in log.scans):
@@ -258,15 +251,9 @@ def tracked(
 ) -> tuple[RobotLog, Track, tuple[str, ...]]:
     """Compute the trajectory of a robot from its log.
 
-    Args:
-        tell: Takes each note as soon as it is known.
-
-    Returns:
-        The log with the odometry of a single source, in metres and radians; its track; and notes on
-        suspicious odometry.
-
-    Raises:
-        LogError: The scans are in random order.
+    Return the log with the odometry of a single source, in metres and radians; its track; and
+    notes on suspicious odometry, which `tell` takes as soon as they are known. Raises LogError
+    if the scans are in random order.
     """
     notes: list[str] = []
 
@@ -331,12 +318,7 @@ def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
 
 
 def calibrated(track: Track, visits: Sequence[Visit], closings: Sequence[VisitMatch]) -> Track:
-    """Return a track with covariances that agree with the closures.
-
-    Args:
-        visits: The visits, in order.
-        closings: The closures between them; with none, the track stays as it is.
-    """
+    """Return a track with covariances that agree with the closures between visits, if any."""
     return replace(track, covariances=track.covariances * factor_of(track, visits, closings))
 
 

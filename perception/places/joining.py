@@ -39,18 +39,12 @@ TURNS = [k * TURN for k in range(round(math.tau / TURN))]
 
 
 def join_logs(logs: Sequence[RobotLog], parts: Sequence[Imported]) -> tuple[RobotLog, Imported]:
-    """Join logs that were imported one by one. The views are made of the images of all drives.
+    """Join logs, one a drive, by the result of `import_log` for each.
 
-    Args:
-        logs: The logs, as they were read, one a drive.
-        parts: The result of `import_log` for each. The names of their traces name the drives.
-
-    Returns:
-        The joint log, and its joint import. Their visits and scans are numbered over all drives.
-        In the steps of the trace, `visit` counts over all drives, and `scan` within the drive.
-
-    Raises:
-        TraceError: Two drives have one name, or the traces differ in what they record.
+    The views are made of the images of all drives. Visits and scans are numbered over all
+    drives. In the steps of the trace, `visit` counts over all drives, and `scan` within the
+    drive. The names of the traces name the drives. Raises TraceError if two have one name, or
+    the traces differ in what they record.
     """
     if len(logs) == 1:
         return logs[0], parts[0]
@@ -163,17 +157,10 @@ def scenes_of(part: Imported) -> list[Scene]:
 def closures_between(
     first: Imported, last: Imported, ours: Sequence[Scene], theirs: Sequence[Scene]
 ) -> list[VisitMatch]:
-    """Find the closures between two drives.
+    """Find the closures between the visits of two drives, by the scene of each visit.
 
-    Args:
-        first: The earlier drive.
-        last: The later drive.
-        ours: The scene of each visit of the earlier drive.
-        theirs: The scene of each visit of the later drive.
-
-    Returns:
-        Closures from visits of the earlier drive to visits of the later one. Empty if too few
-        matches agree.
+    They lead from visits of the earlier drive to visits of the later one. There are none if too
+    few matches agree.
     """
     found: list[VisitMatch] = []
     for j, scene in enumerate(theirs):

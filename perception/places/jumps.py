@@ -54,12 +54,9 @@ TWO_DRIVES = (
 
 
 def keep_one_source(log: RobotLog) -> tuple[RobotLog, list[str]]:
-    """Keep the odometry of one source if the poses of several sources alternate.
+    """Keep the odometry of one source if the poses of several sources alternate, with a note.
 
     The odometry of the other scans is interpolated.
-
-    Returns:
-        The log, and a list of notes: one if there were several sources, otherwise none.
     """
     odometry = Odometry()
     for number, scan in enumerate(log.scans):
@@ -76,10 +73,9 @@ def keep_one_source(log: RobotLog) -> tuple[RobotLog, list[str]]:
 
 
 def seams_of(log: RobotLog) -> list[tuple[int, str]]:
-    """Find where a second drive seems to begin: the laser changes for good, or the clock is reset.
+    """Find the first scans where a second drive seems to begin, and what changes there.
 
-    Returns:
-        The first scan of each further drive, and what changes there.
+    The laser changes for good, or the clock is reset.
     """
     lasers = [(scan.laser.first, scan.laser.step, scan.laser.mount) for scan in log.scans]
     other = [i for i in range(1, len(log)) if lasers[i] != lasers[i - 1]]
@@ -99,11 +95,9 @@ def is_missing(log: RobotLog) -> bool:
 
 
 def goes_back_and_forth(log: RobotLog) -> float:
-    """Compare the trajectory by odometry over every second scan with that over all scans.
+    """Compare the length by odometry over every second scan with that over all scans.
 
-    Returns:
-        The ratio of their mean lengths: about 1 for a drive, 0 for poses of two sources; 1 for a
-        log of less than three scans.
+    The ratio is about 1 for a drive, 0 for poses of two sources; 1 for less than three scans.
     """
     if len(log) < 3:
         return 1.0
@@ -135,17 +129,10 @@ def _of_source(scans: tuple[Scan, ...], members: NDArray[np.intp]) -> tuple[Scan
 def describe_cuts(log: RobotLog, track: Track, turned: list[tuple[int, float]]) -> list[str]:
     """Say in notes where the odometry of a log is wrong: at cuts, breaks and some turns.
 
-    At a *cut* the odometer jumped or hung, so the motion from one scan to the next is unknown. At a
-    *break* the scans show nothing of what was seen before: the robot may have been carried.
-
-    Args:
-        log: The log that the track was made from.
-        track: The poses of the robot at all scans, with `cuts` and `breaks`.
-        turned: Indices of scans at which the robot turned differently from the odometry, and the
-            differences in radians.
-
-    Returns:
-        Sentences for the user, one for each kind of error; empty if nothing is wrong.
+    At a *cut* the odometer jumped or hung, so the motion from one scan to the next is unknown.
+    At a *break* the scans show nothing of what was seen before: the robot may have been
+    carried. `turned` has the indices of scans at which the robot turned differently from the
+    odometry, and the differences in radians. There is a note for each kind of error.
     """
     # If the odometer moved at a cut, it jumped. Otherwise, it stood still while the robot moved.
     steps = {
@@ -250,12 +237,7 @@ class LiveJumps:
         self._steps: deque[float] = deque(maxlen=LATELY)
 
     def __call__(self, scan: int, onward: Pose) -> Doubt:
-        """Judge a step.
-
-        Args:
-            scan: Index of the scan that it leads to.
-            onward: The motion by odometry, in metres and radians.
-        """
+        """Judge the step to a scan, by its index, with a motion in metres and radians."""
         far = math.hypot(*onward[:2])
         usual = float(np.median(self._steps)) if self._steps else 0.0
         least = max(FAR, UNUSUAL * usual)
@@ -377,11 +359,7 @@ def _moved_while_still(
 
 
 def stands_still(log: RobotLog) -> NDArray[np.bool_]:
-    """Find the steps in which the odometer repeats the same pose.
-
-    Returns:
-        Mask, (n - 1,), of the steps between n scans.
-    """
+    """Find the steps between n scans in which the odometer repeats a pose: mask, (n - 1,)."""
     poses = np.array([scan.odometry for scan in log.scans])
     return np.asarray(np.abs(np.diff(poses, axis=0)).max(axis=1) < STILL)
 

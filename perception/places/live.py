@@ -97,14 +97,9 @@ class LiveLog:
         return visits_of(self._followed(), self._width)
 
     def result(self) -> tuple[RobotLog, Track, tuple[str, ...]]:
-        """Return the log when all visits were yielded.
+        """Return the log, its track and notes when all visits were yielded.
 
-        Returns:
-            The log, in which hardly any scan has ranges; its track; and notes on suspicious scans
-            and odometry.
-
-        Raises:
-            LogError: There is no scan.
+        Hardly any scan has ranges. Raises LogError if there is no scan.
         """
         log, track = self._log, self._track
         if not len(log):
@@ -217,19 +212,10 @@ class Teller:
 
 
 def watched(scans: Iterable[Scan], tell: Teller, source: str = "") -> Iterator[Scan]:
-    """Check scans while they come.
+    """Check scans while they come, and yield them with odometry in metres and radians.
 
-    Args:
-        scans: The scans, in order.
-        tell: Takes the notes.
-        source: Name of the log, for errors.
-
-    Yields:
-        The scans, with odometry in metres and radians.
-
-    Raises:
-        LogError: The scans are in random order, their ranges are not in metres, or the odometry has
-            several sources.
+    Raises LogError if the scans are in random order, their ranges are not in metres, or the
+    odometry has several sources.
     """
     coming = iter(scans)
     first = _first_of(coming)
@@ -280,14 +266,9 @@ def _units_of(log: RobotLog, tell: Teller) -> Units:
 
 
 def _checked(scans: Sequence[Scan], begin: int, unseen: bool, source: str) -> list[str]:
-    """Check a stretch of scans.
+    """Check a stretch of scans, but not their ranges. Raises LogError for a random order.
 
-    Args:
-        scans: The scans. Their ranges are not looked at.
-        unseen: Whether the robot moves while its odometer stands still.
-
-    Raises:
-        LogError: The scans are in random order.
+    `unseen` says whether the robot moves while its odometer stands still.
     """
     log = RobotLog(tuple(scans), source=source)
     log_checks.refuse_shuffled(log)

@@ -175,10 +175,7 @@ class LocalMaps:
     def around(self, scan: int, middle: Array | Sequence[float], half: float) -> Patch:
         """Make the square patch around a position near a scan.
 
-        Args:
-            scan: Index of the scan in the middle of the window.
-            middle: (x, y) of the centre of the patch in metres, in the frame of the track.
-            half: Half the side of the patch in metres.
+        The middle, (x, y), and half the side are in metres, in the frame of the track.
         """
         way = self._recent.way(scan)
         begin, end = self._recent.at(way - self._reach), self._recent.at(way + self._reach, "right")

@@ -53,11 +53,7 @@ FAR_WALLS = 50.0
 
 
 def refuse_lengths(log: RobotLog) -> None:
-    """Raise a LogError if the ranges of a log are too long to be metres.
-
-    Raises:
-        LogError: The ranges are not in metres.
-    """
+    """Raise a LogError if the ranges of a log are too long to be metres."""
     met = [scan.ranges[(scan.ranges > 0) & (scan.ranges < scan.laser.reach)] for scan in log.scans]
     usual = float(np.median([float(np.median(some)) for some in met if len(some)] or [0.0]))
     if usual > FAR_WALLS:
@@ -69,11 +65,7 @@ def refuse_lengths(log: RobotLog) -> None:
 
 
 def refuse_shuffled(log: RobotLog) -> None:
-    """Raise a LogError if the scans of a log are in random order.
-
-    Raises:
-        LogError: The scans are in random order.
-    """
+    """Raise a LogError if the scans of a log are in random order."""
     if len(log) < 4 * max(LAGS):
         return
     places = np.array([scan.odometry[:2] for scan in log.scans])
@@ -93,14 +85,10 @@ def refuse_shuffled(log: RobotLog) -> None:
 
 
 def checked(log: RobotLog) -> tuple[RobotLog, list[str], list[str]]:
-    """Check whether a log is one drive in order, before its scans are matched.
+    """Check whether a log is one drive in order, before its scans are matched. Raises LogError.
 
-    Returns:
-        The log with the odometry of a single source, in metres and radians; notes on what was
-        converted; and notes on what is wrong with the whole log.
-
-    Raises:
-        LogError: The scans are in random order, or their ranges are not in metres.
+    Return the log with the odometry of a single source, in metres and radians; notes on what
+    was converted; and notes on what is wrong with the whole log.
     """
     refuse_lengths(log)
     refuse_shuffled(log)
@@ -114,11 +102,8 @@ def describe_drive(log: RobotLog, begin: int = 0, unseen: bool | None = None) ->
     """Describe a log that is reversed, has several drives, or has scans far apart.
 
     Only the odometry, the clock and the laser are looked at, so that this can be said at once.
-
-    Args:
-        begin: Number of the first scan.
-        unseen: Whether the robot moves while its odometer stands still; None if the ranges of the
-            scans show it.
+    `begin` is the number of the first scan. `unseen` says whether the robot moves while its
+    odometer stands still; None if the ranges of the scans show it.
     """
     return [
         *_about_order(log),
@@ -195,12 +180,8 @@ def _about_odometry(log: RobotLog, unseen: bool | None) -> list[str]:
 def judged(log: RobotLog, track: Track, explained: bool) -> tuple[Track, list[str]]:
     """Judge whether a track rests on poor matches, contradicts itself, or never returns.
 
-    Args:
-        explained: Whether another note already gives a cause, so that none is suggested here.
-
-    Returns:
-        The track, which is marked if it is unreliable; and notes for the user, none if nothing is
-        wrong.
+    Return the track, which is marked if it is unreliable, and notes. If another note already
+    gives a cause (`explained`), none is suggested here.
     """
     failing, overriding = share_failing(track), _overriding(log, track)
     is_reliable = failing <= FAILING and overriding <= OVERRIDING

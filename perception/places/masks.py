@@ -18,8 +18,7 @@ def grown(mask: Bools) -> Bools:
 def shrunk(mask: Bools, outside: bool = False) -> Bools:
     """Remove the cells of a mask, (rows, columns), that have a neighbour outside of it.
 
-    Args:
-        outside: Whether the cells beyond the border count as cells of the mask.
+    `outside` says whether the cells beyond the border count as cells of the mask.
     """
     padded = np.pad(mask, 1, constant_values=outside)
     rows = padded[:-2] & padded[1:-1] & padded[2:]
@@ -27,13 +26,7 @@ def shrunk(mask: Bools, outside: bool = False) -> Bools:
 
 
 def near(mask: Bools, far: float, cell: float) -> Bools:
-    """Find the cells that are nearer than some metres to a cell of a mask.
-
-    Args:
-        mask: (rows, columns) mask.
-        far: The metres.
-        cell: Side of a cell in metres.
-    """
+    """Find the cells within `far` metres of a cell, `cell` metres wide, of a mask."""
     if not mask.any():
         return np.zeros_like(mask)
     return np.asarray(ndimage.distance_transform_edt(~mask) * cell < far)

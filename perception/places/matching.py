@@ -128,14 +128,11 @@ class Scene:
         return np.asarray(Turned.of(self, [0.0]).spectra[:, 0].conj())
 
     def agreement(self, points: Array) -> tuple[Array, Array]:
-        """Compute how well points agree with the walls of this scene, for several poses.
+        """Compute how well points, relative to the middle, agree with the walls of this scene.
 
-        Args:
-            points: (n, 2, m) x and y in metres, relative to the middle, of m points in n poses.
-
-        Returns:
-            For each pose, the sum of the agreements of its points, (n,), and the number of points
-            whose cells this scene observed, (n,).
+        They are (n, 2, m) x and y in metres of m points in n poses. For each pose, return
+        the sum of the agreements, (n,), and the number of points whose cells this scene
+        observed, (n,).
         """
         cells = self.cells(points)
         return self._sharp.ravel()[cells].sum(axis=1), self._observed.ravel()[cells].sum(axis=1)
@@ -143,9 +140,7 @@ class Scene:
     def mutual(self, other: Scene, turn: float, shift: Array) -> float:
         """The area that both scenes observed, as a share of the smaller one.
 
-        Args:
-            turn: Its rotation in radians.
-            shift: (x, y) of its middle in metres.
+        The other one is rotated by radians, and its middle shifted by (x, y) in metres.
         """
         here = (np.argwhere(self._observed) - len(self._observed) // 2) * CELL - self._shift
         there = points_turned(-turn, here - shift)
@@ -215,12 +210,8 @@ def _spread_out(at: Array) -> Array:
 def match(first: Scene, second: Turned) -> Match | None:
     """Find the rotation and shift with which the maps of two places agree best.
 
-    Args:
-        first: The first place.
-        second: The second place, in the rotations to try.
-
-    Returns:
-        None if the maps agree nowhere, or agree as well with quite other shifts.
+    None if the maps agree nowhere, or agree as well with quite other shifts. The second place
+    is given in the rotations to try.
     """
     scene = second.scene
     least = OVERLAP * (len(first.walls) + len(scene.walls))

@@ -57,14 +57,9 @@ def with_partings(
 ) -> tuple[tuple[Visit, ...], list[VisitMatch]]:
     """Add a visit for each pass of a place where stretches of a drive lead apart.
 
-    Visits whose middles are nearly the same get the same middle.
-
-    Args:
-        visits: The visits, in order. Each has its local map.
-
-    Returns:
-        All visits, in order, and the closures between their middles. An added visit has the local
-        map of the nearest other one.
+    Visits whose middles are nearly the same get the same middle. An added visit has the local
+    map of the nearest other one. Return all visits, in order, and the closures between their
+    middles.
     """
     drive = _DrivePoints(track, visits)
     moves = _agreed(drive, [*_closed(drive, closings), *_tracked(drive)])
@@ -212,11 +207,7 @@ def _added(drive: _DrivePoints, closings: Sequence[VisitMatch]) -> list[_Pass]:
 
 
 def _agreed(drive: _DrivePoints, relations: Sequence[_Alignment]) -> Array:
-    """Compute shifts of visits. Visits whose discs have nearly one middle then have the same one.
-
-    Returns:
-        (v, 2) metres.
-    """
+    """Compute shifts of visits, (v, 2) metres, so that discs with nearly one middle share it."""
     links = _links(drive, relations)
     moves, done = np.zeros_like(drive.middles), set[int]()
     for root in range(len(drive.middles)):
@@ -244,10 +235,9 @@ def _agreed(drive: _DrivePoints, relations: Sequence[_Alignment]) -> Array:
 def _links(
     drive: _DrivePoints, relations: Sequence[_Alignment]
 ) -> dict[int, list[tuple[int, float, Array]]]:
-    """For each visit, the visits with nearly the same middle, and how they lie relative to it.
+    """For each visit, list the visits with nearly the same middle, and how they lie relative to it.
 
-    Returns:
-        The number of each visit, the rotation from its axes in radians, and its middle in metres.
+    The rotation from its axes is in radians, and the middle in metres.
     """
     links: dict[int, list[tuple[int, float, Array]]] = defaultdict(list)
     for one in relations:
@@ -304,13 +294,9 @@ def _is_known(some: _Pass, known: Sequence[_Pass]) -> bool:
 
 
 def lead_apart(far: Array) -> Iterator[tuple[int, int]]:
-    """Find the points after which two stretches that ran together lead apart.
+    """Yield the points after which two stretches that ran together lead apart, in each.
 
-    Args:
-        far: (n, m) distance of each point of one stretch from each of the other one, in metres.
-
-    Yields:
-        The index of the point in each stretch.
+    `far` has the distance of each point of one from each of the other, (n, m) metres.
     """
     yield from _ahead(far)
     yield from sorted((len(far) - 1 - a, b) for a, b in _ahead(far[::-1]))

@@ -36,11 +36,7 @@ class Recent:
         return self._base + len(self._scans)
 
     def append(self, scan: Scan, pose: Pose | Sequence[float] | Array) -> None:
-        """Add the next scan.
-
-        Args:
-            pose: x, y in metres and heading in radians.
-        """
+        """Add the next scan and its pose: x, y in metres and heading in radians."""
         count = len(self._scans)
         if count == len(self._rows):
             self._compact()
@@ -67,15 +63,9 @@ class Recent:
         return float(self._rows[max(index, self.begin) - self._base, 3])
 
     def at(self, way: float, side: Literal["left", "right"] = "left") -> int:
-        """Find the first kept scan at which the robot has driven a number of metres.
+        """Find the first kept scan at which the robot has driven `way` metres, or the end.
 
-        Args:
-            way: The metres.
-            side: "left" for the first scan at which it has driven at least so far; "right" for the
-                first at which it has driven farther.
-
-        Returns:
-            The index of the scan, or the index after the last scan if there is none.
+        With "left", it has driven at least so far; with "right", farther.
         """
         ways = self._rows[self.begin - self._base : len(self._scans), 3]
         return self.begin + int(np.searchsorted(ways, way, side=side))

@@ -74,8 +74,7 @@ class Junction:
 def junctions(patch: Patch, room: float) -> list[Junction]:
     """Find the junctions and the bends of the skeleton of a local map.
 
-    Args:
-        room: Half the width of the robot in metres.
+    `room` is half the width of the robot in metres.
     """
     mask = passable(patch, room)
     # The middle of the robot is `room` away from obstacles, so the disc of a cell is larger.
@@ -118,11 +117,9 @@ def _with_mouths(found: list[Fork], mouths: list[Fork], far: float) -> list[Fork
 
 
 def open_space(distance: Array, far: float) -> Bools:
-    """Find the cells inside the shores of open spaces.
+    """Find the cells inside the shores of open spaces, which are `far` cells from obstacles.
 
-    Args:
-        distance: (rows, columns) distance of each cell to the nearest obstacle, in cells.
-        far: Distance of a shore from obstacles, in cells.
+    `distance` has that of each cell to the nearest obstacle in cells, (rows, columns).
     """
     if distance.max() < WIDE * far:
         return np.zeros(distance.shape, np.bool_)
@@ -133,23 +130,14 @@ def open_space(distance: Array, far: float) -> Bools:
 
 
 def with_shores(lines: Bools, inner: Bools) -> Bools:
-    """Replace the lines of a skeleton inside open spaces by the shores of these spaces.
-
-    Args:
-        lines: (rows, columns) lines of the skeleton.
-        inner: (rows, columns) cells inside the shores.
-    """
+    """Replace lines of a skeleton, (rows, columns), inside shores by these shores."""
     # A space that leads on beyond the border of the map has no shore there.
     shore = inner & ~ndimage.binary_erosion(inner, border_value=1)
     return thinned((lines & ~inner) | shore)
 
 
 def passable(patch: Patch, room: float) -> Bools:
-    """Find the cells that the middle of the robot can reach, as if there were no furniture.
-
-    Args:
-        room: Half the width of the robot in metres.
-    """
+    """Find the cells that the robot's middle can reach, `room` metres wide, without furniture."""
     trail = grown(patch.trail)
     fits = (patch.free & ~near(patch.occupied, room, CELL)) | trail
     fits = grown(shrunk(fits)) | trail
@@ -197,14 +185,10 @@ def _out(edge: Edge, nodes: Mapping[int, Node], degrees: Mapping[int, int]) -> f
 
 
 def junctions_merged(graph: Graph, distance: Array) -> list[Fork]:
-    """Merge junctions in one open space.
+    """Merge junctions in one open space, and give each its branches: (n, 2) rows and columns.
 
-    Args:
-        distance: (rows, columns) distance of each cell to the nearest obstacle, in cells.
-
-    Returns:
-        Each junction with its branches: (n, 2) rows and columns each. The radius of a merged
-        junction is that of its largest disc.
+    The radius of a merged junction is that of its largest disc. `distance` has that of each
+    cell to the nearest obstacle in cells, (rows, columns).
     """
     degrees = graph.degrees
     head = {node: node for node in graph.nodes if degrees[node] > 2}
@@ -255,15 +239,11 @@ def _branches(graph: Graph, group: set[int], radius: float) -> list[Array]:
 
 
 def bends(graph: Graph, distance: Array, out: float) -> Iterator[Bend]:
-    """Find the bends of a skeleton.
+    """Yield the node of each bend of a skeleton and its two branches: (n, 2) rows and columns.
 
-    Args:
-        distance: (rows, columns) distance of each cell to the nearest obstacle, in cells.
-        out: The direction of a line before and after a cell is measured at points that lie this far
-            outside the disc of the cell, in cells. A line that ends nearer than that has no bend.
-
-    Yields:
-        The node of each bend and its two branches: (n, 2) rows and columns each.
+    `distance` is as in `junctions_merged`. The direction of a line before and after a cell is
+    measured at points that lie `out` cells outside the disc of the cell. A line that ends
+    nearer has no bend.
     """
     degrees = graph.degrees
     for edge in graph.edges:

@@ -81,11 +81,10 @@ class Stays:
         return self._done
 
     def add(self, visits: Sequence[Visit], horizon: int | None) -> Iterator[Visit]:
-        """Add visits that were found, and yield those that are final.
+        """Add the next visits, in the order of their scans, and yield those that are final.
 
-        Args:
-            visits: The next visits, in the order of their scans.
-            horizon: No visit will come that begins before this scan; None at the end of the drive.
+        No visit will come that begins before the scan `horizon`; None at the end of the
+        drive.
         """
         for visit in visits:
             self._pass(visit)

@@ -126,12 +126,10 @@ def thinned(mask: Bools) -> Bools:
 
 
 def graph_of(lines: Bools, distance: Array) -> Graph:
-    """Read lines as a graph.
+    """Read lines one cell wide, (rows, columns), as a graph.
 
-    Args:
-        lines: (rows, columns) lines one cell wide.
-        distance: (rows, columns) distance of each cell to the nearest one outside of the mask that
-            was thinned, in cells.
+    `distance` has that of each cell to the nearest one outside of the mask that was thinned, in
+    cells.
     """
     # The cells are numbered row by row, with a margin, so that neighbours have fixed offsets.
     lines = np.pad(lines, 1)

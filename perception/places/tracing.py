@@ -58,12 +58,8 @@ def to_trace(
 ) -> Trace:
     """Make the trace of a log, without views.
 
-    Args:
-        visits: The visits, in order.
-
-    Returns:
-        A trace with one or two steps a visit. A step has an image, a star, the displacement from
-        the previous step, and the next action.
+    There are one or two steps a visit. A step has an image, a star, the displacement from the
+    previous step, and the next action.
     """
     steps: list[Step] = []
     last: tuple[Visit, Pose] | None = None
@@ -92,11 +88,9 @@ def to_trace(
 
 
 def closure_of(found: VisitMatch, arrivals: Sequence[tuple[int, float]]) -> Closure:
-    """Make a closure between the first steps of two visits.
+    """Make a closure between the first steps of two visits from how the visits lie.
 
-    Args:
-        found: How the visits lie relative to each other.
-        arrivals: The first step of each visit, and its heading in radians.
+    Each arrival has the first step, and its heading in radians.
     """
     (first, heading), (last, other) = arrivals[found.first], arrivals[found.last]
     x, y, turn = relative(found, heading, other)
@@ -168,10 +162,7 @@ def _course(track: Track, first: Visit, last: Visit, heading: float) -> list[lis
     """The course of the robot from one visit to the next, as points of a polygonal chain.
 
     The discs of both places are left out, and the last point is the middle of the next place.
-
-    Args:
-        heading: The direction of the x-axis of the points, in radians. Their origin is the middle
-            of the first place.
+    The x-axis points along `heading`, in radians, from the middle of the first place.
     """
     from skimage.measure import approximate_polygon
 

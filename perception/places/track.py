@@ -121,14 +121,7 @@ class Trust:
     angle: float = 0.02
 
     def covariance(self, onward: Pose) -> NDArray[np.float64]:
-        """Compute the covariance of a motion by odometry.
-
-        Args:
-            onward: Motion ahead and to the left in metres, and turn in radians.
-
-        Returns:
-            (3, 3), in the frame of the robot before the motion.
-        """
+        """Compute the covariance, (3, 3), of a motion by odometry in metres and radians."""
         way = math.hypot(onward[0], onward[1])
         along, across = self.offset + self.way * way, self.offset + self.way * way / 2
         heading = self.angle + self.turning * abs(onward[2]) + self.drift * way

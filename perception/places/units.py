@@ -52,11 +52,7 @@ class Units:
 
 
 def units_of(log: RobotLog) -> tuple[Units, list[str]]:
-    """Recognise the units of the odometry of a log.
-
-    Returns:
-        The units, and notes: one for each unit that is not a metre or radian.
-    """
+    """Recognise the units of a log's odometry, with a note if they are not metres and radians."""
     count, counted = _length(log)
     log = Units(count).convert(log)
     degrees = way_of(log) >= LEAST_WAY and abs(ahead(log)) <= SIDEWAYS
@@ -109,11 +105,9 @@ def _length(log: RobotLog) -> tuple[float, list[str]]:
 
 
 def ahead(log: RobotLog) -> float:
-    """Compute the share of the way that the robot drives in the direction of its heading.
+    """Compute the share of the way that the robot drives ahead, from -1 (backwards) to 1.
 
-    Returns:
-        1 for a robot that drives ahead all the way, -1 for one that drives backwards; 1 for a robot
-        that stands. Jumps of the odometer do not count.
+    It is 1 for a robot that stands. Jumps of the odometer do not count.
     """
     poses = np.array([scan.odometry for scan in log.scans])
     steps = np.diff(poses[:, :2], axis=0)

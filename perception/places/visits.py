@@ -62,11 +62,7 @@ class Visit:
 
 
 def patches_of(visits: Sequence[Visit]) -> list[PackedPatch]:
-    """Return the local map of each visit.
-
-    Raises:
-        ValueError: A visit has none.
-    """
+    """Return the local map of each visit. Raises ValueError if one has none."""
     found = [visit.patch for visit in visits if visit.patch is not None]
     if len(found) < len(visits):
         number = next(i for i, visit in enumerate(visits) if visit.patch is None)

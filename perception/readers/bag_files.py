@@ -59,13 +59,9 @@ def format_of(head: bytes) -> str | None:
 
 @contextmanager
 def files_opened(path: Path, format: str) -> Iterator[Files]:
-    """Open the files of a bag.
+    """Open the files of a bag. Raises LogError.
 
-    Args:
-        format: Format of the file: `ros1`, `ros2` or `mcap`. It is ignored for a folder.
-
-    Raises:
-        LogError: The bag cannot be opened, or a disk is full.
+    The format is `ros1`, `ros2` or `mcap`. It is ignored for a folder.
     """
     try:
         from rosbags import rosbag1, rosbag2  # noqa: F401 - only whether they are installed
@@ -95,8 +91,7 @@ def files_opened(path: Path, format: str) -> Iterator[Files]:
 def _of_folder(path: Path, folder: Path, stack: ExitStack) -> Files:
     """Open a folder by its metadata.yaml. Without a usable one, open all files in it.
 
-    Raises:
-        LogError: No file can be opened, or the files are of several drives.
+    Raises LogError if no file can be opened, or they are of several drives.
     """
     parts = sorted(
         (part for part in path.iterdir() if NAMES.search(part.name) and part.is_file()), key=_number

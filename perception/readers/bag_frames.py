@@ -51,17 +51,11 @@ Frames = dict[str, dict[str, FrameTransform]]
 
 
 def transforms_of(bag: Bag, seen: set[str], damaged: list[Damage]) -> Frames:
-    """Read the transforms between the frames of a bag.
+    """Read the transforms to each frame of a bag, by the name of the parent frame.
 
-    Transforms over time are kept only for the frames of scans and their ancestors. Those of the
-    many joints of a robot are not needed.
-
-    Args:
-        seen: Names of the frames of scans.
-        damaged: Receives the messages that cannot be read.
-
-    Returns:
-        For each frame, its transforms, by the name of the parent frame.
+    Transforms over time are kept only for the frames of scans (`seen`) and their ancestors.
+    Those of the many joints of a robot are not needed. `damaged` receives messages that cannot
+    be read.
     """
     frames: Frames = {}
     topics = set(bag.topics(*TRANSFORMS))
@@ -137,15 +131,11 @@ def ancestors(frames: Frames, frame: str) -> list[str]:
 def mount_of(
     frames: Frames, odom: str, base: str, frame: str, notes: list[str], assumed: dict[str, str]
 ) -> tuple[Pose, bool]:
-    """Compute how the laser is mounted on the robot.
+    """Return the pose of the laser in the frame of the robot, and whether it hangs upside down.
 
-    Args:
-        notes: Receives notes on transforms that contradict each other.
-        assumed: Receives, by the key "mount", a note if no transform leads to the laser. Then the
-            laser is taken to be in the middle of the robot.
-
-    Returns:
-        The pose of the laser in the frame of the robot, and whether it hangs upside down.
+    `notes` receives notes on transforms that contradict each other. `assumed` receives, by the
+    key "mount", a note if no transform leads to the laser. Then the laser is taken to be in the
+    middle of the robot.
     """
     if base == frame:
         return (0.0, 0.0, 0.0), False
@@ -192,10 +182,9 @@ def mount_of(
 
 
 def flat_pose(position: Any, orientation: Any) -> Pose:
-    """Project a position (x, y, z) and a quaternion to a pose in the plane.
+    """Project a position and a quaternion to a pose in the plane.
 
-    Raises:
-        Damaged: A number is not finite, or the quaternion is nearly 0.
+    Raises Damaged if a number is not finite, or the quaternion is nearly 0.
     """
     x, y, z, w = orientation.x, orientation.y, orientation.z, orientation.w
     numbers = position.x, position.y, position.z, x, y, z, w

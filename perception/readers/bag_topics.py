@@ -44,14 +44,7 @@ class Bag:
         return [connection for reader in self.readers for connection in reader.connections]
 
     def topics(self, *kinds: str) -> dict[str, int]:
-        """Count the messages of each topic.
-
-        Args:
-            *kinds: Message kinds; without any, all topics are counted.
-
-        Returns:
-            Dict from the name of each topic of these kinds to its number of messages.
-        """
+        """Count the messages of each topic of these kinds; without any, of all topics."""
         counts: dict[str, int] = {}
         for connection in self.connections:
             if not kinds or connection.msgtype in kinds:
@@ -70,10 +63,9 @@ class Bag:
     def messages(self, topics: set[str]) -> Iterator[tuple[Any, int, float, Any]]:
         """Read the messages of some topics.
 
-        Yields:
-            For each message: its connection, its number within the topic (from 1), the time of
-            recording in seconds, and the message. Damage takes the place of a message that cannot
-            be read.
+        Yield for each its connection, its number within the topic (from 1), the time of
+        recording in seconds, and the message. Damage takes the place of a message that
+        cannot be read.
         """
         from rosbags.serde import SerdeError
 
@@ -115,14 +107,7 @@ class Bag:
 
 @contextmanager
 def bag_opened(path: str | os.PathLike[str], format: str) -> Iterator[Bag]:
-    """Open a bag.
-
-    Args:
-        format: Format of the file: `ros1`, `ros2` or `mcap`. It is ignored for a folder.
-
-    Raises:
-        LogError: The bag cannot be opened.
-    """
+    """Open a bag of the format `ros1`, `ros2` or `mcap`, or a folder. Raises LogError."""
     with bag_files.files_opened(Path(path), format) as files:
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 

@@ -50,18 +50,11 @@ ODOMETRY = ("nav_msgs/msg/Odometry",)
 
 
 def read(bag: Bag, scan_topics: Sequence[str], odom_topic: str | None) -> SurveyedLog:
-    """Survey a bag, so that its scans can be read.
+    """Survey a bag, so that its scans can be read when they are iterated over.
 
-    Args:
-        scan_topics: Topics of the scans; if empty, the only topic with scans is read.
-        odom_topic: Topic of the odometry. If None, the only topic with odometry is read or, if
-            there is no such topic, the transforms.
-
-    Returns:
-        Notes on what was found, and the scans, which are read when they are iterated over.
-
-    Raises:
-        LogError: There are no scans or no odometry, or several topics and none is named.
+    Without topics of scans, the only topic with scans is read. Without one of odometry, the
+    only topic with odometry is read or, if there is none, the transforms. Raises LogError if
+    there are no scans or no odometry, or several topics and none is named.
     """
     notes = list(bag.notes)
     scans = _scan_topics(bag, scan_topics)

@@ -92,11 +92,7 @@ def looks_like(head: bytes) -> bool:
 
 
 def head_of(file: IO[bytes], scans: int) -> bytes:
-    """Read the first lines of a log, up to a number of scans.
-
-    Args:
-        scans: The number.
-    """
+    """Read the first lines of a log, up to a number of scans."""
     head: list[bytes] = []
     while scans and (line := file.readline(LONGEST_LINE)):
         head.append(line)
@@ -107,19 +103,11 @@ def head_of(file: IO[bytes], scans: int) -> bytes:
 def read(
     file: IO[bytes], source: str, format: str | None, surveyed: IO[bytes] | None = None
 ) -> SurveyedLog:
-    """Survey a log in lines, so that its scans can be read.
+    """Survey a log in lines, so that its scans can be read when they are iterated over.
 
-    Args:
-        source: Name of the log, for errors.
-        format: `carmen` ignores vertices and edges; `g2o` requires vertices; None reads what is
-            there.
-        surveyed: The part of the log that is surveyed; None for all of it.
-
-    Returns:
-        Notes on what was found, and the scans, which are read when they are iterated over.
-
-    Raises:
-        LogError: The log holds no scan, or no odometry.
+    The format `carmen` ignores vertices and edges; `g2o` requires vertices; None reads what is
+    there. `surveyed` is the part of the log that is surveyed; None for all of it. Raises
+    LogError if the log holds no scan, or no odometry.
     """
     found = survey_of(surveyed or file, source, format != "carmen")
     if format == "g2o" and not found.graph.vertices:

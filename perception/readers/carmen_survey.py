@@ -126,12 +126,7 @@ class PoseGraph:
         return motion
 
     def is_corrected(self, farthest: float) -> bool:
-        """Check whether the poses of vertices were corrected.
-
-        Args:
-            farthest: Poses were corrected if one is farther than this from its pose by odometry, in
-                metres.
-        """
+        """Check whether a vertex is farther than some metres from its pose by odometry."""
         first = self.vertices[0][1]
         return any(
             math.dist(displacement_between(first, pose)[:2], odometry[:2]) > farthest
@@ -139,23 +134,14 @@ class PoseGraph:
         )
 
     def index_at(self, pose: Pose, guess: int | None = None) -> int | None:
-        """Find the index in `vertices` of a vertex with this pose; None if there is none.
-
-        Args:
-            pose: The pose, up to rounding.
-            guess: Index of a vertex to try first.
-        """
+        """Find the index in `vertices` of one with this pose, up to rounding; try `guess` first."""
         if guess is not None and same_pose(self.vertices[guess][1], pose):
             return guess
         near: list[int] = self._tree.query_ball_point(pose[:2], 2 * ROUNDED)
         return next((i for i in sorted(near) if same_pose(self.vertices[i][1], pose)), None)
 
     def share_at_vertices(self, poses: Sequence[float]) -> float:
-        """Compute the share of poses that equal the pose of a vertex, up to rounding.
-
-        Args:
-            poses: Flat list of poses: x, y, heading, x, …
-        """
+        """Compute the share of poses (flat: x, y, heading, x, …) at vertices, up to rounding."""
         table: NDArray[np.float64] = np.reshape(poses, (-1, 3))
         last = len(self.vertices) - 1
         at = sum(
@@ -231,16 +217,9 @@ class Findings:
 def meaning_of(
     found: Findings, survey: Survey, kind: str, source: str, notes: list[str]
 ) -> Meaning:
-    """Find out what the poses of the scans mean.
+    """Find out what the poses of the scans mean, with notes.
 
-    Args:
-        found: Findings of the first pass.
-        survey: Findings about the kind of lines that is read.
-        source: Name of the log, for errors.
-        notes: Receives notes for the user.
-
-    Raises:
-        LogError: No poses are the odometer's.
+    Raises LogError if no poses are the odometer's.
     """
     is_same = survey.same >= MOST_SCANS * survey.scans
     if kind == "RAWLASER1":
@@ -285,8 +264,7 @@ def _meaning_beside_graph(
 ) -> Meaning:
     """Find out what the poses of the scans mean if the log has vertices.
 
-    Raises:
-        LogError: The poses are those of vertices, and there are no edges.
+    Raises LogError if they are those of vertices, and there are no edges.
     """
     if graph.share_at_vertices(survey.poses) < MOST_SCANS:
         notes.append(
@@ -342,13 +320,8 @@ def mount_in_log(found: Findings, survey: Survey, meaning: Meaning, kind: str) -
 def reach_of(found: Findings, survey: Survey, kind: str, assumed: dict[str, str]) -> float:
     """Find the range in metres from which nothing came back.
 
-    Args:
-        found: Findings of the first pass.
-        survey: Findings about the kind of lines that is read.
-        assumed: Receives, by the key "no_return", a note if the log does not say the range.
-
-    Returns:
-        The range; infinite if each line with a scan gives its own.
+    It is infinite if each line with a scan gives its own. `assumed` receives, by the key
+    "no_return", a note if the log does not say the range.
     """
     if kind != "FLASER":
         return math.inf
@@ -369,9 +342,7 @@ def reach_of(found: Findings, survey: Survey, kind: str, assumed: dict[str, str]
 def survey_of(file: IO[bytes], source: str, with_graph: bool) -> Findings:
     """Read a log, and count the evidence for the meaning of its poses and ranges.
 
-    Args:
-        source: Name of the log, for errors.
-        with_graph: Whether to read vertices and edges.
+    `with_graph` says whether to read vertices and edges.
     """
     found = Findings()
     odometer: tuple[Pose, float | None] | None = None  # Pose and time of the last ODOM line.

@@ -120,11 +120,7 @@ class LaserOptions:
         return scan if laser is scan.laser else replace(scan, laser=laser)
 
     def reach(self, reach: float) -> float:
-        """Return the reach of a laser in metres: from the user, or else from the log.
-
-        Args:
-            reach: Reach according to the log, in metres.
-        """
+        """Return the reach of a laser in metres: from the user, or else from the log."""
         # The ranges may have been rounded to single precision.
         return reach if self.no_return is None else self.no_return * (1 - 1e-6)
 
@@ -150,18 +146,11 @@ class Meaning:
 def interpret_log(
     scans: Sequence[Scan], options: LaserOptions
 ) -> tuple[tuple[Scan, ...], tuple[str, ...]]:
-    """Find out what the ranges of a whole log mean.
+    """Interpret the ranges of a whole log, as the driver wrote them, and note what was found.
 
-    Args:
-        scans: The scans, with ranges as the driver wrote them.
-        options: What the user says about the laser. The survey finds the rest.
-
-    Returns:
-        The scans, in which ranges are infinite if nothing came back and NaN if nothing is known;
-        and notes on what was found.
-
-    Raises:
-        LogError: The user gives one mount, but the scans come from several lasers.
+    Options come first, and then the survey. In the result, ranges are infinite if nothing came
+    back and NaN if nothing is known. Raises LogError if the user gives one mount, but the scans
+    come from several lasers.
     """
     interpret, notes = interpreter_of(scans, options)
     return tuple(map(interpret, scans)), notes
@@ -170,18 +159,10 @@ def interpret_log(
 def interpreter_of(
     scans: Sequence[Scan], options: LaserOptions
 ) -> tuple[Callable[[Scan], Scan], tuple[str, ...]]:
-    """Find out from some scans what the ranges of a log mean.
+    """Find out from some scans what the ranges of a log mean, with notes, as `interpret_log`.
 
-    Args:
-        scans: The scans, with ranges as the driver wrote them.
-        options: What the user says about the laser. The survey finds the rest.
-
-    Returns:
-        A function that interprets a scan of the same lasers, also a later one; and notes on what
-        was found. A scan of another laser is interpreted as by `interpret_scan`.
-
-    Raises:
-        LogError: The user gives one mount, but the scans come from several lasers.
+    Return a function that interprets a scan of the same lasers, also a later one. A scan of
+    another laser is interpreted as by `interpret_scan`.
     """
     lasers = len({scan.laser.mount for scan in scans})
     if options.mount is not None and lasers > 1:
@@ -215,24 +196,13 @@ def _key(scan: Scan) -> _Key:
 
 
 def interpret_scan(scan: Scan, options: LaserOptions) -> Scan:
-    """Interpret the ranges of a single scan without its log.
-
-    Args:
-        scan: The scan, with ranges as the driver wrote them.
-
-    Returns:
-        The scan, in which ranges are infinite if nothing came back and NaN if nothing is known.
-    """
+    """Interpret the ranges of a single scan without its log, as `interpret_log` does."""
     placed = options.placed(scan)
     return _measured(placed, Meaning(options.reach(placed.laser.reach), options.free))
 
 
 def moving(scans: Iterable[Scan]) -> list[Scan]:
-    """Choose scans between which the robot moved, by odometry.
-
-    Returns:
-        The first scan, and each scan at least APART metres or TURNED radians from the last chosen.
-    """
+    """Choose the first scan, and each one at least APART metres or TURNED radians further on."""
     kept: list[Scan] = []
     for scan in scans:
         dx, dy, turned = (

@@ -38,13 +38,9 @@ PACKERS = {
 
 @contextmanager
 def opened(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
-    """Open a file so that it can be read more than once. A pipe is copied to a temporary file.
+    """Open a file to be read more than once. A pipe is copied to a temporary file.
 
-    Yields:
-        The file, as a stream of bytes.
-
-    Raises:
-        LogError: The file cannot be read.
+    Raises LogError if the file cannot be read.
     """
     try:
         file = Path(path).open("rb")  # noqa: SIM115 - it is closed below
@@ -71,14 +67,9 @@ def _unreadable(path: str | os.PathLike[str], error: OSError) -> LogError:
 
 
 def copied(file: IO[bytes], copy: IO[bytes], source: str) -> None:
-    """Copy a file to a temporary one.
+    """Copy a file from its current position to a temporary one.
 
-    Args:
-        file: The file, from its current position.
-        source: Name of the file, for errors.
-
-    Raises:
-        LogError: The disk with the temporary folder is full.
+    Raises LogError if the disk with the temporary folder is full.
     """
     try:
         shutil.copyfileobj(file, copy, 2**20)
@@ -130,21 +121,13 @@ class Piped:
 
 
 def piped(stream: IO[bytes], source: str) -> IO[bytes]:
-    """Read a pipe from its beginning, unpacking it if necessary.
-
-    Args:
-        source: Name of the pipe, for errors.
-    """
+    """Read a pipe from its beginning, unpacking it if necessary."""
     first = stream.read(max(map(len, PACKERS)))
     return unpacked(cast(IO[bytes], Piped(first, stream)), source)
 
 
 def packer(file: IO[bytes]) -> str | None:
-    """Recognise the packer of a file by its first bytes.
-
-    Returns:
-        "gzip", "bzip2", "xz" or "zstd"; None for a file that is not packed.
-    """
+    """Return the packer of a file by its first bytes: "gzip", "bzip2", "xz" or "zstd", or None."""
     file.seek(0)
     head = file.read(max(map(len, PACKERS)))
     return next((name for magic, (name, _) in PACKERS.items() if head.startswith(magic)), None)
@@ -153,15 +136,8 @@ def packer(file: IO[bytes]) -> str | None:
 def unpacked(file: IO[bytes], source: str) -> IO[bytes]:
     """Read a file from its beginning, unpacking it if necessary.
 
-    Args:
-        source: Name of the file, for errors.
-
-    Returns:
-        A stream of unpacked bytes. It raises one of `damages()` if packed data end early or are
-        damaged.
-
-    Raises:
-        LogError: The package that unpacks zstd is missing.
+    The stream raises one of `damages()` if packed data end early or are damaged. Raises
+    LogError if the package that unpacks zstd is missing.
     """
     found = packer(file)
     file.seek(0)
@@ -184,11 +160,7 @@ def unpacked(file: IO[bytes], source: str) -> IO[bytes]:
 
 
 def damages(*others: type[Exception]) -> tuple[type[Exception], ...]:
-    """List the errors of a stream of `unpacked`: data end early (EOFError) or are damaged.
-
-    Args:
-        *others: Errors to add to these.
-    """
+    """List the errors of `unpacked`, data that end early (EOFError) or are damaged, and others."""
     zstd = zstd_module()
     return (
         EOFError,
@@ -211,18 +183,10 @@ def zstd_module() -> Any:
 
 
 def lines(file: IO[bytes], source: str) -> Iterator[tuple[int, bytes | None]]:
-    """Read the lines of a file from its beginning, unpacking it if necessary.
+    """Yield the lines of a file, unpacked if necessary, each with its number, from 1.
 
-    Args:
-        source: Name of the file, for errors.
-
-    Yields:
-        The number of each line, from 1, and the line. A line of more than LONGEST_LINE bytes is
-        None.
-
-    Raises:
-        LogError: Packed data end early or are damaged. The message says up to which line they can
-            be read.
+    A line of more than LONGEST_LINE bytes is None. Raises LogError if packed data end early or
+    are damaged, which says up to which line they can be read.
     """
     found = packer(file)
     stream = unpacked(file, source)

@@ -136,24 +136,12 @@ def live_log(
     zero_is: str | None = None,
     tell: Callable[[str], None] = lambda note: None,
 ) -> Iterator[Scan | Damage]:
-    """Read the scans of a log of CARMEN from a pipe, while they are written.
+    """Read the scans of a log of CARMEN from a pipe, packed or not, while they are written.
 
     The first SURVEYED scans wait until they show what the poses and ranges of the log mean. The
-    arguments from `fov` to `zero_is` are those of `read_log`.
-
-    Args:
-        stream: The pipe, packed or not.
-        source: Its name, for errors.
-        fov: Degrees from the first beam to the last.
-        no_return: Metres from which a range means that nothing came back.
-        zero_is: Meaning of ranges that are no measurement.
-        tell: Takes each note on what the reader assumed or found out.
-
-    Yields:
-        Scans, and `Damage` for the parts that were skipped.
-
-    Raises:
-        LogError: The pipe has no lines of CARMEN, or vertices, whose edges may come later.
+    arguments from `fov` to `zero_is` are those of `read_log`. `tell` takes each note on what
+    the reader assumed or found out. Yield scans, and `Damage` for the parts that were skipped.
+    Raises LogError if the pipe has no lines of CARMEN, or vertices, whose edges may come later.
     """
     options = LaserOptions(fov, mount, no_return, zero_is)
     if not hasattr(stream, "readline") or isinstance(stream, io.TextIOBase):

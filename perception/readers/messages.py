@@ -60,13 +60,9 @@ class ScanLine:
 
 
 def words(raw: bytes | None) -> list[bytes]:
-    """Split a line into words.
+    """Split a line into words. None is a line that was too long to be read.
 
-    Args:
-        raw: The line; None for one that was too long to be read.
-
-    Raises:
-        Damaged: The line is too long, or does not begin with the name of a message.
+    Raises Damaged for such a line, or one that does not begin with the name of a message.
     """
     if raw is None:
         raise Damaged(f"expected a line of at most {LONGEST_LINE // 2**20} MiB, got a longer one")
@@ -79,11 +75,7 @@ def words(raw: bytes | None) -> list[bytes]:
 
 
 def scan_line(tokens: list[bytes]) -> ScanLine | None:
-    """Parse a line with a scan; None for another kind of line.
-
-    Raises:
-        Damaged: Words are missing or are no valid numbers.
-    """
+    """Parse a line with a scan; None for another kind of line. Raises Damaged."""
     kind = tokens[0].decode("ascii")
     if kind not in KINDS:
         return None
@@ -137,11 +129,7 @@ def _ranges(tokens: list[bytes], at: int) -> tuple[NDArray[np.float64], int]:
 
 
 def pose_at(tokens: list[bytes], at: int) -> Pose:
-    """Parse the pose that begins at word `at`: x and y in metres, heading in radians.
-
-    Raises:
-        Damaged: There are no three numbers, or they are too large.
-    """
+    """Parse the pose that begins at word `at`, in metres and radians. Raises Damaged."""
     if len(tokens) < at + 3:
         raise Damaged(
             f"expected a pose of three numbers after word {at}, got {max(0, len(tokens) - at)}"
@@ -165,14 +153,9 @@ def edge_of(tokens: list[bytes]) -> tuple[tuple[int, int], Pose]:
 
 
 def parameters_of(tokens: list[bytes]) -> dict[str, float]:
-    """Parse a PARAM line of a CARMEN log.
+    """Return the parameter of the front laser, if any, by a short name such as "fov".
 
-    Returns:
-        A dict with one entry if the line has a parameter of the front laser: its short name, such
-        as "fov", and its value. Empty for other parameters.
-
-    Raises:
-        Damaged: The value is no number.
+    `tokens` is a PARAM line of a CARMEN log. Raises Damaged if the value is no number.
     """
     if len(tokens) < 2 or tokens[1] not in _PARAMETERS:
         return {}

@@ -85,17 +85,11 @@ class TimedPoses:
 
 
 def clock_of(topics: Mapping[str, Array]) -> tuple[bool, tuple[str, ...]]:
-    """Choose between the stamps in headers and the times of recording.
+    """Return whether to use the stamps in headers instead of the times of recording, with notes.
 
-    Stamps are used if those of each topic are consistent and those of all topics agree. Otherwise,
-    the times of recording are used, even if they are wrong, too.
-
-    Args:
-        topics: For each topic, (n, 2) stamps and times of recording in seconds, in the order of the
-            bag.
-
-    Returns:
-        Whether to use the stamps, and notes on what is wrong with the clocks.
+    Stamps are used if those of each topic are consistent and those of all topics agree.
+    Otherwise, the times of recording are used, even if they are wrong, too. `topics` has, for
+    each, (n, 2) stamps and times of recording in seconds, in the order of the bag.
     """
     wrong = [text for name, times in topics.items() if (text := _wrong_stamps(name, times[:, 0]))]
     held = [
@@ -207,11 +201,8 @@ def sources_of(track: RecordedTrack) -> list[NDArray[np.intp]]:
     """Separate the poses of sources that alternate, such as two programs with the same transform.
 
     Each pose is given to the source whose last pose is nearest. If no source is near, the pose
-    starts a new source.
-
-    Returns:
-        Indices of the poses of each source, the largest source first. If the poses do not
-        alternate, all belong to one source.
+    starts a new source. The largest comes first. If poses do not alternate, all are of one
+    source.
     """
     poses = track.table()[:, 2:]
     if len(poses) < 10:

@@ -98,12 +98,7 @@ class Salvage:
     def messages(
         self, connections: Collection[Connection]
     ) -> Iterator[tuple[Connection, int, bytes]]:
-        """Read the messages of some connections.
-
-        Yields:
-            For each message: its connection, the time of recording in nanoseconds, and the
-            serialised message.
-        """
+        """Yield for each message its connection, its nanoseconds of recording, and its bytes."""
         asked = {connection.id: connection for connection in connections}
         for message in self._messages():
             if message.connection in asked:
