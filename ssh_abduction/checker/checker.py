@@ -109,10 +109,7 @@ def check(trace: Trace, ssh_map: SSHMap, theory: Theory | None = None) -> tuple[
 def violations(trace: Trace, ssh_map: SSHMap, theory: Theory) -> Iterator[Violation]:
     """Find violations one by one, so that a caller can stop at the first one.
 
-    Args:
-        trace: What the robot saw and did, with views.
-        ssh_map: Any map, even a malformed one.
-        theory: The theory, with all its defaults resolved for this trace.
+    The map may be malformed. The theory has all its defaults resolved for this trace.
     """
     reading = Reading(trace, ssh_map, theory)
     checks = [(COHERENCE, test) for test in coherence.CHECKS] + [

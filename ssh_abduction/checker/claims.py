@@ -28,14 +28,11 @@ REASONS = ("time limit", "memory limit", "interrupted", "maps limit", "no proof"
 def false_claims(
     answer: Mapping[str, Any], maps: Sequence[SSHMap], steps: int, theory: Theory, proven: int
 ) -> tuple[str, ...]:
-    """Find the false claims of an answer. No claim is accepted without a check.
+    """Find the false claims of an answer of `solve --json`. None is accepted without a check.
 
-    Args:
-        answer: The answer as `solve --json` prints it (docs/reference/formats.md).
-        steps: The number of steps of the trace.
-        theory: The theory of the answer, with all defaults resolved.
-        proven: The lower bound on dstates that the certificate of the answer proves. Numbers of
-            dstates that clingo refuted, by the certificate, are included without a check.
+    `steps` is the number of steps of the trace. The theory has all defaults resolved. `proven`
+    is the lower bound on dstates that the certificate of the answer proves. Numbers of dstates
+    that clingo refuted, by the certificate, are included without a check.
     """
     claims = _Claims(answer, maps, steps, theory, proven)
     return tuple(
@@ -48,15 +45,10 @@ def false_claims(
 def contradictions(
     answer: Mapping[str, Any], maps: Sequence[SSHMap], steps: int, theory: Theory
 ) -> Iterator[str]:
-    """Find contradictions between the claims of an answer and its maps.
+    """Find contradictions between the claims of an answer and its maps, as `false_claims`.
 
-    The certificate of the answer is accepted unchecked, because its check needs the trace.
-
-    Args:
-        answer: The answer, as for `false_claims`.
-        steps: The number of steps of the trace.
-        theory: The theory of the answer, with all defaults resolved. If it allows faults, costs and
-            bounds are not compared.
+    The certificate of the answer is accepted unchecked, because its check needs the trace. If
+    the theory allows faults, costs and bounds are not compared.
     """
     claims = _Claims(answer, maps, steps, theory, sys.maxsize)
     for check in (

@@ -50,15 +50,10 @@ class Clash:
 
 
 def clashes(sights: Sequence[Sight], turns: Turns, axioms: Collection[str]) -> Iterator[Clash]:
-    """Find the places whose sights (dstate and star) fit no frame (numbering of gateways).
+    """Yield a minimal set of sights (dstate and star) for each place where they fit no frame.
 
-    Args:
-        sights: The sights of a map, sorted by first step.
-        turns: For each pair of sights at one place, the turns from one to the other.
-        axioms: Names of the axioms that hold.
-
-    Yields:
-        For each such place, a minimal set of its sights that fits no frame.
+    A frame numbers the gateways. The sights are those of a map, sorted by first step. `turns`
+    has those from one sight to another at one place. `axioms` names those that hold.
     """
     hard = [name for name in NAMES if name in axioms]
     for place, seen in by_place(sights).items():

@@ -102,11 +102,7 @@ class ErrorFilter:
         return covariance
 
     def new_until(self, end: int) -> Array:
-        """For each step up to `end`, compute the covariance at `end` of the noise up to this step.
-
-        Returns:
-            The covariances, (end + 1, 9).
-        """
+        """Return the covariance at `end` of the noise up to each step, (end + 1, 9)."""
         steps = np.arange(end + 1)
         onward = self.onward(steps, np.full(end + 1, end))
         covariance: Array = (onward @ self.white[: end + 1] @ onward.swapaxes(-1, -2)).reshape(
@@ -115,11 +111,7 @@ class ErrorFilter:
         return covariance
 
     def repeated_since(self, first: Any, last: Any) -> Array:
-        """Compute how the end of each loop moves if scale or drift is one standard deviation off.
-
-        Returns:
-            The changes of the pose by scale and by drift, (m, 3, 2).
-        """
+        """Return how loops end if scale, or drift, is one standard deviation off, (m, 3, 2)."""
         moved: Array = (
             self.repeated[last] - self.onward(first, last) @ self.repeated[first]
         ) * self.sigma

@@ -111,14 +111,9 @@ class Refused:
 def refused_returns(trace: Trace, ssh_map: SSHMap, theory: Theory) -> Iterator[Refused]:
     """Find the single returns and the pair of returns that displacements reject most clearly.
 
-    A return is a pair of steps that the map has at one dstate or at one place.
-
-    Args:
-        theory: The theory, resolved for the trace, so that it has the number of tests.
-
-    Yields:
-        At most one return to a place, one return to a dstate, and then one pair of returns. Nothing
-        if the trace has no displacements.
+    A return is a pair of steps that the map has at one dstate or at one place. At most one
+    return to a place is yielded, one return to a dstate, and then one pair. The theory is
+    resolved for the trace, so that it has the number of tests.
     """
     if not trace.has_displacements:
         return

@@ -89,12 +89,9 @@ def joins_by_minimality(
 
 
 def joins_in_words(joins: Sequence[Join], maps: int = 1, *, minimal: bool = False) -> str:
-    """Say which joins rest on minimality alone, in words. Empty if there are none.
+    """Say which joins of the first map rest on minimality alone; empty if there are none.
 
-    Args:
-        joins: The joins of the first map.
-        maps: The number of maps that are listed.
-        minimal: Whether to say first that the map is minimal.
+    `maps` is the number of maps listed. With `minimal`, say first that the map is minimal.
     """
     kinds = {
         "these places": [join for join in joins if join.at_place],

@@ -62,11 +62,7 @@ def misfit(
 ) -> float:
     """Compute the misfit (the least chi-square) if each step is at a given dstate and place.
 
-    Args:
-        trace: A trace with displacements, and perhaps closures.
-        dstates: The dstate of each step, as a number.
-        places: The place of each step, as a number.
-        faults: The kind and the step of each fault. A displacement that jumped is ignored.
+    Faults have a kind and a step. A displacement that jumped is ignored.
     """
     wrong = [step for kind, step in faults if kind == "jumped"]
     return _Errors(trace.without_displacements_at(wrong), dstates, places).least()
@@ -75,11 +71,7 @@ def misfit(
 def false_costs(
     trace: Trace, answer: Mapping[str, Any], maps: Sequence[SSHMap], theory: Theory
 ) -> Iterator[str]:
-    """Check what an answer claims about the costs of its maps in nats.
-
-    Args:
-        theory: The theory of the answer, with all defaults resolved.
-    """
+    """Check what an answer claims about the costs of its maps in nats, by its resolved theory."""
     weighed = answer.get("weighed")
     if not isinstance(weighed, Mapping) or not maps:
         return
@@ -273,13 +265,10 @@ def likely_moves(
     dstates: Sequence[int],
     places: Sequence[int],
 ) -> Iterator[tuple[int, tuple[float, float, float]]]:
-    """Guess the missing displacements.
+    """Guess the displacements that lead to the `missing` steps.
 
-    Args:
-        moved: The displacement that leads to each of n steps, (n, 3), in metres and radians.
-        missing: The steps to which no displacement is known.
-        dstates: The dstate of each step.
-        places: The place of each step.
+    `moved` has the displacement that leads to each of n steps, (n, 3), in metres and radians.
+    `dstates` and `places` have the dstate and the place of each step.
     """
     begins = [0, *sorted(missing)]
     stretch = [range(a, b) for a, b in pairwise([*begins, len(moved)])]

@@ -64,11 +64,7 @@ class Edges:
             self._at[p].append(s)
 
     def can_be_drawn_by(self, headings: Mapping[int, int]) -> bool:
-        """Tell whether these headings make a drawing without a crossing.
-
-        Args:
-            headings: The slot, 0 to 3 clockwise, that each dstate faces.
-        """
+        """Tell whether the slots that dstates face, 0 to 3 clockwise, give a planar drawing."""
         return self._is_drawing(
             {(s, side): (headings[s] + (1 - side)) % 4 for s in self.place_of for side in (1, -1)}
         )
@@ -78,11 +74,9 @@ class Edges:
     ) -> bool:
         """Tell whether some headings in frames of four slots make a drawing without a crossing.
 
-        Args:
-            stars: The stars (openings ahead, right, back and left) seen at each dstate. Headings
-                must make the stars of one place agree.
-            turned: Whether turns must rotate the heading.
-            distinct: Whether the dstates of a place must face different slots.
+        Headings must make the stars of one place (openings ahead, right, back and left)
+        agree. If `turned`, turns must rotate the heading. If `distinct`, the dstates of a
+        place must face different slots.
         """
         options: list[list[Option]] = []
         for here in self._at.values():
@@ -127,11 +121,9 @@ class Edges:
     def can_be_drawn(self, *, crossing: bool) -> bool:
         """Tell whether some clockwise orders of gateways make a drawing without a crossing.
 
-        This is for places without frames: a turn shows only the side, not the angle.
-
-        Args:
-            crossing: Whether the path after a right or left turn lies on both sides of the path
-                before it. Otherwise only the part ahead is known to lie on the side of the turn.
+        This is for places without frames: a turn shows only the side, not the angle. If
+        `crossing`, the path after a right or left turn lies on both sides of the path
+        before it. Otherwise only the part ahead is known to lie on the side of the turn.
         """
         one = self._gateways()
         if one is None:

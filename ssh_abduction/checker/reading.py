@@ -176,11 +176,9 @@ class Reading:
         return {*self.orders[path].listed, *self.along.get(path, ())}
 
     def onward(self, s: DState) -> tuple[int, ...]:
-        """Find the bearings at which the path of a dstate continues, in degrees.
+        """Find the bearings at which the path of a dstate continues: 0 (ahead) and 180 (behind).
 
-        Returns:
-            0 (ahead) if a place comes after that of the dstate on its path, and 180 (behind) if one
-            comes before it.
+        It does if a place comes after, or before, that of the dstate on its path.
         """
         course = course_of(s)
         if course is None or s.place is None or course[0] not in self.orders:
@@ -297,11 +295,7 @@ class Order:
         return way[::-1]
 
     def ring_steps(self, ring: Sequence[int]) -> list[int]:
-        """List the steps of the travels that put places in a circular order.
-
-        Args:
-            ring: The places. A travel leads from each to the next, and from the last to the first.
-        """
+        """List the steps of the travels that lead around a ring of places in this order."""
         edges = zip(ring, [*ring[1:], ring[0]], strict=True)
         return [step for edge in edges for step in self.travels[edge].steps]
 

@@ -96,8 +96,7 @@ def branches_right_of(
 ) -> dict[Course, dict[int, RightBranch]]:
     """Find the places to the right of each course, each with the branch that leads to it.
 
-    Args:
-        after: Returns the places after a place on a course.
+    `after` returns the places after a place on a course.
     """
     excused = {frozenset(pair) for pair in m.map.excused if is_pair(pair)}
     if m.theory.boundary != "defeasible":

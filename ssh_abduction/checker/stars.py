@@ -59,11 +59,9 @@ def _alike(place: int, seen: Sequence[tuple[Openings, int]]) -> Found:
 
 
 def gateways_by_drive(m: Reading) -> Iterator[tuple[int, str, list[tuple[Openings, int]]]]:
-    """For each place and each drive that was there, find what the drive saw there.
+    """For each place, by number, and each drive there, by time, yield what the drive saw there.
 
-    Yields:
-        The place; the name of the drive; and a list of pairs: the openings, turned into slots of
-        the place, and the step. Places are sorted by number, the drives at a place by time.
+    The third value has pairs: the openings, turned into slots of the place, and the step.
     """
     seen: dict[tuple[int, int], list[tuple[Openings, int]]] = {}
     names = [m.trace.drive or m.trace.name or ALONE]
@@ -79,11 +77,10 @@ def gateways_by_drive(m: Reading) -> Iterator[tuple[int, str, list[tuple[Opening
 
 
 def slot_changes(m: Reading) -> Iterator[tuple[int, int, int, str, str]]:
-    """Find the gateways that differ between a drive and the drive before it at the same place.
+    """Yield the gateways that differ between a drive and the drive before it at the same place.
 
-    Yields:
-        The place; the slot of the gateway; the first step of the later drive there; and what the
-        earlier and the later drive saw, in words.
+    Each has the place, the slot, the first step of the later drive there, and what the earlier
+    and the later drive saw, in words.
     """
     last: dict[int, tuple[str, Openings]] = {}
     for p, name, seen in gateways_by_drive(m):

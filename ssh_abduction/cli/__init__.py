@@ -130,11 +130,7 @@ def parser() -> Parser:
 
 
 def unwritten(error: OSError, output: object) -> str:
-    """Make the message for a file that cannot be written.
-
-    Args:
-        output: The file, in case the error names none.
-    """
+    """Make the message for a file that cannot be written: `output`, if the error names none."""
     mend = MENDS.get(error.errno or 0, "check the path")
     return (
         f"{named(error.filename or output)}: cannot be written: {error.strerror or error}; {mend}"

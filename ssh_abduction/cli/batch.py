@@ -112,13 +112,7 @@ class SolveQuestion:
         trace: Trace | None = None,
         given_up: Callable[[], bool] = lambda: False,
     ) -> SolveAnswer:
-        """Solve one trace. If that fails, the answer says why.
-
-        Args:
-            number: The index of the trace, which the answer repeats.
-            trace: The trace if it was sent along; None to load it from the file.
-            given_up: Returns whether the answer is not needed any more.
-        """
+        """Solve one trace, as `FileQuestion.answer`. If that fails, the answer says why."""
         try:
             return self._solved(number, path, trace or Trace.load(path), given_up)
         except Exception as error:  # one bad trace must not stop the others

@@ -120,12 +120,9 @@ def run(options: argparse.Namespace) -> int:
 
 
 def runner_up_doubts(trace: Trace) -> list[str]:
-    """Find out whether the second best number of views (the runner-up) gives another map.
+    """Warn in a sentence if the second best number of views (the runner-up) gives another map.
 
     Maps are found by the topological theory, or by the causal one if some action has no kind.
-
-    Returns:
-        One warning if the maps differ; an empty list otherwise.
     """
     theory = (
         Theory.topological() if all(action.kind for action in trace.actions) else Theory.causal()

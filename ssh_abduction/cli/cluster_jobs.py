@@ -34,14 +34,9 @@ def answers_on_cluster(
 ) -> Generator[Any]:
     """Yield answers from the workers of a Dask scheduler, in the order in which they are ready.
 
-    Args:
-        address: The address of the scheduler, with a port.
-        jobs: The largest number of files on the cluster at a time; None or -1 for twice the number
-            of its cores.
-        stop: Ends the work early when it is set.
-
-    Raises:
-        AbductionError: The package `distributed`, the scheduler or its workers are missing.
+    At most `jobs` files are on the cluster at a time; None or -1 takes twice the number of its
+    cores. The work ends early when `stop` is set. Raises AbductionError if the package
+    `distributed`, the scheduler or its workers are missing.
     """
     try:
         from distributed import Client

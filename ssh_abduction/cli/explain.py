@@ -150,14 +150,9 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _maps_of(options: argparse.Namespace) -> tuple[str | None, Theory | None, Any]:
-    """Read the file of maps that --theory names, if it names one.
+    """Return the file that --theory names, the theory of its maps, and its data; None if lacking.
 
-    Returns:
-        The file that --theory names, the theory of its maps, and its data; None for what there is
-        not. A file of TOML has no maps.
-
-    Raises:
-        MapError: The file cannot be read, or holds no theory.
+    A file of TOML has no maps. Raises MapError if the file cannot be read, or holds no theory.
     """
     file = maps_path(options.theory) if options.theory else None
     if file is None or not Path(file).is_file():

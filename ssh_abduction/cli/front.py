@@ -20,9 +20,8 @@ from ssh_abduction.theory.theory import Theory
 def run(options: argparse.Namespace) -> int:
     """Print the front: the fewest dstates for each number of faults.
 
-    Returns:
-        The exit code: 0 if the search was completed; 20 if no map has so few faults; 10 if the
-        search was stopped.
+    The exit code is 0 if the search was completed, 20 if no map has so few faults, and 10 if
+    the search was stopped.
     """
     several = len(options.traces) > 1 or options.together
     if several or options.jobs is not None or options.scheduler is not None:

@@ -83,11 +83,7 @@ class Guard:
         self._signals.close()
 
     def say(self, text: Callable[[], str]) -> None:
-        """Make a text and print it. What is printed on Ctrl-C never lands in this text.
-
-        Args:
-            text: Returns the text.
-        """
+        """Make a text and print it. What is printed on Ctrl-C never lands in this text."""
         self._printer.say(text)
 
     def _watch(self) -> None:

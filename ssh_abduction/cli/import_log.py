@@ -130,11 +130,7 @@ def reading_of(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _laser_value(field: str, text: str) -> Any:
-    """Convert text to the value of a field of `LaserOptions`, and check it.
-
-    Args:
-        text: A number, or numbers separated by commas.
-    """
+    """Convert numbers separated by commas to the value of a field of `LaserOptions`; check it."""
     from perception.readers.echoes import LaserOptions
 
     try:

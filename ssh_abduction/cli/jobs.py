@@ -82,13 +82,9 @@ def answers_here(
 ) -> Generator[Any]:
     """Yield answers from processes of this machine, in the order in which they are ready.
 
-    If a process is killed, only its own file is lost. Ctrl-C sets `stop`, which the processes
-    watch. Unfinished files then still yield what is known. A second Ctrl-C raises
-    KeyboardInterrupt.
-
-    Args:
-        jobs: The number of processes; -1 for one per core.
-        stop: Ends the work early when it is set.
+    `jobs` is the number of processes; -1 for one per core. If a process is killed, only its own
+    file is lost. Ctrl-C sets `stop`, which the processes watch. Unfinished files then still
+    yield what is known. A second Ctrl-C raises KeyboardInterrupt.
     """
 
     def end() -> None:
@@ -113,10 +109,7 @@ def answers_here(
 def final_code(codes: Sequence[int], asked: int, stop: StopFlag, files: str) -> int:
     """Compute the exit code for many files, and report interruptions and errors on stderr.
 
-    Args:
-        asked: The number of files.
-        stop: Is set if the work was interrupted.
-        files: The word for the files in messages, such as "traces".
+    `asked` is the number of files, and `files` the word for them in messages, such as "traces".
     """
     if stop.is_set():
         missing = asked - sum(code <= SIGNALLED for code in codes)

@@ -98,11 +98,7 @@ class MapQuestion:
     corrections: Corrections | None = None
 
     def obeying(self, folder: Path) -> MapQuestion:
-        """Return this question with the corrections in a folder, if it has a file of them.
-
-        Raises:
-            MapError: The file is malformed.
-        """
+        """Return this question with the corrections in a folder, if any. Raises MapError."""
         file = beside(folder / "maps.json")
         return self if file is None else replace(self, corrections=load_corrections(file))
 
@@ -136,14 +132,10 @@ class MapQuestion:
         answer_last: Callable[[MapAnswer], None] = workers.reply,
         tell: Callable[[str], None] = lambda note: None,
     ) -> MapAnswer:
-        """Map one log. If that fails, the answer says why.
+        """Map one log, as `FileQuestion.answer`. If that fails, the answer says why.
 
-        Args:
-            number: The index of the log, which the answer repeats.
-            content: The content of the log if it was sent along; None to read it here.
-            given_up: Returns whether the answer is not needed any more.
-            answer_last: Takes the answer if the process has to end because clingo does not stop.
-            tell: Takes each warning about the log as soon as it is known.
+        `answer_last` takes the answer if the process has to end because clingo does not
+        stop. `tell` takes each warning about the log as soon as it is known.
         """
         try:
             if given_up():
@@ -167,16 +159,7 @@ class MapQuestion:
         answer_last: Callable[[MapAnswer], None],
         tell: Callable[[str], None],
     ) -> MapAnswer:
-        """Map the logs of several drives through one building together.
-
-        Args:
-            paths: The files or folders of the logs, one a drive.
-            answer_last: As in `answer`.
-            tell: As in `answer`.
-
-        Raises:
-            AbductionError: A log cannot be read or imported, or the logs do not go together.
-        """
+        """Map the logs of several drives through one building together. Raises AbductionError."""
         return self._mapped(0, paths, paths, digest(paths), lambda: False, answer_last, tell)
 
     def _mapped(

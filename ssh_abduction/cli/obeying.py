@@ -31,17 +31,9 @@ def as_corrected(
 ) -> tuple[Trace, Theory]:
     """Return the trace and the theory as the corrections beside a file of maps change them.
 
-    What is obeyed is printed on stderr. If the file beside the maps is of other drives, a warning
-    says so.
-
-    Args:
-        trace: The trace, as it was recorded or corrected already.
-        maps: The file of maps; None for none.
-        given: The file of corrections that the user names instead; None for none.
-
-    Raises:
-        MapError: The file is malformed or contradicts the trace, or the named one is of other
-            drives.
+    `given` is the file of corrections that the user names instead. What is obeyed is printed on
+    stderr. If the file beside the maps is of other drives, a warning says so. Raises MapError
+    if the file is malformed or contradicts the trace, or the named one is of other drives.
     """
     file = given or beside(maps)
     said = Corrections() if file is None else load_corrections(file)
@@ -88,11 +80,7 @@ class Obeying:
 
     @classmethod
     def of(cls, options: argparse.Namespace, trace: Trace, theory: Theory) -> Obeying:
-        """Read the corrections that --corrections names, or those beside the output.
-
-        Raises:
-            MapError: The file is malformed, is of other drives, or contradicts the trace.
-        """
+        """Read the corrections of --corrections, or those beside the output. Raises MapError."""
         said = corrections_of(options)
         if said is None:
             return cls(Corrections(), trace, theory, trace, theory)

@@ -38,8 +38,7 @@ MAPS_SAID = (
 def add_theory(parser: Parser, default: str = "topological") -> None:
     """Add the options that choose a theory: a preset or a file, and options for single fields.
 
-    Args:
-        default: The words of the help for the theory that is used if the user names none.
+    `default` says in the help which theory is used if the user names none.
     """
     group = parser.add_argument_group(
         "theory",
@@ -128,11 +127,9 @@ def add_output(parser: Parser) -> None:
 
 
 def write(trace: Trace, target: str, said: str) -> None:
-    """Write a trace, and print a message about it.
+    """Write a trace to a file, and print a message.
 
-    Args:
-        target: The file from the option of `add_output`; "-" for standard output.
-        said: The message. If the trace goes to standard output, it is printed on stderr.
+    If the file is "-", the trace goes to standard output, and the message to stderr.
     """
     if target == "-":
         sys.stdout.writelines(line + "\n" for line in trace.to_lines())
@@ -150,10 +147,8 @@ def add_maps(parser: Parser) -> None:
 def add_trace(parser: Parser, needs: str = "") -> None:
     """Add the argument `trace`, which may be left out after a folder that map wrote (`trace_of`).
 
-    Args:
-        parser: The parser of a verb that has the argument `maps`.
-        needs: What a step of the trace needs that the trace in a file of maps lacks, in words; if
-            it is empty, that trace is enough (`solved_trace`).
+    `needs` says what the trace in a file of maps lacks; if empty, it is enough
+    (`solved_trace`).
     """
     by = "map" if needs else "solve -o or map"
     parser.add(
@@ -178,8 +173,7 @@ def trace_path(text: str) -> str:
 def trace_of(options: argparse.Namespace) -> str:
     """Return the trace file of a verb with `add_maps` and `add_trace`. Warn if they are swapped.
 
-    Raises:
-        AbductionError: There is no trace, or the file of maps cannot be read.
+    Raises AbductionError if there is no trace, or the file of maps cannot be read.
     """
     if options.trace is None and (beside := trace_beside(options.maps)) is not None:
         return beside
@@ -196,10 +190,7 @@ def trace_of(options: argparse.Namespace) -> str:
 def solved_trace(options: argparse.Namespace) -> Trace:
     """Load the trace that was solved: the named one (`trace_of`), or the one in the file of maps.
 
-    The trace in the file of maps has no images and no truth.
-
-    Raises:
-        AbductionError: There is no trace, or a file cannot be read.
+    The trace in the file of maps has no images and no truth. Raises AbductionError.
     """
     if options.trace is None and trace_beside(options.maps) is None:
         kept = trace_of_maps(options.maps)
@@ -209,11 +200,7 @@ def solved_trace(options: argparse.Namespace) -> Trace:
 
 
 def trace_of_maps(file: str) -> Trace | None:
-    """Return the trace in a file of maps that solve -o wrote; None for any other file.
-
-    Raises:
-        TraceError: The trace is malformed.
-    """
+    """Return the trace in a file of maps of solve -o; None for others. Raises TraceError."""
     from ssh_abduction.solver import trace_in
 
     try:
@@ -259,11 +246,7 @@ def picture_file(text: str) -> str:
 
 
 def check_picture(file: str | None) -> None:
-    """Check before long work that a figure can be drawn. Raise AbductionError if it cannot.
-
-    Args:
-        file: The file of the figure; None if none was asked for.
-    """
+    """Check before long work that a figure can be drawn. Raise AbductionError if it cannot."""
     if file is None:
         return
     from ssh_abduction.evaluation.paper.figures import require_matplotlib
@@ -272,12 +255,7 @@ def check_picture(file: str | None) -> None:
 
 
 def check_number(number: int | None, maps: Sequence[object], where: str) -> None:
-    """Check that there is a map with this number. Raise MapError if there is none.
-
-    Args:
-        number: The number of the map, from 1; None if the user gave none.
-        where: The file of the maps, for the message.
-    """
+    """Raise MapError, which names the file `where`, if there is no map with this number, from 1."""
     if number is not None and not 1 <= number <= len(maps):
         raise MapError(
             f"{where}: --map: expected 1 to {len(maps)}, got {number}; show lists the maps"
@@ -299,14 +277,9 @@ def _in_order(options: argparse.Namespace) -> None:
 
 
 def read_maps(file: str, mend: str = "name the maps first, and then the trace") -> Any:
-    """Read the JSON in a file of maps.
+    """Read the JSON in a file of maps; "-" for standard input.
 
-    Args:
-        file: The file; "-" for standard input.
-        mend: The advice in the message if the file is a trace.
-
-    Raises:
-        MapError: The file cannot be read, is no JSON, or is a trace.
+    Raises MapError. If the file is a trace, the message advises what `mend` says.
     """
     try:
         return read_json(file)
@@ -324,17 +297,11 @@ def _is_trace(file: str) -> bool:
 
 
 def theory_of(options: argparse.Namespace, found: Theory | None = None) -> Theory:
-    """Find the theory that the options ask for.
+    """Return the theory that the options name, or `found`, with the fields that the user changed.
 
-    Args:
-        found: The theory to use if the user names none; None for the default one.
-
-    Returns:
-        The named theory, or `found`, with the fields changed that the user set.
-
-    Raises:
-        TheoryError: A field has a wrong value, or contradicts another one.
-        MapError: The file that --theory names holds no theory.
+    If `found` is None, the default theory takes its place. Raises TheoryError if a field has a
+    wrong value or contradicts another one, and MapError if the file of --theory holds no
+    theory.
     """
     chosen = choices_of(options)
     named_theory: str | None = options.theory
@@ -370,8 +337,7 @@ def theory_of_maps(data: Any, file: str) -> Theory:
 def number_steps(options: argparse.Namespace, trace: Trace) -> None:
     """Replace the steps in --same and the like that name a drive, such as tuesday:14.
 
-    Raises:
-        TraceError: The trace has no such drive or step.
+    Raises TraceError if the trace has no such drive or step.
     """
     for name in ASSERTIONS:
         pairs = getattr(options, name) or []
@@ -395,9 +361,7 @@ def choices_of(options: argparse.Namespace) -> dict[str, Any]:
 def flags_of(theory: Theory, trace: Trace | None = None) -> list[str]:
     """List the words of the command line that choose a theory. This inverts `theory_of`.
 
-    Args:
-        trace: The trace that it is for; None if unknown. Fields to which this trace sets the
-            default theory need no words.
+    Fields to which the trace, if known, sets the default theory need no words.
     """
     default = Theory.causal() if theory.level == "causal" else Theory.topological()
     flags = ["--theory", "causal"] if theory.level == "causal" else []

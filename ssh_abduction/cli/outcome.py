@@ -68,11 +68,7 @@ def answer_opening(search: Search) -> dict[str, Any]:
 
 
 def given_by(search: Search, ssh_map: SSHMap) -> Given:
-    """Pair a map with its cost, or with None if only maps of one cost are listed.
-
-    Args:
-        ssh_map: The map that the search found last.
-    """
+    """Pair the last map with its cost, or with None if only maps of one cost are listed."""
     return ssh_map, search.cost if search.limits.within else None
 
 
@@ -90,10 +86,7 @@ def answer_ending(
 ) -> dict[str, Any]:
     """Make the fields of a solution's JSON that come after its maps, with all warnings.
 
-    Args:
-        explanation: Why there is no map; None if there is a map or it is unknown.
-        maps: The number of maps that were written.
-        backbone: What all minimal maps share; None if it is unknown.
+    `maps` is the number of maps that were written.
     """
     end = written_ending(solution, maps, backbone)
     found = warnings_of(search, solution)
@@ -136,15 +129,9 @@ def warn(warnings: Iterable[str]) -> None:
 
 
 def save_solution(solution: Solution, file: str | None) -> None:
-    """Write a solution to a file, if one is named.
+    """Write a solution to a file, if one is named. Raises MapError.
 
     A solution without a map does not replace a file of maps. A warning says so.
-
-    Args:
-        file: The file; None for none.
-
-    Raises:
-        MapError: The file cannot be written.
     """
     if file is not None and solution.cost is None and _has_maps(file):
         warn(
@@ -167,12 +154,9 @@ def _has_maps(file: str) -> bool:
 def on_ctrl_c(action: Callable[[], None] | None) -> Iterator[None]:
     """While the block runs, call `action` at Ctrl-C and SIGTERM instead of ending the program.
 
-    During this time, the Guard of the whole program receives no signals. So if the code may ignore
-    `action`, it needs its own Guard.
-
-    Args:
-        action: The function to call; None ignores these signals, also in processes that are
-            started.
+    None ignores these signals, also in processes that are started. During this time, the Guard
+    of the whole program receives no signals. So if the code may ignore `action`, it needs its
+    own Guard.
     """
     if threading.current_thread() is not threading.main_thread():
         yield  # Python lets only the main thread handle signals

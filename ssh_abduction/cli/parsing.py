@@ -216,14 +216,8 @@ class Parser(argparse.ArgumentParser):
     def parse_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
         """Parse the words of a command line. The parser of the verb reports unknown options.
 
-        Options of version 0.1.0 are replaced by their new form.
-
-        Args:
-            args: The words; None takes those of this process.
-            namespace: The object that gets the options; None makes a new one.
-
-        Returns:
-            The options. Their attribute `notes` has a sentence for each replacement.
+        Options of version 0.1.0 are replaced by their new form. The attribute `notes` of
+        the result has a sentence for each replacement.
         """
         notes: list[str] = []
         words = self._with_replacements(list(sys.argv[1:] if args is None else args), notes)

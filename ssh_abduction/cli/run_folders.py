@@ -32,9 +32,7 @@ def write_run(folder: Path, files: Sequence[tuple[str, bytes]]) -> None:
     """Write the files of a run into its folder, and make the folder if it is missing.
 
     run.json is removed first and written last, so it never lies beside files of another run.
-
-    Raises:
-        OSError: A file cannot be written. The error names that file.
+    Raises an OSError that names the file.
     """
     if not files:
         return
@@ -51,11 +49,7 @@ def write_run(folder: Path, files: Sequence[tuple[str, bytes]]) -> None:
 
 
 def check_folder(folder: Path) -> None:
-    """Check before long work that a folder can be made and written.
-
-    Raises:
-        AbductionError: The folder cannot be made or written.
-    """
+    """Raise AbductionError before long work if a folder cannot be made and written."""
     there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     if not there.is_dir():
         raise AbductionError(
@@ -132,23 +126,14 @@ def folders_of(logs: Sequence[str], folder: Path) -> tuple[dict[str, Path], dict
 
 
 def distinct(logs: Sequence[str]) -> tuple[list[str], list[tuple[str, str]]]:
-    """Find logs with the same content.
-
-    Returns:
-        The first log of each content; and each other log with the first one of its content.
-    """
+    """Return the first log of each content; and each other log with the first of its content."""
     first: dict[str, str] = {}  # by content; a log that cannot be read is like no other one
     owners = [(log, first.setdefault(_content([log]) or log, log)) for log in logs]
     return [*first.values()], [(log, other) for log, other in owners if log != other]
 
 
 def is_done(folder: Path, logs: Sequence[str], settings: dict[str, Any]) -> bool:
-    """Whether a folder holds a finished run of these logs with the same settings.
-
-    Args:
-        logs: The log, or the logs that are mapped together.
-        settings: The settings, from `MapQuestion.settings`.
-    """
+    """Whether a folder holds a finished run of these logs with the same `MapQuestion.settings`."""
     run = _run_in(folder)
     content = run.get("digest")
     return bool(
@@ -160,16 +145,11 @@ def is_done(folder: Path, logs: Sequence[str], settings: dict[str, Any]) -> bool
 
 
 def digest(logs: Sequence[str]) -> str | None:
-    """Compute the SHA-256 digest of the unpacked content of logs.
+    """Compute the SHA-256 digest of the unpacked content of logs, as hexadecimal text.
 
-    For a folder, it is the digest of the names and contents of its files. For several logs, it is
-    the digest of the digests and the names of the drives.
-
-    Returns:
-        The digest as hexadecimal text; None for a pipe, which can be read only once.
-
-    Raises:
-        LogError: The log cannot be unpacked.
+    For a folder, it is the digest of the names and contents of its files. For several logs, it
+    is the digest of the digests and the names of the drives. A pipe, which can be read only
+    once, has None. Raises LogError.
     """
     if len(logs) == 1:
         return _digest_of(logs[0])

@@ -44,15 +44,10 @@ class SavedMap:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], number: int | str = 1) -> SavedMap:
-        """Read a map, and the corrections beside it.
+        """Read a map, by its number from 1 or its id, and the corrections beside it.
 
-        Args:
-            path: The file of maps; or a folder with a file `maps.json`.
-            number: The number of the map, from 1, or its id.
-
-        Raises:
-            MapError: A file cannot be read; the maps do not name their drives; or the
-                corrections are of another map.
+        Raises MapError if a file cannot be read, the maps do not name their drives, or the
+        corrections are of another map.
         """
         file = Path(maps_path(str(path)))
         data = read_maps(str(file), "give a file that solve -o wrote")
@@ -79,8 +74,7 @@ class SavedMap:
     def save(self, corrections: Corrections) -> Path:
         """Write the corrections beside the map, after a check. Returns their file.
 
-        Raises:
-            MapError: A gateway contradicts the trace; or a drive or a step is unknown.
+        Raises MapError if a gateway contradicts the trace, or a drive or a step is unknown.
         """
         corrections.known_in(self.drives)
         if (trace := trace_of_maps(str(self.file))) is not None:
@@ -90,17 +84,10 @@ class SavedMap:
         return file
 
     def thing(self, text: str) -> tuple[str, str]:
-        """Find what a person names.
+        """Return the kind of what a person names, and the first step at it. Raises MapError.
 
-        Args:
-            text: A place, path or region by its number, such as "p4" or "path 2"; or a step such
-                as "monday:12", for the place where the robot was.
-
-        Returns:
-            Its kind, and the first step at it.
-
-        Raises:
-            MapError: The map has no such thing.
+        The text is a place, path or region by its number, such as "p4" or "path 2"; or a
+        step such as "monday:12", for the place where the robot was.
         """
         found = _THING.fullmatch(text)
         if found is None:
@@ -118,12 +105,7 @@ class SavedMap:
         return kind, step_name(self.drives, first)
 
     def step_of_name(self, kind: str, step: str) -> str:
-        """Return the step whose name the thing at this step has; this step if it has no name.
-
-        Args:
-            kind: "place", "path" or "region".
-            step: A step, such as "monday:12".
-        """
+        """Return the step whose name the thing at this step has; this step if it has no name."""
         number = self._at(kind, step)
         names = self.corrections.known_in(self.drives).names
         return next(
@@ -138,17 +120,12 @@ class SavedMap:
             raise MapError(f"{error}; or a place such as p4") from None
 
     def gateway(self, text: str) -> tuple[tuple[str, float], ...]:
-        """Find the steps at which the robot faced a gateway.
+        """Return the steps at which the robot faced a gateway, each with degrees clockwise.
 
-        Args:
-            text: A place and a direction on the drawn map, such as "p4 north"; or a step and a
-                direction from the robot, such as "monday:12 left" or "monday:12 135".
-
-        Returns:
-            For each step at the place: the step, and the direction in degrees clockwise from ahead.
-
-        Raises:
-            MapError: The map has no such place or step, or no headings there.
+        Degrees count from ahead. The text is a place and a direction on the drawn map, such
+        as "p4 north"; or a step and a direction from the robot, such as "monday:12 left" or
+        "monday:12 135". Raises MapError if the map has no such place or step, or no
+        headings there.
         """
         where, _, way = text.strip().rpartition(" ")
         kind, step = self.thing(where.strip()) if where else ("", "")

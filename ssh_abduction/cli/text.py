@@ -37,9 +37,7 @@ NOUNS: dict[Matter, tuple[str, str]] = {
 def headline(solution: Solution, count: int, explanation: Explanation | None) -> str:
     """Write one line about how a search ended.
 
-    Args:
-        count: The number of maps that the search found. The solution may hold fewer.
-        explanation: Why there is no map; None if there is one, or if the reason is unknown.
+    `count` is the number of maps found. The solution may hold fewer.
     """
     if explanation:
         return f"{solution.status.value}: {explanation}"
@@ -135,11 +133,7 @@ def by_displacements(solution: Solution) -> Iterator[str]:
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """Write a table with aligned columns. Control characters are escaped.
-
-    Args:
-        rows: The cells of each row.
-    """
+    """Write a table with aligned columns. Control characters are escaped."""
     cells = [[*head], *([printable(str(cell)) for cell in row] for row in rows)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
     return "\n".join(

@@ -42,10 +42,7 @@ def add_verbosity(parser: argparse.ArgumentParser) -> None:
 def telling(options: argparse.Namespace, for_programs: bool) -> Iterator[None]:
     """While the block runs, log on stderr as much as the options ask for.
 
-    Args:
-        options: The options, with those of `add_verbosity`.
-        for_programs: Whether other programs read the output. If so, and stdout and stderr are the
-            same file, there are no lines of progress.
+    If other programs read the output, and stdout and stderr are one file, no progress is shown.
     """
     verbose = getattr(options, "verbose", 0)
     if getattr(options, "quiet", False):

@@ -187,14 +187,9 @@ STANDARD_ACTIONS: dict[str, Action] = {
 
 
 def parse_action(value: Any, where: str) -> Action:
-    """Make an action of a value in a trace file.
+    """Make an action of its name, or of an object with its fields. Raises TraceError.
 
-    Args:
-        value: The name, or an object with some of the fields.
-        where: File, line and field, for error messages.
-
-    Raises:
-        TraceError: If a field is wrong.
+    `where` has file, line and field, for messages.
     """
     if isinstance(value, str):
         value = {"name": value}

@@ -96,12 +96,7 @@ class Closure:
 
 
 def match_in_words(closure: Closure, first: int, last: int) -> str:
-    """Say how well the local maps of two steps match.
-
-    Args:
-        first: What to call the earlier step.
-        last: What to call the later step.
-    """
+    """Say how well the local maps of two steps match. `first` and `last` say what to call them."""
     offset = math.hypot(*closure.displacement[:2])
     return f"the local maps of steps {first} and {last} match with an offset of {offset:.2f} m"
 
@@ -109,8 +104,7 @@ def match_in_words(closure: Closure, first: int, last: int) -> str:
 def parse_closures(value: Any) -> tuple[Closure, ...]:
     """Make closures of the list in the header of a trace file; none of None.
 
-    Raises:
-        TraceError: If the list is malformed. The error names the entry and the field.
+    Raises TraceError, which names the entry and the field.
     """
     if value is None:
         return ()
@@ -126,12 +120,7 @@ def parse_closures(value: Any) -> tuple[Closure, ...]:
 
 
 def checked_closures(value: Any, steps: int, source: str | None) -> tuple[Closure, ...]:
-    """Return closures, each pair of steps once, or raise TraceError.
-
-    Args:
-        steps: The number of steps of the trace.
-        source: The file of the trace, for messages; None if there is none.
-    """
+    """Return closures, each pair of steps once, or raise TraceError. `steps` is their number."""
     where = named(source or "trace")
     if not isinstance(value, Sequence) or isinstance(value, str | bytes):
         raise TraceError(
@@ -157,11 +146,7 @@ def checked_closures(value: Any, steps: int, source: str | None) -> tuple[Closur
 
 
 def closures_among(closures: Sequence[Closure], steps: Sequence[int]) -> tuple[Closure, ...]:
-    """Return the closures between some steps of a trace, with the steps renumbered from 0.
-
-    Args:
-        steps: The steps that are kept, ascending.
-    """
+    """Return the closures between these steps, given in order, renumbered from 0."""
     number = {step: k for k, step in enumerate(steps)}
     kept = [c for c in closures if c.first in number and c.last in number]
     return tuple(

@@ -97,14 +97,8 @@ def named_beside(
 ) -> tuple[SSHMap, ...]:
     """Return maps with the names in the file of corrections beside their file, if there is one.
 
-    If that file is of other drives, a warning says so.
-
-    Args:
-        drives: The drives of their trace, with fingerprints; empty if they are unknown.
-        path: The file of the maps; None or "-" if there is none.
-
-    Raises:
-        MapError: The file of corrections is malformed.
+    `drives` are those of their trace, with fingerprints; empty if unknown. If the file of
+    corrections is of other drives, a warning says so. Raises MapError if it is malformed.
     """
     file = beside(path)
     if file is None or not drives:
@@ -155,14 +149,7 @@ def _note(said: Naming | Passage) -> dict[str, str]:
 
 
 def from_yaml(text: str, source: str = "corrections") -> Corrections:
-    """Read names and corrections from YAML.
-
-    Args:
-        source: The name of the file, for messages.
-
-    Raises:
-        MapError: The text is malformed. The error names the field.
-    """
+    """Read names and corrections from YAML. Raises MapError, which names source and field."""
     import yaml  # loads slowly
 
     try:
@@ -300,11 +287,7 @@ class _CorrectionsReader:
 
 
 def direction(text: str) -> float:
-    """Read a direction: ahead, right, back, left, or degrees clockwise from ahead.
-
-    Raises:
-        MapError: The text is no direction.
-    """
+    """Read a direction: ahead, right, back, left, or degrees clockwise. Raises MapError."""
     with suppress(ValueError):
         degrees = DIRECTIONS[text] if text in DIRECTIONS else float(text)
         if math.isfinite(degrees):

@@ -93,12 +93,7 @@ class DriveStep(int):
 
 
 def named_steps(drives: Sequence[Drive], steps: int) -> Sequence[int]:
-    """Return the numbers of all steps, with names such as "tuesday:14" if there are several drives.
-
-    Args:
-        drives: The drives of a trace; empty if they are unknown.
-        steps: The number of its steps.
-    """
+    """Return the numbers of all steps, or names such as "tuesday:14" for several drives."""
     if len(drives) < 2:
         return range(steps)
     return tuple(DriveStep(t, d.name, d.first) for d in drives for t in range(d.first, d.stop))
@@ -158,12 +153,7 @@ def _fingerprint(steps: Sequence[Step]) -> str:
 def step_named(trace: Trace, name: str) -> int:
     """Return the number of a step, such as "14", or "tuesday:14" for step 14 of a drive.
 
-    Args:
-        name: The number of the step; or the name of a drive, a colon, and the number of the step in
-            this drive, from 0.
-
-    Raises:
-        TraceError: There is no such step.
+    Steps count from 0, in the trace or in the drive. Raises TraceError.
     """
     return step_of(drives_of(trace), name)
 

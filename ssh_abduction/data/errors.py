@@ -75,16 +75,10 @@ def xml_text(text: str) -> str:
 
 
 def checked_index(index: object, count: int, what: str) -> int:
-    """Return an index that counts from 0, or raise an error.
+    """Return an index that counts from 0; a negative one counts from the end.
 
-    Args:
-        index: What the caller gave. A negative index counts from the end.
-        count: The number of things.
-        what: The name of the things in messages, such as "steps".
-
-    Raises:
-        RangeError: If there is no thing with this index.
-        TypeError: If the index is not a whole number.
+    Raises RangeError if there is no thing with this index, and TypeError if it is no whole
+    number. Messages call the things `what`, such as "steps".
     """
     if not is_whole(index):
         raise TypeError(f"{what}: expected a whole number or a slice, got {brief(index)}; give one")

@@ -53,9 +53,7 @@ class FieldReader:
     ) -> tuple[T, ...]:
         """Return the members of the list in a field, each converted by `read`.
 
-        Args:
-            read: Converts a member, given its value and its name in messages.
-            optional: Whether the field may be missing.
+        `read` takes a member and its name in messages.
         """
         members = self.list(record, name, optional)
         return tuple(read(value, f"{name}[{i}]") for i, value in enumerate(members))
@@ -95,11 +93,7 @@ class FieldReader:
         return x, y, z
 
     def view(self, value: Any, name: str, expected: str) -> View | None:
-        """Return a view (a text or an integer), or None for an unknown one.
-
-        Args:
-            expected: What messages say was expected.
-        """
+        """Return a view (a text or an integer), or None for an unknown one."""
         is_view = isinstance(value, str | int | None) and not isinstance(value, bool)
         if not is_view or (isinstance(value, str) and not is_writable(value)):
             raise self.wrong(name, expected, value)

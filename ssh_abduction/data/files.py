@@ -88,9 +88,7 @@ def parse_json(text: str) -> Any:
 def json_line(value: Any) -> str:
     """Return a value as JSON on one line, with the control characters escaped.
 
-    Raises:
-        TypeError: If JSON has no type for the value.
-        ValueError: If a number is not finite, or the value contains itself.
+    Raises TypeError or ValueError if JSON cannot hold the value.
     """
     return _UNSEEN.sub(
         lambda found: f"\\u{ord(found[0]):04x}",
@@ -110,15 +108,9 @@ def shipped(name: str) -> Path:
 
 
 def read_at_most(path: str | os.PathLike[str], most: int) -> bytes:
-    """Return the bytes of a file.
+    """Return the bytes of a file, which may be a device that never ends.
 
-    Args:
-        path: The file. It may be a device that never ends.
-        most: The largest number of bytes allowed.
-
-    Raises:
-        OSError: If the file cannot be read.
-        ValueError: If the file has more than `most` bytes.
+    Raises OSError if it cannot be read, and ValueError if it has more than `most` bytes.
     """
     with Path(path).open("rb") as file:
         data = file.read(most + 1)
@@ -130,12 +122,9 @@ def read_at_most(path: str | os.PathLike[str], most: int) -> bytes:
 def write_file(path: str | os.PathLike[str], data: bytes) -> None:
     """Write a file so that it appears whole or not at all.
 
-    A regular file is replaced and keeps its permissions. If the path is a symbolic link, its target
-    is written. If it is a device or a pipe, the bytes are written to it.
-
-    Raises:
-        OSError: If the file cannot be written. The error names this file.
-        ValueError: If the text is not a path.
+    A regular file is replaced and keeps its permissions. If the path is a symbolic link, its
+    target is written. If it is a device or a pipe, the bytes are written to it. Raises an
+    OSError that names this file, or ValueError if the text is not a path.
     """
     if not os.fspath(path):
         raise ValueError("expected the name of a file, got an empty text")

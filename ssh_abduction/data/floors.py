@@ -41,11 +41,9 @@ def floors_in_words(ssh_map: SSHMap) -> str:
 
 
 def with_floors(ssh_map: SSHMap, trace: Trace) -> SSHMap:
-    """Return a map with the floor of each dstate. Floors are numbered by first visit.
+    """Return a map with the floor of each dstate, numbered by first visit.
 
-    Args:
-        ssh_map: A map of the trace, or of its first steps.
-        trace: The trace. If it has no lifts, the map is returned as it is.
+    Without lifts in the trace, the map is returned as it is.
     """
     if not any(action.changes_floor for action in checked_trace(trace).actions):
         return ssh_map

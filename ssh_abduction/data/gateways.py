@@ -63,16 +63,10 @@ Turned = tuple[Frame, int]  # what a sight sees, and the shift of its slots
 def with_allowed_headings(
     trace: Trace, ssh_map: SSHMap, axioms: Collection[str], changes: bool = False
 ) -> SSHMap | None:
-    """Replace the headings of a map by headings that all stars (gateways seen) of the trace allow.
+    """Replace the headings of a map by headings that all stars of the trace allow.
 
-    Args:
-        trace: The trace, with stars.
-        ssh_map: A map of the trace. Its own headings are ignored.
-        axioms: Names of the axioms that hold.
-        changes: Whether gateways may change between drives.
-
-    Returns:
-        The map with new headings, or None if the stars of some place allow none.
+    None if the stars (gateways seen) of some place allow none. `axioms` names those that hold,
+    and `changes` says whether gateways may change between drives.
     """
     onward = _onward_of(trace, ssh_map, axioms)
     found = allowed_headings(*sights_of(trace, ssh_map, onward, changes), axioms)
@@ -91,14 +85,9 @@ def sights_of(
 ) -> tuple[list[Sight], dict[tuple[Sight, Sight], set[Action]]]:
     """List the sights of a map (dstates with stars), and the turns between sights at one place.
 
-    Args:
-        trace: The trace, with stars.
-        onward: Returns `Sight.onward` for a dstate.
-        changes: Whether gateways may change between drives. Then each drive has sights of its own.
-
-    Returns:
-        The sights, sorted by first step; and a dict from pairs of sights to the turns that lead
-        from the first sight of the pair to the second.
+    The sights are sorted by first step. A dict has, for pairs of sights, the turns that lead
+    from the first sight to the second. `onward` returns `Sight.onward` for a dstate. With
+    `changes`, gateways may change between drives, and each drive has sights of its own.
     """
     states = {s.id: s for s in reversed(ssh_map.dstates)}
     sights: dict[tuple[int, Star, int], Sight] = {}
@@ -162,15 +151,10 @@ def _onward_of(
 def allowed_headings(
     sights: Sequence[Sight], turns: Turns, axioms: Collection[str]
 ) -> dict[int, int]:
-    """Find headings of dstates that the stars (gateways seen) allow.
+    """Find headings of dstates, in degrees, that the stars (gateways seen) allow.
 
-    Args:
-        sights: The sights, sorted by first step. Headings that their dstates have are ignored.
-        axioms: Names of the axioms that hold.
-
-    Returns:
-        A dict from the id of a dstate to its heading in degrees. It lacks the dstates of places
-        that no frame fits.
+    The sights are sorted by first step. Headings that their dstates have are ignored. Dstates
+    of places that no frame fits are missing.
     """
     found: dict[int, int] = {}
     for seen in by_place(sights).values():
@@ -200,16 +184,10 @@ class Facing:
 def facing(
     trace: Trace, ssh_map: SSHMap, axioms: Collection[str], changes: bool = False
 ) -> Facing | None:
-    """Fit the stars of a map in which some paths are not yet known to be one.
+    """Say how the dstates face by the stars of a map in which some paths may yet be one.
 
-    Args:
-        trace: The trace, with stars.
-        ssh_map: A map of the trace. Its headings are ignored.
-        axioms: Names of the axioms that hold.
-        changes: Whether gateways may change between drives.
-
-    Returns:
-        How the dstates face; None if no frame fits the stars of some place.
+    None if no frame fits the stars of some place. The headings of the map are ignored. `axioms`
+    and `changes` are as in `with_allowed_headings`.
     """
     sights, turns = sights_of(trace, ssh_map, lambda s: (), changes)
     found = Facing({}, [], [])
@@ -266,15 +244,10 @@ def frames_that_fit(
 ) -> list[Turned] | None:
     """Find a frame and a shift for each sight at a place so that all pairs satisfy the axioms.
 
-    Of several solutions, it has the fewest gateways that change between drives.
-
-    Args:
-        axioms: Names of the axioms that hold.
-        as_shown: Whether the headings that the dstates have must fit, too.
-
-    Returns:
-        For each sight, its frame (which gateways exist) and its shift (how many slots to add, so
-        that gateways have the same slots as in the first sight); None if nothing fits.
+    Of several solutions, it has the fewest gateways that change between drives; None if nothing
+    fits. A frame says which gateways exist, and a shift how many slots to add, so that gateways
+    have the same slots as in the first sight. With `as_shown`, the headings of the dstates must
+    fit, too.
     """
     place, order = sights[0].dstate.place if sights else None, {s: k for k, s in enumerate(sights)}
     found_turns = [
@@ -402,13 +375,7 @@ class GatewayChange:
 
 
 def changes_in(trace: Trace, ssh_map: SSHMap, axioms: Collection[str]) -> Iterator[GatewayChange]:
-    """Yield the gateways of a map that change between drives, as `changes_of`.
-
-    Args:
-        trace: The trace, with stars.
-        ssh_map: A map of the trace, with headings.
-        axioms: Names of the axioms that hold.
-    """
+    """Yield the gateways of a map with headings that change between drives, as `changes_of`."""
     onward = _onward_of(trace, ssh_map, axioms)
     yield from changes_of(*sights_of(trace, ssh_map, onward, changes=True), axioms)
 
@@ -416,12 +383,7 @@ def changes_in(trace: Trace, ssh_map: SSHMap, axioms: Collection[str]) -> Iterat
 def changes_of(
     sights: Sequence[Sight], turns: Turns, axioms: Collection[str]
 ) -> Iterator[GatewayChange]:
-    """Yield the gateways that change between drives, by a fit to the headings of the dstates.
-
-    Args:
-        sights: The sights of a map, with changes.
-        axioms: Names of the axioms that hold.
-    """
+    """Yield the gateways that change between drives, by a fit to the headings of the dstates."""
     for place, seen in by_place(sights).items():
         fitted = frames_that_fit(seen, turns, axioms) or []
         first_of = {s.drive: k for k, s in reversed([*enumerate(seen)])}

@@ -26,14 +26,9 @@ LARGEST = 2**30
 def write_map(
     path: str | os.PathLike[str], text: str, what: str = "map", option: str = "output"
 ) -> None:
-    """Write a map, or a picture of one, into a file.
+    """Write a map, or a picture of one, into a file, with a line end. Raises MapError.
 
-    Args:
-        text: The text to write, without the last line end.
-        option: The name in messages of the parameter or option that gave the path.
-
-    Raises:
-        MapError: If the file cannot be written.
+    `option` is the name of the parameter or option that gave the path.
     """
     path = a_path("path" if option == "output" else option, path, MapError)
     try:
@@ -119,11 +114,7 @@ def _broken(error: json.JSONDecodeError, text: bytes, source: str) -> MapError:
 
 
 def check_format(data: Mapping[str, Any], expected: str, where: str) -> None:
-    """Check the fields `format` and `version` of a file. Files of early versions have neither.
-
-    Raises:
-        MapError: If the file has another format or version.
-    """
+    """Raise MapError if the fields `format` and `version` of a file, if any, are others."""
     if "format" in data and data["format"] != expected:
         raise MapError(
             f'{where}: format: expected "{expected}", got {brief(data["format"])}; '
@@ -138,16 +129,9 @@ def check_format(data: Mapping[str, Any], expected: str, where: str) -> None:
 
 
 def map_fields(data: Any, where: str) -> dict[str, Any]:
-    """Convert the JSON of a map, as `SSHMap.to_dict` makes it, to the arguments of SSHMap.
+    """Convert the JSON of a map, as `SSHMap.to_dict` makes it, to the arguments of SSHMap by name.
 
-    Args:
-        data: The parsed JSON.
-
-    Returns:
-        A dict from the names of the arguments to their values.
-
-    Raises:
-        MapError: If a field is wrong. The error names the field.
+    Raises MapError, which names the field.
     """
     read = FieldReader(where)
     record = read.mapping(data, "")

@@ -33,11 +33,7 @@ class MapSequence:
     def __getitem__(self, index: slice) -> tuple[SSHMap, ...]: ...
 
     def __getitem__(self, index: int | slice) -> SSHMap | tuple[SSHMap, ...]:
-        """The map at a position, or a tuple of maps for a slice.
-
-        Raises:
-            RangeError: There is no map at this position.
-        """
+        """The map at a position, or a tuple of maps for a slice. Raises RangeError."""
         return (
             self.maps[index]
             if isinstance(index, slice)

@@ -420,11 +420,7 @@ def checked_maps(values: object) -> tuple[SSHMap, ...]:
 def maps_of(data: Any, where: str) -> list[SSHMap]:
     """Make maps of JSON from `solve --json` (several maps) or from `SSHMap.save` (one map).
 
-    Args:
-        data: The parsed JSON.
-
-    Raises:
-        MapError: If a field is wrong. The error names the field.
+    Raises MapError, which names the field.
     """
     if isinstance(data, Mapping) and "maps" in data:
         check_format(data, SOLUTION_FORMAT, where)
@@ -440,16 +436,10 @@ def maps_of(data: Any, where: str) -> list[SSHMap]:
 
 
 def check_of_trace(maps: Iterable[SSHMap], trace: Trace, where: str, *, views: bool = True) -> None:
-    """Check that maps belong to a trace: the dstate of each step must have the view of the step.
+    """Raise MapError if the dstate of a step has another view than the step.
 
-    Steps with an unknown view or a fault are not checked.
-
-    Args:
-        where: The source of the maps, for messages.
-        views: Whether to compare views. Some theories let a dstate have several views.
-
-    Raises:
-        MapError: If a map belongs to another trace.
+    Steps with an unknown view or a fault are not checked. Without `views`, no view is compared,
+    as some theories let a dstate have several. `where` is the source of the maps.
     """
     for i, ssh_map in enumerate(maps):
         if len(ssh_map.dstate_at) != len(trace):

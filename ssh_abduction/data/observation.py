@@ -53,14 +53,7 @@ def checked_probability(value: Any, where: str) -> float:
 
 
 def checked_image(value: Any, where: str) -> tuple[float, ...] | int:
-    """Return an image, or raise TraceError.
-
-    Args:
-        value: Finite numbers (ranges in metres), or an index into the sidecar file.
-
-    Returns:
-        A tuple of numbers, or the index.
-    """
+    """Return an image, finite numbers or an index into the sidecar file, or raise TraceError."""
     if is_whole(value):
         if value < 0:
             raise TraceError(

@@ -128,11 +128,7 @@ NUMBERS = tuple(f.name for f in fields(Odometry) if f.name != "extra")
 
 
 def checked_displacement(value: Any, where: str) -> Displacement:
-    """Return (dx, dy, dtheta) as floats, or raise TraceError.
-
-    Args:
-        value: Metres ahead, metres to the left, and radians counterclockwise.
-    """
+    """Return (dx, dy, dtheta) in metres and radians as floats, or raise TraceError."""
     if hasattr(value, "tolist"):
         value = value.tolist()  # numpy's
     if not _is_triple(value):
@@ -160,11 +156,7 @@ def checked_displacement(value: Any, where: str) -> Displacement:
 
 
 def checked_covariance(value: Any, where: str) -> Covariance:
-    """Return a covariance as three rows of three floats, or raise TraceError.
-
-    Args:
-        value: The covariance of (dx, dy, dtheta), symmetric and positive definite.
-    """
+    """Return a symmetric, positive definite covariance as 3 x 3 floats, or raise TraceError."""
     if hasattr(value, "tolist"):
         value = value.tolist()  # numpy's
     if not _is_triple(value) or not all(map(_is_triple, value)):
@@ -201,12 +193,7 @@ def _is_triple(value: Any) -> bool:
 
 
 def moved(pose: Pose, displacement: Displacement) -> Pose:
-    """Return the pose (x, y, heading) after a displacement, in metres and radians.
-
-    Args:
-        pose: The pose before the displacement.
-        displacement: (dx, dy, dtheta), in the frame of that pose.
-    """
+    """Return the pose (x, y, heading) after a displacement in its frame, in metres and radians."""
     x, y, heading = pose
     dx, dy, turned = displacement
     cos, sin = math.cos(heading), math.sin(heading)

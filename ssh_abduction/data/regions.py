@@ -57,11 +57,7 @@ class Region:
 
 
 def described(region: Region, called: Callable[[str, int], str]) -> str:
-    """Say what the region is.
-
-    Args:
-        called: Returns words for a kind ("place", "region") and a number, as `SSHMap.called`.
-    """
+    """Say what the region is. `called` puts a kind and a number into words, as `SSHMap.called`."""
     places = f"place{'' if len(region.places) == 1 else 's'} {list_in_words(region.places)}"
     parts = [f"{called('region', region.id)}: {places}"]
     if region.bounds:
@@ -75,13 +71,10 @@ def described(region: Region, called: Callable[[str, int], str]) -> str:
 
 
 def of_members(members: Mapping[Reason, Collection[int]]) -> tuple[Region, ...]:
-    """Make a region of each different set of places, and find which regions contain others.
+    """Make a region of each different set of places, the largest first, with those inside it.
 
-    Args:
-        members: For each reason, the places that it makes a region. An empty set makes none.
-
-    Returns:
-        The regions, the largest first. All directed paths that bound a set are its bounds.
+    `members` has, for each reason, the places that it makes a region. An empty set makes none.
+    All directed paths that bound a set are its bounds.
     """
     right: dict[tuple[int, int], set[int]] = {}
     doors: dict[frozenset[int], int] = {}
@@ -138,9 +131,7 @@ def ids_at(regions: Iterable[Region] | None, place: int | None) -> tuple[int, ..
 def region_of(regions: Iterable[Region] | None, place: int | None) -> int | None:
     """Find the region that a person means by a place in it: the smallest one behind one place.
 
-    Returns:
-        Its id. If no region behind one place holds the place, the id of the smallest region; None
-        if no region holds it.
+    Else it is the smallest region with the place; None if there is none.
     """
     around = [region for region in regions or () if place in region.places]
     behind = [region for region in around if region.door is not None]
@@ -153,12 +144,9 @@ def renumbered(
     path: Mapping[int | None, int],
     flipped: Collection[int | None],
 ) -> tuple[tuple[Region, ...], dict[int | None, int]]:
-    """Return the same regions with other numbers of places and paths, and their new numbers.
+    """Return regions with new numbers of places and paths, and the new numbers of the regions.
 
-    Args:
-        place: The new number of each place.
-        path: The new number of each path.
-        flipped: The old numbers of the paths whose directions are exchanged.
+    `flipped` has the old numbers of the paths whose directions are exchanged.
     """
     new = [
         replace(

@@ -23,15 +23,10 @@ from ssh_abduction.data.trace import Action
 
 @lru_cache(maxsize=2**14)
 def rotations(first: Frame, then: Frame, shift: int) -> frozenset[int]:
-    """Find by which angles the robot may have turned between two sights of a place.
+    """Find by which angles the robot may have turned between two sights (gateways) of a place.
 
-    Args:
-        first: The gateways in the earlier sight.
-        then: The gateways in the later sight.
-        shift: Gateway k of `then` is taken to be gateway k + shift of `first`.
-
-    Returns:
-        The angles in whole degrees, clockwise, 0 to 359; empty if the gateways do not match.
+    Gateway k of `then` is taken to be gateway k + shift of `first`. The angles are whole
+    degrees clockwise; empty if the gateways do not match.
     """
     n = first.slots
     if then.slots != n:
@@ -52,12 +47,7 @@ def rotations(first: Frame, then: Frame, shift: int) -> frozenset[int]:
 
 @lru_cache(maxsize=2**14)
 def arc(centre: float, most: float) -> frozenset[int]:
-    """List the angles in an arc in whole degrees, 0 to 359. The ends are rounded outwards.
-
-    Args:
-        centre: The middle of the arc in degrees.
-        most: By how many degrees an angle may differ from it.
-    """
+    """List the whole degrees from 0 to 359 that differ by at most `most` from `centre`."""
     least, last = centre - most + ROUNDING, centre + most - ROUNDING
     return frozenset(angle % 360 for angle in range(math.floor(least), math.ceil(last) + 1))
 
@@ -68,11 +58,9 @@ def angle_between(a: float, b: float) -> float:
 
 
 def turns_so(action: Action, before: Frame, found: frozenset[int]) -> bool:
-    """Whether an action can turn the robot by one of some angles.
+    """Whether a turn can be by one of some angles, in degrees clockwise.
 
-    Args:
-        before: The gateways that the robot saw before the turn.
-        found: The angles in degrees, clockwise.
+    `before` has the gateways that the robot saw before the turn.
     """
     # the bearing or the gateway of a turn is more precise than right, left and around
     if action.bearing is not None:
@@ -103,14 +91,10 @@ def turns_so(action: Action, before: Frame, found: frozenset[int]) -> bool:
 def ways(first: Frame, then: Frame, shift: int, found: frozenset[int]) -> tuple[bool, bool]:
     """Return two flags: may the robot face the same way in both sights, and opposite ways?
 
-    The flags are true if no bearing speaks against a turn of 0, or 180, degrees. They are also true
-    if gateways that are declared opposite match in this way: they are on one path, which may bend.
-
-    Args:
-        first: The gateways in the earlier sight.
-        then: The gateways in the later sight.
-        shift: Gateway k of `then` is taken to be gateway k + shift of `first`.
-        found: By how many degrees the robot may have turned.
+    The flags are true if no bearing speaks against a turn of 0, or 180, degrees (`found` says
+    by how many it may have turned). They are also true if gateways that are declared opposite
+    match in this way: they are on one path, which may bend. Gateway k of `then` is k + shift of
+    `first`.
     """
     alike, opposite = (
         bool(found)

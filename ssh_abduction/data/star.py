@@ -103,11 +103,9 @@ class Frame:
         return len(self.bearings)
 
     def nth(self, turn: str | None, number: int) -> int | None:
-        """Return the slot of the n-th gateway to a side, or None if there are fewer gateways.
+        """Return the slot of the n-th gateway to a side, from 1; None if there are fewer.
 
-        Args:
-            turn: "right" to count gateways clockwise; anything else to count counterclockwise.
-            number: Which gateway, from 1. A gateway straight ahead is not counted.
+        "right" counts clockwise. A gateway straight ahead is not counted.
         """
         beside = [k for k in range(self.slots) if not (self.faces(k) or self.is_closed(k))]
         order = beside if turn == "right" else beside[::-1]
@@ -273,14 +271,10 @@ def is_four(entries: Sequence[Entry]) -> bool:
 
 
 def with_gateway(star: Sequence[Entry], bearing: float, *, is_open: bool) -> tuple[Entry, ...]:
-    """Return a star in which the gateway in some direction is open or closed.
+    """Return a star with the gateway at some degrees clockwise from ahead open or closed.
 
-    Args:
-        bearing: The direction in degrees, clockwise from ahead.
-        is_open: Whether the gateway is open. Then it is added if the star lacks it, else removed.
-
-    Raises:
-        TraceError: The star has only four directions, and this is none of them.
+    An open gateway is added if the star lacks it, and a closed one removed. Raises TraceError
+    if the star has only four directions, and this is none of them.
     """
     if is_four(star):
         quarter = near_quarter(bearing)
@@ -315,13 +309,9 @@ def near_quarter(bearing: float) -> int | None:
 
 
 def parse_star(value: Any, where: str) -> tuple[Entry, ...]:
-    """Check a star and return its entries as a tuple.
+    """Return a star as a tuple of four of 0, 1 or None, or of bearings in degrees and Gateways.
 
-    Returns:
-        Four of 0, 1 or None; or bearings in degrees and Gateways.
-
-    Raises:
-        TraceError: If the value is not a star.
+    Raises TraceError, which names the value `where`.
     """
     if hasattr(value, "tolist"):
         value = value.tolist()  # numpy's

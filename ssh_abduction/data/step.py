@@ -167,13 +167,9 @@ class Step:
 
 
 def of_actions(values: Iterable[Any] | None, name: str, actions: int) -> list[Any]:
-    """Return a list of one value for each step, from one value for each action.
+    """Return a list of one value for each step, from one value for each action, or from none.
 
     The value of an action goes to the step that it led to. The first step gets None.
-
-    Args:
-        values: The values; None to make them all None.
-        actions: The number of actions.
     """
     found = [None] * actions if values is None else as_list(values, name)
     if len(found) != actions:

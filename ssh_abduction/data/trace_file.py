@@ -45,13 +45,9 @@ _HEADER_FIELDS = ("format", "version", "name", "images", "odometry", "drive", "c
 
 
 def read_trace(file: BinaryIO, source: str) -> dict[str, Any]:
-    """Read a trace file.
+    """Return the arguments of Trace, by name, from a trace file.
 
-    Returns:
-        A dict of arguments of Trace: steps, name, images, odometry, drive, closures and extra.
-
-    Raises:
-        TraceError: If the file is malformed. The error names the file, the line and the field.
+    Raises TraceError, which names the file, the line and the field.
     """
     header: dict[str, Any] | None = None
     steps: list[Step] = []

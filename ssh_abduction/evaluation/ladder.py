@@ -112,12 +112,9 @@ class UnderWay:
 def rungs(trace: Trace, theory: Theory, stars: bool = True) -> Iterator[tuple[str, Theory]]:
     """List the theories of the ladder. Each one adds a kind of evidence that the trace has.
 
-    Args:
-        theory: The theory to start from. Its stars, displacements and planarity are replaced.
-        stars: Whether there is a rung for stars, if the trace has some.
-
-    Yields:
-        The name of each rung, and its theory.
+    Yield the name and the theory of each rung. The stars, displacements and planarity of the
+    first theory are replaced. `stars` says whether there is a rung for stars, if the trace has
+    some.
     """
     jumped = theory.jumped
     theory = theory.replace(star="none", displacement="none", planar=False, jumped=0)

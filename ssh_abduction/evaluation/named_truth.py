@@ -176,11 +176,7 @@ def evaluate(maps: Iterable[SSHMap], trace: Trace) -> Evaluation:
 
 
 def tells_names(trace: Trace) -> bool:
-    """Tell whether the truth of some step names a dstate, a place or a path.
-
-    Raises:
-        TraceError: A name is not valid JSON.
-    """
+    """Tell whether the truth of some step names a dstate, place or path. Raises TraceError."""
     return any(
         name
         for t, step in enumerate(trace.steps)
@@ -229,15 +225,10 @@ _SORTS = ("dstate", "place", "path", "course")
 
 
 def _names_in(value: Any, where: str) -> dict[str, Hashable]:
-    """Read the true names of a step.
+    """Return the true names of a step by sort (dstate, place, path, course). Raises TraceError.
 
-    Names are converted to JSON texts, so that lists and objects can also be names.
-
-    Returns:
-        A dict from sorts (dstate, place, path, course) to names. Unknown names are None or missing.
-
-    Raises:
-        TraceError: A name is not valid JSON.
+    Names are converted to JSON texts, so that lists and objects can also be names. Unknown
+    names are None or missing.
     """
 
     def name(value: Any) -> str | None:
@@ -267,14 +258,9 @@ def _hops(names: Sequence[Hashable]) -> list[int]:
 
 
 def map_of_trace(ssh_map: object, where: str, trace: Trace) -> SSHMap:
-    """Return the map if it has a valid label for each step of the trace.
+    """Return a value if it is a map with a valid label for each step of the trace.
 
-    Args:
-        ssh_map: Any value.
-        where: The name of the map, for messages.
-
-    Raises:
-        MapError: The value is not an SSHMap, or its labels do not fit the trace.
+    Raises MapError, which names the map `where`.
     """
     if not isinstance(ssh_map, SSHMap):
         raise MapError(

@@ -245,13 +245,9 @@ def evaluate_visits(
 
 
 def told_poses(trace: Trace) -> list[Pose | None]:
-    """Read the true pose of each step.
+    """Return the true pose of each step, in metres and radians; None if unknown.
 
-    Returns:
-        For each step (x, y, heading) in metres and radians; None if unknown.
-
-    Raises:
-        TraceError: A pose is malformed.
+    Raises TraceError if a pose is malformed.
     """
     values = [
         step.truth.get("pose") if isinstance(step.truth, Mapping) else None for step in trace.steps

@@ -99,12 +99,7 @@ class Relations:
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> Relations:
-        """Read a file of relations.
-
-        Raises:
-            TraceError: A line is malformed, or there are no relations. The message names the line.
-            OSError: The file cannot be read.
-        """
+        """Read a file of relations. Raises OSError, or TraceError, which names the line."""
         try:
             text = read_at_most(path, LARGEST).decode("utf-8")
         except ValueError as error:  # also for bytes that are no text
@@ -137,15 +132,10 @@ class Relations:
     def between(
         self, times: Sequence[float | None], origin: int
     ) -> list[tuple[Pose, float] | None]:
-        """Find the pose of the robot at each moment, in the frame of its pose at one of them.
+        """Return the pose at each moment, in seconds, in the frame of the moment `origin`.
 
-        Args:
-            times: The moments in seconds; None for a step without a time.
-            origin: The index of the moment whose pose is the frame.
-
-        Returns:
-            For each moment the pose, and the length in metres of the way along which relations were
-            composed. None if relations do not lead there, or the moment is not near related times.
+        With it comes the length in metres of the way along which relations were composed.
+        None if relations do not lead there, or the moment is not near related times.
         """
         moments = [self._near(time) for time in times]
         start = moments[origin]

@@ -58,14 +58,10 @@ class Trajectory:
     """
 
     def __init__(self, poses: Iterable[tuple[float, Pose]], source: str = "trajectory") -> None:
-        """Take poses at times.
+        """Take poses (x, y, heading) in metres and radians, each with a time in seconds.
 
-        Args:
-            poses: Pairs of a time in seconds and a pose (x, y, heading) in metres and radians.
-            source: The name of the trajectory, for messages.
-
-        Raises:
-            TraceError: There are no poses, or two different poses at one time.
+        Raises TraceError, which names the source, if there are no poses, or two different
+        poses at one time.
         """
         self.source = source
         found = sorted(dict.fromkeys(poses))
@@ -84,14 +80,10 @@ class Trajectory:
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> Trajectory:
-        """Read a trajectory in TUM format.
+        """Read a trajectory in TUM format. Raises OSError, or TraceError, which names the line.
 
-        Numbers are separated by spaces, tabs, commas or semicolons. Names of columns before the
-        first pose are skipped.
-
-        Raises:
-            TraceError: A line is malformed. The message names the line.
-            OSError: The file cannot be read.
+        Numbers are separated by spaces, tabs, commas or semicolons. Names of columns before
+        the first pose are skipped.
         """
         source = os.fspath(path)
         try:
@@ -117,16 +109,10 @@ class Trajectory:
         return trajectory
 
     def at(self, time: float | None) -> Pose | None:
-        """Find the pose of the robot at a time.
+        """Return the pose of the robot at a time in seconds; None if none is within half a second.
 
-        The pose is interpolated between the poses before and after if these are at most a second
-        apart in time. Otherwise it is the pose nearest in time.
-
-        Args:
-            time: The time in seconds, or None.
-
-        Returns:
-            The pose. None if no pose is within half a second, or `time` is None.
+        The pose is interpolated between the poses before and after if these are at most a
+        second apart in time. Otherwise it is the pose nearest in time.
         """
         if time is None:
             return None
@@ -238,12 +224,8 @@ def checked_time(value: Any, where: str) -> float | None:
 def checked_pose(value: Any, where: str) -> Pose:
     """Read from JSON the pose of a dstate in the frame of the robot that saw it.
 
-    Args:
-        value: A list of x, y and heading; None if the dstate is at the pose of the robot.
-        where: The name of the step, for messages.
-
-    Raises:
-        TraceError: The value is malformed.
+    None says that the dstate is at the pose of the robot. Raises TraceError, which names the
+    step.
     """
     return (0.0, 0.0, 0.0) if value is None else three_numbers(value, f"{where}: seen")
 

@@ -56,20 +56,11 @@ def derive(
     one: bool,
     stop: Callable[[], bool] = lambda: False,
 ) -> Derivation:
-    """Find an argument that two steps are one dstate in all maps, or in none.
+    """Find an argument that two steps are one dstate in all maps (`one`), or in none.
 
-    The caller must already have proved this for the piece.
-
-    Args:
-        piece: Steps of the trace that suffice for the proof.
-        trace: The whole trace. The argument may cite its displacements.
-        first: The earlier step of the pair.
-        second: The later step of the pair.
-        one: True to argue that the steps are one dstate, False that they are different dstates.
-        stop: Called now and then. If it returns True, Interrupted is raised.
-
-    Returns:
-        The argument, line by line.
+    The caller must already have proved this for the piece: steps that suffice for the proof.
+    The argument may cite displacements of the whole trace. `stop` is called now and then. If it
+    returns True, Interrupted is raised.
     """
     return Argument(piece, trace, first, second, one, stop).derivation()
 

@@ -81,9 +81,8 @@ class Axioms:
     def __init__(self, piece: Piece, stop: Callable[[], bool], *, relaxed: bool = False) -> None:
         """Ground the axioms.
 
-        Args:
-            stop: Called now and then. If it returns True, Interrupted is raised.
-            relaxed: Whether each axiom can be switched on or off at each step. If not, all hold.
+        `stop` is called now and then. If it returns True, Interrupted is raised. If
+        `relaxed`, each axiom can be switched on or off at each step. If not, all hold.
         """
         trace, theory = piece.trace, piece.theory
         self._trace, self._theory, self._names = trace, theory, piece.steps
@@ -147,11 +146,9 @@ class Axioms:
     def consistent(
         self, active: Sequence[clingo.Symbol] = (), assumed: Sequence[Assumption] = ()
     ) -> bool:
-        """Tell whether there is a map.
+        """Tell whether there is a map with these atoms true or false, as assumed.
 
-        Args:
-            active: If the axioms are relaxed, the `active` atoms of those that have to hold.
-            assumed: Pairs of an atom and whether it is true in the map.
+        If the axioms are relaxed, only those with an atom in `active` have to hold.
         """
         return self.map_with(active, assumed) is not None
 
@@ -189,12 +186,8 @@ class Axioms:
     ) -> frozenset[clingo.Symbol]:
         """Find the conclusions that hold in all maps in which these axioms hold.
 
-        The caller must know that there is such a map.
-
-        Args:
-            active: The `active` atoms of the axioms that hold.
-            assumed: Pairs of an atom and whether it is true.
-            known: Conclusions that are already known to hold in all these maps.
+        The caller must know that there is such a map, and may know conclusions. Axioms have
+        an atom in `active`. `assumed` has atoms and whether they are true.
         """
         # Clingo's cautious reasoning loses atoms under assumptions. So each query asks for a model
         # in which at least one unproven conclusion fails, until there is none.
@@ -224,12 +217,10 @@ class Axioms:
     def core(
         self, active: Sequence[clingo.Symbol], assumed: Sequence[Assumption]
     ) -> list[Assumption] | None:
-        """Find a minimal subset of the assumptions that contradicts these axioms.
+        """Find a minimal subset of the assumptions that contradicts these axioms, or None.
 
-        Args:
-            active: The `active` atoms of the axioms that hold.
-            assumed: Pairs of an atom and whether it is true. The subset has early pairs rather than
-                late ones.
+        Axioms have an atom in `active`. An assumption is an atom and whether it is true.
+        The subset has early ones rather than late ones.
         """
         # Bisect for the shortest prefix of the assumptions that, with the assumptions in `needed`,
         # contradicts the axioms. Its last assumption is needed. Unsat cores shorten the prefix.
@@ -358,15 +349,12 @@ class Axioms:
         self._control.ground([(name, [])])
 
     def sentences(self, clash: Sequence[tuple[str, int]]) -> tuple[str, ...]:
-        """Describe the returns that displacements reject in a clash, for `Explanation.sentences`.
+        """Describe the returns that displacements reject in a clash, by axioms and steps.
 
-        Without displacements the axioms of the clash have models. Each of these models has a return
-        (two steps at one dstate or at one place) that displacements reject. This method describes
-        the return that is rejected most clearly, forbids it, and repeats this until no model is
-        left.
-
-        Args:
-            clash: Pairs of an axiom and the number of a step in the piece.
+        Without displacements the axioms of the clash have models. Each of these models has
+        a return (two steps at one dstate or at one place) that displacements reject. This
+        method describes the return that is rejected most clearly, forbids it, and repeats
+        this until no model is left.
         """
         displacement = displacement_of(self._problem)
         steps = [t for axiom, t in clash if displacement and axiom == displacement.axiom]
@@ -405,13 +393,11 @@ class Axioms:
         return tuple(dict.fromkeys(sentence for found in clearest_first for _, sentence in found))
 
     def smallest_clash(self, assumed: Sequence[Assumption] = ()) -> list[tuple[str, int]]:
-        """Find a minimal set of pairs (axiom, step) that no map satisfies.
+        """Find a minimal set of pairs (axiom, step) that no map with these assumptions satisfies.
 
-        There are many minimal sets. To get a short one, whole axioms are dropped before single
-        steps, once in the order of the axioms and once in reverse. The smaller result is returned.
-
-        Args:
-            assumed: Pairs of an atom and whether it is true in the map.
+        There are many minimal sets. To get a short one, whole axioms are dropped before
+        single steps, once in the order of the axioms and once in reverse. The smaller
+        result is returned.
         """
         found = [
             self._shrunk(list(order), assumed) for order in (self._pairs, reversed(self._pairs))

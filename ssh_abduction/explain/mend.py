@@ -151,11 +151,7 @@ class TraceQuestion(LimitedQuestion[TraceExplanation]):
         self._complete = False
 
     def known(self, why: Stop | None = None) -> TraceExplanation:
-        """Return what is known so far.
-
-        Args:
-            why: The reason that is about to end the search; None if there is none.
-        """
+        """Return what is known if `why` is about to end the search."""
         mends = tuple(sorted(self._mends, key=lambda mend: (mend.step, mend.kind)))
         return TraceExplanation(
             self._possible, self._clash, mends, self._complete, why or self.stopped

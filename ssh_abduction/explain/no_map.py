@@ -92,22 +92,13 @@ def explain(
     stop: Callable[[], bool] = lambda: False,
     near: range | None = None,
 ) -> Explanation | None:
-    """Explain why a trace has no map.
+    """Explain why a trace has no map; None if it has one.
 
-    First find a short stretch of steps without a map, or else try the whole trace. Then drop steps
-    from its end and from its start, as long as the other steps have no map. Then drop axioms one by
-    one, until each axiom that is left is needed for the clash.
-
-    Args:
-        trace: The trace, with views.
-        theory: The theory; Theory.topological() if None.
-        stop: Called now and then. If it returns True, Interrupted is raised.
-        near: Consecutive steps that are tried first; None if nothing is known.
-
-    Raises:
-        TraceError: As `solve` does.
-        TheoryError: As `solve` does, and if the theory allows wrong displacements (`jumped`).
-        Interrupted: `stop` returned True.
+    First find a short stretch of steps without a map, of those `near`, or else try the whole
+    trace. Then drop steps from its end and from its start, as long as the other steps have no
+    map. Then drop axioms one by one, until each axiom that is left is needed for the clash.
+    `stop` is called now and then. If it returns True, Interrupted is raised. Raises TraceError
+    and TheoryError as `solve` does, and if the theory allows wrong displacements (`jumped`).
     """
     problem = settle(trace, theory)
     theory = problem.theory
@@ -188,14 +179,8 @@ def check_two_steps(trace: Trace, first: object, second: object) -> None:
 def shortest(longest: int, has_no_map: Callable[[int], bool]) -> int | None:
     """Find the least number of steps without a map, by doubling and bisection.
 
-    This is exact, because if some steps have no map, more steps have none either.
-
-    Args:
-        longest: The greatest number of steps to try.
-        has_no_map: A function that tells whether a number of steps has no map.
-
-    Returns:
-        The number of steps, or None if even the longest stretch has a map.
+    This is exact, because if some steps have no map, more steps have none either. None if even
+    the longest stretch has a map.
     """
     short, long = 0, 1
     while not has_no_map(long):

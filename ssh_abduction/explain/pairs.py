@@ -134,11 +134,7 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
         self._ruling_out: dict[bool, Piece] = {}  # a piece of the trace without a map of the side
 
     def known(self, why: Stop | None = None) -> PairExplanation:
-        """Return what is known so far.
-
-        Args:
-            why: The reason that is about to end the search; None if there is none.
-        """
+        """Return what is known if `why` is about to end the search."""
         verdict = self._verdict()
         stopped = why or self.stopped
         return PairExplanation(

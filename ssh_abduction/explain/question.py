@@ -72,11 +72,7 @@ class LimitedQuestion(ABC, Generic[_Answer]):
 
     @abstractmethod
     def known(self, why: Stop | None = None) -> _Answer:
-        """Return what is known so far.
-
-        Args:
-            why: The reason that is about to end the search; None if there is none.
-        """
+        """Return what is known so far; `why` is about to end the search, if not None."""
 
     @abstractmethod
     def _find_out(self) -> None:
@@ -140,9 +136,8 @@ def changes_in_words(
 ) -> list[str]:
     """Say what changed, and what a map costs without changes.
 
-    Args:
-        nats: Its cost in nats; None if maps are not weighed.
-        without: An ended search for the best map without any changes.
+    `nats` is its cost in nats, if maps are weighed. `without` is an ended search for the best
+    map without any changes.
     """
     said = [f"{change}; this change costs {change.cost:g} dstates" for change in changes]
     if without.status is Status.UNSATISFIABLE:

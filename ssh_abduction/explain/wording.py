@@ -68,11 +68,9 @@ class Words:
         }
 
     def of(self, conclusion: tuple[str, tuple[int, ...]], *, would: bool) -> str:
-        """Put a conclusion into a clause.
+        """Put a conclusion, a name and steps by their numbers in the piece, into a clause.
 
-        Args:
-            conclusion: The name of the conclusion, and its steps by their numbers in the piece.
-            would: Whether to write "would be" instead of "is", because it is only supposed.
+        If it is only supposed, `would` writes "would be" instead of "is".
         """
         name, steps = conclusion
         if name in (
@@ -123,11 +121,8 @@ class Words:
     ) -> str:
         """Put into a clause why an axiom at a step gives some conclusions.
 
-        Args:
-            t: The step, by its number in the piece.
-            said: The conclusions, each a name and steps by their numbers in the piece.
-            pair: The two steps that the argument is about, by their numbers in the piece.
-            short: Whether to write only the sentence of the axiom, without what was seen or done.
+        Steps have their numbers in the piece. The argument is about the steps of `pair`. If
+        `short`, write only the sentence of the axiom, without what was seen or done.
         """
         steps, sentence = self._piece.steps, self._sentences.get(axiom, axiom).rstrip(".")
         sentence = sentence[:1].lower() + sentence[1:]

@@ -104,12 +104,8 @@ def map_of(
 ) -> tuple[SSHMap, NDArray[np.intp]]:
     """Return the map to learn from, and the labels of its n steps, (n,), by `labels_of`.
 
-    Args:
-        solution: The minimal maps.
-        vectors: (n, d) the vector of each image. Views say little about how drives relate. So if
-            there are several joint maps, only those that fit the images best are kept.
-        choose: Index of the map, from 0; None takes the first map, and labels only the steps on
-            which all maps agree.
+    `vectors` has the vector of each image, (n, d). Views say little about how drives relate. So
+    if there are several joint maps, only those that fit the images best are kept.
     """
     maps: Sequence[SSHMap] = solution.maps
     if choose is None and len(maps) > 1 and len(solution.drives) > 1:
@@ -123,11 +119,8 @@ def fitting_best(
 ) -> list[SSHMap]:
     """Find the joint maps by which most images are at the dstate of the most similar image.
 
-    Only the images of other drives are compared with an image.
-
-    Args:
-        maps: Joint maps of n steps.
-        vectors: (n, d) the vector of each image.
+    Only the images of other drives are compared with an image. `vectors` has the vector of each
+    image, (n, d).
     """
     nearest = np.zeros(len(vectors), np.intp)
     steps = np.arange(len(vectors))
@@ -160,12 +153,8 @@ def labels_on(
 ) -> NDArray[np.intp]:
     """Follow traces on a map. Return the dstate of each step, (n,), or -1 if it is unknown.
 
-    A dstate that no image looks like counts as unknown.
-
-    Args:
-        traces: Traces with n steps in all.
-        views: The number of the view of each step, (n,); -1 if there is none.
-        looks: The dstate that the image of each step looks like, (n,).
+    `views` has the number of the view of each step, (n,), or -1, and `looks` the dstate that
+    its image looks like. A dstate that no image looks like counts as unknown.
     """
     parts = zip(traces.each, traces.parts(views), traces.parts(looks), strict=True)
     found = np.concatenate(
@@ -179,16 +168,11 @@ def _followed(
 ) -> NDArray[np.intp]:
     """Follow a trace that may begin at any dstate. Return the dstate of each step, (m,).
 
-    Try each dstate as the first one. Drop those that a later view contradicts. Take the one for
-    which most images look like their dstates. After an action for which the map has no link,
-    dstates are unknown (-1) and contradict no view.
-
+    `views` and `looks` are as in `labels_on`. Try each dstate as the first one. Drop those that
+    a later view contradicts. Take the one for which most images look like their dstates. After
+    an action for which the map has no link, dstates are unknown (-1) and contradict no view.
     All steps get -1 if two first dstates fit equally many images, or if the best one fits fewer
     than half of the steps with a known dstate.
-
-    Args:
-        views: The number of the view of each step; -1 if there is none.
-        looks: The dstate that the image of each step looks like, (m,).
     """
     leads = {(here, action): there for here, action, there in ssh_map.links}
     ways = []

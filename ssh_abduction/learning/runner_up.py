@@ -65,13 +65,9 @@ class SecondMap:
 
 
 def with_runner_up(trace: Trace, views: Iterable[View] | None) -> Trace:
-    """Copy a trace with the runner-up's view in the field `runner_up` of each step.
+    """Copy a trace with the runner-up's view of each step in its field `runner_up`; None drops it.
 
-    Args:
-        views: A view for each step; None removes the field.
-
-    Raises:
-        TraceError: The views are malformed.
+    Raises TraceError if the views are malformed.
     """
     others = [{k: v for k, v in step.extra.items() if k != FIELD} for step in trace.steps]
     if views is not None:
@@ -84,8 +80,7 @@ def with_runner_up(trace: Trace, views: Iterable[View] | None) -> Trace:
 def runner_up(trace: Trace) -> Trace | None:
     """Copy a trace with the runner-up's views as its views; None if no step has one.
 
-    Raises:
-        TraceError: Only some steps have a view of the runner-up, or one is malformed.
+    Raises TraceError if only some steps have such a view, or one is malformed.
     """
     if not any(FIELD in step.extra for step in trace.steps):
         return None
@@ -110,17 +105,10 @@ def second_map(
 ) -> SecondMap | None:
     """Solve the trace with the runner-up's views. Return the result if its maps differ.
 
-    Return None if the trace has no runner-up, or if one of its maps puts the same steps at the same
-    dstates and places as one of `maps`.
-
-    Args:
-        trace: A trace of the chosen views, perhaps with those of the runner-up.
-        maps: The minimal maps of the chosen views.
-        limit: Seconds for the search, at most SECONDS; None takes SECONDS.
-        memory: MiB that the process may use, as in `solve`; None for no limit.
-
-    Raises:
-        TraceError: The views of the runner-up are malformed.
+    Return None if the trace has no runner-up, or if one of its maps puts the same steps at the
+    same dstates and places as one of `maps`, the minimal maps of the chosen views. The search
+    takes `limit` seconds, at most SECONDS. `memory` is in MiB, as in `solve`. Raises TraceError
+    if the views of the runner-up are malformed.
     """
     other = runner_up(trace)
     if other is None:

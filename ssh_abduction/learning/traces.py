@@ -59,11 +59,7 @@ class Traces:
 
     @cached_property
     def images(self) -> NDArray[np.float64]:
-        """The images of all n steps, (n, d). Each image has d numbers.
-
-        Raises:
-            PerceptionError: A step has no image, or traces have images of different lengths.
-        """
+        """The images of all n steps, (n, d), or PerceptionError if a step lacks one of length d."""
         tables = [images_of(trace) for trace in self.each]
         for i, table in enumerate(tables):
             if table.shape[1] != tables[0].shape[1]:
@@ -75,11 +71,7 @@ class Traces:
 
     @property
     def features(self) -> Any:
-        """The default transformer of these images to vectors, which is not fitted yet.
-
-        Raises:
-            PerceptionError: The traces have images of different kinds or shapes.
-        """
+        """The transformer of these images to vectors, not fitted yet, or PerceptionError."""
         kinds = [features_of(trace) for trace in self.each]
         for i, kind in enumerate(kinds):
             if (type(kind), kind.get_params()) != (type(kinds[0]), kinds[0].get_params()):
@@ -91,11 +83,7 @@ class Traces:
 
     @property
     def joint(self) -> Trace:
-        """The traces as drives of one joint trace, without images; or the only trace.
-
-        Raises:
-            TraceError: The traces differ in what they record.
-        """
+        """The traces as drives of one joint trace, without images, or TraceError."""
         if len(self.each) == 1:
             return self.each[0]
         names = [trace.name or "" for trace in self.each]
@@ -117,15 +105,11 @@ class Traces:
         second: Integers | None,
         sure: NDArray[np.float64] | None = None,
     ) -> Traces:
-        """Copy these traces with a view at each step.
+        """Copy these traces with a view, (n,), and its confidence, (n,), if any, at each step.
 
-        A step without a view (noise) gets the view whose centre is nearest to its image.
-
-        Args:
-            images: The vector of each image, (n, d).
-            views: The number of the view of each step, (n,); -1 for noise.
-            second: The runner-up's view of each step, (n,); None if there is no runner-up.
-            sure: The confidence in each view, (n,), from 0 to 1; None stores no confidence.
+        `images` has the vector of each image, (n, d). A step without a view (noise, -1)
+        gets the view whose centre is nearest to its image. `second` has the runner-up's
+        views, if any.
         """
         of_steps = np.ones(len(images)) if sure is None else sure.round(4)
         parts = zip(

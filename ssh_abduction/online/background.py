@@ -82,13 +82,9 @@ def solved(
     speedups: Speedups,
     watch: Watch | None = None,
 ) -> Solved:
-    """Run `solve` on a trace and return the parts of its solution that are needed.
+    """Run `solve` on a trace with a settled theory, and return the needed parts of the solution.
 
-    Args:
-        theory: The theory, in which no field is "auto".
-        limit: Seconds for the search; None for no limit.
-        maps: List at most this many maps; None lists all.
-        watch: Not used. It is here because `in_process` passes a watch as the last argument.
+    `limit` is in seconds. `in_process` passes a `watch` as the last argument; it is not used.
     """
     found = solve(
         trace, theory.of_steps(0, len(trace)), time_limit=limit, max_maps=maps, speedups=speedups
@@ -166,10 +162,8 @@ class FaultSolver:
     def solve(self, trace: Trace, theory: Theory, has_map: bool) -> Solved | None:
         """Solve the trace within the time limit of a step, or in the background.
 
-        Args:
-            theory: The theory, in which no field is "auto".
-            has_map: Whether some map is known. If so, and the last search was slow, the search runs
-                in the background.
+        The theory is settled. If `has_map`, and the last search was slow, the search runs
+        in the background.
         """
         steps, options = len(trace), self._options
         limit = options.time_limit
@@ -184,10 +178,9 @@ class FaultSolver:
         return found
 
     def begin_in_background(self, trace: Trace, theory: Theory) -> bool:
-        """Start a search in another process, unless one is running.
+        """Start a search in another process, and return whether one is running.
 
-        Returns:
-            Whether one is running. False without `processes`, or with only one processor.
+        False without `processes`, or with only one processor.
         """
         maps, speedups = self._options.max_maps, self._options.speedups
         if not self._background and speedups.processes and has_processors():

@@ -67,9 +67,8 @@ class Moves:
     def move(self, action: Action, turned: float | None = None) -> Move:
         """Return the move of an action.
 
-        Args:
-            turned: The angle in radians counterclockwise by which the robot turned, by odometry;
-                None takes it from the action.
+        `turned` is the angle of the turn by odometry, in radians counterclockwise; None
+        takes it from the action.
         """
         if not self._by_angle or action.kind != "turn":
             return action.name
@@ -136,16 +135,10 @@ def _links_of(
 
 
 def view_ratios(ssh_map: SSHMap, trace: Trace | None) -> dict[View, Observation]:
-    """For each view v, find the dstates x that show it, and the ratios f(v|x) / q(v).
+    """For each view v that a dstate shows, find these dstates x, and the ratios f(v|x) / q(v).
 
-    Args:
-        ssh_map: The map. It says what a dstate shows if no step of the trace is at this dstate
-            (equation 4).
-        trace: The trace that was mapped, to estimate f by counting (equation 3); None takes all
-            views from the map.
-
-    Returns:
-        The observation for each view. A view that no dstate shows is missing.
+    The trace that was mapped serves to estimate f by counting (equation 3). The map says what a
+    dstate shows if no step of the trace is at it, or if the trace is None (equation 4).
     """
     # Count the steps at each dstate that show each view.
     counts = Counter[tuple[int, View]]()
@@ -178,11 +171,9 @@ def view_ratios(ssh_map: SSHMap, trace: Trace | None) -> dict[View, Observation]
 def transitions(ssh_map: SSHMap, trace: Trace | None) -> dict[str, Links]:
     """Find where each action leads, by its name.
 
-    Args:
-        ssh_map: The map. Its links say where an action leads from a dstate if the trace does not
-            have that action there (equation 4).
-        trace: The trace that was mapped, to estimate probabilities by counting (equation 3); None
-            takes all links from the map.
+    The trace that was mapped serves to estimate probabilities by counting (equation 3). The
+    links of the map say where an action leads if the trace lacks it there, or is None (equation
+    4).
     """
     # Count how often each action led from one dstate to another.
     counts = Counter[tuple[int, str, int]]()

@@ -464,11 +464,7 @@ class Abilities:
         self._names: dict[tuple[object, object], set[str]] = {}
 
     def note(self, seen: Step, can: Collection[Action | str]) -> None:
-        """Record the actions that the robot can do at the current step.
-
-        Args:
-            can: The actions, as objects or names.
-        """
+        """Record the actions, as objects or names, that the robot can do at the current step."""
         self.here = {action.name: action for action in map(Action.of, can)}
         self.ever |= self.here
         for star in {seen.star, None}:

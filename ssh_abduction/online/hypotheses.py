@@ -64,12 +64,7 @@ class ExtendedMap:
 
     @classmethod
     def of(cls, ssh_map: SSHMap, trace: Trace, theory: Theory) -> ExtendedMap:
-        """Make the hypothesis that a map stands for.
-
-        Args:
-            ssh_map: A map of the trace or of its first steps.
-            theory: The theory, in which no field is "auto".
-        """
+        """Make the hypothesis that a map of the trace, or of its first steps, stands for."""
         wrong = {fault.step for fault in ssh_map.faults if fault.kind != "slipped"}
         looks: dict[int, Seen] = {}
         for t, label in enumerate(ssh_map.dstate_at):
@@ -117,14 +112,9 @@ class ExtendedMap:
         )
 
     def contradiction(self, action: str, seen: Seen) -> int | None:
-        """Find the dstate that contradicts what is seen after an action.
+        """Return the dstate that an action leads to, if it shows something else than `seen`.
 
-        Args:
-            seen: The view and star after it.
-
-        Returns:
-            The dstate that the action leads to, if it shows something else; None if it shows
-            `seen`, or if the map has no link for the action.
+        None if it shows that, or if the map has no link for the action.
         """
         there = self.links.get((self.here, action))
         return None if there is None or self.shows[there] == seen else there
@@ -157,9 +147,7 @@ class ExtendedMap:
     def ways_on(self, action: str, step: Step, seen: Seen, theory: Theory) -> Iterator[ExtendedMap]:
         """Yield the extensions of this rival by one step. Those without extra cost come first.
 
-        Args:
-            action: The name of the action before the step.
-            theory: The theory, in which no field is "auto".
+        `action` is the name of the action before the step, and the theory is settled.
         """
         t, there = len(self.labels), self.links.get((self.here, action))
         alike = [s for s, shown in enumerate(self.shows) if shown == seen]
@@ -233,13 +221,9 @@ class Scale:
 
     @classmethod
     def of(cls, theory: Theory, chance: float, dstates: int, views: int) -> Scale:
-        """Make the scale for a theory.
+        """Make the scale for a theory with faults.
 
-        Args:
-            theory: The theory, with faults.
-            chance: Probability of its cheapest kind of fault, at each step.
-            dstates: Number of dstates.
-            views: Number of views.
+        At each step, the cheapest kind of fault has the probability `chance`.
         """
         cheapest = min(round(10 * price) for price in (theory.misread, theory.slipped) if price)
         return cls(-math.log(chance), cheapest, max(dstates, 2), max(views, 2))

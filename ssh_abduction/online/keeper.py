@@ -87,13 +87,10 @@ class MapKeeper:
         return self.solver.searches
 
     def restarted(self, problem: Problem) -> MapKeeper:
-        """Make a keeper for a theory that changed with the last step.
+        """Make a keeper for a theory that changed with the last step, which `problem` has.
 
-        The minimal maps so far need not be minimal by the new theory. They become drafts (maps to
-        be extended step by step) if the old theory already used displacements.
-
-        Args:
-            problem: The steps so far, with one more, and the new theory.
+        The minimal maps so far need not be minimal by the new theory. They become drafts
+        (maps to be extended step by step) if the old theory already used displacements.
         """
         trace = problem.trace
         keeper = MapKeeper(problem, self._options, before=self)
@@ -103,11 +100,7 @@ class MapKeeper:
         return keeper
 
     def take(self, problem: Problem) -> None:
-        """Add the last step: keep the maps that predict it, and drop those that it contradicts.
-
-        Args:
-            problem: The steps so far, with one more, and the theory.
-        """
+        """Add the last step: keep the maps that predict it, and drop those that it contradicts."""
         self._problem, trace = problem, problem.trace
         action = trace.steps[-2].action
         assert action
@@ -124,8 +117,7 @@ class MapKeeper:
     def answer(self, began: float) -> Solution:
         """Search for minimal maps of the steps so far if needed, and return what is known.
 
-        Args:
-            began: When the step began, by `time.perf_counter`.
+        `began` is when the step began, by `time.perf_counter`.
         """
         minimal = self.minimal
         if (
@@ -217,15 +209,10 @@ class IncrementalSolver:
         self._next_search = 0
 
     def maps(self, trace: Trace, theory: Theory, known: SSHMap | None) -> tuple[SSHMap, ...]:
-        """Search for the minimal maps of a trace.
+        """Search for the minimal maps of a trace by a settled theory.
 
-        Args:
-            theory: The theory, in which no field is "auto".
-            known: A map that is known to be minimal, so that only the others are searched for; None
-                if no minimal map is known.
-
-        Returns:
-            The minimal maps, or the best map found in time. `solution.status` says which.
+        If a minimal map is `known`, only the others are searched for. Return the minimal
+        maps, or the best map found in time, as `solution.status` says.
         """
         self.searches += 1
         search = Search.continuing(
@@ -295,11 +282,7 @@ class Drafts:
         return [draft.sketch.map() for draft in self._drafts]
 
     def follow(self, action: Action, step: Step) -> None:
-        """Extend drafts and sketches by a step, and drop those that it contradicts.
-
-        Args:
-            action: The action before the step.
-        """
+        """Extend drafts and sketches by a step, and drop those that it contradicts."""
         self._drafts = [draft for draft in self._drafts if draft.sketch.extend(action, step)]
         self._sketches = [draft for draft in self._sketches if draft.sketch.extend(action, step)]
 
@@ -320,10 +303,8 @@ class Drafts:
     def best(self, trace: Trace, pairs: Pairs) -> SSHMap | None:
         """Return the map of the best consistent draft, else of a consistent sketch, else None.
 
-        Drafts that turn out to be inconsistent are dropped.
-
-        Args:
-            pairs: What the evidence says about pairs of these steps.
+        `pairs` is what the evidence says about pairs of these steps. Drafts that turn out
+        to be inconsistent are dropped.
         """
         while self._drafts:
             if self._is_consistent(self._drafts[0], trace, pairs):

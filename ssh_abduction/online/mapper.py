@@ -296,12 +296,7 @@ class TheorySettler:
         self._theory = theory.replace(star=settled.star)
 
     def settled(self, trace: Trace, known: Problem | None = None) -> Problem:
-        """Choose the value of each field that is "auto", for the steps so far.
-
-        Args:
-            known: The result for fewer steps, to reuse the pairs of steps that its evidence found;
-                None without one.
-        """
+        """Choose each "auto" for the steps so far. What is known of fewer steps is reused."""
         theory = self._theory
         if theory.displacement == "auto":
             theory = theory.replace(displacement="use" if trace.has_displacements else "none")
@@ -310,11 +305,7 @@ class TheorySettler:
         return settle(trace.prefix(1), theory, known).changed(trace)
 
     def is_settled(self, problem: Problem, trace: Trace) -> bool:
-        """Whether a theory chosen for fewer steps is still the right choice.
-
-        Args:
-            problem: The steps before the last, and the theory that was chosen for them.
-        """
+        """Whether the theory of `problem`, chosen for fewer steps, is still the right choice."""
         theory = problem.theory
         if theory.displacement == "none":
             return self._theory.displacement == "none" or trace.steps[-1].displacement is None
@@ -326,13 +317,7 @@ class TheorySettler:
         return count_returns(Problem(trace, theory, evidence))
 
     def check_star(self, step: Step, number: int) -> None:
-        """Raise TraceError if this step has a star but the first step had none.
-
-        This holds for `star="auto"`.
-
-        Args:
-            number: The number of the step, for the message.
-        """
+        """Raise TraceError if, with star="auto", only this step and not the first has a star."""
         if self._refuses_stars and step.star is not None:
             raise TraceError(
                 f"step {number}: star: expected none, as the first step has none; "

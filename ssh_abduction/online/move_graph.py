@@ -68,18 +68,11 @@ class MoveGraph:
             self._add_implied()
 
     def nodes(self, name: int | str, field: str) -> tuple[set[Node], str]:
-        """Find the dstates that a user names.
+        """Return the dstates that a user names, and words for them, such as "place 3".
 
-        Args:
-            name: The number of a dstate; or a place or region for all dstates there: "p3",
-                "region2", or its name.
-            field: The parameter that the name was given for, for messages.
-
-        Returns:
-            The dstates, and words for them, such as "dstate 4" or "place 3".
-
-        Raises:
-            MapError: There is no such dstate, place or region. The message names those that exist.
+        A name is the number of a dstate; or a place or region for all dstates there: "p3",
+        "region2", or its name. `field` is the parameter that has it, for messages. Raises
+        MapError, which lists what exists.
         """
         count, text = len(self.map.dstates), str(name)
         own = next((n.id for n in self.map.names if (n.kind, n.text) == ("place", name)), None)
@@ -122,15 +115,9 @@ class MoveGraph:
     def shortest(
         self, here: AbstractSet[Node], there: AbstractSet[Node], closed: AbstractSet[Node]
     ) -> list[Node] | None:
-        """Find the shortest way between two sets of nodes.
+        """Return the nodes of the shortest way from some nodes to others; None if there is none.
 
-        Args:
-            here: The nodes where the way may begin.
-            there: The nodes where it may end.
-            closed: The nodes that it must not visit.
-
-        Returns:
-            The nodes of the way, with both ends; None if there is no way.
+        The way has both ends, and does not visit the nodes that are `closed`.
         """
         # If all dstates of a place are closed, close its other courses, too.
         closed_places = {

@@ -77,19 +77,11 @@ class Recovery:
         return self.solver.searches
 
     def restarted(self, problem: Problem) -> Recovery:
-        """Make a Recovery for a theory that changed with the last step. It has no proofs yet.
-
-        Args:
-            problem: The steps so far, with one more, and the new theory.
-        """
+        """Make a Recovery for a theory that changed with the last step. It has no proofs yet."""
         return Recovery(problem, self._options, before=self)
 
     def take(self, problem: Problem) -> None:
-        """Add the last step: extend all rivals by it, and record if it contradicts the best map.
-
-        Args:
-            problem: The steps so far, with one more, and the theory.
-        """
+        """Add the last step: extend all rivals by it, and record if it contradicts the best map."""
         trace = problem.trace
         self._trace, lead = trace, self._maps.lead
         if lead and self._confidence.known is None:
@@ -102,8 +94,7 @@ class Recovery:
     def answer(self, began: float) -> Solution:
         """Solve the trace again if that is due, and return what is known.
 
-        Args:
-            began: When the step began, by `time.perf_counter`.
+        `began` is when the step began, by `time.perf_counter`.
         """
         if not self._maps.is_settled and self.solver.is_due(self._trace):
             self._solve()

@@ -32,14 +32,9 @@ class ReplayedMap:
         self._sights = dict(zip(self._labels, seen, strict=True))
 
     def follow(self, action: str, seen: object, pairs: Pairs) -> Outcome:
-        """Extend the map by one step if it predicts the step.
+        """Extend the map by one step if it predicts what the step shows (an `observation`).
 
-        Args:
-            action: The name of the action before the step.
-            seen: What the step shows, as `observation` returns it.
-
-        Returns:
-            Whether the map predicts the step, contradicts it, or has no link for the action.
+        Return whether it predicts that, contradicts it, or has no link for the action.
         """
         there = self._links.get((self._labels[-1], action))
         if there is None:
@@ -88,13 +83,8 @@ class MinimalMaps:
     def follow(self, action: Action, trace: Trace, pairs: Pairs) -> list[ReplayedMap]:
         """Keep the maps that predict the last step. If none does, reset the status to UNKNOWN.
 
-        Args:
-            action: The action before the last step.
-            trace: The steps so far, one more than before.
-            pairs: What evidence says about pairs of these steps.
-
-        Returns:
-            If no map is kept, the maps that have no link for the action; else an empty list.
+        `trace` has this step, and `action` led to it. If no map is kept, return the maps
+        that have no link for the action, else an empty list.
         """
         self._seen.append(observation(trace.steps[-1], self._theory))
         outcomes = [(m, self._outcome(m, trace, action.name, pairs)) for m in self.maps]
@@ -123,9 +113,8 @@ class MinimalMaps:
     ) -> None:
         """Take the result of a search. Known minimal maps stay if it listed fewer.
 
-        Args:
-            complete: Whether these are all minimal maps.
-            cost: The counts of a minimal map; None if there is no map.
+        `complete` says whether these are all minimal maps. `cost` has the counts of one, if
+        any.
         """
         maps, was_proven = list(found), self.status is Status.OPTIMAL
         self.status, self.complete, self.cost = status, complete, cost
@@ -133,11 +122,7 @@ class MinimalMaps:
             self.maps = [ReplayedMap(m, self._seen) for m in maps]
 
     def is_settled(self, max_maps: int | None) -> bool:
-        """Whether another search would find nothing new.
-
-        Args:
-            max_maps: The number of maps to keep at most; None for all.
-        """
+        """Whether another search would find nothing new, if at most `max_maps` are kept."""
         return self.status is Status.OPTIMAL and (self.complete or len(self.maps) == max_maps)
 
     @property

@@ -41,11 +41,7 @@ class ReturnDoubts:
         self._least: dict[Doubt, int] = {}  # lower bound of the dstates of a map without the return
 
     def in_doubt(self, ssh_map: SSHMap, trace: Trace) -> Iterator[Doubt]:
-        """Yield the doubtful returns of a map, the latest first.
-
-        Args:
-            ssh_map: A minimal map.
-        """
+        """Yield the doubtful returns of a minimal map, the latest first."""
         if not self._margin:
             return
         at = [
@@ -68,15 +64,10 @@ class ReturnDoubts:
                 yield doubt
 
     def rival(self, doubt: Doubt, trace: Trace, theory: Theory, dstates: int) -> SSHMap | None:
-        """Find the best map without a return. Without such a map, stop doubting the return.
+        """Return the best map without a return. Without such a map, stop doubting the return.
 
-        Args:
-            theory: The theory, in which no field is "auto".
-            dstates: The number of dstates of a minimal map.
-
-        Returns:
-            The map; None if it has more than `margin` dstates more than a minimal map, or was not
-            found in time.
+        None if the map has more than `margin` dstates more than `dstates`, the number in a
+        minimal map, or was not found in time. The theory is settled.
         """
         kind = "different" if theory.level == "causal" else "elsewhere"
         denied = theory.replace(**{kind: (*getattr(theory, kind), doubt)})

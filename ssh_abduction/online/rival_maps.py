@@ -109,11 +109,7 @@ class RivalMaps:
         return rival.cost == self._least
 
     def follow(self, problem: Problem) -> StepEffect:
-        """Extend the rivals by the last step.
-
-        Args:
-            problem: The steps so far, with one more, and the theory.
-        """
+        """Extend the rivals by the last step of `problem`, which has all steps and the theory."""
         self._problem, trace = problem, problem.trace
         t = len(trace) - 1
         self._views.add(trace.steps[t].view)
@@ -141,9 +137,7 @@ class RivalMaps:
     def absorb(self, found: Solved) -> None:
         """Use a result of the solver: add its maps to the rivals, and record what is proven.
 
-        Args:
-            found: The result for the steps so far, or for the first of them. In the second case,
-                its maps are extended by the later steps.
+        If it is for the first of the steps so far, its maps are extended by the later ones.
         """
         steps, self.solved = len(self._trace), found
         if (found.bound.tenths or 0) >= (self.bound.tenths or 0):
@@ -197,13 +191,10 @@ class RivalMaps:
             del self.rivals[0]
 
     def undecided(self) -> tuple[list[ExtendedMap], list[float]]:
-        """List the rivals that later steps have to decide between.
+        """List the rivals that later steps have to decide between, and their probabilities.
 
-        Among rivals with the same faults, only the cheapest ones by the theory count, because no
-        evidence ever refutes a superfluous dstate.
-
-        Returns:
-            The rivals, and the probability of each.
+        Among rivals with the same faults, only the cheapest ones by the theory count,
+        because no evidence ever refutes a superfluous dstate.
         """
         least: dict[frozenset[Fault], tuple[int, ...]] = {}
         for rival in self.rivals:

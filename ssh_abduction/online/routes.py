@@ -378,11 +378,7 @@ class Leg:
         return self.in_words(named_by_number)
 
     def in_words(self, called: Callable[[str, int], str]) -> str:
-        """Say what to do.
-
-        Args:
-            called: Returns words for a kind ("place", "region") and a number, as `SSHMap.called`.
-        """
+        """Say what to do. `called` puts a kind and a number into words, as `SSHMap.called`."""
         if self.region is not None and self.door is not None:
             return (
                 f"{self.move} {called('region', self.region)} through {called('place', self.door)}"

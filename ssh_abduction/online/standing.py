@@ -116,22 +116,12 @@ class Confidence:
         self._located: _LocatedBelief | None = None
 
     def note(self, step: int, broke: str | None) -> None:
-        """Record that a step contradicted the best map.
-
-        Args:
-            step: The number of the step.
-            broke: A sentence about the contradiction; None if there is none.
-        """
+        """Record that a step contradicted the best map, if `broke` has a sentence on it."""
         if broke:
             self._broke.append((step, broke))
 
     def standing(self, maps: RivalMaps, trace: Trace, listed: Sequence[SSHMap]) -> Standing:
-        """Compute how sure the mapper is now.
-
-        Args:
-            maps: The rivals (the possible maps) of the steps so far.
-            listed: The maps of the solution, the best one first.
-        """
+        """Compute how sure the mapper is now, by the rivals and the maps listed, best first."""
         broke = tuple(sentence for _, sentence in self._broke)
         lead = maps.lead
         if lead is None:

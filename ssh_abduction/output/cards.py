@@ -76,12 +76,7 @@ def trace_card(trace: Trace) -> str:
 
 
 def card(heading: str, *parts: str) -> str:
-    """Make HTML of a heading, with parts below it.
-
-    Args:
-        heading: The heading as plain text.
-        parts: The parts as HTML.
-    """
+    """Make HTML of a heading, as plain text, with parts of HTML below it."""
     return f"<div><p><b>{html_text(heading)}</b></p>{''.join(parts)}</div>"
 
 
@@ -91,11 +86,9 @@ def paragraph(sentence: str) -> str:
 
 
 def html_table(head: Sequence[str], rows: Iterable[Iterable[object]], more: str = "rows") -> str:
-    """Make an HTML table of at most ROWS rows. If rows are left out, say how many below it.
+    """Make an HTML table of at most ROWS rows, whose cells become plain text.
 
-    Args:
-        rows: The cells of each row. They become plain text.
-        more: The word for rows in the sentence below the table, such as "dstates".
+    If rows are left out, a sentence below says how many. `more` is its word for rows.
     """
     listed = list(rows)
     names = "".join(f"<th>{html_text(name)}</th>" for name in head)
@@ -108,12 +101,7 @@ def html_table(head: Sequence[str], rows: Iterable[Iterable[object]], more: str 
 
 
 def folded(title: str, part: str) -> str:
-    """Make a section that opens when its title is clicked.
-
-    Args:
-        title: The title as plain text.
-        part: The content as HTML.
-    """
+    """Make a section that opens when its title, as plain text, is clicked."""
     return f"<details><summary>{html_text(title)}</summary>{part}</details>"
 
 

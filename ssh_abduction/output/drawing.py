@@ -24,13 +24,10 @@ ALARM = "#b00020"  # of faults
 
 
 def element(tag: str, content: str = "", /, **attributes: object) -> str:
-    """Make an SVG element.
+    """Make an SVG element with content of SVG.
 
-    Args:
-        tag: The name of the element, such as "circle".
-        content: The content of the element, as SVG; empty for none.
-        attributes: The attributes by name. Underscores in names become hyphens. Underscores at the
-            end are removed, so that `class_` is possible.
+    Underscores in the names of attributes become hyphens. Underscores at the end are removed,
+    so that `class_` is possible.
     """
     written = "".join(
         f' {name.rstrip("_").replace("_", "-")}="{value}"' for name, value in attributes.items()
@@ -39,12 +36,9 @@ def element(tag: str, content: str = "", /, **attributes: object) -> str:
 
 
 def titled(title: str, /, *marks: str, **attributes: object) -> str:
-    """Group marks and give them a title, which browsers show under the pointer.
+    """Group marks of SVG and give them a title, which browsers show under the pointer.
 
-    Args:
-        title: The title as plain text.
-        marks: The marks as SVG.
-        attributes: Attributes of the group, as in `element`.
+    Attributes are as in `element`.
     """
     return element("g", f"<title>{escaped(title)}</title>{''.join(marks)}", **attributes)
 
@@ -73,12 +67,7 @@ def svg_text(
     weight: str = "normal",
     halo: bool = False,
 ) -> str:
-    """Make a label that is centred at a point.
-
-    Args:
-        label: The plain text.
-        halo: Whether the text has a white outline, so that it can be read on top of lines.
-    """
+    """Make a label that is centred at a point. A white halo makes it readable on top of lines."""
     return element(
         "text",
         escaped(label),
@@ -94,11 +83,9 @@ def svg_text(
 
 
 def fault_mark(x: float, y: float, title: str, size: float = 1.0) -> str:
-    """Make a red diamond with an exclamation mark, which shows a fault of a map.
+    """Make a red diamond with an exclamation mark and a title, which shows a fault of a map.
 
-    Args:
-        title: The text that browsers show under the pointer.
-        size: A factor for the size; 1 is 16 units across.
+    At size 1 it is 16 units across.
     """
     u = 8 * size
     diamond = element(
@@ -112,11 +99,7 @@ def fault_mark(x: float, y: float, title: str, size: float = 1.0) -> str:
 
 
 def faults_in_words(ssh_map: SSHMap) -> dict[int, str]:
-    """Describe the faults of a map (observations and actions that it treats as wrong).
-
-    Returns:
-        For each dstate with a fault at one of its steps, the faults in words.
-    """
+    """For each dstate with a fault of the map at one of its steps, say the faults in words."""
     faults: dict[int, list[str]] = {}
     for fault in ssh_map.faults:
         faults.setdefault(ssh_map.dstate_at[fault.step], []).append(str(fault))
@@ -124,11 +107,7 @@ def faults_in_words(ssh_map: SSHMap) -> dict[int, str]:
 
 
 def link_names(ssh_map: SSHMap) -> dict[tuple[int, int], str]:
-    """Find the actions that lead from one dstate to another one.
-
-    Returns:
-        For each pair (start, end) of different dstates with a link, the names, joined by commas.
-    """
+    """Join the names of actions from one dstate to another by commas, by (start, end)."""
     actions: dict[tuple[int, int], list[str]] = {}
     for source, action, target in ssh_map.links:
         if source != target:
@@ -139,11 +118,8 @@ def link_names(ssh_map: SSHMap) -> dict[tuple[int, int], str]:
 def floor_marks(ssh_map: SSHMap, at: Sequence[Point]) -> tuple[list[str], list[Point]]:
     """Draw the names of floors and, in a map with places, lifts as dashed lines.
 
-    Args:
-        at: The point of each dstate on the page.
-
-    Returns:
-        The marks, and the points that the page has to include. Both are empty without floors.
+    `at` has the point of each dstate on the page. Return the marks, and the points that the
+    page has to include. Both are empty without floors.
     """
     marks, points = [], []
     floor = [s.floor for s in ssh_map.dstates]
@@ -165,12 +141,7 @@ def escaped(label: str) -> str:
 
 
 def page(marks: Sequence[str], points: Sequence[Point], margin: float = MARGIN) -> str:
-    """Make the text of an SVG file.
-
-    Args:
-        marks: The elements to draw, as SVG.
-        margin: The width of the margin around these points.
-    """
+    """Make the text of an SVG file of marks, with a margin around the points."""
     xs, ys = [x for x, _ in points] or [0.0], [y for _, y in points] or [0.0]
     left, top = min(xs) - margin, min(ys) - margin
     width, height = max(xs) + margin - left, max(ys) + margin - top

@@ -63,10 +63,8 @@ def turns_between(
     """Yield the known turns between dstates.
 
     They follow from the headings of dstates at one place, and from the actions of links.
-
-    Args:
-        degrees: For each action's name, the degrees clockwise that it turns, and their weight.
-        spot: For each dstate, a number that is equal for dstates at one place.
+    `degrees` has what each action turns, clockwise, and its weight. `spot` has a number for
+    each dstate that is equal at one place.
     """
     dstates = ssh_map.dstates
     in_slots = max((s.heading or 0 for s in dstates), default=0) < 4
@@ -99,17 +97,11 @@ def headings_by(
 ) -> tuple[dict[int, float], int]:
     """Find headings that agree best with all turns.
 
-    In each connected part of the map, the first dstate faces right.
-
-    Args:
-        courses: For each dstate, its course, and the angle in radians from the heading of the
-            course to that of the dstate.
-        robust: Whether to draw most turns exactly and a few of them very wrong if turns contradict
-            each other, instead of drawing all of them a little wrong.
-
-    Returns:
-        The heading of each dstate, in radians counterclockwise from x, and the number of turns that
-        may go to a wrong side.
+    In each connected part of the map, the first dstate faces right. `courses` has, for each
+    dstate, its course, and the angle in radians from the heading of the course to its own. If
+    turns contradict each other, `robust` draws most turns exactly and a few of them very wrong,
+    instead of all a little wrong. Return the heading of each dstate, in radians
+    counterclockwise from x, and the number of turns that may go to a wrong side.
     """
     graph: nx.MultiDiGraph[Any] = nx.MultiDiGraph()
     graph.add_nodes_from(course for course, _ in courses.values())

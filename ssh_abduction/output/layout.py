@@ -49,11 +49,9 @@ class Layout:
     metric: bool = False
 
     def to_dict(self) -> dict[str, Any]:
-        """The layout as a dict for JSON.
+        """The layout for JSON: `places` are [id, [x, y]], and `dstates` [x, y, heading or None].
 
-        Returns:
-            Keys: `places`, a list of [id, [x, y]]; `dstates`, a list of [x, y, heading or None];
-            and `metric`, whether the positions are in metres.
+        `metric` says whether the positions are in metres.
         """
         return {
             "metric": self.metric,
@@ -69,11 +67,7 @@ class Layout:
 def layout(ssh_map: SSHMap, turns: Trace | Turns | None = None) -> Layout:
     """Choose positions for drawing a map: its poses if it has any, else computed ones.
 
-    Args:
-        turns: How actions turn, as in `to_svg`.
-
-    Raises:
-        MapError: `turns` has a value that is no turn.
+    `turns` says how actions turn, as in `to_svg`. Raises MapError for a value that is no turn.
     """
     degrees = degrees_of(turns)
     poses = drawable_poses(ssh_map)

@@ -363,14 +363,10 @@ class _Picture:
 
 
 def axes(spread: tuple[float, float, float]) -> tuple[tuple[float, float], float]:
-    """Find the principal axes of a covariance.
+    """Find the principal axes of a covariance (xx, xy, yy).
 
-    Args:
-        spread: The covariance (xx, xy, yy).
-
-    Returns:
-        The standard deviations along both axes, the larger one first, and the angle of the first
-        axis in radians counterclockwise from x.
+    Return the standard deviations along both axes, the larger one first, and the angle of the
+    first axis in radians counterclockwise from x.
     """
     xx, xy, yy = spread
     mean, half = (xx + yy) / 2, math.hypot((xx - yy) / 2, xy)

@@ -23,12 +23,8 @@ def region_marks(
 ) -> tuple[list[str], list[Point]]:
     """Draw a band around the places of each region behind one place, with its name beside it.
 
-    Args:
-        spots: The point of each place on the page.
-        width: The width of the innermost bands, in units of the page.
-
-    Returns:
-        The marks, and the points that the page has to include.
+    `spots` has the point of each place on the page. Return the marks, and the points that the
+    page has to include.
     """
     bands: list[str] = []
     names: list[str] = []

@@ -15,11 +15,9 @@ from ssh_abduction.theory.theory import Theory
 def pair_explained(
     trace: Trace, first: int, second: int, theory: Theory, limit: float | None, watch: Watch
 ) -> PairExplanation:
-    """Explain why two steps are one dstate (a place and a heading), or why they are not.
+    """Explain in `limit` seconds why two steps are one dstate (place and heading), or not.
 
-    Args:
-        limit: Seconds for the answer; None for no limit.
-        watch: Not used, as the server ends the process. Functions that run in a process take it.
+    A function that runs in a process takes a watch. The server ends the process instead.
     """
     return explain_pair(trace, first, second, theory, time_limit=limit)
 
@@ -27,12 +25,8 @@ def pair_explained(
 def solved_with(
     trace: Trace, theory: Theory, maps: int, limit: float | None, watch: Watch
 ) -> Solution:
-    """Find the minimal maps by a theory with assumptions.
+    """Find the minimal maps by a theory with assumptions about pairs of steps.
 
-    Args:
-        theory: The theory, with the pairs of steps that the user assumes to be one dstate or not.
-        maps: List at most this many maps; None lists all.
-        limit: Seconds for the answer; None for no limit.
-        watch: Not used, as in `pair_explained`.
+    At most `maps` are listed; None lists all. `limit` is in seconds. `watch` is not used.
     """
     return solve(trace, theory, max_maps=maps, time_limit=limit)

@@ -32,15 +32,10 @@ Pair = tuple[int, int]
 def assumptions(
     listing: Listing, trace: Trace, theory: Theory, seconds: float
 ) -> dict[Pair, dict[str, str]]:
-    """Find the costs of assumptions for pairs of steps on which all minimal maps agree.
+    """Say what "same" and "different" cost for pairs of steps on which all minimal maps agree.
 
-    Args:
-        listing: The minimal maps.
-        seconds: The time limit. Pairs for which time runs out are missing in the result.
-
-    Returns:
-        For each pair, a dict that says in words what "same" and "different" cost, as
-        `PairExplanation.assuming` does.
+    The words are those of `PairExplanation.assuming`. Pairs for which the seconds run out are
+    missing in the result.
     """
     end = time.monotonic() + seconds
     problem = settle(trace, theory)

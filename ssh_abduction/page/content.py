@@ -57,15 +57,10 @@ def content_of(
 ) -> dict[str, Any]:
     """Make the content of the page as a dict for JSON.
 
-    Args:
-        source: A solution, or maps of one trace.
-        trace: The trace that was mapped, for its actions and images; None if it is unknown.
-        run: A run of a robot that was localised in the maps, to be replayed; None for none.
-        called: File names and flags for the commands that the page shows; None for placeholders.
-
-    Raises:
-        MapError: The maps are of several traces, or not of `trace`.
-        TraceError: The header of the trace describes its images wrongly.
+    The trace tells actions and images, if known. `run` is a run of a robot that was localised
+    in the maps, to be replayed. `called` has file names and flags for the commands that the
+    page shows; None for placeholders. Raises MapError if the maps are not of one trace, or not
+    of this one, and TraceError if the header of the trace describes its images wrongly.
     """
     listing = Listing.of(source)
     called = called or Called()

@@ -111,12 +111,7 @@ def view_page(
 
 
 def html_of(content: Mapping[str, Any], *, served: bool = False) -> str:
-    """Make the text of the HTML file.
-
-    Args:
-        content: The content, from `content_of`.
-        served: Whether a server answers the questions of the page.
-    """
+    """Make the text of the HTML file. If `served`, a server answers the questions of the page."""
     style = _file("page.css")
     script = "\n".join(_file(f"script/{name}.js") for name in SCRIPTS)
     text = json.dumps(

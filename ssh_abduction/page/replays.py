@@ -59,16 +59,11 @@ class Run:
 def replays(
     maps: Sequence[SSHMap], labelings: Sequence[int], trace: Trace | None, run: Run | None
 ) -> list[dict[str, Any]]:
-    """Make the replays for the slider of the page.
+    """Make the replays for the slider of the page, a dict for each.
 
-    Args:
-        labelings: For each map, the number of its labeling (the dstates of all steps).
-        trace: The trace that was mapped; None if it is unknown.
-        run: A run that is localised in the maps; None for none.
-
-    Returns:
-        A dict for each replay. The last one is the trace that was mapped. If `run` has another
-        trace, it comes first.
+    The last one is the trace that was mapped, if known. If `run`, which is localised in the
+    maps, has another trace, it comes first. `labelings` has, for each map, the number of its
+    labeling (the dstates of all steps).
     """
     first = maps[0]
     name = "the trace that was mapped"
@@ -182,21 +177,13 @@ def _belief(belief: dict[str, Any], count: int) -> list[Any]:
 
 
 def beams_of(trace: Trace, count: int) -> tuple[float, float]:
-    """Find the bearings of the laser beams of a trace.
+    """Find the bearings of a number of laser beams of a trace.
 
-    The field `beams` of the trace's header gives them. Without it, the beams cover the half circle
-    ahead from right to left, as most scanners do. The first of an odd number of beams points
-    straight to the right. The first of an even number is half a beam further to the left.
-
-    Args:
-        count: The number of beams.
-
-    Returns:
-        The bearing of the first beam in degrees counterclockwise from straight ahead, and the
-        degrees from each beam to the next.
-
-    Raises:
-        TraceError: The header is wrong.
+    Return the bearing of the first beam in degrees counterclockwise from straight ahead, and
+    the degrees from each beam to the next. The field `beams` of the trace's header gives them;
+    TraceError if it is wrong. Without it, the beams cover the half circle ahead from right to
+    left, as most scanners do. The first of an odd number of beams points straight to the right.
+    The first of an even number is half a beam further to the left.
     """
     beams = trace.extra.get("beams")
     if beams is None:

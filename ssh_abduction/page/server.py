@@ -94,12 +94,7 @@ class PageServer(ThreadingHTTPServer):
         return f"http://127.0.0.1:{self.port}/{self._token}/"
 
     def is_known(self, path: str) -> str | None:
-        """Check the token in the path of a request.
-
-        Returns:
-            The rest of the path, which names the question; empty for the page itself. None if the
-            token is wrong.
-        """
+        """Return the question in the path of a request, "" for the page; None for a wrong token."""
         token, _, rest = path.partition("?")[0].lstrip("/").partition("/")
         return rest if hmac.compare_digest(token.encode(), self._token.encode()) else None
 
@@ -108,21 +103,13 @@ class PageServer(ThreadingHTTPServer):
         return self._page
 
     def answer(self, question: str, data: Mapping[str, Any], watch: Watch) -> dict[str, Any]:
-        """Answer a question of the page.
+        """Answer "explain", why two steps are one dstate or not, or "solve", to find maps.
 
-        Args:
-            question: "explain", why two steps are one dstate or not; or "solve", to find maps.
-            data: `pair`, the two steps to explain; `same` and `different`, lists of pairs of steps
-                that are assumed to be one dstate, or different ones.
-            watch: Can interrupt the work.
-
-        Returns:
-            A dict with `text`; and with `assuming`, the cost of each assumption, or `content`, the
-            new content of the page.
-
-        Raises:
-            AbductionError: The question is malformed, or has no answer.
-            LimitError: A limit was reached.
+        `data` has `pair`, the two steps to explain; and `same` and `different`, lists of
+        pairs of steps that are assumed to be one dstate, or different ones. The answer has
+        `text`; and `assuming`, the cost of each assumption, or `content`, the new content
+        of the page. Raises AbductionError for a malformed question or one without an
+        answer, and LimitError.
         """
         if question not in ("explain", "solve"):
             raise MapError(f"expected explain or solve, got {brief(question)}; ask one of the two")

@@ -20,11 +20,7 @@ export default { render({ model, el }) {
 
 
 def widget_of(html: str) -> Any:
-    """Make a notebook widget that shows a page in an iframe of HTML.
-
-    Raises:
-        MapError: The package anywidget is not installed.
-    """
+    """Make a notebook widget that shows a page in an iframe. Raises MapError without anywidget."""
     try:
         import anywidget
         import traitlets

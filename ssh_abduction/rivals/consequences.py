@@ -121,11 +121,7 @@ class Consequences:
         return OPEN
 
     def sure_ends(self, actions: Sequence[Action]) -> tuple[tuple[int, str, int], ...]:
-        """List the untried actions whose ends the axioms imply.
-
-        Returns:
-            Triples of a dstate, the name of an action, and the dstate that the action leads to.
-        """
+        """List the untried actions whose ends the axioms imply: dstate, action, dstate reached."""
         turns = [action for action in actions if action.kind == "turn"]
         if not (self._framed or (self._turns_back and self._at)):
             return ()

@@ -224,13 +224,10 @@ class Laboratory:
         return self._plan_for(everything, (0,) * len(everything))
 
     def predictions(self, actions: Sequence[str]) -> tuple[Prediction, ...]:
-        """List the predictions of the rivals after each of these actions.
+        """List a prediction for each group of rivals that predict the same after these actions.
 
-        Args:
-            actions: Names of actions. All rivals must have the links for them.
-
-        Returns:
-            A prediction for each group of rivals that predict the same; empty without actions.
+        All rivals must have links for the actions. Without actions, there are no
+        predictions.
         """
         names = [action.name for action in self._actions]
         found: dict[tuple[int, ...], list[int]] = {}

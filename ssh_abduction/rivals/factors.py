@@ -37,16 +37,11 @@ from ssh_abduction.rivals.table import Bools
 
 
 def deciding(columns: Sequence[Bools] | Bools, maps: int, tiers: Sequence[int] = ()) -> list[int]:
-    """Choose questions that distinguish all maps that can be distinguished.
+    """Choose questions that distinguish all maps that can be distinguished; none is superfluous.
 
-    Args:
-        columns: For each question, the answers of all maps. Earlier questions win ties.
-        maps: The number of maps.
-        tiers: The tier of each question. A question is chosen only if no question of a lower tier
-            distinguishes any more maps. By default all questions have one tier.
-
-    Returns:
-        The indices of the questions, in the order of choice. None is superfluous.
+    `columns` has, for each question, the answers of all maps. Earlier questions win ties. A
+    question is chosen only if no question of a lower tier distinguishes any more maps. By
+    default all have one tier. Return the indices of the questions, in the order of choice.
     """
     groups = np.zeros(maps, dtype=np.intp)
     # A question distinguishes ever fewer new pairs as others are chosen. So its pairs are counted
@@ -75,13 +70,10 @@ def deciding(columns: Sequence[Bools] | Bools, maps: int, tiers: Sequence[int] =
 
 
 def independent(columns: Sequence[Bools] | Bools) -> list[list[int]]:
-    """Divide questions into the finest independent choices.
+    """Divide questions into the finest independent choices, in the order of first questions.
 
-    Args:
-        columns: For each question, the answers of all maps. Maps with equal answers count once.
-
-    Returns:
-        The choices as lists of indices, in the order of their first questions.
+    `columns` has the answers of all maps for each question. Maps with equal answers count once.
+    A choice is a list of indices.
     """
     if not len(columns):
         return []
@@ -98,15 +90,10 @@ def independent(columns: Sequence[Bools] | Bools) -> list[list[int]]:
 
 
 def options_of(columns: Sequence[Bools] | Bools, maps: int) -> NDArray[np.intp]:
-    """Number the options: the different combinations of answers to some questions.
+    """Number the options, the different combinations of answers, of each map: shape (maps,).
 
-    Args:
-        columns: For each question, the answers of all maps.
-        maps: The number of maps.
-
-    Returns:
-        The option of each map, shape (maps,). Options are numbered from 0 in the order of the maps.
-        Maps with the same answers have the same option.
+    `columns` has the answers of all maps for each question. Options are numbered from 0 in the
+    order of the maps.
     """
     if not len(columns):
         return np.zeros(maps, dtype=np.intp)

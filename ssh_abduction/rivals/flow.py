@@ -28,19 +28,12 @@ ROUNDS = 8
 def shortest_walk(
     moves: Sequence[StanceMove], start: int, due: set[int], unseen: set[int]
 ) -> tuple[str, ...]:
-    """Find the shortest walk that makes required moves and visits required stances.
+    """Find the shortest walk that makes the moves `due` and visits the stances `unseen`.
 
-    The order of the moves is found by Fleury's algorithm: each move must not cut off the rest of
-    the walk. Among such moves, one with an unknown end comes first, as it is most informative.
-
-    Args:
-        start: The number of the stance where the robot is.
-        due: Indices of the moves that the walk has to make.
-        unseen: Numbers of the stances that the walk has to visit.
-
-    Returns:
-        The names of the actions up to the first move with an unknown end. Empty if there is no such
-        walk, or if none is found in time.
+    Return the names of the actions up to the first move with an unknown end. Empty if there is
+    no such walk, or none is found in time. The order of the moves is found by Fleury's
+    algorithm: each move must not cut off the rest of the walk. Among such moves, one with an
+    unknown end comes first, as it is most informative.
     """
     times = shortest_flow(moves, start, due, unseen)
     if times is None:
@@ -176,10 +169,7 @@ def nearest_of(
 ) -> tuple[str, ...]:
     """Find the shortest way to make one required move or to visit one required stance.
 
-    Parameters as in `shortest_walk`.
-
-    Returns:
-        The names of the actions; empty if no such move or stance can be reached.
+    Parameters as in `shortest_walk`. Return the names of the actions; empty if there is no way.
     """
     after: dict[int, list[int]] = {}
     for k, move in sorted(enumerate(moves), key=lambda pair: pair[0] not in due):

@@ -239,16 +239,9 @@ class Machine:
 
 
 def leads_of(ssh_map: SSHMap, number: int) -> dict[int, dict[str, int]]:
-    """For each dstate, find the actions that were tried there and where they lead.
+    """For each dstate, return the actions that were tried there and where they lead.
 
-    Args:
-        number: The index of the map, for messages.
-
-    Returns:
-        For each dstate, a dict from the names of actions to the dstates that they lead to.
-
-    Raises:
-        MapError: An action leads from one dstate to two dstates.
+    Raises MapError, which gives the number of the map, if an action leads to two dstates.
     """
     found: dict[int, dict[str, int]] = {s.id: {} for s in ssh_map.dstates}
     for source, action, target in sorted(ssh_map.links):
@@ -275,12 +268,10 @@ def with_ends(
 def machine_of(
     start: int, links: Mapping[int, Mapping[str, int]], sights: Sequence[int]
 ) -> tuple[Machine, tuple[int, ...]]:
-    """Make the machine of a map.
+    """Make the machine of a map, and the dstate of each of its states.
 
-    Args:
-        start: The current dstate.
-        links: For each dstate, a dict from actions to the dstates that they lead to.
-        sights: For each dstate, the number of what is seen there.
+    For each dstate, `links` has the actions and where they lead, and `sights` the number of
+    what is seen there.
     """
     number, reached = {start: 0}, [start]
     ends: list[tuple[tuple[str, int], ...]] = []
@@ -313,15 +304,10 @@ class MachineTable:
                     self.ends[i, s, column[action]] = target
 
     def follow(self, group: Array, rows: Array, action: int) -> tuple[Array, Array]:
-        """Follow an action from joint states.
+        """Follow an action from joint states of machines, and return what is seen there, too.
 
-        Args:
-            group: The indices of the machines, shape (m,).
-            rows: The joint states, shape (n, m): the state of each machine.
-
-        Returns:
-            The joint states after the action, and the numbers of what is seen there, both of shape
-            (n, m). Entries are UNKNOWN if the machine lacks the link.
+        `group` has the indices of the machines, (m,), and `rows` the state of each, (n, m).
+        Both results are (n, m). Entries are UNKNOWN if the machine lacks the link.
         """
         there = self.ends[group, rows, action]
         return there, np.where(there < 0, UNKNOWN, self.sights[group, there])
@@ -394,9 +380,8 @@ class Walk:
     def moves(self, layer: Layer) -> Iterator[tuple[int, int, Array, Array]]:
         """Follow each action from the joint states of a layer, part by part.
 
-        Yields:
-            The number of the first row of the part, the index of the action, the joint states after
-            the action, and the numbers of what is seen there.
+        Yield the first row of the part, the index of the action, the joint states after it,
+        and the numbers of what is seen there.
         """
         size = max(CHUNK // len(self.group), 1)
         for start in range(0, len(layer.rows), size):

@@ -109,14 +109,10 @@ class AnsweredQuestion:
 def questions_of(
     table: Table, maps: Sequence[SSHMap], *, same_places: bool
 ) -> list[AnsweredQuestion]:
-    """List all questions that distinguish maps, each once.
+    """List all questions that distinguish maps, each once, with their answers.
 
-    Args:
-        same_places: Whether all maps have the same places.
-
-    Returns:
-        The questions with their answers, in the order of causes (faults, dstates, places, paths,
-        courses). Among questions of one sort, those about earlier steps come first.
+    They are in the order of causes (faults, dstates, places, paths, courses), and then of
+    steps. `same_places` says whether all maps have the same places.
     """
     found: dict[bytes, AnsweredQuestion] = {}
     faults = {fault for ssh_map in maps for fault in ssh_map.faults}

@@ -77,13 +77,10 @@ class Table:
         return len(np.unique(self.ones[sort], axis=0))
 
     def heads(self, sort: Sort) -> Ints:
-        """Group the classes that all maps treat in the same way.
+        """Give each class the first class that all maps treat in the same way: shape (classes,).
 
-        Two classes are treated in the same way if in each map they are one, or both have no place,
-        path or course.
-
-        Returns:
-            For each class the first class of its group, shape (classes,).
+        Two classes are treated in the same way if in each map they are one, or both have no
+        place, path or course.
         """
         _, first, inverse = np.unique(
             self.ones[sort], axis=1, return_index=True, return_inverse=True
@@ -91,14 +88,11 @@ class Table:
         return first[inverse.reshape(-1)].astype(np.int32)
 
     def questions(self, sort: Sort) -> Iterator[tuple[int, int, Bools]]:
-        """Yield questions that distinguish maps: are two classes one?
+        """Yield questions that distinguish maps: are two classes, the earlier first, one in each?
 
-        Each class is paired only with the first class of its group in each map. Two maps that agree
-        on these pairs group all classes in the same way.
-
-        Yields:
-            Two classes, the earlier first, and for each map whether the two are one in it. If both
-            are the same class: for each map, whether the class has a place, or a path.
+        Each class is paired only with the first class of its group in each map. Two maps
+        that agree on these pairs group all classes in the same way. If both classes are the
+        same: for each map, whether the class has a place, or a path.
         """
         ones = self.ones[sort]
         for c in np.flatnonzero((ones != ones[0]).any(axis=0)).tolist():

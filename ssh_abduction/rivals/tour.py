@@ -86,8 +86,7 @@ def next_tour(
 def with_doubted_returns(ssh_map: SSHMap, trace: Trace, margin: int) -> SSHMap:
     """Copy a map, with a new place for each doubted return and without paths.
 
-    Args:
-        margin: A return is doubted until more than this many dstates are seen there.
+    A return is doubted until more than `margin` dstates are seen there.
     """
     believed: set[int] = set()
     # believing a return may add dstates to doubted places beside it: repeat until nothing changes

@@ -36,13 +36,9 @@ HEADING, CHORD = 0.2, 0.3
 
 
 def edges_of(trace: Trace, ssh_map: SSHMap) -> dict[int, int]:
-    """Number the edges of a map in the order in which the robot first took them.
+    """Number the edges of a map by first use, for the step at which each travel begins.
 
-    Args:
-        trace: The trace of a log. Its travels have a `course`. Others count as straight.
-
-    Returns:
-        The number of the edge of each travel, by the step at which it begins.
+    Travels of a log have a `course`. Others count as straight.
     """
     places = place_of_steps(ssh_map)
     travels = {
@@ -101,15 +97,7 @@ def _laid(trace: Trace, ssh_map: SSHMap, t: int) -> Array:
 
 
 def resampled(way: Array, step: float) -> Array:
-    """Place points evenly along a polygonal chain.
-
-    Args:
-        way: (n, 2) points in metres.
-        step: Metres between two points.
-
-    Returns:
-        (m, 2) metres; the last point is the end of the chain.
-    """
+    """Place points every `step` metres along a chain, (n, 2) metres, the last one at its end."""
     far = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way, axis=0).T))])
     moving = np.concatenate([[True], np.diff(far) > 1e-6])
     if far[-1] < 1e-6:
@@ -119,12 +107,7 @@ def resampled(way: Array, step: float) -> Array:
 
 
 def frechet(first: Array, second: Array) -> float:
-    """Compute the discrete Fréchet distance of two sequences of points, in metres.
-
-    Args:
-        first: (n, 2) metres.
-        second: (m, 2) metres.
-    """
+    """Compute the discrete Fréchet distance of two sequences of points, (n, 2), in metres."""
     far = cdist(first, second)
     best = np.empty(far.shape)
     best[0] = np.maximum.accumulate(far[0])

@@ -216,11 +216,8 @@ class LogMap:
     def recogniser(self) -> Any:
         """Train a recogniser on the images of the trace, labelled with the dstates of the best map.
 
-        This is the last step of the bootstrap loop (Kuipers & Beeson 2002): it recognises dstates
-        in the images of another drive.
-
-        Returns:
-            A fitted pipeline of scikit-learn, as `perception.recognition.recogniser` makes it.
+        This is the last step of the bootstrap loop (Kuipers & Beeson 2002): it recognises
+        dstates in the images of another drive.
         """
         images = [step.image for step in self.imported.trace.steps]
         return new_recogniser(FLOOR).fit(images, self.solution.maps[0].dstate_at)

@@ -52,12 +52,7 @@ ASIDE = 5.0  # metres between drives that share no place
 
 
 def figure(log: RobotLog, imported: Imported, solution: Solution) -> str:
-    """Draw the first map over the scans, with a caption.
-
-    Args:
-        imported: The trace of the log, and how it was made.
-        solution: The maps; without a map, the visits are drawn.
-    """
+    """Draw the first map over the scans, with a caption; without a map, draw the visits."""
     drives = drives_of(imported.trace)
     sheet = _Sheet.of(log, imported, solution.maps[0] if solution.maps else None)
     marks = [*sheet.walls_and_way()]
@@ -108,10 +103,9 @@ def paths_mean_something(solution: Solution) -> bool:
 
 
 def doubtful_joins(solution: Solution) -> list[tuple[int, int, float]]:
-    """List the joins of the first map whose probability is less than SURE, least first.
+    """List the joins of the first map with a probability below SURE, least first.
 
-    Returns:
-        The two steps of each join, and its probability; none if the costs are in doubt.
+    Each has two steps and its probability. There are none if the costs are in doubt.
     """
     weighed = solution.weighed
     joins = weighed.joins if weighed else ()
@@ -341,12 +335,9 @@ def _pose(row: Array) -> Pose:
 
 
 def laid_over(poses: Sequence[Pose], imported: Imported, ssh_map: SSHMap | None) -> list[Pose]:
-    """Move the poses of each drive into the frame of the first one.
+    """Move the poses of each drive into the frame of the first one, by the places that they share.
 
-    Args:
-        poses: The pose of each scan, in the frame of its drive.
-        imported: The trace, and how it was made.
-        ssh_map: The map that says which places drives share; None if there is no map.
+    Without a map, no places are shared.
     """
     drives = drives_of(imported.trace)
     bounds = [0, *imported.starts, len(poses)]

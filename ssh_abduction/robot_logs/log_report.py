@@ -47,11 +47,7 @@ def report(
 ) -> str:
     """Make the page as the text of an HTML file that loads no other file.
 
-    Args:
-        log: The robot's log, with its scans.
-        imported: The trace of the log, and how it was made.
-        solution: The minimal maps.
-        rungs: The rungs of the ladder, each with one more kind of evidence; empty without a ladder.
+    `rungs` are those of the ladder, each with one more kind of evidence, if there is one.
     """
     name = imported.trace.name or "log"
     parts = [

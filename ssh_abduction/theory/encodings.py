@@ -49,19 +49,11 @@ class Axiom:
     conditions: tuple[str, ...]
 
     def holds_in(self, choices: Mapping[str, object]) -> bool:
-        """Whether a theory has the axiom.
-
-        Args:
-            choices: The value of each field of the theory, by name.
-        """
+        """Whether a theory with these values of its fields has the axiom."""
         return all(_holds(condition, choices) for condition in self.conditions)
 
     def has_subject_in(self, choices: Mapping[str, object]) -> bool:
-        """Whether a theory has what the axiom is about, such as stars.
-
-        Args:
-            choices: The value of each field of the theory, by name.
-        """
+        """Whether a theory with these values of fields has what the axiom is about."""
         return all(_holds(condition, choices) for condition in self.subject)
 
 

@@ -86,8 +86,7 @@ CAUSAL = "Theory.causal() (--theory causal)"  # for error messages
 def normalise(theory: Theory) -> None:
     """Check all fields of a new theory, and convert each to its standard form.
 
-    Raises:
-        TheoryError: A field is wrong, or two fields contradict each other.
+    Raises TheoryError if a field is wrong, or two contradict each other.
     """
     for name, values in CHOICES.items():
         if not isinstance(getattr(theory, name), str) or getattr(theory, name) not in values:

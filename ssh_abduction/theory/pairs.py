@@ -34,11 +34,7 @@ class Pairs:
         elsewhere: Iterable[tuple[int, int]] = (),
         one: Iterable[tuple[int, int]] = (),
     ) -> Pairs:
-        """Make Pairs of pairs of steps. The two steps of a pair may come in any order.
-
-        Args:
-            apart: Steps at different dstates. Those of `elsewhere` are added.
-        """
+        """Make Pairs of pairs of steps in any order. Those of `elsewhere` are apart, too."""
         away = list(elsewhere)
         return Pairs(_earlier([*apart, *away]), _earlier(away), _earlier(one))
 
@@ -67,10 +63,8 @@ class Pairs:
     ) -> bool:
         """Whether the pairs of a step and earlier steps allow the step its label.
 
-        Args:
-            labels: The dstate of each step.
-            place_of: The place of each dstate, if known. Without it, `elsewhere` is checked as
-                different dstates only.
+        `place_of` has the place of each dstate, if known. Without it, steps that are
+        `elsewhere` only have different dstates.
         """
         if step not in self.asked_for:
             return True
@@ -86,11 +80,7 @@ class Pairs:
         )
 
     def broken_by(self, labels: Sequence[int]) -> list[tuple[int, int]]:
-        """List the pairs that contradict some labels, as (earlier step, later step).
-
-        Args:
-            labels: The dstate of each of the first steps. Pairs with other steps are ignored.
-        """
+        """List the pairs, the earlier step first, that contradict the labels of the first steps."""
         size = len(labels)
         wrong = [(i, t) for i, t in pairs_in(self.apart) if t < size and labels[i] == labels[t]]
         return wrong + [

@@ -219,11 +219,8 @@ def has_way(
 ) -> bool:
     """Whether some choice of one way for each step leads through all steps.
 
-    This is a depth-first search without recursion, because there may be many steps.
-
-    Args:
-        start: The state before the first step.
-        ways: Yields the states to which a step can lead from a state.
+    `ways` yields the states to which a step can lead from a state. This is a depth-first search
+    without recursion, because there may be many steps.
     """
     gone: list[Iterator[State]] = []
     state = start

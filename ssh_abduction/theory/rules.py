@@ -46,11 +46,7 @@ class Rules:
     text: str = field(repr=False)
 
     def __post_init__(self) -> None:
-        """Convert the line ends, and check the text.
-
-        Raises:
-            TheoryError: The text would make clingo's lexer abort the process or stop too early.
-        """
+        """Convert the line ends. Raise TheoryError for a text that would stop clingo's lexer."""
         if not isinstance(self.name, str) or not isinstance(self.text, str):
             raise TheoryError(
                 f"rules: expected a name and a text, got {brief(self.name)} and "
@@ -92,10 +88,8 @@ class Rules:
     def of(cls, value: Any) -> Rules:
         """Make Rules of the path of a file, or of a dict with `name` and `text`.
 
-        Rules are returned as they are.
-
-        Raises:
-            TheoryError: The file cannot be read, or has wrong characters.
+        Rules are returned as they are. Raises TheoryError if the file cannot be read, or
+        has wrong characters.
         """
         if isinstance(value, Rules):
             return value
@@ -123,13 +117,9 @@ class Rules:
 
     @classmethod
     def all_of(cls, value: Any) -> tuple[Rules, ...]:
-        """Make a tuple of Rules of one value or of a list.
+        """Make a tuple of Rules of one value as for `of`, or of a list. Raises TheoryError.
 
-        Args:
-            value: Values as for `of`. A text may contain several paths, separated by commas.
-
-        Raises:
-            TheoryError: A value is wrong.
+        A text may contain several paths, separated by commas.
         """
         if isinstance(value, str):
             value = [part.strip() for part in value.split(",") if part.strip()]

@@ -52,13 +52,9 @@ class Problem:
         return pairs_of(self.trace, self.theory, self.evidence)
 
     def changed(self, trace: Trace | None = None, theory: Theory | None = None) -> Problem:
-        """Return this problem (a trace and a theory) with another trace or theory.
+        """Return this problem with another trace or settled theory; None keeps it.
 
         The results of its evidence, such as excluded pairs of steps, are reused.
-
-        Args:
-            trace: Another trace, such as this one with more steps, or a part of it; None keeps it.
-            theory: Another theory, in which no field is "auto"; None keeps it.
         """
         theory = theory or self.theory
         return Problem(trace or self.trace, theory, evidence_of(theory, self.evidence))
@@ -67,19 +63,11 @@ class Problem:
 def settle(trace: Trace, theory: Theory | None = None, known: Problem | None = None) -> Problem:
     """Replace each "auto" in a theory, and check that the trace has what the axioms need.
 
-    A step whose view is unknown may be at any dstate.
-
-    Args:
-        theory: The theory; Theory.topological() by default.
-        known: A problem with the same trace, or with its first steps. The results of its evidence
-            are reused.
-
-    Returns:
-        The trace, the theory with all values chosen, and the evidence.
-
-    Raises:
-        TraceError: All views, the kind of an action, or a star is missing.
-        TheoryError: The theory needs stars or displacements, but the trace has none.
+    Return the trace, the theory, and the evidence. A step whose view is unknown may be at any
+    dstate. If a problem with the same trace, or with its first steps, is `known`, the results
+    of its evidence are reused. Raises TraceError if all views, the kind of an action, or a star
+    is missing, and TheoryError if the trace lacks the stars or displacements that the theory
+    needs.
     """
     checked_trace(trace)
     theory = checked_theory(theory)

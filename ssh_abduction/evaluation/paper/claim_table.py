@@ -36,11 +36,7 @@ class Claim:
 
 
 def claims(name: str) -> list[Claim]:
-    """List the claims of the paper about an experiment, and our own.
-
-    Args:
-        name: The name of the experiment: "notched-rectangle" or "taylor-hall".
-    """
+    """List the claims of the paper about "notched-rectangle" or "taylor-hall", and our own."""
     e = EXPERIMENTS[name]
     triple = f"{e.dstates}, {e.places}, {e.paths}"
     counts = {"dstates": e.dstates, "places": e.places, "paths": e.paths}
@@ -188,14 +184,10 @@ def _trend(run: SeedRun) -> float:
 
 
 def summary(name: str, runs: Sequence[SeedRun]) -> list[dict[str, Any]]:
-    """Make a table of the claims about an experiment.
+    """Make a table of the claims about an experiment from its runs, one for each seed.
 
-    Args:
-        runs: The runs, one for each seed.
-
-    Returns:
-        A row for each claim, as a dict: the value in the paper, the value for each seed, and the
-        number of runs in which the claim holds.
+    A row has the value in the paper, the value for each seed, and the number of runs in which
+    the claim holds.
     """
     return [
         {

@@ -178,12 +178,7 @@ class SeedRun:
 
 
 def measure(name: str, seed: int) -> SeedRun:
-    """Run an experiment from simulation to recognition rates.
-
-    Args:
-        name: The name of the experiment: "notched-rectangle" or "taylor-hall".
-        seed: The seed of all noise.
-    """
+    """Run "notched-rectangle" or "taylor-hall" from simulation to recognition rates."""
     warnings.simplefilter("ignore", ImageWarning)
     e = EXPERIMENTS[name]
 
@@ -236,14 +231,9 @@ def rate(
 ) -> float:
     """Measure how often a recogniser that learns labels recognises the true dstate.
 
-    The rate is cross-validated in ten folds. A recognised label counts as the true dstate that has
-    this label most often in the training part.
-
-    Args:
-        ranges: The images: ranges in metres, (n, d).
-        labels: The label of each image to learn, (n,).
-        truth: The true dstate of each image, (n,).
-        seed: The seed of the folds.
+    The rate is cross-validated in ten folds. A recognised label counts as the true dstate that
+    has this label most often in the training part. The ranges are in metres, (n, d), the labels
+    and the truth (n,).
     """
     found = []
     for train, test in StratifiedKFold(10, shuffle=True, random_state=seed).split(ranges, truth):
@@ -352,10 +342,8 @@ class NotchOutcome:
 def outcome(notch: float, scale: float, seed: int = 0) -> NotchOutcome:
     """Take images in the notched rectangle with another notch, and run the method on them.
 
-    Args:
-        notch: The depth of the notch in metres.
-        scale: The factor for the offsets of the robot's poses from the mean pose at their dstate.
-        seed: The seed of all noise.
+    The notch is in metres. `scale` is the factor for the offsets of the robot's poses from the
+    mean pose at their dstate.
     """
     warnings.simplefilter("ignore", ImageWarning)
     # Scan at the poses that the robot drove to, with their offsets scaled.

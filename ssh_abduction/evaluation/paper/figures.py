@@ -64,13 +64,7 @@ def _save(figure: Any, path: str | Path) -> None:
 def draw_quality(
     path: str | Path, quality: Mapping[int, float], uncertainty: Mapping[int, float], chosen: int
 ) -> None:
-    """Draw M, and U if it is known, against the number of clusters k.
-
-    Args:
-        quality: M (separation of clusters) for each k.
-        uncertainty: U (how well the dstate determines the view) for each k; empty if unknown.
-        chosen: The chosen k, which is marked.
-    """
+    """Draw M for each k (number of clusters), and U, which may be unknown. Mark the chosen k."""
     # M on the left axis, U on the right one.
     figure, axes = _pyplot().subplots(figsize=(5.5, 3.2))
     axes.plot(list(quality), list(quality.values()), "o-", color=BLUE, label="M")
@@ -93,11 +87,7 @@ def draw_quality(
 
 
 def draw_learning(path: str | Path, curves: Mapping[str, LearningCurve]) -> None:
-    """Draw the recognition rate against the number of images: mean and range over the folds.
-
-    Args:
-        curves: Learning curves by name, three at most.
-    """
+    """Draw recognition rates, three at most, against images: mean and range over the folds."""
     figure, axes = _pyplot().subplots(figsize=(5.5, 3.2))
     for (name, curve), colour in zip(curves.items(), (BLUE, ORANGE, GREEN), strict=False):
         axes.fill_between(
@@ -112,10 +102,8 @@ def draw_learning(path: str | Path, curves: Mapping[str, LearningCurve]) -> None
 def draw_beliefs(path: str | Path, beliefs: Sequence[Mapping[str, Any]]) -> None:
     """Draw the entropy of each belief, and the probability that the robot is nowhere on the map.
 
-    Steps at which the robot was lost or nowhere are shaded.
-
-    Args:
-        beliefs: The belief after each step, as `Belief.to_dict` returns it.
+    Beliefs are as `Belief.to_dict` returns them. Steps at which the robot was lost or nowhere
+    are shaded.
     """
     pyplot = _pyplot()
     figure, (upper, lower) = pyplot.subplots(
@@ -163,11 +151,7 @@ def draw_beliefs(path: str | Path, beliefs: Sequence[Mapping[str, Any]]) -> None
 
 
 def draw_world(path: str | Path, world: World, poses: Sequence[Sequence[float]]) -> None:
-    """Draw the walls, the clutter, the true dstates, and the poses at which images were taken.
-
-    Args:
-        poses: The poses (x, y, …) in metres.
-    """
+    """Draw the walls, the clutter, the true dstates, and the poses, in metres, of images."""
     figure, axes = _pyplot().subplots(figsize=(7, 4))
     for x1, y1, x2, y2 in world.segments:
         axes.plot([x1, x2], [y1, y2], color="black", linewidth=1.5)
@@ -208,10 +192,7 @@ def draw_views(
 ) -> None:
     """Draw the images of each view on top of each other, as the robot sees them.
 
-    Args:
-        images: Ranges in metres, (n, d).
-        views: The view of each image, (n,).
-        truth: The true dstate of each image, (n,), for the titles.
+    Images are ranges in metres, (n, d). Titles tell the true dstates.
     """
     names = sorted(set(views.tolist()))
     columns = min(5, len(names))
@@ -304,8 +285,7 @@ def draw_map(path: str | Path, ssh_map: SSHMap) -> None:
 def draw_spread(path: str | Path, spread: Sequence[Sequence[float]]) -> None:
     """Draw the largest offset of a pose from the mean pose of its dstate, tour by tour.
 
-    Args:
-        spread: For each tour the largest offsets in x and y (metres) and heading (radians).
+    Offsets are in x and y (metres) and heading (radians).
     """
     # Positions on the left axis, headings on the right one.
     table = np.array(spread)
@@ -339,9 +319,8 @@ def draw_outcomes(
 ) -> None:
     """Draw k, U, the map and the recognition rate over the notch and the spread of poses.
 
-    Args:
-        outcomes: One for each pair of notch and scale. Results as in the paper get a frame.
-        here: The depth of the notch in metres and the scale in the experiment. A cross marks them.
+    Results as in the paper get a frame. A cross marks the notch and the scale of the
+    experiment.
     """
     notches = sorted({o.notch for o in outcomes})
     scales = sorted({o.scale for o in outcomes})

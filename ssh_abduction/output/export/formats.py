@@ -137,16 +137,9 @@ def export_doubts(
     turns: Trace | Turns | None = None,
     hide_undecided: bool = False,
 ) -> tuple[str, ...]:
-    """Find reasons why a program may navigate wrongly by an exported map.
+    """Say for which reasons a program may navigate wrongly by a map in nav2 or tmap2.
 
-    Args:
-        to: The format, as in `export_map`.
-        level: What a node is, as in `export_map`.
-        turns: How actions turn, as in `export_map`.
-        hide_undecided: Whether undecided places are left out, as in `export_map`.
-
-    Returns:
-        A sentence for each reason. Empty for formats other than nav2 and tmap2.
+    Parameters as in `export_map`. There are no reasons for other formats.
     """
     if to not in FOR_NAVIGATION:
         return ()
@@ -179,11 +172,7 @@ def _level(ssh_map: SSHMap, to: str, level: str | None) -> str:
 
 
 def nav2(roads: Roads, name: str, frame: str) -> str:
-    """Write a map as the GeoJSON text of a route graph.
-
-    Args:
-        frame: The name of the coordinate frame of the positions.
-    """
+    """Write a map as the GeoJSON text of a route graph. `frame` is that of the positions."""
     # All ids must differ, so the ids of edges follow those of nodes.
     first = max(stop.id for stop in roads.stops) + 1
     at = {stop.id: [round(stop.x, DIGITS), round(stop.y, DIGITS)] for stop in roads.stops}

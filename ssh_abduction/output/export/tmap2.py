@@ -29,10 +29,8 @@ RADIUS = 0.75
 def tmap2(roads: Roads, name: str, frame: str, updated: datetime | None = None) -> str:
     """Write a map as the YAML text of a topological map.
 
-    Args:
-        name: The name of the map and of its pointset.
-        frame: The name of the coordinate frame of the positions.
-        updated: The time when the map was made; None for now.
+    The name is that of the map and of its pointset, the frame that of the positions. `updated`
+    is the time when the map was made; None for now.
     """
     title = {"places": "place", "dstates": "dstate"}[roads.level]
     names = {stop.id: f"{title}-{stop.id}" for stop in roads.stops}

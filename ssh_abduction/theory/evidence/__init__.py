@@ -53,11 +53,9 @@ __all__ = [
 
 
 def evidence_of(theory: Theory, known: Iterable[Evidence] = ()) -> tuple[Evidence, ...]:
-    """Make an object for each kind of evidence that a theory uses.
+    """Make an object for each kind of evidence that a settled theory uses.
 
-    Args:
-        theory: The theory, in which no field is "auto".
-        known: Evidence that was made before. Its results for traces are reused.
+    The results of evidence that is `known` are reused.
     """
     made = [kind.of(theory) for kind in KINDS if kind.axiom in theory.axioms]
     before = {type(evidence): evidence for evidence in known}
@@ -67,14 +65,10 @@ def evidence_of(theory: Theory, known: Iterable[Evidence] = ()) -> tuple[Evidenc
 def said_by(
     kinds: Iterable[Evidence], trace: Trace, refused: Mapping[str, int]
 ) -> dict[str, dict[str, int]]:
-    """Count what each kind of evidence excluded.
+    """Count by kind of evidence the pairs of steps and the sets of equalities that it excluded.
 
-    Args:
-        refused: The number of rejected sets of equalities, by the name of the kind.
-
-    Returns:
-        For the name of each kind, a dict: "pairs" is the number of pairs of steps that are
-        different dstates, and "refused" the number of rejected sets.
+    For each name of a kind, "pairs" is the number of pairs of steps that are different dstates,
+    and "refused" that of rejected sets, as `refused` has it.
     """
     return {
         kind.name: {
@@ -86,13 +80,9 @@ def said_by(
 
 
 def pairs_of(trace: Trace, theory: Theory, evidence: Iterable[Evidence] | None = None) -> Pairs:
-    """Return which pairs of steps the evidence shows to be equal or different.
+    """Return which pairs of steps the evidence of a settled theory shows to be equal or different.
 
     Evidence that may be wrong, because the theory allows a fault of it, is left out.
-
-    Args:
-        theory: The theory, in which no field is "auto".
-        evidence: The evidence that this theory uses; by default it is made.
     """
     kinds = evidence_of(theory) if evidence is None else evidence
     return Pairs.joined([e.pairs(trace) for e in kinds if e.axiom in theory.hard])

@@ -63,12 +63,9 @@ class Course(NamedTuple):
 def hold(
     equalities: Collection[Equality], labels: Sequence[int], places: Sequence[int | None]
 ) -> bool:
-    """Whether all these equalities hold in a map.
+    """Whether all these equalities, the earlier step first, hold in a map.
 
-    Args:
-        equalities: Equalities of two steps, the earlier one first.
-        labels: The dstate of each step.
-        places: The place of each dstate.
+    `labels` has the dstate of each step, and `places` the place of each dstate.
     """
     return all(
         equality.second < len(labels)

@@ -91,11 +91,10 @@ class Loops:
 
     @staticmethod
     def of(trace: Trace, bend: float = 0.0, drift: float | None = None) -> Loops:
-        """Make the loops of a trace. First remove a steady drift of heading from its displacements.
+        """Make the loops of a trace, without a steady drift of heading in radians a metre.
 
-        Args:
-            bend: The drift, in radians a metre.
-            drift: The standard deviation of the remaining drift; that of the odometry by default.
+        `drift` is the standard deviation of the remaining drift; that of the odometry by
+        default.
         """
         odometry = trace.odometry or Odometry()
         sums = _sums(trace, 0, len(trace), np.array([bend]), np.zeros((1, COLUMNS)))[0]
@@ -110,12 +109,8 @@ class Loops:
     def closings(self, first: ArrayLike, last: ArrayLike) -> tuple[Array, Array]:
         """Return the errors at the end of m loops, in the frame of the first step of the trace.
 
-        Args:
-            first: The steps at which the loops begin, m.
-            last: The steps at which they end, m.
-
-        Returns:
-            The errors, m x 3, in metres and radians, and their covariances, m x 3 x 3.
+        The loops lead from the steps `first` to the steps `last`. The errors are m x 3, in
+        metres and radians, and their covariances m x 3 x 3.
         """
         i, j = np.asarray(first, dtype=int), np.asarray(last, dtype=int)
         closing = self._closing(i, j)
@@ -132,16 +127,11 @@ class Loops:
     def shared(
         self, loops: tuple[ArrayLike, ArrayLike], others: tuple[ArrayLike, ArrayLike]
     ) -> Array:
-        """Return the covariances between the closings of m loops and those of m other loops.
+        """Return the covariances, m x 3 x 3, between the closings of m loops and of m other loops.
 
-        They come from displacements in both loops, and from errors that all displacements share.
-
-        Args:
-            loops: The steps at which the loops begin, and those at which they end.
-            others: The same for the other loops.
-
-        Returns:
-            The covariances, m x 3 x 3.
+        Loops are given by the steps at which they begin, and those at which they end.
+        Covariances come from displacements in both loops, and from errors that all
+        displacements share.
         """
         (i, j), (k, m) = (
             tuple(np.asarray(steps, dtype=int) for steps in pair) for pair in (loops, others)
@@ -243,12 +233,7 @@ class Loops:
         return self._white(np.zeros_like(every), every, there, there).reshape(-1, 9)
 
     def noise(self, first: Steps, last: Steps) -> Array:
-        """Return the covariances of loop closings that noisy displacements cause, m x 3 x 3.
-
-        Args:
-            first: The steps at which the loops begin, m.
-            last: The steps at which they end, m.
-        """
+        """Return the covariances of m loop closings that noisy displacements cause, m x 3 x 3."""
         return self._white(first, last, last, last)
 
     def repeated(self, first: Steps, last: Steps) -> Array:
@@ -268,11 +253,7 @@ class Reckoning:
     """
 
     def __init__(self, trace: Trace, before: Reckoning | None = None) -> None:
-        """Compute the poses and sums for each drift.
-
-        Args:
-            before: The reckoning of its first steps, if known.
-        """
+        """Compute the poses and sums for each drift, from those of the first steps, if known."""
         self.odometry = trace.odometry or Odometry()
         sigma = self.odometry.bend
         step = sigma / BENDS_A_SIGMA
@@ -318,13 +299,7 @@ class Reckoning:
         )
 
     def closings(self, numbers: Steps, first: Steps, last: Steps) -> tuple[Array, Array]:
-        """Compute closings and covariances as `Loops.closings` does, with a drift for each loop.
-
-        Args:
-            numbers: The index in `bends` of the drift of each loop, m.
-            first: The steps at which the loops begin, m.
-            last: The steps at which they end, m.
-        """
+        """Compute closings as `Loops.closings`, with the index in `bends` of each loop's drift."""
         array = self._rows.array
         flat = Loops._of(array.reshape(-1, COLUMNS), self._part, self.odometry, 0.0, self._drift)
         offset = numbers * array.shape[1]
@@ -440,11 +415,7 @@ def _summed(before: Array, values: Array) -> Array:
 def chi_squares(closing: Array, covariance: Array) -> tuple[Array, Array]:
     """Return two chi-squares of each closing: by position, and by position and heading.
 
-    They have 2 and 3 degrees of freedom.
-
-    Args:
-        closing: The closings, m x 3.
-        covariance: Their covariances, m x 3 x 3.
+    They have 2 and 3 degrees of freedom. Closings are m x 3, and covariances m x 3 x 3.
     """
     (a, b, p), (_, c, q), (_, _, s) = covariance.transpose(1, 2, 0)
     x, y, turned = closing.T

@@ -394,12 +394,7 @@ class _ArmClasses:
 
 
 def fewest(moves: list[int], cross: Callable[[list[int]], bool]) -> list[int]:
-    """Return a minimal subset of the travels and turns that still crosses.
-
-    Args:
-        moves: The steps at which they begin.
-        cross: Returns whether the edges of such a subset cross.
-    """
+    """Return a minimal subset of the travels and turns (by their first steps) that crosses."""
     size = max(1, len(moves) // 2)
     while True:
         begin = 0
@@ -418,12 +413,7 @@ def fewest(moves: list[int], cross: Callable[[list[int]], bool]) -> list[int]:
 def split(
     labels: Mapping[int, int], steps: Sequence[int], cross: Callable[[Mapping[int, int]], bool]
 ) -> Mapping[int, int]:
-    """Give each of these steps a dstate of its own, unless the edges then no longer cross.
-
-    Args:
-        labels: The dstate of each step.
-        cross: Returns whether edges cross if the steps have some labels.
-    """
+    """Give each of these steps a dstate of its own, unless the edges then no longer cross."""
     new = max(labels.values()) + 1
     for step in steps:
         look_at_clock()
@@ -438,10 +428,8 @@ def description(
 ) -> Iterator[Equality]:
     """Yield which of these steps are one dstate or at one place, and which are not.
 
-    Args:
-        labels: The dstate of each step.
-        at: The place of each step.
-        distinct: Whether to yield that dstates at one place are different.
+    `labels` and `at` have the dstate and the place of each step. With `distinct`, also yield
+    that dstates at one place are different.
     """
     first: dict[int, int] = {}  # the first step of each dstate
     for step in steps:

@@ -62,23 +62,13 @@ class Evidence(Protocol):
         return NO_PAIRS
 
     def facts(self, trace: Trace, start: int, stop: int) -> str:
-        """Return further facts for the encoding of this kind, as a text for clingo.
-
-        Args:
-            start: The first step that the facts are about.
-            stop: The step after the last one.
-        """
+        """Return further facts of the steps from `start` to before `stop`, as a text for clingo."""
         return ""
 
     def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
-        """Find equalities and inequalities of steps in a map that cannot all hold in any map.
+        """Return a small set of (in)equalities of steps in a map that hold in no map together.
 
-        Args:
-            ssh_map: A map of the first steps of the trace.
-            since: The map of the first `since` steps is known to have no such set. So only later
-                steps need to be checked.
-
-        Returns:
-            A small set of such equalities and inequalities; None if there is none.
+        None if there is none. The map is of the first steps. Its first `since` steps are
+        known to have no such set, so only later steps need to be checked.
         """
         return None

@@ -50,10 +50,7 @@ class Returns:
     ) -> None:
         """Prepare the tests. If `before` has tested its steps, test the new steps now.
 
-        Args:
-            evidence: The evidence that says how to test.
-            before: The returns of the first steps of the trace, if known.
-            reckoning: The dead reckoning of the trace, if known.
+        `evidence` says how to test. `before` has the returns of the first steps, if known.
         """
         from ssh_abduction.theory.evidence.loops import Reckoning  # loads numpy
 
@@ -169,12 +166,9 @@ class Returns:
         return likely
 
     def threshold(self, freedom: int, together: bool) -> float:
-        """Return the chi-square above which a return, or a set of two, is rejected.
+        """Return the chi-square above which a return, or a set of two (`together`), is rejected.
 
-        Args:
-            freedom: The degrees of freedom: 2 for a return to a place, 3 for one to a dstate, and
-                the sum for a set of two.
-            together: Whether the threshold is for a set of two.
+        A return to a place has 2 degrees of freedom, one to a dstate 3, and a set the sum.
         """
         from scipy.special import gammainccinv
 
@@ -253,12 +247,9 @@ class Returns:
     def refused_together(self, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
         """Find two returns of a map that are rejected together; None if there are none.
 
-        If such a set was rejected in an earlier map, return that one. Otherwise, return the two
-        that are rejected most clearly.
-
-        Args:
-            since: The map of the first `since` steps is known to be accepted. So only returns that
-                end later are tested.
+        If such a set was rejected in an earlier map, return that one. Otherwise, return the
+        two that are rejected most clearly. The map of the first `since` steps is known to
+        be accepted, so only returns that end later are tested.
         """
         import numpy as np
 
@@ -293,15 +284,10 @@ class Returns:
     def refused_at(
         self, labels: Sequence[int], places: Sequence[int | None], step: int
     ) -> frozenset[Equality] | None:
-        """Find the two returns that are rejected most clearly together, while neither is alone.
+        """Find two returns that are rejected most clearly together, while neither is alone.
 
-        Args:
-            labels: The dstate of each step. They need not be those of a map.
-            places: The place of each step.
-            step: The step where the later return ends.
-
-        Returns:
-            The two returns; None if there are none.
+        The later return ends at `step`. `labels` has the dstate of each step, and `places`
+        the place. They need not be those of a map.
         """
         alone = self.pairs
         rows = self._returns_among(labels[: step + 1], places)
@@ -323,9 +309,7 @@ class Returns:
     ) -> list[Equality]:
         """List the returns that end at a step and are rejected alone.
 
-        Args:
-            labels: The dstate of each step.
-            places: The place of each step.
+        `labels` has the dstate of each step, and `places` the place.
         """
         elsewhere = [
             Equality(i, step, "place")
@@ -351,10 +335,7 @@ class Returns:
     def why_apart(self, first: int, last: int, names: Sequence[int] = ()) -> str | None:
         """Say in words why two steps are not one dstate or place; None if displacements allow it.
 
-        Args:
-            first: The earlier step.
-            last: The later step.
-            names: What to call the steps; empty if this is the whole trace.
+        `names` says what to call the steps; it is empty if this is the whole trace.
         """
         names = names or named_steps(drives_of(self.trace), len(self.trace))
         named = f"steps {names[first]} and {names[last]}"

@@ -87,10 +87,8 @@ class Together:
     ) -> None:
         """Choose the drift of heading that is tried first. No pair is tested yet.
 
-        Args:
-            thresholds: The chi-square above which a pair is rejected, by its degrees of freedom.
-            before: The same for the first of these rows and steps, if known. Its results are
-                reused.
+        `thresholds` has the chi-square above which a pair is rejected, by its degrees of
+        freedom. The results of `before`, for the first of these rows and steps, are reused.
         """
         self.rows = rows
         self._reckoning, self._thresholds = reckoning, thresholds
@@ -103,13 +101,9 @@ class Together:
             self._number, self._chosen_among = self._likeliest(), len(rows)
 
     def worst(self, new: Mask) -> tuple[Steps, Steps] | None:
-        """Find the pair that is rejected most clearly, out of the pairs with a new return.
+        """Return the later and the earlier row of the pair that is rejected most clearly, or None.
 
-        Args:
-            new: Whether each return is new.
-
-        Returns:
-            The later row and the earlier row of the pair; None if no pair is rejected.
+        Only pairs with a return that is `new` count.
         """
         rows = self.rows
         worst, most = None, 0.0
@@ -281,12 +275,7 @@ class Together:
 
 
 def joint_squares(loops: Loops, these: Steps, others: Steps) -> Array:
-    """Return the joint chi-square of each return with its partner.
-
-    Args:
-        these: Rows of returns, as in `Together.rows`.
-        others: The row of the partner of each return.
-    """
+    """Return the joint chi-square of each return, a row of `Together.rows`, with its partner."""
     joint, off = np.empty((len(these), 6, 6)), np.empty((len(these), 6))
     for rows, at in ((these, slice(3)), (others, slice(3, 6))):
         closing, covariance = loops.closings(rows[:, 0], rows[:, 1])
