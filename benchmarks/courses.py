@@ -3,8 +3,8 @@
 A map of a log says which visits are at one place and which travels are on one edge. Corrected poses
 say which visits are near each other and which travels have one course. A course is the true way of
 the robot from one visit to the next. Two courses are one if their Fréchet distance is small, in
-either direction. The drive parts where two stretches of it that ran together lead apart. A map
-without a visit there cannot tell the two ways apart.
+either direction. The drive parts where two stretches of it that ran together diverge. A map without
+a visit there cannot tell the two ways apart.
 
 Reference:
     Eiter & Mannila 1994, "Computing discrete Fréchet distance".
@@ -182,7 +182,7 @@ def is_one(first: Array, second: Array) -> bool:
 
 
 def partings(positions: Array) -> Array:
-    """Find the points where two stretches of a drive that ran together lead apart.
+    """Find the points where two stretches of a drive that ran together diverge.
 
     Args:
         positions: (n, 2) true position of each scan in metres.
@@ -207,13 +207,13 @@ def partings(positions: Array) -> Array:
 
 
 def _lead_apart(way: Array, i: int, j: int, ahead: int, side: int) -> bool:
-    """Check whether two stretches of a drive lead apart at two of its points.
+    """Check whether two stretches of a drive diverge at two of its points.
 
     Args:
         way: (n, 2) metres, PACE apart.
         i: Index of the point of the earlier stretch.
         j: Index of the point of the later stretch, near the other point.
-        ahead: Direction along the earlier stretch in which they lead apart: 1 or -1.
+        ahead: Direction along the earlier stretch in which they diverge: 1 or -1.
         side: 1 if the robot drove both in one direction, -1 if not.
     """
     back, reach = round(TOGETHER / PACE), round(REACH / PACE)

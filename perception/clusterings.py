@@ -22,7 +22,7 @@ APART = 2.3
 # Values of trimmed M within this factor of the largest count as equal, and the smallest k wins.
 EQUAL = 0.95
 # The distance of an image to its third nearest neighbour decides whether it is isolated. So two or
-# three images of one strange thing are isolated, too.
+# three images of one unusual object are isolated, too.
 NEIGHBOURS = 3
 
 
@@ -32,8 +32,8 @@ class Tried:
 
     Attributes:
         k: The chosen number of views.
-        quality: M for each k that was tried.
-        trimmed: Trimmed M for each k that was tried.
+        quality: M for each k that was tried (`perception.quality.cluster_quality`).
+        trimmed: Trimmed M for each k that was tried (`perception.quality.trimmed_quality`).
         labels: The view of each image for each k that was tried, (n,).
     """
 
@@ -44,7 +44,7 @@ class Tried:
 
     @property
     def runner_up(self) -> int | None:
-        """The number of views that may be better than the chosen one; None if there is none."""
+        """Another k whose views may make a better map; see `ViewClusterer.runner_up_`."""
         others = {k: worth for k, worth in self.trimmed.items() if k != self.k}
         if others and self.trimmed[self.k] < NEAR * max(others.values()):
             return smallest_good(others)

@@ -141,7 +141,7 @@ class ImageLikelihood:
     def _features(self, images: ArrayLike) -> NDArray[np.float64]:
         """Compute the features, (n, d), that the last estimator of the pipeline compares.
 
-        Raises PerceptionError for images that are no finite table or have another length.
+        Raises PerceptionError if the images are not a finite table or have another length.
         """
         try:
             table = np.asarray(equal_length(images), np.float64)

@@ -58,7 +58,7 @@ BLOCK = 2048
 # Quantiles of distances are estimated on at most this many images (32 MB of distances).
 SAMPLE = 2_000
 # If the median cluster has at least SEEN images, trimmed M ignores the width of clusters of at most
-# FEW images, because clusterers often put unlike strange images together.
+# FEW images, because clusterers often put two unusual images that differ into one cluster.
 SEEN, FEW = 6, 2
 # Number of pairs of images recomputed from differences at once; 12 MB for 180 ranges an image.
 GATHERED = 8192
@@ -129,8 +129,8 @@ def trimmed_quality(
     pair of images. Here, the gap between two clusters is the `trim`-quantile of the distances
     between their images, and the width of a cluster is the (1 - `trim`)-quantile of the distances
     within it. The result is the smallest gap divided by the largest width; larger is better. A
-    cluster of one image has no width. If most clusters are large, the width of a cluster of two
-    images is ignored.
+    cluster of one image has no width. If the median cluster has at least six images, the width of
+    clusters of two images is ignored, too.
 
     Args:
         X: (n, d) images, finite. If n > 2,000, only a fixed random sample of 2,000 is measured.
@@ -264,9 +264,9 @@ def _separation(images: Floats, clusters: Integers) -> float:
 class _Cells:
     """Images grouped into cells of near images, with a lower bound for each pair of cells.
 
-    The bound is on the squared distance between two images, one of each cell, that belong to
-    different components. Components only merge, so that smallest distance only grows. So a bound
-    stays valid in later rounds.
+    It is a lower bound of the squared distance between an image of one cell and an image of the
+    other, if they belong to different components. Components only merge. So fewer pairs count in
+    later rounds, and the bound stays valid.
     """
 
     def __init__(self, images: Floats) -> None:
@@ -341,7 +341,11 @@ class _ShortestEdges:
         self.ends = np.zeros((len(self.best), 2), np.intp)
 
     def improve(self, lower: Floats, slack: float, row: int, column: int) -> None:
-        """Search a block of pairs for shorter edges, by lower bounds of their squared distances."""
+        """Search a block of pairs for shorter edges.
+
+        `lower` has lower bounds of the squared distances of the pairs. The first pair of the block
+        is (`row`, `column`).
+        """
         components, least = self.components[row : row + len(lower)], lower.min(axis=1)
         hot = np.flatnonzero(least < self.best[components])
         if not len(hot):
@@ -443,7 +447,10 @@ def _rounding(beams: int, dtype: type[np.floating[Any]], reach: float) -> float:
 
 
 def _numbered(labels: ArrayLike, count: int | None = None) -> Integers:
-    """Number the labels 0, 1, …; raise unless they are a row, of `count` labels if given."""
+    """Number the labels 0, 1, ….
+
+    Raises PerceptionError unless the labels are a row, of length `count` if that is given.
+    """
     of = np.asarray(labels)
     if of.ndim != 1 or not len(of) or (count is not None and len(of) != count):
         raise PerceptionError(

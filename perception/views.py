@@ -60,9 +60,8 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
     A view is a cluster of images that look alike. If k is not given, the k in [k_min, k_max] with
     the largest M is chosen (`perception.quality`; eq. 5 of the paper); ties go to the smallest k. M
     depends on two distances only, so a single lost beam can change it. Each k therefore also has a
-    trimmed M, which uses quantiles. If trimmed M prefers another k, or likes it nearly as well,
-    that k is the runner-up. Its views may make a better map. If all images are equal, there is one
-    view, and an ImageWarning.
+    trimmed M, which uses quantiles. Another k with a large trimmed M may make a better map; see
+    `runner_up_`. If all images are equal, there is one view, and an ImageWarning.
 
     Args:
         k: Number of views; None chooses it by M.
@@ -80,7 +79,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         trim: Share of distances that trimmed M ignores at each end, in [0, 0.5].
         isolated: A factor greater than 1. An image is isolated if the distance to its third nearest
             neighbour exceeds this factor times the median of these distances. So up to three images
-            of one strange thing are isolated if most views were seen more often. None isolates no
+            of one unusual object are isolated if most views have more images. None isolates no
             image.
 
     Attributes:
@@ -225,11 +224,11 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
 
     @property
     def runner_up_(self) -> int | None:
-        """Another k whose views may make a better map.
+        """Another k whose views may make a better map; None if there is none.
 
-        If trimmed M of k_ is below 1.5 times the largest of the other k, it is the smallest other k
-        that is at least 0.95 times as good as the best of these. Otherwise it is the larger k with
-        the largest trimmed M, if that is at least 2.3. Otherwise it is None.
+        Let T be the largest trimmed M of the other k. If the trimmed M of k_ is below 1.5 T, the
+        runner-up is the smallest other k with a trimmed M of at least 0.95 T. Otherwise it is the k
+        above k_ with the largest trimmed M, if that is at least 2.3.
         """
         return self.tried_.runner_up
 

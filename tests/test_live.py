@@ -78,7 +78,7 @@ def test_a_pipe_shows_at_its_end_where_lanes_part(
     given(monkeypatch, (tmp_path / "lanes.log").read_bytes())
     assert main(["import", "-", "-o", str(tmp_path / "live.jsonl")]) == 0
     *shown, last, _ = capsys.readouterr().out.splitlines()
-    assert last == "at the end of the drive: 2 more visits where stretches of it lead apart"
+    assert last == "at the end of the drive: 2 more visits where stretches of it diverge"
     visits = import_log(read_log(tmp_path / "lanes.log")).visits
     assert len(visits) == len(shown) + 2
     assert sum(math.dist(visit.middle, (12, 0.4)) < 1.0 for visit in visits) == 2

@@ -1,4 +1,4 @@
-"""Where stretches of a drive that ran together lead apart, each pass has a visit."""
+"""Where stretches of a drive that ran together diverge, each pass has a visit."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ class VisitMatch:
     Attributes:
         first: Index of the earlier visit.
         last: Index of the later visit.
-        match: How the later middle lies relative to the earlier one.
+        match: How the middle of the later place lies relative to that of the earlier one.
     """
 
     first: int
@@ -60,11 +60,11 @@ def find_closures(
 ) -> list[VisitMatch]:
     """Find the closures between the visits of a log.
 
-    Each visit is matched with at most MATCHES earlier ones, so the time grows with the number
-    of visits, not with its square. They are the nearest ones by the track, in which each
-    closure that was found corrects the poses after it. `patches` has the local map of each
-    visit. Two visits are matched if there are at least `apart` metres of way between them, so
-    that their local maps share no scans.
+    Each visit is matched with at most MATCHES earlier ones, so the time grows with the number of
+    visits, not with its square. These are the nearest ones by the track. Each closure that is found
+    corrects the later positions for this choice. `patches` has the local map of each visit. Two
+    visits are matched if the robot drove at least `apart` metres between them, so that their local
+    maps share no scans.
     """
 
     @lru_cache(SCENES)
@@ -107,12 +107,12 @@ def is_reliable(found: Match) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _Gate:
-    """What the track says about how one visit lies relative to an earlier one.
+    """The relative poses that the track allows for two visits.
 
     Attributes:
         poses: (d, 3) x, y and rotation of the later visit, by the axes of the earlier one, for each
             drift of the heading.
-        covariance: (3, 3), inflated.
+        covariance: (3, 3) covariance by the track, times INFLATED.
     """
 
     poses: Array
@@ -214,7 +214,7 @@ def seen_from(first: Array, last: Array) -> Array:
 
 
 def errors_of(poses: Array, matches: Array) -> Array:
-    """Subtract the poses that matches give from other poses: (..., 3) metres and radians."""
+    """Subtract poses by matches from poses by the track: (..., 3) metres and radians."""
     off = poses - matches
     off[..., 2] = (off[..., 2] + math.pi) % math.tau - math.pi
     return off

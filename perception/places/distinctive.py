@@ -1,9 +1,11 @@
 """Finds the distinctive places that a robot passes: junctions, turning points, and the two ends.
 
 Milestones are scans a metre apart on the trajectory. The local map of each milestone has a
-skeleton with junctions. Junctions near each other at successive milestones are one chain. If the
-robot drives through the disc of a chain, and half of the local maps nearby show its junction, then
-this is a visit. The robot comes and leaves where its trajectory crosses the disc.
+skeleton with junctions. Junctions near each other at successive milestones form a chain. A junction
+has a disc, which reaches to the nearest obstacle. The disc of a chain has the median middle and the
+median radius of its junctions. If the robot drives through this disc, and half of the local maps
+nearby show the junction, this is a visit. The robot comes and leaves where its trajectory crosses
+the disc.
 
 Visits are found while the robot drives. A visit is final when the robot is at most DELAY metres
 beyond its last scan. Only the last scans, the open chains and the visits that are not final yet are
@@ -128,7 +130,7 @@ class _Detector:
 
     @property
     def _horizon(self) -> int:
-        """No visit will be found whose first scan is before this one."""
+        """The earliest scan at which a visit that is not found yet can begin."""
         last = self._recent.way(self._milestones[self._seen - self._first - 1])
         first = min([last, *(chain.sightings[0].way for chain in self._open)])
         return self._recent.at(first - GAP * EVERY)

@@ -131,16 +131,16 @@ def import_live(
 ) -> tuple[RobotLog, Imported]:
     """Import a log as a trace while it is read or recorded.
 
-    Memory hardly grows: each scan leaves about 400 bytes, and each visit its local map. The trace
-    is that of `import_log` if the odometry is good. Unlike there, each step of the odometer is
-    judged by those before it only.
+    Memory hardly grows: each scan leaves about 400 bytes, and each visit its local map. If the
+    odometry is good, the trace is that of `import_log`. They can differ because each step of the
+    odometer is judged by earlier steps only.
 
     Args:
         items: The scans with odometry, in order, for example those of `stream_log` or `live_log`.
         width: Width of the robot in metres.
         tell: Takes each note on suspicious scans and odometry as soon as it is known.
-        show: Takes each visit when it is final, except those where stretches of the drive lead
-            apart (`partings`).
+        show: Takes each visit when it is final, except those where stretches of the drive diverge
+            (`partings`).
         source: Name of the log, for errors.
 
     Returns:
@@ -162,7 +162,7 @@ def import_live(
 
 
 def _refuse_bad(log: RobotLog, track: Track, notes: Sequence[str]) -> None:
-    """Raise a LogError if the track shows no drive. The notes, which may say why, go with it."""
+    """Raise a LogError if the track shows no drive. It carries the notes, which may say why."""
     if len(track.breaks) > MOST_BREAKS * len(log):
         raise _noted(
             f"{named(log.source)}: expected a log of one drive, got {len(log)} scans of which "
@@ -219,12 +219,11 @@ def stream_visits(
 
     A visit is final, and yielded, when the robot is at most 125 m of trajectory beyond the last
     scan of the stay, if scans are at most 0.5 m apart. Usually this is after 30 to 40 m. At the end
-    of the scans, the other visits follow. The first 100 scans with a motion wait until the units of
-    the odometry are recognised.
+    of the scans, the other visits follow. No visit is yielded before the units of the odometry are
+    recognised, which takes about 100 scans of a moving robot.
 
-    The visits are those of `import_log` if the odometry is good. Unlike there, a jump of the
-    odometer is judged by the steps before it only, and visits where stretches of the drive lead
-    apart are missing (`partings`).
+    If the odometry is good, the visits are those of `import_log`, without those where stretches of
+    the drive diverge (`partings`). A jump of the odometer is judged by earlier steps only.
 
     Args:
         scans: The scans with odometry, in order, for example those of `stream_log`. Damaged parts
@@ -276,7 +275,7 @@ def tracked(
 
 
 def _noted(message: str, notes: Sequence[str]) -> LogError:
-    """Make an error with notes. They are no part of its text, as they were told already."""
+    """Make an error with notes. Its text leaves them out, as the user has already seen them."""
     error = LogError(message)
     for note in notes:
         error.add_note(note)

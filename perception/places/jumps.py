@@ -195,7 +195,7 @@ def describe_cuts(log: RobotLog, track: Track, turned: list[tuple[int, float]]) 
 
 
 def _gaps(log: RobotLog, track: Track) -> list[int]:
-    """Find the scans behind a long step that match nothing, though the odometry is trusted."""
+    """Find the scans after a long step that match nothing, though the odometry is trusted."""
     far = _far(log, 1) if len(log) > 1 else np.zeros(0)
     return [
         i
@@ -216,7 +216,7 @@ def _where(log: RobotLog, number: int) -> str:
 
 
 class Doubt(Enum):
-    """How far the odometry of a step can be trusted. The values explain it."""
+    """How far the odometry of a step can be trusted. The value of each member explains it."""
 
     NONE = "as usual"
     SEAM = "a drive seems to begin: the step is unknown unless the scan matches at its end"

@@ -1,11 +1,11 @@
 """Imports a log while it is read or recorded.
 
-The scans pass through one at a time. What stays of them is the track, the visits with their local
-maps, and about 400 bytes a scan for the checks at the end.
+The scans are processed one at a time. Only the track, the visits with their local maps, and about
+400 bytes a scan for the checks at the end are kept.
 
-The first scans wait until the units of the odometry are recognised. Then the scans are checked as
-those of a whole log are. The checks see stretches of 1,600 scans. Each stretch is checked four
-times: when it has 200, 400, 800 and 1,600 scans.
+The first scans wait until the units of the odometry are recognised. Then the scans get the checks
+of a whole log, but in stretches of 1,600 scans. Each stretch is checked four times: when it has
+200, 400, 800 and 1,600 scans.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class LiveLog:
         return visits_of(self._followed(), self._width)
 
     def result(self) -> tuple[RobotLog, Track, tuple[str, ...]]:
-        """Return the log, its track and notes when all visits were yielded.
+        """Return the log, its track and notes. Call this after `visits` has yielded all visits.
 
         Hardly any scan has ranges. Raises LogError if there is no scan.
         """
@@ -202,7 +202,7 @@ class Teller:
         self._kinds: set[str] = set()
 
     def __call__(self, notes: Iterable[str]) -> None:
-        """Tell the notes that differ from those before in more than numbers."""
+        """Tell each note, unless an earlier note begins with the same words up to a number."""
         for note in notes:
             kind = re.split(r"\d", note)[0]
             if kind not in self._kinds:

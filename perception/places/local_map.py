@@ -97,7 +97,7 @@ class BeamCells:
 
     Args:
         recent: The scans with their poses.
-        reach: Metres of trajectory, on both sides of a scan, that share one grid.
+        reach: Metres of trajectory before and after a scan whose scans share one grid.
     """
 
     def __init__(self, recent: Recent, reach: float) -> None:

@@ -1,4 +1,4 @@
-"""Checks whether a log is one drive in order, with odometry in metres and radians that fits it.
+"""Checks whether a log is one drive in order, with usable odometry in metres and radians.
 
 The thresholds were measured on ten recorded logs and ten simulated drives. No good log reaches any
 of them (docs/measurements/robustness.md). Each check says what is wrong and what to do.
@@ -101,9 +101,9 @@ def checked(log: RobotLog) -> tuple[RobotLog, list[str], list[str]]:
 def describe_drive(log: RobotLog, begin: int = 0, unseen: bool | None = None) -> list[str]:
     """Describe a log that is reversed, has several drives, or has scans far apart.
 
-    Only the odometry, the clock and the laser are looked at, so that this can be said at once.
-    `begin` is the number of the first scan. `unseen` says whether the robot moves while its
-    odometer stands still; None if the ranges of the scans show it.
+    If `unseen` is given, the ranges of the scans are not read. It says whether the robot moves
+    while its odometer stands still; None finds it from the ranges. `begin` is the number of the
+    first scan.
     """
     return [
         *_about_order(log),

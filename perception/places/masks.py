@@ -26,7 +26,7 @@ def shrunk(mask: Bools, outside: bool = False) -> Bools:
 
 
 def near(mask: Bools, far: float, cell: float) -> Bools:
-    """Find the cells within `far` metres of a cell, `cell` metres wide, of a mask."""
+    """Find the cells within `far` metres of a cell of a mask. Cells are `cell` metres wide."""
     if not mask.any():
         return np.zeros_like(mask)
     return np.asarray(ndimage.distance_transform_edt(~mask) * cell < far)

@@ -140,7 +140,7 @@ class Scene:
     def mutual(self, other: Scene, turn: float, shift: Array) -> float:
         """The area that both scenes observed, as a share of the smaller one.
 
-        The other one is rotated by radians, and its middle shifted by (x, y) in metres.
+        The other one is rotated by `turn` radians, and its middle is shifted by `shift` metres.
         """
         here = (np.argwhere(self._observed) - len(self._observed) // 2) * CELL - self._shift
         there = points_turned(-turn, here - shift)
@@ -210,8 +210,8 @@ def _spread_out(at: Array) -> Array:
 def match(first: Scene, second: Turned) -> Match | None:
     """Find the rotation and shift with which the maps of two places agree best.
 
-    None if the maps agree nowhere, or agree as well with quite other shifts. The second place
-    is given in the rotations to try.
+    Returns None if the maps agree nowhere, or agree equally well at very different shifts. The
+    second place is given in the rotations to try.
     """
     scene = second.scene
     least = OVERLAP * (len(first.walls) + len(scene.walls))

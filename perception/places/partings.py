@@ -1,12 +1,12 @@
-"""Finds the places where two stretches of a drive that ran together lead apart.
+"""Finds partings: places where two stretches of a drive that ran together diverge.
 
-A robot changes its lane in a wide corridor, or leaves a hall at one side. No junction of a skeleton
-is there, but the robot decided something. The drive shows it: closures say how stretches of the
-drive lie relative to each other. Where two stretches lead apart and no place is near, there is a
-place. Each stretch that passes it has a visit.
+In a wide corridor a robot changes its lane, or it leaves a hall at one side. The skeleton has no
+junction there, but the robot made a choice. Closures say how stretches of the drive lie relative to
+each other, so they show where two stretches diverge. If no known place is near, there is a new
+place. Each stretch that passes it gets a visit.
 
-The relations also show visits whose middles are nearly the same. The junction in their local maps
-was found at slightly different points. They get one middle, so that they are to one place.
+Closures also show visits whose middles are nearly the same. Their local maps show one junction at
+slightly different points. So they get one middle, and are visits to one place.
 
 The second stretch may come long after the first one. So these visits are found when a drive ends.
 """
@@ -31,8 +31,8 @@ from perception.places.visits import Visit, Way
 # A stretch reaches REACH metres of trajectory to both sides of a visit. Its points are PACE metres
 # apart.
 REACH, PACE = 12.0, 0.25
-# Two stretches run together if they are within BESIDE metres for TOGETHER metres. Then they lead
-# apart if each is more than APART metres from the other one within AHEAD metres.
+# Two stretches run together if they are within BESIDE metres for TOGETHER metres. Then they diverge
+# if each is more than APART metres from the other one within AHEAD metres.
 BESIDE, TOGETHER, APART, AHEAD = 1.0, 2.0, 2.0, 4.0
 # A parting within NEAR metres of the middle of a visit, or within BEYOND metres of its disc, is at
 # the place of the visit. Partings within ONE metres are one. Points within PASS metres of the
@@ -55,7 +55,7 @@ _Pass = tuple[float, Array]
 def with_partings(
     track: Track, visits: Sequence[Visit], closings: Sequence[VisitMatch]
 ) -> tuple[tuple[Visit, ...], list[VisitMatch]]:
-    """Add a visit for each pass of a place where stretches of a drive lead apart.
+    """Add a visit for each pass of a place where stretches of a drive diverge.
 
     Visits whose middles are nearly the same get the same middle. An added visit has the local
     map of the nearest other one. Return all visits, in order, and the closures between their
@@ -84,7 +84,7 @@ class _Alignment:
     Attributes:
         first: Metres driven up to the earlier visit.
         last: Metres driven up to the later visit.
-        turn: Rotation from the axes there to the axes at the earlier visit, in radians.
+        turn: Rotation from the axes at the later visit to those at the earlier one, in radians.
         here: (x, y) of a point by the earlier visit, in metres.
         there: (x, y) of the same point by the later visit.
     """
@@ -151,7 +151,7 @@ class _DrivePoints:
             yield (ours[a] * PACE, middle), (theirs[b] * PACE, one.reverse.moved(middle))
 
     def is_near(self, some: _Pass) -> bool:
-        """Whether some visit is near enough to a pass to be to the same place."""
+        """Whether a visit is so near to a pass that it is at the same place."""
         soon = np.abs(self.ways - some[0]) <= PASS
         return bool((soon & (np.hypot(*(self.middles - some[1]).T) <= self._reaches)).any())
 
@@ -207,7 +207,7 @@ def _added(drive: _DrivePoints, closings: Sequence[VisitMatch]) -> list[_Pass]:
 
 
 def _agreed(drive: _DrivePoints, relations: Sequence[_Alignment]) -> Array:
-    """Compute shifts of visits, (v, 2) metres, so that discs with nearly one middle share it."""
+    """Compute how to move the middles of visits, (v, 2) metres, so that near middles coincide."""
     links = _links(drive, relations)
     moves, done = np.zeros_like(drive.middles), set[int]()
     for root in range(len(drive.middles)):
@@ -235,9 +235,10 @@ def _agreed(drive: _DrivePoints, relations: Sequence[_Alignment]) -> Array:
 def _links(
     drive: _DrivePoints, relations: Sequence[_Alignment]
 ) -> dict[int, list[tuple[int, float, Array]]]:
-    """For each visit, list the visits with nearly the same middle, and how they lie relative to it.
+    """For each visit, list the visits with nearly the same middle, and their relative poses.
 
-    The rotation from its axes is in radians, and the middle in metres.
+    Such a pose is the rotation from the axes of the other visit in radians, and its middle
+    relative to that of the first one in metres.
     """
     links: dict[int, list[tuple[int, float, Array]]] = defaultdict(list)
     for one in relations:
@@ -254,7 +255,7 @@ def _links(
 
 
 def _moved(visit: Visit, move: Array) -> Visit:
-    """Move the middle of the place of a visit. Its ways cross the rim of the disc as before."""
+    """Move the middle of the place of a visit, and keep the points where its ways cross the rim."""
     if not move.any():
         return visit
     rim = visit.radius + BEYOND
@@ -266,14 +267,14 @@ def _moved(visit: Visit, move: Array) -> Visit:
 
 
 def _change(one: VisitMatch, moves: Array) -> Array:
-    """How the shift of a closure changes if the middles of its visits move."""
+    """Compute how the shift of a closure changes if the middles of its visits move by `moves`."""
     return np.asarray(points_turned(one.match.turn, moves[one.last]) - moves[one.first])
 
 
 def _passes(
     drive: _DrivePoints, pair: tuple[_Pass, _Pass], relations: Sequence[_Alignment]
 ) -> list[_Pass]:
-    """List all passes of a parting: two of the pair, and those that relations find elsewhere."""
+    """List all passes of a parting: the given pair, and those of stretches that relations align."""
     place = list(pair)
     for way, middle in place:  # The list grows.
         for one in (some for relation in relations for some in (relation, relation.reverse)):
@@ -294,7 +295,7 @@ def _is_known(some: _Pass, known: Sequence[_Pass]) -> bool:
 
 
 def lead_apart(far: Array) -> Iterator[tuple[int, int]]:
-    """Yield the points after which two stretches that ran together lead apart, in each.
+    """Yield where two stretches that ran together diverge: the index of the point in each.
 
     `far` has the distance of each point of one from each of the other, (n, m) metres.
     """
@@ -303,7 +304,7 @@ def lead_apart(far: Array) -> Iterator[tuple[int, int]]:
 
 
 def _ahead(far: Array) -> Iterator[tuple[int, int]]:
-    """Find where stretches lead apart, as `lead_apart` does, in the first stretch's direction."""
+    """Do what `lead_apart` does, but only in the direction of the first stretch."""
     back, ahead = round(TOGETHER / PACE), round(AHEAD / PACE)
     ours, theirs = far.min(axis=1), far.min(axis=0)
     ends = np.flatnonzero((ours[:-1] <= BESIDE) & (ours[1:] > BESIDE))

@@ -63,9 +63,10 @@ class Recent:
         return float(self._rows[max(index, self.begin) - self._base, 3])
 
     def at(self, way: float, side: Literal["left", "right"] = "left") -> int:
-        """Find the first kept scan at which the robot has driven `way` metres, or the end.
+        """Find the first kept scan at which the robot has driven `way` metres.
 
-        With "left", it has driven at least so far; with "right", farther.
+        "left" finds the first scan at which it has driven at least `way`, "right" the first at
+        which it has driven farther. If there is none, the result is the index after the last scan.
         """
         ways = self._rows[self.begin - self._base : len(self._scans), 3]
         return self.begin + int(np.searchsorted(ways, way, side=side))

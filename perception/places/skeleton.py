@@ -3,11 +3,13 @@
 The skeleton is the set of the points that are as far as possible from all obstacles around them. It
 has a junction where ways part. A junction has a disc, which reaches to the nearest obstacle, and a
 branch for each way. A way into a niche has a branch, too. So a branch that ends soon after it
-leaves the disc is removed. Junctions whose discs hold each other's middle are one.
+leaves the disc is removed. Two junctions are merged if one is in the disc of the other, and the
+space between them is not narrow.
 
-In a hall, ways part in front of its doors, and not only in its middle. So the skeleton is also
-extended: around an open space it follows the walls at a fixed distance. Each way into the open
-space has a junction with this shore. A bend of a line counts as a junction of two ways.
+In a hall, ways part in front of its doors, and not only in its middle. So the skeleton gets a shore
+around each open space: a line that follows the walls at a fixed distance. Each way into the open
+space has a junction with the shore, called a mouth. A bend of a line counts as a junction of two
+ways.
 
 References:
     Thrun 1998, "Learning metric-topological maps for indoor mobile robot navigation".
@@ -103,9 +105,9 @@ def junctions(patch: Patch, room: float) -> list[Junction]:
 
 
 def _with_mouths(found: list[Fork], mouths: list[Fork], far: float) -> list[Fork]:
-    """Combine the junctions of a skeleton without shores and with shores.
+    """Combine the junctions `found` without shores with the `mouths`, which are those with shores.
 
-    Those with shores are taken. A junction amid an open space, far from all of these, is kept.
+    All mouths are kept. Of the others, those amid an open space are kept, if no mouth is near.
     """
     # The disc of a junction amid an open space is as large as those of the mouths around it.
     amid = [
@@ -211,9 +213,10 @@ def junctions_merged(graph: Graph, distance: Array) -> list[Fork]:
 def _are_one(
     edge: Edge, heads: tuple[int, int], nodes: Mapping[int, Node], distance: Array
 ) -> bool:
-    """Check whether the junctions of an edge are in one open space.
+    """Check whether the junctions at the ends of an edge are in one open space.
 
-    `heads` has, for each end, the junction with the largest disc of those merged with that end.
+    Each end may be merged with other junctions already. `heads` has the largest junction of each
+    end's group.
     """
     first, second = (nodes[node] for node in heads)
     rows, columns = np.rint(edge.cells).astype(int).T
@@ -255,7 +258,8 @@ def bends(graph: Graph, distance: Array, out: float) -> Iterator[Bend]:
 def _bends_of(edge: Edge, first: float, last: float, distance: Array, out: float) -> Iterator[Bend]:
     """Find the bends of one line, the sharpest first. See `bends`.
 
-    The discs of its nodes hold its `first` and `last` cells, by length.
+    The line is within the disc of its first node for a length of `first` cells, and within that of
+    its last node for a length of `last` cells.
     """
     cells = edge.cells
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(cells, axis=0).T))])
@@ -272,8 +276,8 @@ def _bends_of(edge: Edge, first: float, last: float, distance: Array, out: float
 def _turns(cells: Array, along: Array, radii: Array, out: float) -> Array:
     """Compute by how many radians a line of cells, (n, 2), turns at each of them, (n,).
 
-    `along` is the length up to each cell, `radii` has the discs, and directions are measured `out`
-    cells outside these.
+    `along` is the length up to each cell, and `radii` has the radius of the disc of each cell.
+    Directions are measured `out` cells outside the disc.
     """
 
     def at(where: Array) -> Array:

@@ -2,8 +2,8 @@
 
 A drive begins and ends in dead ends of its trajectory. So both are turning points, too.
 
-Visits pass through in order while the robot drives. No visit waits for more than a bounded number
-of metres.
+Visits are completed in order while the robot drives. Each visit is final after a bounded number of
+metres.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ STRIDES, REVERSED = (1.0, 2.0, 4.0), math.radians(135)
 # END metres of trajectory.
 END = 2.0
 # A turn waits for visits up to NEARBY metres of trajectory away. No stride is longer, and discs are
-# taken to be no larger. Turns near each other wait for each other up to TURNING metres.
+# assumed to be no larger. Turns near each other wait for each other up to TURNING metres.
 NEARBY, TURNING = 4.0, 8.0
 # A robot that comes back within STAY metres after it left a disc, and visited no other place, did
 # not leave the place.
@@ -119,10 +119,10 @@ class Stays:
             self._passing = replace(visit, begin=min(visit.begin, last.begin))
 
     def _may_overlap(self, last: Visit, scan: int, begin: int | None = None) -> bool:
-        """Whether a visit may overlap with the visit before it.
+        """Whether a visit may overlap with `last`, the visit before it.
 
-        `scan` is nearest to its middle, and `begin` its first one, or the earliest that they may
-        be.
+        `scan` is the scan of the visit nearest to its middle, and `begin` its first scan. If the
+        visit is not known yet, `scan` is the earliest possible first scan, and `begin` is None.
         """
         soon = self._recent.way(scan) <= self._recent.way(last.scan) + STAY
         return soon and (scan if begin is None else begin) <= last.end + 2

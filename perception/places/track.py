@@ -48,9 +48,9 @@ class Track:
 
     @cached_property
     def spreads(self) -> Array:
-        """The sums of the covariances up to each scan: (n, 3, 3).
+        """The sums of the covariances of all increments up to each scan: (n, 3, 3).
 
-        They are covariances of the origin of the frame, moved by the errors of all increments.
+        The covariance of each increment is first expressed as an error at the origin of the frame.
         """
         cos, sin = np.cos(self.poses[:-1, 2]), np.sin(self.poses[:-1, 2])
         arms = np.zeros((len(self.poses), 3, 3))
@@ -107,7 +107,7 @@ class Trust:
     """Standard deviations of the errors of an odometer from one scan to the next.
 
     Attributes:
-        way: Error along the motion, as a share of its length; half of that across.
+        way: Error along the motion, as a share of its length. The error across is half of it.
         offset: Additional error of the position, in metres.
         turning: Error of the heading, as a share of the turn.
         drift: Error of the heading for each metre, in radians.

@@ -203,8 +203,8 @@ def _live(options: argparse.Namespace, tell: Callable[[str], None]) -> tuple[Rob
     log, done = import_live(items, options.width or WIDTH, None, tell, show, "-")
     if more := len(done.visits) - next(numbers):
         print(
-            f"at the end of the drive: {counted(more, 'more visits')} where stretches of it lead "
-            "apart",
+            f"at the end of the drive: {counted(more, 'more visits')} where stretches of it "
+            "diverge",
             file=sys.stderr if options.output == "-" else sys.stdout,
         )
     for warning in log.warnings:
