@@ -375,3 +375,21 @@ def test_each_map_is_listed_once() -> None:
     solution = solve(trace, Theory.topological().replace(star="none", boundary="none"))
     assert solution.status is Status.OPTIMAL
     assert 1 < len(solution.maps) == len(set(solution.maps))
+
+
+def test_maps_of_one_cost_are_minimal_whatever_their_paths(tmp_path: Path) -> None:
+    """Two drives share a corner of a square, but nothing says which. Paths cost nothing."""
+    square = [(10, 0, 0), (0, 0, math.pi / 2)] * 4
+    first = Trace.from_steps("abababa", ["travel", "left"] * 3, displacements=square[:6], name="k")
+    other = Trace.from_steps("bababab", ["left", "travel"] * 3, displacements=square[1:7], name="l")
+    solution = solve([first, other])
+    assert {cost.paths for cost in solution.costs} == {3, 4}
+    assert solution.minimal_maps == solution.maps
+    assert solution.headline.endswith("4 maps of least cost")
+    assert solution.backbone is not None
+    assert solution.backbone.dstates.one_in(0, 8) == "some"
+    solution.save(tmp_path / "maps.json")
+    assert Solution.load(tmp_path / "maps.json").headline == solution.headline
+    wider = solve([first, other], within=20)
+    assert wider.minimal_maps == solution.maps
+    assert wider.count > solution.count

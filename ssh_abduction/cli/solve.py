@@ -131,7 +131,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_setting(
         "within K",
         "also list maps with up to K dstates more than the minimum; for each number of "
-        "dstates, only the best maps (default: 0)",
+        "dstates, only the best maps (default: 0). With displacements, K is in nats",
         default=0,
         type=int,
     )

@@ -38,12 +38,11 @@ class Answer:
 
         Args:
             ssh_map: The map.
-            cost: The preferred counts of the map, the most important one first.
+            cost: The preferred counts of the map, the most important one first (`Priced`).
         """
-        theory = self._parts.task.theory
+        if self._last is None or self._last[1] != cost:
+            self._levels.append(Level(cost_as_counted(ssh_map, cost, self._parts.task.theory), 0))
         self._first, self._last = self._first or ssh_map, (ssh_map, cost)
-        if not self._levels or self._levels[-1].cost.preferred_by(theory) != cost:
-            self._levels.append(Level(cost_as_counted(ssh_map, cost, theory), 0))
         self._levels[-1] = replace(self._levels[-1], count=self._levels[-1].count + 1)
 
     def count_apart(self) -> None:

@@ -70,7 +70,8 @@ def solve(
             `complete` only if this proves that no further map exists.
         within: Also list maps with up to this many dstates more than the minimum: for each number
             of dstates, the best maps with that number. If the theory prefers few paths or places
-            first, paths or places are counted instead.
+            first, paths or places are counted instead. If maps are compared by cost, all maps that
+            cost up to this many nats more.
         memory_limit: MiB of memory. The search stops when the process reaches this peak.
         speedups: The speed-ups that are on. None of them changes the answer.
         on_progress: A function that is called now and then with a `Progress`.

@@ -20,7 +20,7 @@ ONE_MORE_SHARE = 0.1
 _log = log_of(__name__)
 
 Priced: TypeAlias = tuple[SSHMap, tuple[int, ...]]
-"""A map and its preferred counts, the most important one first."""
+"""A map and its preferred counts, the most important one first; equal in all maps of a level."""
 
 
 def listed(parts: Parts, found: Iterator[Priced], *, keeps_time: bool) -> Iterator[Priced]:

@@ -76,13 +76,16 @@ def cost_as_counted(ssh_map: SSHMap, cost: tuple[int, ...], theory: Theory) -> C
     """Return the cost of a map, with the counts that the theory minimises taken from clingo.
 
     Without some axioms, a dstate may have several places or paths, but a map shows only one. Then
-    clingo counts more than the map shows.
+    clingo counts more than the map shows. If maps are compared by their cost in nats, those of one
+    cost may have different counts: then the map is counted.
 
     Args:
         ssh_map: The map.
         cost: The counts that clingo minimised, the most important one first.
         theory: The theory that minimises them.
     """
+    if theory.weigh == "cost":
+        return Cost.of(ssh_map)
     counted = {
         name: count for name, count in zip(theory.priorities, cost, strict=True) if name != "tenths"
     }

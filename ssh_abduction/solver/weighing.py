@@ -190,7 +190,11 @@ class Weighing:
             known.keep(Found.of(best, self._parts.task.theory), best.dstate_at)
 
     def maps(self) -> Generator[Priced, None, None]:
-        """Yield the maps of least cost, then maps that cost up to `within` nats more."""
+        """Yield the maps of least cost, then maps that cost up to `within` nats more.
+
+        All maps of least cost come with the counts of the best one, even if theirs differ. A map
+        that costs more comes with its own counts and its rank, so that it has a level of its own.
+        """
         parts, theory = self._parts, self._parts.task.theory
         complete = True
         listed: set[SSHMap] = set()  # Candidates with the same dstates and places list one another.
@@ -199,12 +203,12 @@ class Weighing:
             complete &= proven
             new = [ssh_map for ssh_map in maps if ssh_map not in listed]
             listed.update(new)
-            yield from ((ssh_map, Cost.of(ssh_map).preferred_by(theory)) for ssh_map in new)
+            yield from ((ssh_map, parts.known.cost) for ssh_map in new)
         parts.rivals.listed = complete
         most = self.candidates[0].nats + parts.limits.within if self.candidates else 0.0
-        for candidate in self.candidates[len(self.minimal()) :]:
+        for rank, candidate in enumerate(self.candidates[len(self.minimal()) :]):
             if candidate.nats <= most:
-                yield candidate.map, Cost.of(candidate.map).preferred_by(theory)
+                yield candidate.map, (*Cost.of(candidate.map).preferred_by(theory), rank)
 
     def _with_other_paths(self, ssh_map: SSHMap) -> tuple[tuple[SSHMap, ...], bool]:
         """List all maps that differ from a map only in their paths, and have as many paths.

@@ -47,7 +47,8 @@ def summary_of(solution: Solution, count: int, backbone: Backbone | None) -> str
             "" if backbone.proven else ", as far as is known: other maps may differ in more"
         )
     more = sum(level.count for level in solution.levels[1:])
-    text += f"; and {more} with up to {solution.within} more" if more else ""
+    unit = "nats " if solution.weighed else ""
+    text += f"; and {more} with up to {solution.within} {unit}more" if more else ""
     return text + (f"; {solution.weighed.sentence}" if solution.weighed else "")
 
 
