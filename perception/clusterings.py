@@ -91,7 +91,7 @@ def single(fitted: Any, images: NDArray[np.float64], trim: float) -> tuple[Any, 
 
 
 def smallest_good(worth: dict[int, float]) -> int:
-    """The smallest k whose trimmed M, its worth, is at least EQUAL times the largest."""
+    """The smallest k whose trimmed M (`worth`) is at least EQUAL times the largest."""
     return min(k for k in worth if not worth[k] < EQUAL * max(worth.values()))
 
 
@@ -105,9 +105,10 @@ def cluster_labels(fitted: Any, images: NDArray[np.float64]) -> NDArray[np.intp]
 def to_neighbour(
     images: NDArray[np.float64], among: NDArray[np.float64], itself: int
 ) -> NDArray[np.float64]:
-    """The distance from each image, (n, d), to its third nearest in (m, d), or the farthest: (n,).
+    """The distance from each image, (n, d), to its third nearest neighbour `among` (m, d): (n,).
 
-    `itself` is 1 if `among` contains the images themselves, otherwise 0.
+    With fewer neighbours it is the distance to the farthest one. `itself` is 1 if `among`
+    contains the images themselves, otherwise 0.
     """
     number = min(NEIGHBOURS + itself, len(among))
     distances, _ = (

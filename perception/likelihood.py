@@ -115,8 +115,8 @@ class ImageLikelihood:
     def ratios(self, images: ArrayLike) -> Iterator[NDArray[np.float64]]:
         """Compute how much likelier each image is at a known place than at an unknown one.
 
-        Yield for each image, as the recogniser takes it, (c,) ratios p(o|x) / p(o|nowhere),
-        from 0 to c + 1, for each of `classes`.
+        Yield for each image the ratios p(o|x) / p(o|nowhere), (c,), one for each of `classes`.
+        A ratio is between 0 and c + 1.
         """
         features = self._features(images)
         for some in np.array_split(features, max(1, math.ceil(len(features) / AT_ONCE))):

@@ -119,9 +119,9 @@ def save(model: Any, path: str | os.PathLike[str]) -> None:
 
 
 def written(model: Any, name: str = "recogniser") -> bytes:
-    """Make the content of the file, with this name, of a fitted estimator or pipeline.
+    """Make the content of a file that stores a fitted estimator or pipeline.
 
-    Raises PerceptionError if `load` would reject it.
+    Raises PerceptionError, with this name of the file, if `load` would reject it.
     """
     classes = np.asarray(getattr(model, "classes_", ())).tolist()
     versions = {

@@ -363,9 +363,9 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
 
 
 def as_view_clusterer(clusterer: Any) -> ViewClusterer:
-    """Wrap a scikit-learn clusterer, unless it is a ViewClusterer, in one. Raises PerceptionError.
+    """Wrap a scikit-learn clusterer in a ViewClusterer, unless it is one already.
 
-    Its k is the number of clusters that the clusterer is set to.
+    Its k is the number of clusters that the clusterer is set to. Raises PerceptionError.
     """
     if isinstance(clusterer, ViewClusterer):
         return clusterer

@@ -84,7 +84,7 @@ class Driver:
     recorder: Recorder | None = None
 
     def look(self, images: int = 1) -> Array:
-        """Take an image, (180,) metres from right to left: the median of some scans by beam."""
+        """Take an image, (180,) metres from right to left: the median of `images` scans."""
         scans = self.laser.scan(self.world, np.repeat([self.robot.pose], images, axis=0), self.rng)
         return np.median(scans, axis=0) if images > 1 else scans[0]
 

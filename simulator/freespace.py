@@ -185,8 +185,8 @@ class FreeRectangle:
     def nearest(self, region: int, goal: Point, room: float) -> Point:
         """Find the point (x, y) of a region, by its number, that is nearest to a goal.
 
-        It is `room` metres from walls, if the region has such points. Otherwise, points as
-        far from walls as possible are considered. Lengths are metres.
+        It is at least `room` metres from walls, if the region has such points. Otherwise, it is
+        as far from walls as possible.
         """
         cells = np.argwhere(self.regions == region)
         clearance = self.clearance[tuple(cells.T)]
@@ -222,9 +222,9 @@ def _shortest(
 ) -> Cells | None:
     """The cells, (n, 2) rows and columns, of the cheapest route between two cells, or None.
 
-    `clearance` has metres to the nearest occupied cell, (rows, columns), and `least` the
-    smallest ones of the route. Near start and goal, where the robot may be closer to obstacles
-    than planned, a cell need only not touch an occupied one.
+    `clearance` is the distance to the nearest occupied cell in metres, (rows, columns). A route
+    needs at least `least`. Near start and goal, where the robot may be closer to obstacles than
+    planned, it need only not touch an occupied cell.
     """
     rows, columns = clearance.shape
     free = clearance >= least

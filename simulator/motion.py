@@ -31,9 +31,9 @@ def reported(
 ) -> Displacement:
     """Add systematic errors and random noise to a displacement, as odometry reports it, rounded.
 
-    It has metres ahead and to the left, and radians turned. The noise is drawn with the
-    covariance of the odometry. `scale` is the share by which reported distances are too long,
-    and `bend` by how many radians a metre the reported heading drifts to the left.
+    A displacement is metres ahead and to the left, and radians turned. The noise is drawn with
+    the covariance of the odometry. Reported distances are too long by the share `scale`. The
+    reported heading drifts to the left by `bend` radians a metre.
     """
     dx, dy, turned = displacement
     drift = bend * math.hypot(dx, dy)

@@ -67,8 +67,8 @@ class Odometer:
     def as_noisy_as(self, along: float) -> Odometer:
         """Copy the odometer, with noise of the default proportions, scaled to a value of `along`.
 
-        That is the standard deviation along the motion after one metre, in metres, from 0
-        to 1, or SimulatorError is raised.
+        That is the standard deviation along the motion after one metre, in metres. Raises
+        SimulatorError if it is not from 0 to 1.
         """
         if not is_finite(along) or not 0 <= along <= WORST:
             raise SimulatorError(
@@ -113,7 +113,7 @@ class Odometer:
         return np.column_stack([x, y, np.remainder(heading + np.pi, 2 * np.pi) - np.pi])
 
     def covariances(self, readings: Array) -> Array:
-        """Estimate the covariances, (n, 3, 3), of the noise of readings, (n, 3), since the first.
+        """Estimate the covariances, (n, 3, 3), of readings, (n, 3), relative to the first one.
 
         The estimate is of first order. It does not include systematic errors, which a robot
         cannot know.

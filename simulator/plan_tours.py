@@ -155,9 +155,10 @@ class Floor:
         )
 
     def way_through(self, stand: Stand, goal: int) -> Iterator[tuple[Action, Stand]]:
-        """Yield the actions to the gateway `goal` of the room and through it, and their ends.
+        """Yield the actions that lead through the gateway `goal` of the room.
 
-        They are a turn, unless it is ahead, and a travel.
+        They are a turn, unless the gateway is ahead, and a travel. Each comes with the state
+        after it.
         """
         return _way_through(self.plan, stand, goal)
 

@@ -109,9 +109,9 @@ def streets_of(
 ) -> list[Street]:
     """Find the streets between walls, clockwise from straight behind, in different directions.
 
-    Of streets in about the same direction, the longest is taken. It must be free of points near
-    its midline. `reach` is half its width, and `farther` the smallest distance from the robot
-    to which it must reach, in metres.
+    Of streets in about the same direction, the longest is taken. A street has no points near
+    its midline. `reach` is half the width of a street. A street reaches at least to a distance
+    of `farther` metres from the robot.
     """
     found: list[Street] = []
     for street in sorted(
@@ -324,9 +324,9 @@ class Panorama:
 def compass(ranges: Array, image: Array, about: float, turned: float) -> float:
     """Find the heading at which an image agrees best with known ranges.
 
-    Ranges are (360,), or NaN, and the image (180,), in metres. All angles are radians. The
-    heading is expected `about` here. After a larger turn since the last known heading, `turned`
-    by odometry, more headings are tried, since the error of odometry is relative.
+    `ranges` has (360,) metres or NaN, and the image (180,) metres. Angles are radians. `about`
+    is the expected heading, and `turned` the turn by odometry since the last known heading. The
+    error of odometry is relative, so more headings are tried after a larger turn.
     """
     best = about
     for window, step in ((2 + OFF * math.degrees(abs(turned)), 0.5), (0.5, 0.05)):

@@ -85,7 +85,7 @@ class Clutter:
 
 
 def are_square(walls: Array) -> bool:
-    """Check whether nearly all walls, (n, 4), by length, have one of two square directions."""
+    """Check whether nearly all walls, (n, 4), by length, are parallel or perpendicular."""
     ways = (walls[:, 2] - walls[:, 0]) + 1j * (walls[:, 3] - walls[:, 1])
     lengths = np.abs(ways)
     directions = np.angle(ways) * 4  # Makes perpendicular directions equal.
@@ -219,7 +219,7 @@ class WorldReader:
         """Divide walls, (n, 4) metres, into pieces, and shift the ends of the pieces at random.
 
         The shifts are always the same, so that a world looks the same on each drive.
-        `value` is their standard deviation in metres; 0 changes nothing.
+        `value` is the standard deviation of the shifts in metres; 0 changes nothing.
         """
         if not is_finite(value) or not 0 <= value <= 1:
             raise self.wrong("ragged", "metres by which walls are uneven, 0 to 1", value)

@@ -135,9 +135,9 @@ def agreement(log: RobotLog, track: Track) -> Agreement:
 
 
 def disagreement(log: RobotLog, track: Track) -> str | None:
-    """Note how scan matching and odometry differ, likely causes, and the options that mend it.
+    """Describe how scan matching and odometry differ, likely causes, and options that correct it.
 
-    None if scans and odometry agree.
+    Returns None if scans and odometry agree.
     """
     found = agreement(log, track)
     covers = None if found.is_good else field_of_view(log)
@@ -191,9 +191,9 @@ def disagreement(log: RobotLog, track: Track) -> str | None:
 
 
 def laser_direction(log: RobotLog) -> float | None:
-    """Estimate the degrees to the left of ahead of the laser, if the log gives wrong ones.
+    """Estimate the direction of the laser, in degrees to the left of straight ahead.
 
-    None also if the scans do not show the direction, or if there are several lasers.
+    Returns None if the log is right, the scans do not show it, or there are several lasers.
     """
     angles = {scan.laser.mount[2] for scan in log.scans}
     apart = _apart(log, np.radians(TURNS)) if len(angles) == 1 else None
@@ -206,7 +206,7 @@ def laser_direction(log: RobotLog) -> float | None:
 
 
 def field_of_view(log: RobotLog) -> float | None:
-    """Estimate the degrees that the laser sees; None if the log, or no scan, shows it."""
+    """Estimate the field of view in degrees; None if the log is right or scans do not show it."""
     fov = _fov(log.scans[0])
     tried = [_apart(log, np.zeros(1), float(degrees) / fov) for degrees in FIELDS]
     now = _apart(log, np.zeros(1))

@@ -270,7 +270,7 @@ def _stays(far: Array, radius: float) -> Iterator[tuple[int, int]]:
     """Yield the first and last index of each stay in a disc.
 
     A stay ends where the robot is more than `LEFT` metres outside of the disc. `far` has the
-    (n,) distances of the robot from its middle, in metres, as is the radius.
+    distance of the robot from its middle at each scan, (n,) metres.
     """
     begin = None
     for i, distance in enumerate(far.tolist()):

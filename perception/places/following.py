@@ -273,7 +273,7 @@ def _carried(log: RobotLog, track: Track) -> list[int]:
 
 
 def turned_wrongly(log: RobotLog, track: Track) -> list[tuple[int, float]]:
-    """Yield scans that match well but whose turn differs from the odometry, by which radians."""
+    """List scans that match well but turned differently from the odometry, by how many radians."""
     found: list[tuple[int, float]] = []
     for i in range(1, len(log)):
         measured = displacement_between(log.scans[i - 1].odometry, log.scans[i].odometry)[2]

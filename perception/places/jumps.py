@@ -237,7 +237,7 @@ class LiveJumps:
         self._steps: deque[float] = deque(maxlen=LATELY)
 
     def __call__(self, scan: int, onward: Pose) -> Doubt:
-        """Judge the step to a scan, by its index, with a motion in metres and radians."""
+        """Judge the step to the scan with this index, from its motion in metres and radians."""
         far = math.hypot(*onward[:2])
         usual = float(np.median(self._steps)) if self._steps else 0.0
         least = max(FAR, UNUSUAL * usual)

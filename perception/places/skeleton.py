@@ -119,9 +119,9 @@ def _with_mouths(found: list[Fork], mouths: list[Fork], far: float) -> list[Fork
 
 
 def open_space(distance: Array, far: float) -> Bools:
-    """Find the cells inside the shores of open spaces, which are `far` cells from obstacles.
+    """Find the cells inside the shores of open spaces. Shores are `far` cells from obstacles.
 
-    `distance` has that of each cell to the nearest obstacle in cells, (rows, columns).
+    `distance` is from each cell to the nearest obstacle, in cells, (rows, columns).
     """
     if distance.max() < WIDE * far:
         return np.zeros(distance.shape, np.bool_)
@@ -139,7 +139,10 @@ def with_shores(lines: Bools, inner: Bools) -> Bools:
 
 
 def passable(patch: Patch, room: float) -> Bools:
-    """Find the cells that the robot's middle can reach, `room` metres wide, without furniture."""
+    """Find the cells that the middle of a robot of `room` metres radius can reach.
+
+    Furniture does not count as an obstacle.
+    """
     trail = grown(patch.trail)
     fits = (patch.free & ~near(patch.occupied, room, CELL)) | trail
     fits = grown(shrunk(fits)) | trail
@@ -189,8 +192,8 @@ def _out(edge: Edge, nodes: Mapping[int, Node], degrees: Mapping[int, int]) -> f
 def junctions_merged(graph: Graph, distance: Array) -> list[Fork]:
     """Merge junctions in one open space, and give each its branches: (n, 2) rows and columns.
 
-    The radius of a merged junction is that of its largest disc. `distance` has that of each
-    cell to the nearest obstacle in cells, (rows, columns).
+    The radius of a merged junction is that of its largest disc. `distance` is from each cell to
+    the nearest obstacle, in cells, (rows, columns).
     """
     degrees = graph.degrees
     head = {node: node for node in graph.nodes if degrees[node] > 2}

@@ -88,9 +88,9 @@ def to_trace(
 
 
 def closure_of(found: VisitMatch, arrivals: Sequence[tuple[int, float]]) -> Closure:
-    """Make a closure between the first steps of two visits from how the visits lie.
+    """Make a closure between the first steps of two visits from the match of the visits.
 
-    Each arrival has the first step, and its heading in radians.
+    `arrivals` has the first step of each visit, and its heading in radians.
     """
     (first, heading), (last, other) = arrivals[found.first], arrivals[found.last]
     x, y, turn = relative(found, heading, other)

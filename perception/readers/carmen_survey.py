@@ -318,10 +318,10 @@ def mount_in_log(found: Findings, survey: Survey, meaning: Meaning, kind: str) -
 
 
 def reach_of(found: Findings, survey: Survey, kind: str, assumed: dict[str, str]) -> float:
-    """Find the range in metres from which nothing came back.
+    """Find the reach of the laser in metres. A range of at least this means no return.
 
     It is infinite if each line with a scan gives its own. `assumed` receives, by the key
-    "no_return", a note if the log does not say the range.
+    "no_return", a note if the log does not say the reach.
     """
     if kind != "FLASER":
         return math.inf

@@ -66,7 +66,7 @@ class LaserOptions:
             hangs upside down.
         mount: Position of the laser on the robot: metres ahead, metres to the left, degrees to the
             left.
-        no_return: Metres from which a range means that nothing came back.
+        no_return: A range of at least this many metres means that nothing came back.
         zero_is: Meaning of a range of 0, below 0, below the laser's least range, or NaN: "free"
             (nothing came back) or "unknown" (nothing is known).
 
@@ -135,7 +135,7 @@ class Meaning:
     """Which ranges of a laser mean that nothing came back.
 
     Attributes:
-        reach: Metres from which a range means that nothing came back.
+        reach: A range of at least this many metres means that nothing came back.
         free: Kinds of beams without a measurement that also mean this, a subset of KINDS.
     """
 
@@ -148,9 +148,9 @@ def interpret_log(
 ) -> tuple[tuple[Scan, ...], tuple[str, ...]]:
     """Interpret the ranges of a whole log, as the driver wrote them, and note what was found.
 
-    Options come first, and then the survey. In the result, ranges are infinite if nothing came
-    back and NaN if nothing is known. Raises LogError if the user gives one mount, but the scans
-    come from several lasers.
+    `options` override the survey. In the result, ranges are infinite if nothing came back and
+    NaN if nothing is known. Raises LogError if the user gives one mount, but the scans come
+    from several lasers.
     """
     interpret, notes = interpreter_of(scans, options)
     return tuple(map(interpret, scans)), notes

@@ -1,7 +1,7 @@
 """Reads the lines of a log, plain or packed, one at a time.
 
-So long logs do not fill the memory, and neither does a very long line, which is skipped. A packed
-file is recognised by its first bytes: gzip, bzip2, xz or zstd.
+So a long log does not fill the memory. A very long line is skipped. A packed file is recognised by
+its first bytes: gzip, bzip2, xz or zstd.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ class Piped:
         self._head, self._rest = io.BytesIO(head), rest
 
     def seek(self, offset: int) -> int:
-        """Go to one of the first bytes, before any later one was read."""
+        """Go to one of the first bytes. Bytes after them must not have been read yet."""
         return self._head.seek(offset)
 
     def read(self, size: int = -1) -> bytes:
@@ -160,7 +160,7 @@ def unpacked(file: IO[bytes], source: str) -> IO[bytes]:
 
 
 def damages(*others: type[Exception]) -> tuple[type[Exception], ...]:
-    """List the errors of `unpacked`, data that end early (EOFError) or are damaged, and others."""
+    """List the errors of `unpacked` data that end early (EOFError) or are damaged, and `others`."""
     zstd = zstd_module()
     return (
         EOFError,
@@ -186,7 +186,7 @@ def lines(file: IO[bytes], source: str) -> Iterator[tuple[int, bytes | None]]:
     """Yield the lines of a file, unpacked if necessary, each with its number, from 1.
 
     A line of more than LONGEST_LINE bytes is None. Raises LogError if packed data end early or
-    are damaged, which says up to which line they can be read.
+    are damaged. The message says up to which line they can be read.
     """
     found = packer(file)
     stream = unpacked(file, source)

@@ -63,7 +63,7 @@ def read_log(
             or is wrong. `perception.readers.echoes.LaserOptions` explains these four arguments.
         mount: Position of the laser on the robot: metres ahead, metres to the left, degrees to the
             left.
-        no_return: Metres from which a range means that nothing came back.
+        no_return: A range of at least this many metres means that nothing came back.
         zero_is: Meaning of ranges that are no measurement: "free" or "unknown".
 
     Returns:
@@ -113,9 +113,9 @@ def stream_log(
 ) -> Iterator[Scan | Damage]:
     """Read the scans of a robot's log one at a time, in the order of the file.
 
-    Arguments and errors are those of `read_log`. Unlike there, ranges are interpreted without the
-    rest of the log. So a range that often repeats counts as a wall unless `no_return` is given, and
-    ranges of 0 are unknown unless `zero_is` is given.
+    Arguments and errors are those of `read_log`. Each scan is interpreted without the rest of the
+    log. So a range that often repeats counts as a wall unless `no_return` is given, and ranges of 0
+    are unknown unless `zero_is` is given.
 
     Yields:
         Scans, and `Damage` for the parts that were skipped.

@@ -139,8 +139,8 @@ def _wrong_stamps(name: str, stamps: Array) -> str | None:
 def _wrong_recording(name: str, times: Array, stamps_are_wrong: bool) -> str | None:
     """Describe what is wrong with the times of recording of a topic; None if nothing is wrong.
 
-    They are wrong if they stand still while the stamps in the headers go on, or are wrong, too.
-    `times` has both in seconds, (n, 2).
+    They are wrong if they stand still although the stamps in the headers go on or are wrong.
+    `times` has the stamps and the times of recording in seconds, (n, 2).
     """
     stamps, recorded = times.T
     if len(times) < 3:
@@ -185,8 +185,8 @@ def _apart(topics: Mapping[str, Array]) -> list[str]:
 def _ahead(times: Array, begin: float, every: float) -> tuple[Array, Array]:
     """Compute by how many seconds the stamps of a topic are ahead of its times of recording.
 
-    For each interval with messages: mean time of recording since `begin`, (k,), and median lead of
-    the stamps, (k,).
+    Time is divided into intervals of `every` seconds. For each interval with messages, return the
+    mean time of recording since `begin`, (k,), and the median lead of the stamps, (k,).
     """
     recorded = times[:, 1] - begin
     ahead = times[:, 0] - times[:, 1]

@@ -98,7 +98,7 @@ class Salvage:
     def messages(
         self, connections: Collection[Connection]
     ) -> Iterator[tuple[Connection, int, bytes]]:
-        """Yield for each message its connection, its nanoseconds of recording, and its bytes."""
+        """Yield each message: connection, time of recording in nanoseconds, and bytes."""
         asked = {connection.id: connection for connection in connections}
         for message in self._messages():
             if message.connection in asked:

@@ -33,10 +33,9 @@ class LaserScanner:
         first: Bearing of the first beam, in radians counterclockwise from straight ahead.
         step: Angle from each beam to the next, in radians.
         beams: Number of beams of a scan.
-        reach: Largest range in metres that is measured. A range from here on means that nothing
-            came back.
+        reach: A range of at least this many metres means that nothing came back.
         mount: Pose of the scanner in the frame of the robot.
-        nearest: Largest range in metres that is too short to be a measurement.
+        nearest: A range of at most this many metres is too short to be a measurement.
     """
 
     first: float
@@ -50,8 +49,8 @@ class LaserScanner:
     def steps(self) -> int:
         """The number of angular steps in the field of view.
 
-        If the number of beams is even, a last beam is missing after them, as for a SICK and for
-        scanners of a full circle. The step to that beam is counted.
+        If the number of beams is even, the field of view is taken to end one step after the last
+        beam. This holds for a SICK and for scanners of a full circle.
         """
         return max(1, self.beams - self.beams % 2)
 

@@ -216,7 +216,7 @@ def _messages(
 ) -> Iterator[tuple[str, int, Any]]:
     """Yield topic, time in nanoseconds and message of all scans, or raise LogError.
 
-    There has to be a scan. Times are not negative, and the laser is always mounted equally.
+    Errors are: no scan, a negative time, or a laser whose mount changes.
     """
     types = store.types
     mounted: set[Pose] = set()
