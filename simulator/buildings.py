@@ -151,7 +151,7 @@ def _span(flat: Opening, walls: Array) -> tuple[float, float]:
 
 
 def _across(flat: Opening, wall: Array, along: float) -> float:
-    """Measure how many metres across a door's middle a wall is, at `along` metres along the door."""
+    """Measure how far to the left a wall lies, `along` metres along it from the door's middle."""
     ends = flat.frame(wall.reshape(2, 2))
     return float(np.interp(along, *ends[np.argsort(ends[:, 0])].T))
 
