@@ -1,7 +1,7 @@
 """Bootstrap learning where one image in twenty is bad: maps, images named, recogniser accuracy.
 
     python benchmarks/bad_images.py [--world notched-rectangle] [--tours 10] [--seeds 300-309]
-                                    [--only TEXT] [--page docs/measurements/reproduction.md]
+                                    [--only TEXT]
 
 A bad image shows a person in front of the laser, a person at its side, or random ranges
 (benchmarks/doubts.py). The solver has ten seconds for a map. It uses the default theory, with
@@ -15,13 +15,12 @@ import argparse
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from arguments import seeds_from
 from doubts import DOUBTS, spoilt
 from numpy.typing import NDArray
-from pages import print_rows, seeds_from
 
 from perception.confidence import NOISE
 from perception.errors import PerceptionError
@@ -199,12 +198,9 @@ def main() -> None:
     parser.add_argument("--tours", type=int, default=10)
     parser.add_argument("--seeds", default="300-309", help="first and last seed")
     parser.add_argument("--only", default="", help="only the rows whose name contains this")
-    parser.add_argument(
-        "--page", type=Path, help="page whose table of this world is to be replaced"
-    )
     options = parser.parse_args()
-    found = rows(options.world, options.tours, seeds_from(options.seeds), options.only)
-    print_rows(found, options.page, rf"\| {options.world}, \d+ drives")
+    for row in rows(options.world, options.tours, seeds_from(options.seeds), options.only):
+        print(row, flush=True)
 
 
 if __name__ == "__main__":

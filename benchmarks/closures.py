@@ -1,6 +1,6 @@
 """What closures are worth on logs, and whether the covariances of the track are right.
 
-    python benchmarks/closures.py LOG ... [--drift 0.0003] [--page docs/measurements/logs.md]
+    python benchmarks/closures.py LOG ... [--drift 0.0003]
 
 The first table compares the best hypotheses of the beam for the trace of each log, with and without
 its closures. The beam has no time limit, so the machine does not matter. The second table has
@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 from courses import counts_of
 from logs import name_of, sidecar
-from pages import print_rows
 from visited import truth_of
 
 from perception.places.closures import uncertainty
@@ -112,7 +111,6 @@ def main() -> None:
     parser.add_argument(
         "--sigma", type=float, default=0.03, help="error of corrected poses in metres"
     )
-    parser.add_argument("--page", type=Path, help="page whose tables are replaced")
     options = parser.parse_args()
     rows, tracks, whole, closures = [*HEAD], [*HEAD_OF_TRACKS], [{}, {}], 0
     for log in options.logs:
@@ -125,10 +123,8 @@ def main() -> None:
             total.update({key: total.get(key, 0) + number for key, number in side.items()})
         closures += len(imported.trace.closures)
         rows.append(pairs_line(name, len(imported.trace.closures), sides))
-        print(rows[-1], tracks[-1], sep="\n", flush=True)
     rows.append(pairs_line("**all**", closures, whole))
-    print_rows(rows, options.page, r"\| log \| closures")
-    print_rows(tracks, options.page, r"\| track \|")
+    print(*rows, "", *tracks, sep="\n")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
 """Where M chooses too few or too many views, whether a warning says so, and trimmed M beside it.
 
     python benchmarks/doubts.py [--seeds 200-204] [--tours 10]
-                                [--page docs/measurements/reproduction.md]
     python benchmarks/doubts.py --tolerances      # spread of poses and k by the tolerance
 
 The script makes the table of docs/measurements/reproduction.md. M and trimmed M measure how well
@@ -17,11 +16,10 @@ import re
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
+from arguments import seeds_from
 from numpy.typing import NDArray
-from pages import print_rows, seeds_from
 
 from perception.errors import ImageWarning, PerceptionError
 from perception.images import images_of
@@ -276,7 +274,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--seeds", default="200-204", help="first and last seed")
     parser.add_argument("--tours", type=int, default=10)
-    parser.add_argument("--page", type=Path, help="page whose table is to be replaced")
     parser.add_argument(
         "--tolerances",
         action="store_true",
@@ -284,11 +281,8 @@ def main() -> None:
     )
     options = parser.parse_args()
     seeds = seeds_from(options.seeds)
-    if options.tolerances:
-        for line in tolerances(seeds, options.tours):
-            print(line, flush=True)
-        return
-    print_rows(rows(seeds, options.tours), options.page, r"\| the notched rectangle, but ")
+    for line in (tolerances if options.tolerances else rows)(seeds, options.tours):
+        print(line, flush=True)
 
 
 if __name__ == "__main__":

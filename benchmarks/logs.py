@@ -1,18 +1,14 @@
-"""Maps of whole logs beside the skeleton of the metric map, under the same measures.
+"""Maps of whole logs, judged by the truth.
 
     python benchmarks/logs.py [LOG ...] [--plans FOLDER] --out rows.jsonl [--runs FOLDER]
-                              [--page docs/measurements/logs.md]
 
 The script prints tables in Markdown. With --plans, a robot is simulated in each floor plan of a
-folder, one drive for each seed, and these logs are added. `ssh-abduction map` maps each log. Its
-events (visits according to a mapper) and its first map are compared with the truth. The same is
-done with skeletons of occupancy grids. One grid has the scans at their corrected poses, which a
-robot does not have. The skeleton of this grid is judged without and with nodes at doors. The other
-grid has the scans at the poses of the odometry, which any robot has. The method `pairs` counts
-which pairs of visits and of travels the map joins, and which it should (`courses.py`). For drives
-through floor plans, it also finds the rooms and doors that the map does not tell apart
-(`rooms.py`). The truth of a simulated log NAME.log is in NAME.truth.json beside the log. Rows that
-are stored are not measured again.
+folder, one drive for each seed, and these logs are added. `ssh-abduction map` maps each log. The
+method `pairs` counts which pairs of visits and of travels the map joins, and which it should
+(`courses.py`). For drives through floor plans, it also finds the rooms and doors that the map does
+not tell apart (`rooms.py`). The method `events` compares the events (visits according to the map)
+with the true visits (`visited.py`). The truth of a simulated log NAME.log is in NAME.truth.json
+beside the log. Rows that are stored are not measured again.
 """
 
 from __future__ import annotations
@@ -20,19 +16,16 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import statistics
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from itertools import chain, pairwise, product
 from pathlib import Path
-from time import process_time
 from typing import Any
 
 import numpy as np
+from arguments import seeds_from
 from courses import counts_of, joins_of
-from pages import print_rows, seeds_from
 from rooms import rooms_and_doors, told_line, untold
 from skeleton import lay, poses_of, skeleton_of
 from truth import diagram, reliability
@@ -43,32 +36,16 @@ from ssh_abduction import Solution, SSHMap, Trace
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.maps import maps_of
 
-OURS = "ssh-abduction"
-# For each skeleton: the poses of the scans in the grid, and whether doors are nodes.
-SKELETONS = {
-    "skeleton": ("corrected", False),
-    "skeleton with doors": ("corrected", True),
-    "skeleton, odometry": ("odometry", False),
-}
-# Pairs of visits and of travels in the map of `ssh-abduction`, and partings.
-PAIRS = "pairs"
-METHODS = (OURS, PAIRS, *SKELETONS)
-HEAD = (
-    "| log | mapper | places | events | events: precision, recall | passes noticed | "
-    "accuracy | edges: precision, recall | pairs: joined, returns | pairs: precision, "
-    "recall | CPU s |",
-    "|---|---|---|---|---|---|---|---|---|---|---|",
+PAIRS, EVENTS = "pairs", "events"
+HEAD_OF_EVENTS = (
+    "| log | places | events | events: precision, recall | passes noticed | accuracy | "
+    "edges: precision, recall | pairs: precision, recall |",
+    "|---|---|---|---|---|---|---|---|",
 )
 HEAD_OF_PAIRS = (
     "| log | visits | places | visit pairs: right of joined (2 m) | found of true (1 m) | "
     "travel pairs: right of joined | found of true | partings with a visit | s |",
     "|---|---|---|---|---|---|---|---|---|",
-)
-SIMULATED = (
-    "| mapper | logs | mapped | isomorphic | places right | doors noticed | passes "
-    "noticed | places, median | accuracy, median | edges: precision, recall, medians | "
-    "pairs: precision, recall, of all logs |",
-    "|---|---|---|---|---|---|---|---|---|---|---|",
 )
 
 
@@ -111,13 +88,6 @@ def driven(plans: Path, seeds: Sequence[int], runs: Path) -> Iterator[Path]:
             ]
             subprocess.run(command, check=True, capture_output=True)
         yield log
-
-
-def by_skeleton(log: Path, kind: str, doors: bool) -> Events:
-    read = read_log(str(log))
-    poses = poses_of(read, kind)
-    passed = skeleton_of(read, poses, doors=doors).events(poses)
-    return Events(tuple(scan for scan, _ in passed), tuple(node for _, node in passed))
 
 
 def mapped(log: Path, runs: Path) -> tuple[Trace, SSHMap | None]:
@@ -208,59 +178,34 @@ def pairs_row(log: Path, truth: Truth | None, runs: Path) -> dict[str, Any]:
     return row | counts_of(trace, ssh_map, truth.poses)
 
 
-def row_of(log: Path, method: str, truth: Truth, runs: Path) -> dict[str, Any]:
-    row = {"log": name_of(log), "method": method, "simulated": sidecar(log) is not None}
-    began = process_time()
+def events_row(log: Path, truth: Truth, runs: Path) -> dict[str, Any]:
+    """Compare the events of `ssh-abduction map` on a log with its truth."""
+    row = {"log": name_of(log), "method": EVENTS}
     try:
-        events = by_map(log, runs) if method == OURS else by_skeleton(log, *SKELETONS[method])
+        return row | judged(by_map(log, runs), truth).to_dict()
     except (OSError, ValueError) as error:
-        failed = row | {"failed": str(error)}
-        trace = runs / name_of(log) / "trace.jsonl"
-        if method == OURS and trace.exists():  # judge the events also without a map
-            events = Events.of(Trace.load(trace))
-            told = judged(replace(events, places=tuple(range(len(events.places)))), truth).to_dict()
-            failed |= {
-                name: told[name] for name in ("events", "event_precision", "event_recall", "passes")
-            }
-        return failed
-    return row | {"seconds": process_time() - began, **judged(events, truth).to_dict()}
+        return row | {"failed": str(error)}
 
 
 def shown(*values: float | None) -> str:
     return ", ".join("–" if value is None else f"{value:.2f}" for value in values)
 
 
-def lines_of(row: dict[str, Any]) -> Iterator[str]:
-    """Make the row of a recorded log and, if it has relations, one for pairs by relations."""
+def events_line(row: dict[str, Any]) -> str:
+    """Make the row of a log in the table of events."""
     if "failed" in row:
-        came = "{1} of {0}".format(*row["passes"]) if "passes" in row else ""
-        found = shown(row["event_precision"], row["event_recall"]) if came else ""
-        told = f"{row['failed']} | {row.get('events', '')} | {found} | {came}"
-        yield f"| {row['log']} | {row['method']} | {told} | | | | | |"
-        return
-    pairs, (come, noticed) = row["poses"], row["passes"]
+        return f"| {row['log']} | {row['failed']} | | | | | | |"
     cells = [
         row["log"],
-        row["method"],
         row["nodes"],
         row["events"],
         shown(row["event_precision"], row["event_recall"]),
-        f"{noticed} of {come}",
-    ]
-    cells += [
+        "{1} of {0}".format(*row["passes"]),
         shown(row["accuracy"]),
         shown(row["edge_precision"], row["edge_recall"]),
-        f"{pairs['joined']}, {pairs['returns']}",
+        shown(row["poses"]["precision"], row["poses"]["recall"]),
     ]
-    cells += [
-        shown(pairs["precision"], pairs["recall"]),
-        "–" if row["method"] == OURS else f"{row['seconds']:.1f}",
-    ]
-    yield "| " + " | ".join(map(str, cells)) + " |"
-    if (pairs := row.get("relations")) is not None:
-        counts = f"{pairs['joined']}, {pairs['returns']}"
-        rates = shown(pairs["precision"], pairs["recall"])
-        yield f"| by relations | {row['method']} | | | | | | | {counts} | {rates} | |"
+    return "| " + " | ".join(map(str, cells)) + " |"
 
 
 def pairs_line(row: dict[str, Any]) -> str:
@@ -297,39 +242,6 @@ def total(rows: Sequence[dict[str, Any]], name: str) -> dict[str, Any]:
         names = rows[0][key] if rows else ()
         whole[key] = {part: sum(row[key][part] for row in rows) for part in names}
     return whole
-
-
-def simulated_line(method: str, rows: Sequence[dict[str, Any]]) -> str:
-    """Make the row of one method in the table of simulated logs, from the rows of all logs."""
-    done = [row for row in rows if "failed" not in row]
-    if not done:
-        return f"| {method} | {len(rows)} | 0 | 0 | 0 | | | | | | |"
-
-    def median(name: str) -> float | None:
-        return statistics.median([row[name] for row in done if row[name] is not None] or [0])
-
-    joined, right, returns = (
-        sum(row["poses"][name] for row in done) for name in ("joined", "right", "returns")
-    )
-    come, noticed = (sum(row["passes"][k] for row in done) for k in (0, 1))
-    cells = [
-        method,
-        len(rows),
-        len(done),
-        sum(row["isomorphic"] for row in done),
-        sum(row["places_right"] for row in done),
-    ]
-    cells += [
-        shown(statistics.mean(row["event_recall"] for row in done)),
-        f"{noticed} of {come}",
-        median("nodes"),
-        shown(median("accuracy")),
-    ]
-    cells += [
-        shown(median("edge_precision"), median("edge_recall")),
-        shown(right / joined if joined else None, right / returns if returns else None),
-    ]
-    return "| " + " | ".join(map(str, cells)) + " |"
 
 
 def draw(path: Path, logs: Sequence[Path], runs: Path) -> None:
@@ -414,16 +326,15 @@ def main() -> None:
     parser.add_argument(
         "--methods",
         nargs="+",
-        choices=METHODS,
-        default=METHODS,
-        help="mappers to judge (default: all)",
+        choices=(PAIRS, EVENTS),
+        default=[PAIRS],
+        help="measures (default: pairs)",
     )
     parser.add_argument(
         "--figure",
         type=Path,
         help="draw the given logs with their skeletons and maps into this file",
     )
-    parser.add_argument("--page", type=Path, help="also write the tables into this page")
     options = parser.parse_args()
     rows = (
         [json.loads(line) for line in options.out.read_text().splitlines()]
@@ -440,7 +351,7 @@ def main() -> None:
             if method == PAIRS:
                 rows.append(pairs_row(log, truth, options.runs))
             elif truth is not None:
-                rows.append(row_of(log, method, truth, options.runs))
+                rows.append(events_row(log, truth, options.runs))
             else:
                 continue
             with options.out.open("a") as file:
@@ -448,13 +359,8 @@ def main() -> None:
     if options.figure:
         draw(options.figure, options.logs, options.runs)
     pairs = [row for row in rows if row["method"] == PAIRS]
-    rows = [row for row in rows if row["method"] != PAIRS]
     if pairs:
-        print_rows(
-            [*HEAD_OF_PAIRS, *map(pairs_line, [*pairs, total(pairs, "all")])],
-            options.page,
-            r"\| log \| visits",
-        )
+        print(*HEAD_OF_PAIRS, *map(pairs_line, [*pairs, total(pairs, "all")]), sep="\n")
         print(told_line(pairs))
         joins = [(p, right) for row in pairs for p, right in row.get("joins", ())]
         if joins:
@@ -464,25 +370,8 @@ def main() -> None:
                 f"expected calibration error {error:.3f}, Brier score {brier:.3f} "
                 f"({diagram(joins)})"
             )
-    if not rows:
-        return
-    real = sorted(
-        (row for row in rows if not row["simulated"]),
-        key=lambda row: (row["log"], METHODS.index(row["method"])),
-    )
-    print_rows(
-        [*HEAD, *(line for row in real for line in lines_of(row))],
-        options.page,
-        r"\| log \| mapper",
-    )
-    simulated = [row for row in rows if row["simulated"]]
-    if simulated:
-        by_method = [[row for row in simulated if row["method"] == method] for method in METHODS]
-        print_rows(
-            [*SIMULATED, *(simulated_line(rows[0]["method"], rows) for rows in by_method if rows)],
-            options.page,
-            r"\| mapper \| logs",
-        )
+    if events := [row for row in rows if row["method"] == EVENTS]:
+        print(*HEAD_OF_EVENTS, *map(events_line, events), sep="\n")
 
 
 if __name__ == "__main__":

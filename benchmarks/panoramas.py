@@ -1,6 +1,6 @@
 """Bootstrap learning on simulated panoramas: which features and which clusterings suit them.
 
-    python benchmarks/panoramas.py [--seeds 300-302] [--page docs/measurements/panoramas.md]
+    python benchmarks/panoramas.py [--seeds 300-302]
     python benchmarks/panoramas.py --figure docs/figures/panoramas.png
 
 The script makes the tables and the figure of docs/measurements/panoramas.md. The images of a drive
@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 import tempfile
 import warnings
 from collections.abc import Iterator
@@ -27,8 +26,8 @@ from typing import Any
 import networkx as nx
 import numpy as np
 import streets
+from arguments import seeds_from
 from numpy.typing import NDArray
-from pages import seeds_from
 from scipy.optimize import linear_sum_assignment
 from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.cluster import HDBSCAN, AgglomerativeClustering, SpectralClustering
@@ -321,17 +320,14 @@ HEAD = (
 )
 
 
-def tables(seeds: list[int], workers: int) -> Iterator[tuple[str, str]]:
-    """Measure, and make the two tables line by line.
+def tables(seeds: list[int], workers: int) -> Iterator[str]:
+    """Measure, and yield the lines of the two tables.
 
     The first table compares features in all worlds, the second one clusterings over a day.
 
     Args:
         seeds: Seeds of the drives.
         workers: Number of processes.
-
-    Yields:
-        The name of a table ("features" or "clusterings"), and a line of it.
     """
     by_k_means = [(features, "k-means") for features in FEATURES]
     others = [
@@ -342,9 +338,8 @@ def tables(seeds: list[int], workers: int) -> Iterator[tuple[str, str]]:
     ]
     rows: dict[tuple[str, str], list[Found]] = {}
     yield (
-        "features",
         f"| world | light | textures | features | {HEAD} "
-        "|\n|---|---|---|---|---|---|---|---|---|---|---|---|---|",
+        "|\n|---|---|---|---|---|---|---|---|---|---|---|---|---|"
     )
     with ProcessPoolExecutor(workers) as pool:
         for group in [
@@ -359,16 +354,13 @@ def tables(seeds: list[int], workers: int) -> Iterator[tuple[str, str]]:
                 if group[1] == "a day":
                     rows.setdefault(pair, []).extend(of_pair)
                 if pair in by_k_means:
-                    yield "features", f"| {' | '.join(group)} | {pair[0]} | {cells(of_pair)} |"
-    yield (
-        "clusterings",
-        f"| features | clustering | {HEAD} |\n|---|---|---|---|---|---|---|---|---|---|---|",
-    )
+                    yield f"| {' | '.join(group)} | {pair[0]} | {cells(of_pair)} |"
+    yield (f"\n| features | clustering | {HEAD} |\n|---|---|---|---|---|---|---|---|---|---|---|")
     for pair in sorted(
         rows, key=lambda pair: (list(FEATURES).index(pair[0]), list(CLUSTERERS).index(pair[1]))
     ):
         if pair[0] in ("raw pixels", "PanoramaTransformer"):
-            yield "clusterings", f"| {' | '.join(pair)} | {cells(rows[pair])} |"
+            yield f"| {' | '.join(pair)} | {cells(rows[pair])} |"
 
 
 def figure(path: Path, seed: int = 1) -> None:
@@ -406,22 +398,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--seeds", default="300-302", help="first and last seed")
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--page", type=Path, help="page whose tables are to be replaced")
     parser.add_argument("--figure", type=Path, metavar="PNG", help="draw some panoramas instead")
     options = parser.parse_args()
     if options.figure:
         figure(options.figure)
         return
-    lines: dict[str, list[str]] = {}
-    for name, line in tables(seeds_from(options.seeds), options.workers):
+    for line in tables(seeds_from(options.seeds), options.workers):
         print(line, flush=True)
-        lines.setdefault(name, []).append(line)
-    if options.page:
-        text = options.page.read_text()
-        for name, rows in lines.items():
-            marked = re.compile(rf"(<!-- {name}:begin -->\n).*?(<!-- {name}:end -->)", re.DOTALL)
-            text = marked.sub(lambda m, rows=rows: m[1] + "\n".join(rows) + "\n" + m[2], text)  # type: ignore[misc]
-        options.page.write_text(text)
 
 
 if __name__ == "__main__":

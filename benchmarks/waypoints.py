@@ -1,6 +1,6 @@
 """Maps of logs beside two graphs of the metric map: its skeleton, and a graph of waypoints.
 
-    python benchmarks/waypoints.py LOG [LOG ...] --runs FOLDER [--page docs/measurements/logs.md]
+    python benchmarks/waypoints.py LOG [LOG ...] --runs FOLDER
 
 The script prints a table in Markdown. The two graphs are made from an occupancy grid of the scans
 at their corrected poses, which the robot did not have. They cover the free space where the robot
@@ -26,7 +26,6 @@ import numpy as np
 from courses import counted, counts_of, course_of
 from logs import known_truth, mapped, name_of
 from numpy.typing import NDArray
-from pages import print_rows
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import Delaunay, cKDTree
 from skeleton import CELL, RADIUS, REACH, Array, Skeleton, _chains, _pixels, grid_of, skeleton_of
@@ -185,9 +184,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("logs", nargs="+", type=Path, metavar="LOG")
     parser.add_argument("--runs", type=Path, required=True, metavar="FOLDER")
-    parser.add_argument("--page", type=Path, help="also write the table into this page")
     options = parser.parse_args()
-    lines = list(HEAD)
+    print(*HEAD, sep="\n", flush=True)
     for path in options.logs:
         truth = known_truth(path)
         if truth is None:
@@ -195,14 +193,13 @@ def main() -> None:
         log, poses = read_log(str(path)), [(x, y, a) for x, y, a in truth.poses.tolist()]
         trace, ssh_map = mapped(path, options.runs)
         if ssh_map is not None:
-            lines.append(row_of_map(path, trace, ssh_map, truth.poses))
+            print(row_of_map(path, trace, ssh_map, truth.poses), flush=True)
         for name, made in (
             ("skeleton", skeleton_of(log, poses)),
             ("skeleton with doors", skeleton_of(log, poses, doors=True)),
             ("waypoints", waypoints_of(log, poses)),
         ):
-            lines.append(row_of_graph(path, name, made, truth.poses))
-    print_rows(lines, options.page, r"\| log \| graph")
+            print(row_of_graph(path, name, made, truth.poses), flush=True)
 
 
 if __name__ == "__main__":
