@@ -103,7 +103,7 @@ FOR_PROGRAMS = ("json", "facts", "dot", "graphml", "svg")
 
 @cache
 def parser() -> Parser:
-    """Make the parser of the whole command line, once: it holds several hundred options."""
+    """Make the parser of the whole command line. It is cached, as it has hundreds of options."""
     top = Parser(
         prog="ssh-abduction",
         description="Find the topological maps that explain what a robot saw and did.",
@@ -130,7 +130,7 @@ def parser() -> Parser:
 
 
 def unwritten(error: OSError, output: object) -> str:
-    """Make the message for a file that cannot be written: `output`, if the error names none."""
+    """Say that a file cannot be written: the one that the error names, or else `output`."""
     mend = MENDS.get(error.errno or 0, "check the path")
     return (
         f"{named(error.filename or output)}: cannot be written: {error.strerror or error}; {mend}"
@@ -141,7 +141,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code.
 
     Args:
-        arguments: The words behind the program's name; None takes those of this process.
+        arguments: The words after the program's name; None for those in `sys.argv`.
 
     Raises:
         SystemExit: The usage is wrong (code 2), or help was asked for (code 0).

@@ -112,7 +112,7 @@ class SolveQuestion:
         trace: Trace | None = None,
         given_up: Callable[[], bool] = lambda: False,
     ) -> SolveAnswer:
-        """Solve one trace, as `FileQuestion.answer`. If that fails, the answer says why."""
+        """Implement `FileQuestion.answer`: solve one trace. If that fails, the answer says why."""
         try:
             return self._solved(number, path, trace or Trace.load(path), given_up)
         except Exception as error:  # one bad trace must not stop the others
@@ -159,9 +159,9 @@ class SolveQuestion:
         maps: list[Given],
         given_up: Callable[[], bool],
     ) -> contextlib.AbstractContextManager[object]:
-        """Make a guard that ends this process at its limits, if it only solves this trace.
+        """Make a guard that ends a worker process at its limits.
 
-        Otherwise return a context manager that does nothing.
+        In any other process, return a context manager that does nothing.
         """
 
         def last_words(why: Stop) -> tuple[SolveAnswer, int]:
@@ -307,7 +307,7 @@ def _forget_memory() -> None:
 def _progress(total: int) -> Iterator[tuple[Callable[[str], None], Callable[[], None]]]:
     """Show a progress bar on stderr, if it is a terminal.
 
-    Yield what prints a line and what advances it.
+    Yield two functions: one prints a line, the other advances the bar by one.
     """
     if not sys.stderr.isatty():
         yield partial(print, flush=True), lambda: None

@@ -42,7 +42,7 @@ class _Judgement:
     Attributes:
         violations: The violations of each map.
         theory: The theory, in which no field is "auto".
-        said: Sentences about what was checked besides the axioms.
+        said: Sentences about everything else that was checked, such as bounds and costs.
         holds: Whether all maps and claims hold.
     """
 
@@ -154,7 +154,10 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _refuse_bound(resolved: Theory, solved: Theory | None) -> None:
-    """Raise MapError if the proof of a bound does not hold for a theory."""
+    """Raise MapError if a clique of steps proves no bound by one of these theories.
+
+    `resolved` is the theory to check by, `solved` that of the file of maps, if known.
+    """
     if resolved.has_faults or (solved is not None and solved.has_faults):
         raise MapError(
             "bound: expected a theory without faults (misread, slipped), as a clique of steps "
@@ -168,7 +171,7 @@ def _refuse_bound(resolved: Theory, solved: Theory | None) -> None:
 
 
 def _axioms_of(theory: Theory) -> Theory:
-    """Set the fields that say what is minimal to fixed values, to compare two theories."""
+    """Return a theory with a default objective, so that two theories compare by axioms alone."""
     return theory.replace(prefer=AUTO, weigh="count")
 
 
@@ -180,7 +183,7 @@ def _costs_hold(
     where: str,
     said: list[str],
 ) -> bool:
-    """Compute the costs of maps in nats anew, append to `said` what is false; whether all hold."""
+    """Recompute the costs of maps in nats. Append the result to `said`; return if all hold."""
     from ssh_abduction.checker.misfit import LONGEST, false_costs  # loads numpy
 
     Solution.from_dict(data, where, trace)  # the fields that claim costs have the right form

@@ -120,9 +120,10 @@ def run(options: argparse.Namespace) -> int:
 
 
 def runner_up_doubts(trace: Trace) -> list[str]:
-    """Warn in a sentence if the second best number of views (the runner-up) gives another map.
+    """Return a warning if the second best number of views (the runner-up) gives another map.
 
-    Maps are found by the topological theory, or by the causal one if some action has no kind.
+    The theory is the topological one, or the causal one if some action is of unknown kind.
+    Without a reason to warn, the list is empty.
     """
     theory = (
         Theory.topological() if all(action.kind for action in trace.actions) else Theory.causal()

@@ -158,8 +158,9 @@ def _on_workers(
 ) -> Iterator[Any]:
     """Yield the answers for some files from the workers of a cluster, at most `most` at a time.
 
-    Files are read here, so that workers need not share the disk. This uses Dask directly, because
-    joblib's backend for Dask hangs when a worker is killed. `killed` receives the files of such.
+    Files are read here, so that workers need not share the disk. Files whose worker was killed are
+    appended to `killed`. This uses Dask directly, because joblib's backend for Dask hangs when a
+    worker is killed.
     """
     from distributed import KilledWorker, as_completed
 

@@ -71,7 +71,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _how_to_obey(maps: Path) -> str:
-    """Say how a person solves again, so that the corrections beside a file of maps are obeyed."""
+    """Write the command that solves again and obeys the corrections beside a file of maps."""
     if trace_beside(str(maps)) is None:
         return f"solve again with -o {shlex.quote(str(maps))}"
     folder = shlex.quote(str(maps.parent))

@@ -1,7 +1,7 @@
 """ssh-abduction explain TRACE [STEP STEP]: why two steps are one dstate or not.
 
-Without steps, it explains why the trace has no map. With a place, and perhaps a path, it explains
-on which side of paths the place lies.
+Without steps, it explains why the trace has no map. With a place and a path, it explains on which
+side of the path the place lies. With a place alone, it does so for all paths.
 """
 
 from __future__ import annotations
@@ -150,9 +150,10 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _maps_of(options: argparse.Namespace) -> tuple[str | None, Theory | None, Any]:
-    """Return the file that --theory names, the theory of its maps, and its data; None if lacking.
+    """Return the file that --theory names, the theory of its maps, and its data.
 
-    A file of TOML has no maps. Raises MapError if the file cannot be read, or holds no theory.
+    All three are None if --theory names no file. A TOML file has no maps: only its name is
+    returned. Raises MapError if the file cannot be read, or holds no theory.
     """
     file = maps_path(options.theory) if options.theory else None
     if file is None or not Path(file).is_file():
@@ -170,8 +171,8 @@ class _InMap:
     Attributes:
         is_one_place: Whether the two steps are at one place.
         probability: The probability that they are; None if maps were not compared by cost.
-        nats: How many nats more the best known map costs that says otherwise; None if no such map
-            is known.
+        nats: The extra cost, in nats, of the best known map that contradicts `is_one_place`; None
+            if no such map is known.
     """
 
     is_one_place: bool

@@ -83,7 +83,7 @@ class Guard:
         self._signals.close()
 
     def say(self, text: Callable[[], str]) -> None:
-        """Make a text and print it. What is printed on Ctrl-C never lands in this text."""
+        """Make a text and print it. The last words on Ctrl-C are never printed inside it."""
         self._printer.say(text)
 
     def _watch(self) -> None:

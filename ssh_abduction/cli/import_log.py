@@ -178,7 +178,7 @@ def _whole(options: argparse.Namespace, tell: Callable[[str], None]) -> tuple[Ro
 
 
 def _live(options: argparse.Namespace, tell: Callable[[str], None]) -> tuple[RobotLog, Imported]:
-    """Import the log on standard input while it comes, and show each visit when it is final."""
+    """Import the log on standard input as it arrives, and print each visit once it is final."""
     from perception.places.importing import import_live
     from perception.readers.logs import live_log
 

@@ -38,7 +38,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.add("trace", "trace file (JSON Lines), or - for standard input", type=trace_path)
     parser.add(
         "-n --maps K",
-        "list at most N maps on each rung; 0 for all (default: 100)",
+        "list at most K maps on each rung; 0 for all (default: 100)",
         type=int,
         default=100,
     )
@@ -55,7 +55,7 @@ def run(options: argparse.Namespace) -> int:
     under_way = UnderWay()
 
     def written() -> str:
-        """The table of all rungs; empty with --json, as these are printed when they are ready."""
+        """The table of all rungs; empty with --json, as each rung was printed when it was found."""
         return "" if options.json else f"{table(HEAD, list(map(_row, rungs)))}\n"
 
     def last_words(_: Stop) -> tuple[str, int]:

@@ -42,9 +42,9 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.add(
         "--time-limit S",
-        "seconds for the search (default: so many that the whole command takes a twentieth of "
-        "the time that the robot drove, but at least 30). Without this option, a search that "
-        "has no map by then goes on until it has one",
+        "seconds for the search (default: a twentieth of the time that the robot drove, less the "
+        "time for the import, but at least 30). Without this option, a search that has no map by "
+        "then may take up to 64 times as long",
         type=float,
     )
     parser.add_setting(

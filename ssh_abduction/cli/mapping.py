@@ -132,7 +132,7 @@ class MapQuestion:
         answer_last: Callable[[MapAnswer], None] = workers.reply,
         tell: Callable[[str], None] = lambda note: None,
     ) -> MapAnswer:
-        """Map one log, as `FileQuestion.answer`. If that fails, the answer says why.
+        """Implement `FileQuestion.answer`: map one log. If that fails, the answer says why.
 
         `answer_last` takes the answer if the process has to end because clingo does not
         stop. `tell` takes each warning about the log as soon as it is known.

@@ -29,11 +29,12 @@ def corrections_of(options: argparse.Namespace) -> Corrections | None:
 def as_corrected(
     trace: Trace, theory: Theory, maps: str | None, given: str | None = None
 ) -> tuple[Trace, Theory]:
-    """Return the trace and the theory as the corrections beside a file of maps change them.
+    """Apply the corrections beside a file of maps to a trace and a theory, and return both.
 
-    `given` is the file of corrections that the user names instead. What is obeyed is printed on
-    stderr. If the file beside the maps is of other drives, a warning says so. Raises MapError
-    if the file is malformed or contradicts the trace, or the named one is of other drives.
+    `given` is a file of corrections that the user names instead. The number of corrections obeyed
+    is printed on stderr. If the file beside the maps is of other drives, it is ignored with a
+    warning. Raises MapError if the file is malformed or contradicts the trace, or if `given` is of
+    other drives.
     """
     file = given or beside(maps)
     said = Corrections() if file is None else load_corrections(file)
@@ -99,7 +100,8 @@ class Obeying:
     def blamed(self, explanation: Explanation | None) -> list[str]:
         """List the corrections without which the trace may have a map.
 
-        Sentences are left out one by one, as long as the stretch of the explanation has no map.
+        They are left out one by one. A correction without which the stretch of the explanation
+        still has no map is not listed.
         """
         said = self.corrections.known_in(drives_of(self.trace)) if self.corrections else None
         if explanation is None or said is None:

@@ -145,10 +145,11 @@ def add_maps(parser: Parser) -> None:
 
 
 def add_trace(parser: Parser, needs: str = "") -> None:
-    """Add the argument `trace`, which may be left out after a folder that map wrote (`trace_of`).
+    """Add the argument `trace`. If the user leaves it out, the trace beside the maps is taken.
 
-    `needs` says what the trace in a file of maps lacks; if empty, it is enough
-    (`solved_trace`).
+    `needs` says in the help what the verb needs, such as " with images". The copy of the trace
+    in a file of maps lacks this, so the verb calls `trace_of`. If `needs` is empty, the copy
+    suffices, and the verb calls `solved_trace`.
     """
     by = "map" if needs else "solve -o or map"
     parser.add(
@@ -161,12 +162,12 @@ def add_trace(parser: Parser, needs: str = "") -> None:
 
 
 def maps_path(text: str) -> str:
-    """Return the file of maps that an argument names: of a folder, its maps.json."""
+    """Return the file of maps that an argument names. If it names a folder, add maps.json."""
     return str(Path(text) / MAPS) if Path(text).is_dir() else text
 
 
 def trace_path(text: str) -> str:
-    """Return the trace file that an argument names: of a folder, its trace.jsonl."""
+    """Return the trace file that an argument names. If it names a folder, add trace.jsonl."""
     return str(Path(text) / TRACE) if Path(text).is_dir() else text
 
 
@@ -200,7 +201,10 @@ def solved_trace(options: argparse.Namespace) -> Trace:
 
 
 def trace_of_maps(file: str) -> Trace | None:
-    """Return the trace in a file of maps of solve -o; None for others. Raises TraceError."""
+    """Return the trace that solve -o put into a file of maps; None if it has none.
+
+    Raises TraceError.
+    """
     from ssh_abduction.solver import trace_in
 
     try:
@@ -335,7 +339,7 @@ def theory_of_maps(data: Any, file: str) -> Theory:
 
 
 def number_steps(options: argparse.Namespace, trace: Trace) -> None:
-    """Replace the steps in --same and the like that name a drive, such as tuesday:14.
+    """Replace each step with a drive, such as tuesday:14, by its number, in --same and the like.
 
     Raises TraceError if the trace has no such drive or step.
     """
@@ -361,7 +365,8 @@ def choices_of(options: argparse.Namespace) -> dict[str, Any]:
 def flags_of(theory: Theory, trace: Trace | None = None) -> list[str]:
     """List the words of the command line that choose a theory. This inverts `theory_of`.
 
-    Fields to which the trace, if known, sets the default theory need no words.
+    Only fields that differ from the default theory need words. If the trace is known, "auto" in
+    the default theory is replaced by what the trace decides.
     """
     default = Theory.causal() if theory.level == "causal" else Theory.topological()
     flags = ["--theory", "causal"] if theory.level == "causal" else []

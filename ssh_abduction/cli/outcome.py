@@ -68,7 +68,7 @@ def answer_opening(search: Search) -> dict[str, Any]:
 
 
 def given_by(search: Search, ssh_map: SSHMap) -> Given:
-    """Pair the last map with its cost, or with None if only maps of one cost are listed."""
+    """Pair the last map that a search found with its cost; with None if `within` is 0."""
     return ssh_map, search.cost if search.limits.within else None
 
 
@@ -110,7 +110,7 @@ _second_opinions: WeakKeyDictionary[Search, list[str]] = WeakKeyDictionary()
 
 
 def _second_opinion(search: Search, solution: Solution) -> list[str]:
-    """Warn if the second best number of views gives another map. Needs time that is left."""
+    """Warn if the second best number of views gives another map, if there is time to solve it."""
     if search not in _second_opinions:
         limit = search.limits.time_limit
         left = None if limit is None else limit - solution.seconds.total
@@ -154,9 +154,8 @@ def _has_maps(file: str) -> bool:
 def on_ctrl_c(action: Callable[[], None] | None) -> Iterator[None]:
     """While the block runs, call `action` at Ctrl-C and SIGTERM instead of ending the program.
 
-    None ignores these signals, also in processes that are started. During this time, the Guard
-    of the whole program receives no signals. So if the code may ignore `action`, it needs its
-    own Guard.
+    None ignores these signals, also in processes started meanwhile. While the block runs, the Guard
+    of the whole program receives no signals. So code that may ignore `action` needs its own Guard.
     """
     if threading.current_thread() is not threading.main_thread():
         yield  # Python lets only the main thread handle signals

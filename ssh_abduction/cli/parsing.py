@@ -132,7 +132,7 @@ class Parser(argparse.ArgumentParser):
                 with choices such as "--by"; or a flag such as "--json".
             said: The help text.
             to: The group in which the help lists it; None for none.
-            details: What argparse needs to know besides, by name.
+            details: Further arguments of argparse's `add_argument`, by name.
         """
         names = [word for word in spec.split() if word.startswith("-")]
         if not names:

@@ -126,7 +126,7 @@ def folders_of(logs: Sequence[str], folder: Path) -> tuple[dict[str, Path], dict
 
 
 def distinct(logs: Sequence[str]) -> tuple[list[str], list[tuple[str, str]]]:
-    """Return the first log of each content; and each other log with the first of its content."""
+    """Return the logs without copies; and pairs of each copy and the log with the same content."""
     first: dict[str, str] = {}  # by content; a log that cannot be read is like no other one
     owners = [(log, first.setdefault(_content([log]) or log, log)) for log in logs]
     return [*first.values()], [(log, other) for log, other in owners if log != other]
@@ -148,8 +148,8 @@ def digest(logs: Sequence[str]) -> str | None:
     """Compute the SHA-256 digest of the unpacked content of logs, as hexadecimal text.
 
     For a folder, it is the digest of the names and contents of its files. For several logs, it
-    is the digest of the digests and the names of the drives. A pipe, which can be read only
-    once, has None. Raises LogError.
+    is the digest of the digests and the names of the drives. The result is None for a pipe, which
+    can be read only once. Raises LogError.
     """
     if len(logs) == 1:
         return _digest_of(logs[0])

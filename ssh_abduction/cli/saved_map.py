@@ -105,7 +105,10 @@ class SavedMap:
         return kind, step_name(self.drives, first)
 
     def step_of_name(self, kind: str, step: str) -> str:
-        """Return the step whose name the thing at this step has; this step if it has no name."""
+        """Return the step to which the name of a place, path or region belongs.
+
+        `kind` and `step` say which thing. If it has no name yet, return `step`.
+        """
         number = self._at(kind, step)
         names = self.corrections.known_in(self.drives).names
         return next(
@@ -201,5 +204,5 @@ class SavedMap:
 
 
 def sentences_of(corrections: Corrections) -> Iterator[str]:
-    """Yield the sentences of some corrections in words."""
+    """Put corrections into words: yield one sentence for each."""
     yield from map(str, (*corrections.names, *corrections.pairs, *corrections.gateways))

@@ -140,7 +140,8 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.add_setting(
         "without_speedups NAMES",
-        f"speed-ups to turn off, separated by commas: {', '.join(SPEEDUPS)}",
+        "speed-ups to turn off, separated by commas, to measure what they save. None of them "
+        f"changes an answer: {', '.join(SPEEDUPS)}",
         default="",
     )
 
@@ -396,8 +397,8 @@ def _lines(
 def _progress(prints_meanwhile: bool) -> Iterator[Any]:
     """Show a line of progress on stderr while the block runs, if stderr is a terminal.
 
-    Yield a function that shows a Progress. It is None if nothing is shown, as then output that is
-    printed meanwhile goes to a terminal.
+    Yield a function that shows a Progress. Yield None if no progress is shown: stderr is no
+    terminal, `prints_meanwhile` and the output goes to a terminal, or progress is logged.
     """
     if (
         not sys.stderr.isatty()

@@ -95,7 +95,7 @@ def headline(solution: Solution, count: int, explanation: Explanation | None) ->
 
 
 def _levels_above(solution: Solution) -> str:
-    """Write the number and the counts of the maps above the minimum, for each cost."""
+    """For each cost above the minimum, write how many maps have it, and their counts."""
     return "".join(
         f"; {level.count} with {', '.join(counted(v, k) for k, v in level.cost.to_dict().items())}"
         for level in solution.levels[1:]

@@ -47,7 +47,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _state(name: str, preset: str) -> str:
-    """Say when a preset has an axiom: "on", "stars", "gateways" or "–"."""
+    """Say if a preset has an axiom: "on", only with "stars" or "gateways", or "–" if never."""
     theory = PRESETS[preset]()
     if name in theory.axioms:
         return "on"

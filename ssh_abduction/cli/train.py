@@ -94,7 +94,10 @@ def pair(text: str) -> tuple[int, int]:
 
 
 def _labelled(options: argparse.Namespace) -> tuple[Any, Any, Any]:
-    """The images, (n, d), and labels, (n,), of steps with a label, and an untrained recogniser."""
+    """Return the images, (n, d), of the n labelled steps, their labels, (n,), and a recogniser.
+
+    The recogniser is untrained.
+    """
     from perception.recognition import recogniser
 
     images, labels, _, features = _mapped(options)
@@ -102,7 +105,10 @@ def _labelled(options: argparse.Namespace) -> tuple[Any, Any, Any]:
 
 
 def _mapped(options: argparse.Namespace) -> tuple[Any, Any, SSHMap, Any]:
-    """The images, (n, d), and labels, (n,), of steps with a label, their map, and a transformer."""
+    """Return images, (n, d), their labels, (n,), the map, and a transformer of the images.
+
+    Only the n steps with a label count. The labels are ids of dstates in the map.
+    """
     from perception.appearance import features_of
     from perception.images import images_of
     from ssh_abduction.learning.learner import labels_of

@@ -63,7 +63,7 @@ def telling(options: argparse.Namespace, for_programs: bool) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _handled(log: logging.Logger, handler: logging.Handler, level: int) -> Iterator[None]:
-    """While the block runs, send the records of a log from this level on to a handler."""
+    """While the block runs, send a handler all records of a log of this level or higher."""
     before = log.level
     log.addHandler(handler)
     log.setLevel(level)
