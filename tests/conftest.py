@@ -16,7 +16,6 @@ from threadpoolctl import threadpool_limits
 from worlds import rectangle
 
 from ssh_abduction.cli import jobs, verbosity, view
-from ssh_abduction.solver import beams
 
 # Hypothesis has no deadlines, because clingo takes a hundred times as long for some random traces
 # as for others. Examples are the same in each run.
@@ -33,10 +32,6 @@ verbosity.EVERY = math.inf
 
 # A page may spend three seconds on the costs of assumptions. Only tests of these costs allow it.
 view.ASSUMING = 0.1
-
-# A beam of 64 hypotheses takes half of the time of a search with displacements, and the narrower
-# beams find the same maps in these small worlds. Only a test of this beam allows it.
-beams.LONGER = math.inf
 
 # Background processes and their children ignore Ctrl-C. Restore the handler for tests.
 with contextlib.suppress(ValueError):

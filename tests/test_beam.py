@@ -23,8 +23,7 @@ from ssh_abduction.data import Odometry
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.explain.no_map import explain
 from ssh_abduction.runtime.clock import heeding
-from ssh_abduction.solver import Search, Status, beams
-from ssh_abduction.solver.candidates import Candidates
+from ssh_abduction.solver import Search, Status
 from ssh_abduction.solver.guesses.beam import Beam
 from ssh_abduction.solver.guesses.completing import completed
 from ssh_abduction.solver.misfit import Misfit
@@ -224,25 +223,3 @@ def test_two_steps_that_clash_end_the_search_at_once() -> None:
     explanation = explain(trace, theory)
     assert explanation is not None
     assert (explanation.first, explanation.last) == (1, 2)
-
-
-@pytest.mark.parametrize(
-    ("longer", "widths"),
-    [(0.0, [1, 16, 64]), pytest.param(math.inf, [1, 16], marks=pytest.mark.slow)],
-)
-def test_a_wider_beam_takes_part_if_the_others_were_quick(
-    monkeypatch: pytest.MonkeyPatch, longer: float, widths: list[int]
-) -> None:
-    """`longer` is how many times as long as the last beam the wider one is expected to take."""
-    (known,) = truth.mazes(3, 20, [702], DRIFTING)
-    asked: list[int] = []
-    beam = Candidates.beam
-
-    def asking(self: Candidates, width: int) -> Beam | None:
-        asked.append(width)
-        return beam(self, width)
-
-    monkeypatch.setattr(beams, "LONGER", longer)
-    monkeypatch.setattr(Candidates, "beam", asking)
-    assert truth.is_true(solve(known.trace, time_limit=60).maps[0], known)
-    assert [width for width in dict.fromkeys(asked) if width != 4] == widths

@@ -19,9 +19,6 @@ from ssh_abduction.solver.weighed import EQUAL
 WIDTHS, BREAKING = {1: 0.7, 4: 0.6, 16: 0.7}, 0.8
 # Joining the maps of drives ends after the share JOINING.
 JOINING = 0.5
-# A further beam of WIDER hypotheses takes about LONGER times as long as the widest of these. Search
-# it only if all beams then take at most the share QUICK of the time, and MOST_SECONDS.
-WIDER, QUICK, MOST_SECONDS, LONGER = 64, 0.3, 60.0, 5.0
 # A beam of this width or more nearly always ends with the map of least cost.
 BROAD = 4
 
@@ -97,7 +94,6 @@ class Beams:
             self._keep_best()
         may_have_map = self._search_widths(time, clashes)
         if may_have_map:
-            self._search_wider(time)
             self._search_without_axioms(time)
         watch.end_stage_after(math.inf)
         return may_have_map
@@ -138,24 +134,12 @@ class Beams:
         """
         return bool(self._took) and now + width * self._took[0] < time.end(WIDTHS[width])
 
-    def _search_wider(self, time: _Time) -> None:
-        """Search by a beam of WIDER hypotheses if there is time and the widest beam ended."""
-        parts, watch = self._parts, self._parts.watch
-        end = time.begun + min(QUICK * time.seconds, MOST_SECONDS)
-        if self._ended < max(WIDTHS) or watch.elapsed() + LONGER * self._took[-1] > end:
-            return
-        watch.end_stage_after(end)
-        if beam := parts.candidates.beam(WIDER):
-            self._ends(beam, WIDER)
-            self._keep_best()
-            parts.report()
-
     def _search_without_axioms(self, time: _Time) -> None:
         """Find how many nats broken axioms save, if unknown, by the widest beam that ended."""
         self._parts.watch.end_stage_after(time.end(BREAKING))
         is_open = self._best[1] < math.inf and math.isinf(self.broken)
         with suppress(StageTimeError):
-            if is_open and (beam := self._parts.candidates.beam(min(self._ended, max(WIDTHS)))):
+            if is_open and (beam := self._parts.candidates.beam(self._ended)):
                 self.broken = self._best[1] - beam.nats_without_axioms()
 
     def _ends(self, beam: Beam, width: int) -> bool:
@@ -164,7 +148,7 @@ class Beams:
             nats = [self._add(ssh_map) for ssh_map in self._parts.candidates.maps_of(beam)]
         except StageTimeError:
             return False
-        self._ended = max(self._ended, width)
+        self._ended = width
         if width >= BROAD:
             estimate = beam.best.nats if beam.best else math.inf
             self._best = min(nats, default=math.inf), estimate

@@ -25,7 +25,7 @@ from ssh_abduction.solver.recorded import Support
 from ssh_abduction.solver.regions import Deriving
 from ssh_abduction.solver.result import Solution
 from ssh_abduction.solver.steps.chart import numbered
-from ssh_abduction.solver.values import Bound, Cost, Effort, Seconds, Status
+from ssh_abduction.solver.values import Bound, Cost, Effort, Seconds, Status, nats_of
 from ssh_abduction.solver.weighed import Weighed
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.theory import Theory
@@ -55,20 +55,20 @@ def laid(
     """
     joint, theory = problem.trace, problem.theory
     ranking, judging = Ranking(joint), Judging(problem)
-    found = sorted(
-        map(ranking.fitted, _joint_maps(old, ssh_map, trace, problem)),
-        key=lambda m: _nats(m, theory),
-    )
+    fitted = map(ranking.fitted, _joint_maps(old, ssh_map, trace, problem))
+    found = sorted(fitted, key=lambda m: _nats(m, Cost.of(m), theory))
     while found and not judging.accepts_grown(found[0], len(old)):
         del found[0]
     if not found:
         return None
     best = Deriving(joint, theory).mapped(found[0])
+    kept = ssh_map if ssh_map.fit else Ranking(old).fitted(ssh_map)
     weighed = Weighed(
-        bound=_without_paths(ssh_map if ssh_map.fit else Ranking(old).fitted(ssh_map), theory),
+        bound=_nats(kept, replace(Cost.of(kept), paths=0), theory),
         within=0.0,
         rivals=tuple(
-            replace(rival_of(m, _nats(m, theory)), estimated=i > 0) for i, m in enumerate(found)
+            replace(rival_of(m, _nats(m, Cost.of(m), theory)), estimated=i > 0)
+            for i, m in enumerate(found)
         ),
         drives=drives_of(joint),
     )
@@ -115,18 +115,10 @@ def unproven(
     )
 
 
-def _nats(ssh_map: SSHMap, theory: Theory) -> float:
-    """Compute the cost in nats of a map that has a fit."""
+def _nats(ssh_map: SSHMap, cost: Cost, theory: Theory) -> float:
+    """Compute what a map with a fit costs in nats, if this is what is counted."""
     assert ssh_map.fit is not None
-    path = theory.prices[2]
-    return _without_paths(ssh_map, theory) + path * len(ssh_map.paths)
-
-
-def _without_paths(ssh_map: SSHMap, theory: Theory) -> float:
-    """Compute the cost in nats of a map that has a fit, without the price of its paths."""
-    assert ssh_map.fit is not None
-    dstate, place, _ = theory.prices
-    return dstate * len(ssh_map.dstates) + place * len(ssh_map.places) + ssh_map.fit.chi2 / 2
+    return nats_of(cost, theory) + ssh_map.fit.chi2 / 2
 
 
 def _joint_maps(old: Trace, ssh_map: SSHMap, trace: Trace, problem: Problem) -> Iterator[SSHMap]:

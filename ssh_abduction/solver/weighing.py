@@ -57,7 +57,7 @@ from ssh_abduction.solver.misfit import Misfit
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.prefixes import Prefixes
 from ssh_abduction.solver.scatter import is_for, least_cost
-from ssh_abduction.solver.values import Cost, Status
+from ssh_abduction.solver.values import Cost, Status, nats_of
 from ssh_abduction.solver.weighed import EQUAL, Rival, Weighed
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.evidence.displacement import jumped
@@ -239,9 +239,8 @@ class Weighing:
         Returns:
             The cost in nats.
         """
-        counts = Cost.of(ssh_map)
-        prices = self._price({name: getattr(counts, name) for name in self._prices})
-        nats = prices + self._misfit.of_map(ssh_map) / 2
+        nats = nats_of(Cost.of(ssh_map), self._parts.task.theory)
+        nats += self._misfit.of_map(ssh_map) / 2
         if self.candidates and nats < self.candidates[0].nats - EQUAL:
             self._improved = self._parts.watch.elapsed()
         if all(known.map != ssh_map for known in self.candidates):
@@ -358,17 +357,14 @@ class Weighing:
 
     def _cost_like(self, best: Rival) -> CostOf:
         """Return a function for the cost of maps with the paths and faults of the best map."""
-        prices, counts = self._prices, Cost.of(self.candidates[0].map)
-        first, price = next(iter(prices.items()))
-        units = _units_of(first)
-        kept = prices["paths"] * counts.paths
-        kept += price * (getattr(counts, first) - counts.dstates * units)
+        theory = self._parts.task.theory
+        dstate, place, _ = theory.prices
+        kept = nats_of(replace(Cost.of(self.candidates[0].map), dstates=0, places=0), theory)
         wrong = [step for kind, step in best.faults if kind == "jumped"]
 
         def cost_of(dstates: Sequence[int], places: Sequence[int]) -> float:
             nats: float = kept + self._misfit.of_course(dstates, places or dstates, wrong) / 2
-            nats += price * units * len(set(dstates)) + prices["places"] * len(set(places))
-            return nats
+            return nats + dstate * len(set(dstates)) + place * len(set(places))
 
         return cost_of
 
@@ -379,13 +375,8 @@ def _prices_of(theory: Theory) -> dict[str, float]:
     If faults are allowed, that is "tenths": the cost of dstates and faults in tenths of dstates.
     """
     dstate, place, path = theory.prices
-    first = "tenths" if theory.has_faults else "dstates"
-    return {first: dstate / _units_of(first), "places": place, "paths": path}
-
-
-def _units_of(first: str) -> int:
-    """Return how many units of the count minimised first a dstate is: 10 tenths, or 1 dstate."""
-    return 10 if first == "tenths" else 1
+    first = {"tenths": dstate / 10} if theory.has_faults else {"dstates": dstate}
+    return {**first, "places": place, "paths": path}
 
 
 def _exactly(ssh_map: SSHMap) -> list[Equality]:

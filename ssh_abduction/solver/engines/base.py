@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Generator, Iterator
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
+import clingo
+
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.solver.asp.control import Asker
+from ssh_abduction.solver.asp.control import Asker, mapped
+from ssh_abduction.solver.asp.facts.path_reader import PathReader
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.engines.doubts import Settled
 from ssh_abduction.solver.steps.log import Log
@@ -23,6 +26,8 @@ from ssh_abduction.theory.theory import Theory
 FIRST_PREFIXES = 32
 # Compare at most this many steps in pairs: n steps need a matrix of n x n bytes.
 AT_ONCE = 8000
+# After this many conflicts, stop improving paths one by one; raise the bound from below instead.
+BETTERING = 20_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,6 +172,38 @@ class LabellingEngine(Protocol):
         with one labelling.
         """
         ...
+
+
+def maps_of_labels(
+    asker: Asker,
+    control: clingo.Control,
+    reader: PathReader,
+    theory: Theory,
+    mode: str,
+    conflicts: int = -1,
+) -> Generator[Found, None, bool]:
+    """Yield maps with given dstates.
+
+    Args:
+        asker: Asks clingo.
+        control: Its answers are the places and paths that fit these dstates.
+        reader: Reads the answers.
+        theory: Its preference says what a map costs.
+        mode: Clingo's opt-mode; "ignore" for a single map.
+        conflicts: Stop after this many conflicts; -1 for no limit.
+
+    Returns:
+        Whether clingo ended before the limit of conflicts.
+    """
+    answers = asker.answers(
+        reader.read,
+        mode,
+        int(mode == "ignore"),
+        control=control,
+        conflicts=conflicts,
+        ahead=True,
+    )
+    return (yield from mapped(lambda answer: Found.of(reader.map_of(answer), theory), answers))
 
 
 def next_charted_size(size: int, failed: int, steps: int) -> int:

@@ -104,7 +104,6 @@ class Settled:
         control: clingo.Control,
         mode: str,
         reader: path_reader.PathReader,
-        map_of: Callable[[path_reader.PathAnswer], SSHMap],
     ) -> None:
         """Prepare the questions, without asking clingo yet.
 
@@ -113,10 +112,9 @@ class Settled:
             control: Its answers are the places and paths for the labelling.
             mode: Clingo's opt-mode for the best maps.
             reader: Reads the answers.
-            map_of: Makes a map from an answer.
         """
         self._asker, self._control, self._mode = asker, control, mode
-        self._reader, self._map_of = reader, map_of
+        self._reader = reader
         self._doubts = Doubts(asker, control, reader.condition)
         self._any: SSHMap | None = None
 
@@ -130,10 +128,10 @@ class Settled:
             with closing(
                 self._asker.answers(self._reader.read, self._mode, 1, control=self._control)
             ) as answers:
-                self._any = next(map(self._map_of, answers), None)
+                self._any = next(map(self._reader.map_of, answers), None)
         return self._any
 
     def map_with(self, doubts: Collection[Doubt]) -> SSHMap | None:
         """Find a map in which at least one of these doubts about dstates holds; else None."""
         answer = self._doubts.answer(doubts, self._reader.read, self._mode)
-        return None if answer is None else self._map_of(answer)
+        return None if answer is None else self._reader.map_of(answer)

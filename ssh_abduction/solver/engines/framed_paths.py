@@ -17,9 +17,9 @@ from dataclasses import dataclass, replace
 
 import clingo
 
-from ssh_abduction.solver.asp.control import Asker, mapped
+from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.facts import names_lp, path_reader, paths_lp
-from ssh_abduction.solver.engines.base import Found, Task
+from ssh_abduction.solver.engines.base import BETTERING, Found, Task, maps_of_labels
 from ssh_abduction.solver.engines.doubts import Settled
 from ssh_abduction.solver.engines.paths import Paths
 from ssh_abduction.solver.engines.refusing import minimal_part
@@ -38,8 +38,6 @@ ALL_PATHS = 0.1
 # Clasp cannot be stopped while it prepares to solve. That takes this many times as long as
 # grounding took.
 PREPARED = 3.5
-# After this many conflicts, stop improving paths one by one; raise the bound from below instead.
-BETTERING = 20_000
 
 
 @dataclass(frozen=True)
@@ -155,16 +153,11 @@ class FramedPaths:
         """
         control = naming.control or self.control(naming.chart, naming.labels)
         reader = self._reader(naming, control)
-        answers = self._asker.answers(
-            reader.read,
-            mode,
-            int(mode == "ignore"),
-            control=control,
-            conflicts=conflicts,
-            ahead=True,
+        return (
+            yield from maps_of_labels(
+                self._asker, control, reader, self.task.theory, mode, conflicts
+            )
         )
-        theory = self.task.theory
-        return (yield from mapped(lambda answer: Found.of(reader.map_of(answer), theory), answers))
 
     def settled(self, naming: NodeLabels, mode: str) -> Settled:
         """Prepare questions about what the best maps with these dstates share.
@@ -175,7 +168,7 @@ class FramedPaths:
         """
         control = naming.control or self.control(naming.chart, naming.labels)
         reader = self._reader(naming, control)
-        return Settled(self._asker, control, mode, reader, reader.map_of)
+        return Settled(self._asker, control, mode, reader)
 
     def _reader(self, naming: NodeLabels, control: clingo.Control) -> path_reader.PathReader:
         """Make a reader of the places and paths in answers of a control."""

@@ -12,16 +12,15 @@ from __future__ import annotations
 from collections.abc import Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from itertools import chain, pairwise
+from itertools import chain
 from typing import TypeAlias
 
 import clingo
-import networkx as nx
 
-from ssh_abduction.solver.asp.control import Asker, Control, mapped
+from ssh_abduction.solver.asp.control import Asker, Control
 from ssh_abduction.solver.asp.facts import names_lp, path_reader, paths_lp, sides_lp
 from ssh_abduction.solver.asp.facts.atoms import number_symbols
-from ssh_abduction.solver.engines.base import Found, Task
+from ssh_abduction.solver.engines.base import BETTERING, Found, Task, maps_of_labels
 from ssh_abduction.solver.engines.doubts import Settled
 from ssh_abduction.solver.engines.homes import fewest_paths, homes_of
 from ssh_abduction.solver.engines.named_labels import NamedLabels
@@ -31,11 +30,9 @@ from ssh_abduction.solver.steps.chart import Link
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Equality
 
-# Give clingo the axioms of this many paths, or this many forbidden pairs of dstates, at once. With
-# fewer, clingo would be asked more often. With more, most would not be needed.
+# Give clingo the axioms of this many paths at once. With fewer, clingo would be asked more often.
+# With more, most would not be needed.
 CONTRARY = 8
-# After this many conflicts, stop improving paths one by one; raise the bound from below instead.
-BETTERING = 20_000
 
 # The labels of all steps, the options of clasp, and the parts of the program.
 _Question: TypeAlias = tuple[tuple[int, ...], tuple[str, ...], tuple[str, ...]]
@@ -225,22 +222,16 @@ class PlacesAndPaths:
             next(count for count in self._task.theory.priorities if count in ("places", "paths"))
             == "places"
         )
-        reader = path_reader.PathReader(
-            control, self._task.trace, self._task.theory, self.named.chart, labels
-        )
-        answers = mapped(
-            reader.map_of,
-            self._asker.answers(reader.read, "opt", 0, control=control, conflicts=TIGHTLY),
-        )
+        reader, theory = self._reader(control, labels), self._task.theory
+        found = maps_of_labels(self._asker, control, reader, theory, "opt", TIGHTLY)
         best: Found | None = None
-        with closing(answers):
+        with closing(found):
             while True:
                 try:
-                    ssh_map = next(answers).without_headings()
+                    best = next(found)
                 except StopIteration as end:
                     return best if end.value and places_first else None
-                best = Found.of(ssh_map, self._task.theory)
-                if len(ssh_map.paths) <= fewest:
+                if len(best.map.paths) <= fewest:
                     return best
 
     def why_not(self, labels: list[int]) -> list[int] | None:
@@ -266,42 +257,13 @@ class PlacesAndPaths:
             self._give_axioms(new)
             return
         far = self._far_away(labels)
-        for members in self._turned_together(links, far) or [
-            _Members.of(minimal_part(self._clash, [*links, *far]))
-        ]:
-            placed = {at for apart in members.far for at in apart.placed}
-            self.named.program.add_links_at({step for step, _ in placed})
-            self._forbidden += 1
-            self.named.program.add_rules(
-                f"forbidden_{self._forbidden}", names_lp.forbidden_links(members.links, placed)
-            )
-
-    def _turned_together(self, links: Iterable[Link], far: Iterable[_Far]) -> list[_Members]:
-        """Find constraints that turns violate: they put the dstates of each pair at one place.
-
-        Args:
-            links: All links between dstates.
-            far: The constraints from evidence.
-
-        Returns:
-            Each violated constraint, with the links of the shortest sequence of turns between the
-            dstates of each pair. At most `CONTRARY` of them, those with the fewest links first.
-        """
-        turns = nx.Graph(
-            (s, x, {"link": (s, action, x)}) for s, action, x in links if self._actions[action].turn
+        members = _Members.of(minimal_part(self._clash, [*links, *far]))
+        placed = {at for apart in members.far for at in apart.placed}
+        self.named.program.add_links_at({step for step, _ in placed})
+        self._forbidden += 1
+        self.named.program.add_rules(
+            f"forbidden_{self._forbidden}", names_lp.forbidden_links(members.links, placed)
         )
-        turns.add_nodes_from(dstate for apart in far for dstate in chain(*apart.pairs))
-        found = []
-        for apart in far:
-            if all(nx.has_path(turns, x, y) for x, y in apart.pairs):
-                ways = (nx.shortest_path(turns, x, y) for x, y in apart.pairs)
-                found.append(
-                    _Members(
-                        [turns.edges[pair]["link"] for way in ways for pair in pairwise(way)],
-                        [apart],
-                    )
-                )
-        return sorted(found, key=lambda members: len(members.links))[:CONTRARY]
 
     def _clash(self, members: list[Link | _Far]) -> bool:
         """Whether no places and paths exist for these members."""
@@ -401,16 +363,7 @@ class PlacesAndPaths:
             mode: Clingo's opt-mode for the best maps.
         """
         control = self._path_control(labels)
-        reader = path_reader.PathReader(
-            control, self._task.trace, self._task.theory, self.named.chart, labels
-        )
-        return Settled(
-            self._asker,
-            control,
-            mode,
-            reader,
-            lambda answer: reader.map_of(answer).without_headings(),
-        )
+        return Settled(self._asker, control, mode, self._reader(control, labels))
 
     def improving_maps(self, labels: Sequence[int]) -> Iterator[Found]:
         """Yield maps with these dstates, none more expensive than the one before.
@@ -446,24 +399,17 @@ class PlacesAndPaths:
             Whether clingo ended before the limit of conflicts.
         """
         control = self._path_control(labels, options, parts)
-        reader = path_reader.PathReader(
-            control, self._task.trace, self._task.theory, self.named.chart, labels
-        )
-        answers = self._asker.answers(
-            reader.read,
-            mode,
-            int(mode == "ignore"),
-            control=control,
-            conflicts=conflicts,
-            ahead=True,
-        )
+        reader = self._reader(control, labels)
         return (
-            yield from mapped(
-                lambda answer: Found.of(
-                    reader.map_of(answer).without_headings(), self._task.theory
-                ),
-                answers,
+            yield from maps_of_labels(
+                self._asker, control, reader, self._task.theory, mode, conflicts
             )
+        )
+
+    def _reader(self, control: clingo.Control, labels: Sequence[int]) -> path_reader.PathReader:
+        """Make a reader of the places and paths in answers of a control."""
+        return path_reader.PathReader(
+            control, self._task.trace, self._task.theory, self.named.chart, labels
         )
 
 

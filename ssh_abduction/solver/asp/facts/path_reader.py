@@ -75,7 +75,7 @@ class PathReader:
             for i, _ in members
         }
         self._at, self._part = _Choices(control, "at"), _Choices(control, "course")
-        self._total = theory.path_order == "total"
+        self._total, self._framed = theory.path_order == "total", theory.star == "frame"
         # The literals of atoms of `before`; 0 if an atom is never true.
         self._before: dict[_Ahead, int] = {}
         # For each path, its places in order in the answer that was read last.
@@ -159,7 +159,7 @@ class PathReader:
             p, turned = answer.at[component]
             place, facing = arrived.setdefault(p, (len(arrived), (slot + turned) % 4))
             path_of, direction = course.get(i, (None, None))
-            heading = (slot + turned - facing) % 4
+            heading = (slot + turned - facing) % 4 if self._framed else None
             dstates.append(DState(i, view, place, path_of, direction, heading))
         paths = tuple(
             MapPath(path, tuple(arrived[p][0] for p in answer.order[h][::first]))
