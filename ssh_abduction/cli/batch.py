@@ -15,13 +15,13 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 from ssh_abduction.cli import EXIT_ERROR
 from ssh_abduction.cli.cluster_jobs import answers_on_cluster
 from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.jobs import StopFlag, answers_here, final_code, in_a_line
-from ssh_abduction.cli.options import theory_of
+from ssh_abduction.cli.jobs import FileQuestion, StopFlag, answers_here, final_code, in_a_line
+from ssh_abduction.cli.options import check_jobs, theory_of
 from ssh_abduction.cli.outcome import (
     Given,
     all_given,
@@ -35,7 +35,7 @@ from ssh_abduction.cli.outcome import (
     why_no_map,
 )
 from ssh_abduction.cli.text import headline
-from ssh_abduction.data.errors import AbductionError, SolverError, named
+from ssh_abduction.data.errors import AbductionError, named
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.no_map import Explanation
@@ -44,18 +44,10 @@ from ssh_abduction.solver import Backbone, Search, Solution, Start, Stop, worker
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 
-KILLED = (
-    "process: expected an answer, got killed, as happens when memory runs out; set "
-    "--memory-limit, or solve fewer traces at a time"
-)
-# A process is lost if it has no answer after GUARDED times its time limit plus OVERDUE seconds, or
-# PATIENCE seconds after Ctrl-C. This is a last resort, as its own guard should end it earlier. On a
-# busy machine that takes it several seconds.
-GUARDED, OVERDUE, PATIENCE = 1.2, 10.0, 3.0
-LATE = (
-    "process: expected an answer soon after --time-limit, got none, as happens when the machine is "
-    "busy or memory is swapped; solve fewer traces at a time (--jobs), or set --memory-limit"
-)
+# A process is lost if it has no answer after GUARDED times its time limit plus OVERDUE seconds.
+# This is a last resort, as its own guard should end it earlier. On a busy machine that takes it
+# several seconds.
+GUARDED, OVERDUE = 1.2, 10.0
 
 
 class SolveAnswer(NamedTuple):
@@ -75,8 +67,8 @@ class SolveAnswer(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class SolveQuestion:
-    """The settings for solving each of many traces. It implements `jobs.FileQuestion`.
+class SolveQuestion(FileQuestion):
+    """The settings for solving each of many traces.
 
     Attributes:
         theory: The theory.
@@ -95,6 +87,17 @@ class SolveQuestion:
     speedups: Speedups
     json: bool
     within: int = 0
+
+    patience: ClassVar = 3.0
+    killed: ClassVar = (
+        "process: expected an answer, got killed, as happens when memory runs out; set "
+        "--memory-limit, or solve fewer traces at a time"
+    )
+    late: ClassVar = (
+        "process: expected an answer soon after --time-limit, got none, as happens when the "
+        "machine is busy or memory is swapped; solve fewer traces at a time (--jobs), or set "
+        "--memory-limit"
+    )
 
     @property
     def has_limits(self) -> bool:
@@ -218,15 +221,6 @@ class SolveQuestion:
         """The seconds after which a process without an answer is given up; None for no limit."""
         return None if self.limit is None else GUARDED * self.limit + OVERDUE
 
-    @property
-    def patience(self) -> float:
-        """The seconds to wait for unfinished answers after Ctrl-C."""
-        return PATIENCE
-
-    def lost(self, lost: workers.Lost, path: str) -> SolveAnswer:
-        """Make the answer for a trace whose process ended without an answer."""
-        return self.failed(lost.number, path, SolverError(LATE if lost.late else KILLED))
-
     def failed(self, number: int, path: str, error: Exception) -> SolveAnswer:
         """Make the answer for a trace that could not be solved because of an error."""
         message = in_a_line(error)
@@ -245,11 +239,7 @@ def run(options: argparse.Namespace) -> int:
             "-: expected files where there are several traces, --jobs or --scheduler, got "
             "standard input; save it to a file"
         )
-    if options.jobs == 0:
-        raise AbductionError(
-            "--jobs: expected how many traces to solve at a time, or -1 for one a core, got 0; "
-            "leave it out for 1"
-        )
+    check_jobs(options.jobs, "traces to solve at a time")
     speedups = Speedups.without(options.without_speedups)
     question = SolveQuestion(
         theory_of(options),

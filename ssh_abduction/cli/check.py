@@ -17,6 +17,7 @@ from ssh_abduction.cli.options import (
     add_theory,
     add_trace,
     solved_trace,
+    some_maps,
     theory_of,
 )
 from ssh_abduction.cli.parsing import Verbs
@@ -118,12 +119,10 @@ def run(options: argparse.Namespace) -> int:
     solved = None if written is None else Theory.from_dict(written)
     trace, theory = as_corrected(trace, theory_of(options, solved), options.maps)
     theory.check_steps(trace)
-    maps = maps_of(data, str(options.maps))
-    if not maps and not options.bound:
-        raise MapError(
-            f"{options.maps}: maps: expected one to check, got none; see the status that solve "
-            "printed, or check its bound (--bound)"
-        )
+    if options.bound:
+        maps = maps_of(data, str(options.maps))
+    else:
+        maps = some_maps(data, options.maps, "check", ", or check its bound (--bound)")
     # Replace each "auto" once for all maps, because counting returns takes long.
     resolved = settle(trace, theory).theory
     made_by = settle(trace, solved or theory).theory

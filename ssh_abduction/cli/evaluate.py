@@ -5,13 +5,12 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from ssh_abduction.cli.options import add_maps, add_trace, read_maps, trace_of
+from ssh_abduction.cli.options import add_maps, add_trace, read_maps, some_maps, trace_of
 from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import counted, table
 from ssh_abduction.data.errors import MapError, named
 from ssh_abduction.data.files import json_line
-from ssh_abduction.data.maps import maps_of
 from ssh_abduction.data.trace import Trace
 
 if TYPE_CHECKING:
@@ -93,12 +92,7 @@ def run(options: argparse.Namespace) -> int:
 
     file = trace_of(options)
     data = read_maps(options.maps)
-    maps = maps_of(data, str(options.maps))
-    if not maps:
-        raise MapError(
-            f"{options.maps}: maps: expected one to evaluate, got none; see the status that solve "
-            "printed"
-        )
+    maps = some_maps(data, options.maps, "evaluate")
     trace = Trace.load(file)
     if options.truth is not None:
         trace = Trajectory.load(options.truth).told_to(trace)

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Generator, Sequence
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 from ssh_abduction.cli import EXIT_ERROR
 from ssh_abduction.cli.outcome import on_ctrl_c
-from ssh_abduction.data.errors import AbductionError, printable
+from ssh_abduction.data.errors import AbductionError, SolverError, printable
 from ssh_abduction.runtime.program import SIGNALLED, interrupted_code
 from ssh_abduction.solver import workers
 
@@ -40,23 +40,29 @@ class FileQuestion(Protocol):
     """A question to be answered for each of many files.
 
     Questions and answers are plain data, because they are sent to other processes and machines.
+
+    Attributes:
+        limit: The seconds for each file; None for no limit.
+        patience: The seconds to wait for unfinished answers after Ctrl-C.
+        killed: The message for a file whose process was killed.
+        late: The message for a file whose process was given up.
     """
+
+    __slots__ = ()
+    limit: float | None
+    patience: ClassVar[float]
+    killed: ClassVar[str]
+    late: ClassVar[str] = ""
 
     @property
     def overdue(self) -> float | None:
         """The seconds after which a process without an answer is given up; None for no limit."""
+        return None
 
     @property
     def has_limits(self) -> bool:
         """Whether each answer needs its own process, which can be killed at a limit."""
-
-    @property
-    def limit(self) -> float | None:
-        """The seconds for each file; None for no limit."""
-
-    @property
-    def patience(self) -> float:
-        """The seconds to wait for unfinished answers after Ctrl-C."""
+        return True
 
     def load(self, path: str) -> Any:
         """Read a file here, because a worker may not be able to read it."""
@@ -72,6 +78,7 @@ class FileQuestion(Protocol):
 
     def lost(self, lost: workers.Lost, path: str) -> Any:
         """Make the answer for a file whose process ended without an answer."""
+        return self.failed(lost.number, path, SolverError(self.late if lost.late else self.killed))
 
     def failed(self, number: int, path: str, error: Exception) -> Any:
         """Make the answer for a file that raised an error."""

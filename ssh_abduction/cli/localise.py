@@ -15,13 +15,13 @@ from ssh_abduction.cli.options import (
     check_picture,
     picture_file,
     read_maps,
+    some_maps,
     trace_path,
 )
 from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import steps_in_words, table
 from ssh_abduction.data.errors import LocaliserError, MapError, named
 from ssh_abduction.data.files import json_line
-from ssh_abduction.data.maps import maps_of
 from ssh_abduction.data.trace import Trace
 
 if TYPE_CHECKING:
@@ -112,12 +112,7 @@ def _localiser(options: argparse.Namespace) -> Localiser:
     from ssh_abduction.online.chances import Chances
     from ssh_abduction.online.localiser import Localiser
 
-    maps = maps_of(read_maps(options.maps), str(options.maps))
-    if not maps:
-        raise MapError(
-            f"{named(options.maps)}: maps: expected one to localise in, got none; see the status "
-            "that solve printed"
-        )
+    maps = some_maps(read_maps(options.maps), options.maps, "localise in")
     check_number(options.map, maps, options.maps)
     if len(maps) > 1 and options.map is None:
         warnings.warn(

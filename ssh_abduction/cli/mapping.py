@@ -14,16 +14,16 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from ssh_abduction.checker.joins import joins_in_words
 from ssh_abduction.cli import EXIT_ERROR, unwritten
 from ssh_abduction.cli.cluster_jobs import answers_on_cluster
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.import_log import WIDTH, named_after, reading_of
-from ssh_abduction.cli.jobs import StopFlag, answers_here, final_code, in_a_line
+from ssh_abduction.cli.jobs import FileQuestion, StopFlag, answers_here, final_code, in_a_line
 from ssh_abduction.cli.obeying import say_obeyed
-from ssh_abduction.cli.options import choices_of, theory_of
+from ssh_abduction.cli.options import check_jobs, choices_of, theory_of
 from ssh_abduction.cli.outcome import exit_code, on_ctrl_c, warn
 from ssh_abduction.cli.run_folders import (
     check_folder,
@@ -36,7 +36,7 @@ from ssh_abduction.cli.run_folders import (
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.corrections import Corrections
 from ssh_abduction.data.corrections_file import beside, load_corrections, to_yaml
-from ssh_abduction.data.errors import AbductionError, MapError, SolverError, named
+from ssh_abduction.data.errors import AbductionError, MapError, named
 from ssh_abduction.runtime.program import interrupted_code
 from ssh_abduction.solver import Stop, check_limit, workers
 from ssh_abduction.theory.theory import Theory
@@ -45,12 +45,7 @@ if TYPE_CHECKING:
     from ssh_abduction.robot_logs.log_maps import LogMap, LogMapping
 from ssh_abduction.robot_logs.log_picture import paths_mean_something
 
-KILLED = (
-    "process: expected an answer, got killed, as happens when memory runs out; map fewer logs at "
-    "a time (--jobs)"
-)
 GIVEN_UP = "expected time to map this log, got an interruption; map it again"
-PATIENCE = 10.0  # seconds that a worker has to report what is known when all work is to stop
 KEPT = 64  # the copy of a log for a worker keeps this many last characters of its name
 
 
@@ -74,8 +69,8 @@ class MapAnswer:
 
 
 @dataclass(frozen=True, slots=True)
-class MapQuestion:
-    """The settings for mapping each of many logs. It implements `jobs.FileQuestion`.
+class MapQuestion(FileQuestion):
+    """The settings for mapping each of many logs.
 
     Attributes:
         theory: The theory; None to choose it for each log.
@@ -96,6 +91,12 @@ class MapQuestion:
     maps: int
     ladder: bool
     corrections: Corrections | None = None
+
+    patience: ClassVar = 10.0
+    killed: ClassVar = (
+        "process: expected an answer, got killed, as happens when memory runs out; map fewer logs "
+        "at a time (--jobs)"
+    )
 
     def obeying(self, folder: Path) -> MapQuestion:
         """Return this question with the corrections in a folder, if any. Raises MapError."""
@@ -281,24 +282,6 @@ class MapQuestion:
         """Make the answer for a log that was interrupted before anything was known."""
         return MapAnswer(number, f"{named(path)}: {GIVEN_UP}", interrupted_code())
 
-    @property
-    def has_limits(self) -> bool:
-        """True, as each log needs its own process, which can be killed."""
-        return True
-
-    @property
-    def overdue(self) -> float | None:
-        """None for no limit, as it is unknown how long it takes to read a log."""
-        return None
-
-    @property
-    def patience(self) -> float:
-        """The seconds to wait for unfinished answers after Ctrl-C."""
-        return PATIENCE
-
-    def lost(self, lost: workers.Lost, path: str) -> MapAnswer:
-        return self.failed(lost.number, path, SolverError(KILLED))
-
     def failed(self, number: int, path: str, error: Exception) -> MapAnswer:
         message = in_a_line(error)
         return MapAnswer(
@@ -310,11 +293,7 @@ class MapQuestion:
 
 
 def run(options: argparse.Namespace) -> int:
-    if options.jobs == 0:
-        raise AbductionError(
-            "--jobs: expected how many logs to map at a time, or -1 for one a core, got 0; leave "
-            "it out for 1"
-        )
+    check_jobs(options.jobs, "logs to map at a time")
     if "-" in options.logs:
         raise AbductionError("-: expected the files of logs, got standard input; save it to a file")
     if options.maps < 0:

@@ -13,6 +13,7 @@ from ssh_abduction.cli.options import (
     add_theory,
     add_trace,
     solved_trace,
+    some_maps,
     theory_of,
 )
 from ssh_abduction.cli.outcome import on_ctrl_c, warn
@@ -21,7 +22,6 @@ from ssh_abduction.cli.text import table
 from ssh_abduction.data.errors import MapError, named, printable
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.map_file import read_json
-from ssh_abduction.data.maps import maps_of
 from ssh_abduction.runtime.program import interrupted_code
 from ssh_abduction.solver import Watch, check_limit
 from ssh_abduction.theory.theory import Theory
@@ -67,12 +67,7 @@ def run(options: argparse.Namespace) -> int:
     check_limit("--memory-limit", "MiB", options.memory_limit)
     trace = solved_trace(options)
     data = read_json(options.maps)
-    maps = maps_of(data, str(options.maps))
-    if not maps:
-        raise MapError(
-            f"{named(options.maps)}: maps: expected one to seek an experiment for, got none; see "
-            "the status that solve printed"
-        )
+    maps = some_maps(data, options.maps, "seek an experiment for")
     sureness = Listing.from_dict(data, named(options.maps)).sureness
     found = data.get("theory") if isinstance(data, dict) else None
     theory: Theory | None = theory_of(options, None if found is None else Theory.from_dict(found))

@@ -16,6 +16,7 @@ from ssh_abduction.cli.parsing import Parser, true_or_false
 from ssh_abduction.data.drives import step_named
 from ssh_abduction.data.errors import AbductionError, MapError, TheoryError, brief, named
 from ssh_abduction.data.map_file import read_json
+from ssh_abduction.data.maps import SSHMap, maps_of
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory.fields import ASSERTIONS, CHOICES
 from ssh_abduction.theory.settle import settle
@@ -278,6 +279,26 @@ def _in_order(options: argparse.Namespace) -> None:
         file=sys.stderr,
     )
     options.maps, options.trace = options.trace, options.maps
+
+
+def some_maps(data: Any, file: str, purpose: str, mend: str = "") -> list[SSHMap]:
+    """Return the maps in the data of a file, at least one. Raises MapError."""
+    maps = maps_of(data, str(file))
+    if not maps:
+        raise MapError(
+            f"{named(file)}: maps: expected one to {purpose}, got none; see the status that solve "
+            f"printed{mend}"
+        )
+    return maps
+
+
+def check_jobs(jobs: int | None, things: str, default: int = 1) -> None:
+    """Raise AbductionError if the option --jobs is 0."""
+    if jobs == 0:
+        raise AbductionError(
+            f"--jobs: expected how many {things}, or -1 for one a core, got 0; leave it out for "
+            f"{default}"
+        )
 
 
 def read_maps(file: str, mend: str = "name the maps first, and then the trace") -> Any:

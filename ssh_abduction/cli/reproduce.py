@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from ssh_abduction.cli.options import output
+from ssh_abduction.cli.options import check_jobs, output
 from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import table
 from ssh_abduction.data.errors import AbductionError, brief, named
@@ -47,10 +47,7 @@ def run(options: argparse.Namespace) -> int:
     from ssh_abduction.evaluation.paper.report import reproduce, steps
 
     seeds = _seeds(options.seeds)
-    if options.jobs == 0:
-        raise AbductionError(
-            "--jobs: expected how many processes, or -1 for one a core, got 0; leave it out for 2"
-        )
+    check_jobs(options.jobs, "processes", default=2)
     folder = Path(options.output or f"out/{options.experiment}")
     columns = (
         TextColumn("{task.description}"),
