@@ -69,7 +69,8 @@ class Said:
     """Two steps that a person says are one dstate or at one place, or are different ones.
 
     Attributes:
-        kind: "same", "different", "elsewhere" or "same_place".
+        kind: "same" (one dstate), "different" (two dstates), "elsewhere" (two places) or
+            "same_place".
         steps: The two steps, such as ("monday:12", "tuesday:3").
         note: A remark of the person; it has no effect.
     """

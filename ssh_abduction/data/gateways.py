@@ -52,7 +52,7 @@ class Sight:
     drive: int = 0
 
     def __hash__(self) -> int:
-        """Hash few fields. Sights are often hashed, and few of a map share these."""
+        """Hash few fields, to be fast. Few sights of a map are equal in these."""
         return hash((self.step, self.dstate.id))
 
 
@@ -184,7 +184,7 @@ class Facing:
 def facing(
     trace: Trace, ssh_map: SSHMap, axioms: Collection[str], changes: bool = False
 ) -> Facing | None:
-    """Say how the dstates face by the stars of a map in which some paths may yet be one.
+    """Say how the dstates face by the stars of a map whose paths may still be merged.
 
     None if no frame fits the stars of some place. The headings of the map are ignored. `axioms`
     and `changes` are as in `with_allowed_headings`.
@@ -244,10 +244,10 @@ def frames_that_fit(
 ) -> list[Turned] | None:
     """Find a frame and a shift for each sight at a place so that all pairs satisfy the axioms.
 
-    Of several solutions, it has the fewest gateways that change between drives; None if nothing
-    fits. A frame says which gateways exist, and a shift how many slots to add, so that gateways
-    have the same slots as in the first sight. With `as_shown`, the headings of the dstates must
-    fit, too.
+    Of several solutions, return one with the fewest gateways that change between drives; None
+    if nothing fits. A frame says which gateways exist. A shift says how many slots to add, so
+    that gateways have the same slots as in the first sight. With `as_shown`, the headings of the
+    dstates must fit, too.
     """
     place, order = sights[0].dstate.place if sights else None, {s: k for k, s in enumerate(sights)}
     found_turns = [

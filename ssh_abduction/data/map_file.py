@@ -114,7 +114,7 @@ def _broken(error: json.JSONDecodeError, text: bytes, source: str) -> MapError:
 
 
 def check_format(data: Mapping[str, Any], expected: str, where: str) -> None:
-    """Raise MapError if the fields `format` and `version` of a file, if any, are others."""
+    """Raise MapError if the field `format` or `version` of a file has another value."""
     if "format" in data and data["format"] != expected:
         raise MapError(
             f'{where}: format: expected "{expected}", got {brief(data["format"])}; '

@@ -153,7 +153,7 @@ class Fit:
 
     Attributes:
         chi2: The sum of the squared normalised residuals.
-        dof: The degrees of freedom. If the map and the noise model are right, chi2 is near them.
+        dof: The degrees of freedom. If the map and the noise model are right, chi2 is near dof.
         p: The probability that chi2 has this value or a larger one.
         scale: The share by which displacements are too long.
         bend: The drift of the heading, in radians a metre.

@@ -73,7 +73,7 @@ def described(region: Region, called: Callable[[str, int], str]) -> str:
 def of_members(members: Mapping[Reason, Collection[int]]) -> tuple[Region, ...]:
     """Make a region of each different set of places, the largest first, with those inside it.
 
-    `members` has, for each reason, the places that it makes a region. An empty set makes none.
+    `members` has the places of the region that each reason makes. An empty set makes no region.
     All directed paths that bound a set are its bounds.
     """
     right: dict[tuple[int, int], set[int]] = {}
@@ -129,9 +129,10 @@ def ids_at(regions: Iterable[Region] | None, place: int | None) -> tuple[int, ..
 
 
 def region_of(regions: Iterable[Region] | None, place: int | None) -> int | None:
-    """Find the region that a person means by a place in it: the smallest one behind one place.
+    """Find the region that a person means by a place in it.
 
-    Else it is the smallest region with the place; None if there is none.
+    It is the smallest region with the place and a door, or else the smallest with the place. None
+    if no region has the place.
     """
     around = [region for region in regions or () if place in region.places]
     behind = [region for region in around if region.door is not None]

@@ -80,8 +80,8 @@ class Theory:
             its displacements.
         joint: How many returns (visits that come back to a place) are tested together. 1: each
             alone. 2: also pairs of them.
-        returns: How many returns to a place or a dstate may be true, so that `reject` is divided
-            among them; 0 counts them in the trace.
+        returns: Number of returns to a place or a dstate that may be true. `reject` is divided
+            among them. 0 counts them in the trace.
         misread: Cost in dstates, with one decimal, of treating a view or a star (the gateways seen
             at a place) as wrong; 0 forbids it.
         slipped: Cost in dstates of an action that did not do what its name says; 0 forbids it.

@@ -56,7 +56,7 @@ class Course(NamedTuple):
 
     @staticmethod
     def of(labels: tuple[int, ...], places: tuple[int | None, ...]) -> Course:
-        """Make a course of some labels. Places of dstates with larger numbers are left out."""
+        """Make a course of some labels. Places of dstates above the largest label are dropped."""
         return Course(labels, places[: max(labels, default=-1) + 1])
 
 

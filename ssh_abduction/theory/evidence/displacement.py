@@ -97,10 +97,10 @@ class Displacement(Evidence):
     def believed(
         self, trace: Trace, returns: Collection[Equality], wrong: Collection[int]
     ) -> frozenset[Equality]:
-        """Find the displacements in the loops of returns that a map believes.
+        """Find the displacements in the loops of `returns` that a map does not treat as wrong.
 
         Closures make further loops. So with closures, all displacements are in loops. The result is
-        empty if no displacement may be wrong.
+        empty if the theory allows no wrong displacement.
 
         Args:
             wrong: The steps whose displacements the map treats as wrong.

@@ -237,7 +237,7 @@ class Loops:
         return self._white(first, last, last, last)
 
     def repeated(self, first: Steps, last: Steps) -> Array:
-        """Return those that a wrong scale and a steady drift cause, m x 3 x 3."""
+        """Return the covariances that a wrong scale and a steady drift cause, m x 3 x 3."""
         return self._repeated((first, last), (first, last))
 
 

@@ -284,7 +284,7 @@ class Returns:
     def refused_at(
         self, labels: Sequence[int], places: Sequence[int | None], step: int
     ) -> frozenset[Equality] | None:
-        """Find two returns that are rejected most clearly together, while neither is alone.
+        """Find the two returns that are rejected most clearly together, but not one by one.
 
         The later return ends at `step`. `labels` has the dstate of each step, and `places`
         the place. They need not be those of a map.
