@@ -651,7 +651,9 @@ def test_an_error_is_json_too(
         data = json.loads(out)
         assert list(data) == ["status", "error"]
         assert (data["status"], err) == ("error", f"ssh-abduction: {data['error']}\n")
-    assert main(["solve", room, "--json", "-o", str(tmp_path / "nosuch" / "maps.json")]) == 1
+    ring = tmp_path / "ring"  # only writing it shows that it is no file
+    ring.symlink_to(ring)
+    assert main(["solve", room, "--json", "-o", str(ring)]) == 1
     assert json.loads(capsys.readouterr().out)["status"] == "optimal"  # no error follows it
 
 

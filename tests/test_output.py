@@ -495,3 +495,30 @@ def test_an_error_names_the_file_and_no_draft(target: str, tmp_path: Path) -> No
     path = tmp_path / target
     with pytest.raises(OSError, match=re.escape(f"'{path}'") + "$"):
         write_file(path, b"x")
+
+
+@pytest.mark.parametrize(
+    ("target", "why"),
+    [
+        ("none/maps.json", "its folder is not there; make it first"),
+        ("", "it is a folder; name a file in it"),
+        ("sealed/maps.json", "its folder may not be written; name another one"),
+    ],
+)
+def test_a_file_that_cannot_be_written_is_an_error_before_the_work(
+    target: str,
+    why: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (tmp_path / "sealed").mkdir()
+    sealed = tmp_path / "sealed"  # the mode of a folder does not stop root
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != sealed)
+    trace, file = tmp_path / "a.jsonl", tmp_path / target
+    Trace.from_steps("aba", ["travel"] * 2).save(trace)
+    for verb, what in (("solve", "the solution"), ("import", "the trace")):
+        assert main([verb, str(trace), "-o", str(file)]) == 1
+        captured = capsys.readouterr()
+        assert captured.out == ""
+        assert captured.err == f"ssh-abduction: {file}: cannot write {what}: {why}\n"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from ssh_abduction.cli.options import add_map, add_maps, trace_path
+from ssh_abduction.cli.options import add_map, add_maps, output, trace_path
 from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.data.errors import MapError
@@ -34,7 +34,9 @@ def add_parser(verbs: Verbs) -> None:
         "the trace that was mapped; its turns give a better layout of a map without poses",
         type=trace_path,
     )
-    parser.add("-o --output FILE", "file to write (default: standard output)", default="-")
+    parser.add(
+        "-o --output FILE", "file to write (default: standard output)", default="-", type=output
+    )
     parser.add_setting(
         "level",
         "what a node is: a place or a dstate (default: places for nav2 and tmap2 if the map "

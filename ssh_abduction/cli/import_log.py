@@ -10,10 +10,10 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ssh_abduction.cli.options import add_output, write
+from ssh_abduction.cli.options import add_output, check_output, write
 from ssh_abduction.cli.parsing import Parser, Verbs
 from ssh_abduction.cli.text import counted
-from ssh_abduction.data.errors import AbductionError, named
+from ssh_abduction.data.errors import AbductionError
 
 if TYPE_CHECKING:
     from perception.places.importing import Imported
@@ -151,11 +151,7 @@ def _laser_value(field: str, text: str) -> Any:
 def run(options: argparse.Namespace) -> int:
     from ssh_abduction.cli.outcome import warn
 
-    if options.output != "-" and not Path(options.output).absolute().parent.is_dir():
-        raise AbductionError(
-            f"{named(options.output)}: cannot write the trace: its folder is not there; make it "
-            "first"
-        )
+    check_output(options.output, "the trace")
     log, done = (_live if options.log == "-" else _whole)(options, lambda note: warn([note]))
     said = (
         f"{counted(len(log), 'scans')}, {done.track.way[-1]:.0f} m: "

@@ -34,5 +34,5 @@ def run(options: argparse.Namespace) -> int:
     kind, step = saved.thing(options.what)
     step = saved.step_of_name(kind, step)
     file = saved.save(saved.corrections.with_name(options.name, kind, step))
-    print(printable(f"the {kind} of {step} is {options.name!r}, in {named(file)}"))
+    print(printable(f"the {kind} of {step} is {options.name.strip()!r}, in {named(file)}"))
     return 0

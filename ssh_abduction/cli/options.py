@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import os
 import re
 import sys
 from collections.abc import Sequence
@@ -125,6 +126,22 @@ def add_output(parser: Parser) -> None:
         type=output,
         required=True,
     )
+
+
+def check_output(target: str, what: str) -> None:
+    """Raise AbductionError before long work if a file cannot be written into its folder."""
+    folder, path = Path(target).absolute().parent, Path(target)
+    if target == "-" or not (path.is_dir() or path.is_file() or not path.exists()):
+        return  # a device has no draft beside it
+    if path.is_dir():
+        why = "it is a folder; name a file in it"
+    elif not folder.is_dir():
+        why = "its folder is not there; make it first"
+    elif not os.access(folder, os.W_OK):
+        why = "its folder may not be written; name another one"
+    else:
+        return
+    raise AbductionError(f"{named(target)}: cannot write {what}: {why}")
 
 
 def write(trace: Trace, target: str, said: str) -> None:

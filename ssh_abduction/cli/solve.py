@@ -18,8 +18,10 @@ from ssh_abduction.cli.obeying import Obeying
 from ssh_abduction.cli.options import (
     add_limits,
     add_theory,
+    check_output,
     maps_path,
     number_steps,
+    output,
     theory_of,
     trace_path,
 )
@@ -85,7 +87,7 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.add("--json", "print the solution as JSON; for many traces, one line each")
     parser.add("--together", "the traces are drives through one building: find their joint maps")
-    parser.add("-o --output FILE", "also write the solution to this file, as JSON")
+    parser.add("-o --output FILE", "also write the solution to this file, as JSON", type=output)
     parser.add(
         "--onto MAPS",
         "add the trace to the first map in this file, which solve -o wrote, and keep its "
@@ -147,6 +149,8 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    if options.output is not None:
+        check_output(options.output, "the solution")
     if options.onto is not None:
         from ssh_abduction.cli import onto
 

@@ -8,7 +8,7 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ssh_abduction.cli.options import add_maps, flags_of, trace_beside, trace_path
+from ssh_abduction.cli.options import add_maps, flags_of, output, trace_beside, trace_path
 from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.data.errors import AbductionError, MapError, brief, is_whole, named
 
@@ -41,7 +41,7 @@ def add_parser(verbs: Verbs) -> None:
         nargs="?",
         type=trace_path,
     )
-    parser.add("-o --output FILE", "write the page to this file and do not open it")
+    parser.add("-o --output FILE", "write the page to this file and do not open it", type=output)
     parser.add(
         "--run RUN",
         "a second trace from the mapped world. The page replays it, with a belief about where the "

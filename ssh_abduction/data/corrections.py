@@ -144,7 +144,7 @@ class Corrections:
             step: The step, such as "monday:12".
 
         Raises:
-            MapError: Another place, path or region has this name, or an argument is wrong.
+            MapError: Another thing of this kind has this name, or an argument is wrong.
         """
         one_of("kind", kind, NAMED, MapError)
         kept = [n for n in self.names if (n.kind, n.step) != (kind, step)]
