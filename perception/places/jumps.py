@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 # A step between two scans is impossible if it is longer than both FAR metres and UNUSUAL times the
 # usual step. It is doubtful if it is longer than half of that.
 FAR, UNUSUAL = 1.5, 3.5
-# A scan matches nothing if less than this share of its points lies on walls seen before. Behind a
+# A scan matches nothing if less than this share of its points lies on walls seen before. After a
 # step of more than FAR metres, ten good logs have 0.32 or more.
 UNMATCHED = 0.1
 # After a pause of PAUSE times the usual interval, the robot may have driven on at up to FASTER

@@ -43,8 +43,8 @@ NEAR, DRIFT, AWAY = 3.0, 0.02, 15.0
 # A scan contradicts the scans before it if less than the share POORLY of its points matches, and
 # more than the share INTRUDING of the points of either side lies in the free space of the other, at
 # least MARGIN metres from walls. BESIDE scans on each side are compared. In good logs, scans that
-# match so badly have at most 27 % of their points there. If the share that matches is by WORSE less
-# than in all but RARELY percent of the scans of the log, the share INTRUDING_RARELY suffices.
+# match so badly have at most 27 % of their points there. The share INTRUDING_RARELY suffices if
+# the share that matches is more than WORSE below the RARELY-th percentile of the log.
 INTRUDING, MARGIN, POORLY, BESIDE = 0.3, 0.4, 0.6, 3
 INTRUDING_RARELY, WORSE, RARELY = 0.15, 0.25, 1.0
 # Beams that meet walls are at most this many metres long, in the median of a log. Good logs have up

@@ -35,11 +35,11 @@ from perception.places.track import Array
 
 # Obstacles that stand free and cover less than this many square metres are furniture.
 FURNITURE = 4.0
-# A branch counts if it leads at least OUT metres out of the disc of its junction, and at least a
-# share of SHARE of the radius of the disc.
+# A branch counts if it leads at least OUT metres out of the disc of its junction, and at least
+# SHARE times the radius of the disc.
 OUT, SHARE = 0.75, 0.5
-# Junctions are one up to ONE metres from each other, even if their discs are smaller. The free
-# space between them is nowhere narrower than a share of NARROW of the smaller disc.
+# Junctions within ONE metres of each other are merged, even if their discs are smaller. The free
+# space between merged junctions is nowhere narrower than NARROW times the smaller disc.
 ONE, NARROW = 0.6, 0.75
 # A shore is SHORE widths of the robot away from obstacles. A space is open if its middle is at
 # least WIDE times as far from obstacles as the shore. Then the shores on both sides of the space

@@ -22,7 +22,7 @@ from ssh_abduction.data.odometry import radians_between
 # Junctions are one place within SAME metres, or within this share of the smaller radius.
 SAME, SHARE = 0.6, 0.5
 # The robot turned around if its directions of motion over some stride in metres, before and after,
-# differ by more than REVERSED radians. It turns on the spot or in a bow, so there are several
+# differ by more than REVERSED radians. It turns on the spot or in a curve, so there are several
 # strides. Other visits are farther away along the trajectory than a stride and than their radius.
 STRIDES, REVERSED = (1.0, 2.0, 4.0), math.radians(135)
 # The beginning and the end of a drive are turning points, too, if the robot visits no place within

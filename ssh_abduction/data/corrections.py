@@ -38,7 +38,7 @@ from ssh_abduction.data.trace import Trace, checked_trace
 FORMAT, VERSION = "ssh-corrections", 1
 # The kinds of pairs of steps, which are fields of a theory.
 PAIRS = ("same", "different", "elsewhere", "same_place")
-# How verbs write the number of a dstate, place, path or region. No name may read so.
+# How the command line writes the number of a dstate, place, path or region. No name may look so.
 _NUMBER = re.compile(r"((p|place|path|region) ?)?[0-9]+")
 # The directions of gateways by name, in degrees clockwise from ahead.
 DIRECTIONS = {"ahead": 0.0, "right": 90.0, "back": 180.0, "left": 270.0}

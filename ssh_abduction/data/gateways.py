@@ -315,7 +315,7 @@ def _fitted(
         return None
 
     if len(sights) > 1:
-        # The search goes on from what fits all but the last sight, if that is the first answer.
+        # Extend the first answer for all sights but the last. If that fails, search anew.
         earlier = tuple(turn for turn in made if sights[-1] not in turn[:2])
         fewer = None if headings is None else headings[:-1]
         known = _fitted(sights[:-1], fewer, earlier, axioms, most)
