@@ -67,10 +67,10 @@ def derive(
 
 @dataclass(frozen=True)
 class _Line:
-    """A line of an argument: new conclusions from `group`, links, and the lines before it.
+    """A line of an argument: the conclusions that follow from its links and the lines before it.
 
-    Without conclusions, it reaches a contradiction. A supposed line holds only under the
-    supposition that leads to it.
+    `group` has the links. A line without conclusions is the contradiction. A line that is
+    `supposed` holds only under the supposition.
     """
 
     group: tuple[tuple[str, int], ...]
@@ -183,9 +183,9 @@ class Argument:
         assumed: Sequence[Assumption],
         known: frozenset[clingo.Symbol],
     ) -> tuple[tuple[str, int], ...] | None:
-        """Find the first link of `left`, in a tuple, with a new conclusion or a contradiction.
+        """Find the first link of `left` that gives a new conclusion or a contradiction.
 
-        None if no single link gives anything new.
+        Return it as a tuple of one link; None if no single link gives anything new.
         """
         for link in left:
             active = _active([*placed, link])
@@ -260,10 +260,10 @@ class Argument:
     def _support(
         self, conclusion: clingo.Symbol | None
     ) -> tuple[list[clingo.Symbol], tuple[tuple[str, int], ...]]:
-        """Find a minimal set of earlier conclusions that imply a conclusion, and its links.
+        """Find the premises of a conclusion: a minimal set of earlier conclusions, and the links.
 
-        None stands for the contradiction at the end. The links are those of the line of the
-        conclusion, and earlier ones that are needed again.
+        The links are those of the conclusion's own line, and links of earlier lines if the
+        conclusions of these lines do not suffice. The conclusion None is the contradiction.
         """
         line = self._line_of(conclusion)
         number = len(self._lines) - 1 if conclusion is None else self._born[conclusion]
@@ -294,8 +294,8 @@ class Argument:
     def _rank(self, symbol: clingo.Symbol) -> tuple[bool, bool, int, int, tuple[int, ...]]:
         """Compute a sort key of premises. Premises with lower keys are preferred.
 
-        Premises that hold in every map should be about the first step of the pair, and premises
-        under the supposition about the second step.
+        A premise should be about a step of the pair. Under the supposition, it should be about the
+        second step or about both, not about the first step alone.
         """
         name, steps = facts.read_conclusion(symbol)
         supposed = self._lines[self._born[symbol]].supposed
@@ -394,9 +394,9 @@ class Argument:
             )
 
     def _map_without(self, link: tuple[str, int]) -> SSHMap:
-        """Find a map with the supposition in which all links but this one hold.
+        """Find a map that satisfies the supposition and all links of the argument but this one.
 
-        The axioms in SHOWN hold in the map at as many steps as possible.
+        Axioms in SHOWN also hold at other steps, at as many as possible.
         """
         supposed = [self._supposed]
         active = _active(other for other in self._links if other != link)

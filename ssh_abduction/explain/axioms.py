@@ -146,9 +146,10 @@ class Axioms:
     def consistent(
         self, active: Sequence[clingo.Symbol] = (), assumed: Sequence[Assumption] = ()
     ) -> bool:
-        """Tell whether there is a map with these atoms true or false, as assumed.
+        """Tell whether a map satisfies the axioms and the assumptions.
 
-        If the axioms are relaxed, only those with an atom in `active` have to hold.
+        An assumption is an atom and whether it is true. If the axioms are relaxed, only those
+        with an atom in `active` have to hold.
         """
         return self.map_with(active, assumed) is not None
 
@@ -184,10 +185,10 @@ class Axioms:
         assumed: Sequence[Assumption] = (),
         known: Collection[clingo.Symbol] = (),
     ) -> frozenset[clingo.Symbol]:
-        """Find the conclusions that hold in all maps in which these axioms hold.
+        """Find the conclusions that hold in all maps that satisfy these axioms and assumptions.
 
-        The caller must know that there is such a map, and may know conclusions. Axioms have
-        an atom in `active`. `assumed` has atoms and whether they are true.
+        Arguments are as in `consistent`. There must be such a map. `known` has conclusions
+        that are already known to hold, which saves time.
         """
         # Clingo's cautious reasoning loses atoms under assumptions. So each query asks for a model
         # in which at least one unproven conclusion fails, until there is none.
@@ -219,8 +220,7 @@ class Axioms:
     ) -> list[Assumption] | None:
         """Find a minimal subset of the assumptions that contradicts these axioms, or None.
 
-        Axioms have an atom in `active`. An assumption is an atom and whether it is true.
-        The subset has early ones rather than late ones.
+        Arguments are as in `consistent`. Early assumptions are preferred to late ones.
         """
         # Bisect for the shortest prefix of the assumptions that, with the assumptions in `needed`,
         # contradicts the axioms. Its last assumption is needed. Unsat cores shorten the prefix.

@@ -151,7 +151,7 @@ class TraceQuestion(LimitedQuestion[TraceExplanation]):
         self._complete = False
 
     def known(self, why: Stop | None = None) -> TraceExplanation:
-        """Return what is known if `why` is about to end the search."""
+        """Return what is known so far. `why` is the limit that is about to end the search."""
         mends = tuple(sorted(self._mends, key=lambda mend: (mend.step, mend.kind)))
         return TraceExplanation(
             self._possible, self._clash, mends, self._complete, why or self.stopped
@@ -187,7 +187,7 @@ class TraceQuestion(LimitedQuestion[TraceExplanation]):
         self._complete = True
 
     def _suits(self, trace: Trace, theory: Theory) -> bool:
-        """Tell whether a changed trace still has all that the theory reads."""
+        """Tell whether a changed trace still has everything that the theory needs."""
         try:
             settle(trace, theory)
         except AbductionError:

@@ -94,9 +94,9 @@ def explain(
 ) -> Explanation | None:
     """Explain why a trace has no map; None if it has one.
 
-    First find a short stretch of steps without a map, of those `near`, or else try the whole
-    trace. Then drop steps from its end and from its start, as long as the other steps have no
-    map. Then drop axioms one by one, until each axiom that is left is needed for the clash.
+    First find a stretch of steps without a map. Try the steps `near`, then short stretches, then
+    the whole trace. Then drop steps from the end and from the start, as long as the other steps
+    have no map. Then drop axioms one by one, until each axiom that is left is needed for the clash.
     `stop` is called now and then. If it returns True, Interrupted is raised. Raises TraceError
     and TheoryError as `solve` does, and if the theory allows wrong displacements (`jumped`).
     """

@@ -134,7 +134,7 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
         self._ruling_out: dict[bool, Piece] = {}  # a piece of the trace without a map of the side
 
     def known(self, why: Stop | None = None) -> PairExplanation:
-        """Return what is known if `why` is about to end the search."""
+        """Return what is known so far. `why` is the limit that is about to end the search."""
         verdict = self._verdict()
         stopped = why or self.stopped
         return PairExplanation(
@@ -153,10 +153,10 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
         )
 
     def _loop(self) -> str | None:
-        """Say how far off the loop between the steps closes; None if that is not known.
+        """Put the closing error of the loop between the steps into words; None if unknown.
 
-        It is unknown without displacements, and if one is missing in the loop: where a drive
-        starts, or after a lift.
+        It is unknown if the theory uses no displacements, or if one is missing in the loop: where
+        a drive starts, or after a lift.
         """
         evidence = displacement_of(self.problem)
         if evidence is None:
@@ -247,8 +247,8 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
     def _pieces(self, most: int) -> Iterator[list[int]]:
         """Yield lists of steps around the pair, from few to at most `most`.
 
-        If the theory has rules of the user or faults, a map of the trace, cut to fewer steps, may
-        break an axiom. Then only the whole trace is yielded, if it is short.
+        A map of the trace, restricted to fewer steps, is a map of these steps. This may fail if
+        the theory has faults or rules of the user. Then only the whole trace is yielded, if short.
         """
         whole = range(len(self.trace))
         if self.theory.rules or self.theory.has_faults:
@@ -299,7 +299,7 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
     def _list_minimal_maps(self, settled: bool) -> None:
         """List minimal maps, and count those of each side.
 
-        If the verdict is `settled`, look for one.
+        If the verdict is already `settled`, look for a single minimal map only.
         """
         left = self._watch.left()
         seconds = (

@@ -25,8 +25,8 @@ class Piece:
             renumbered. Where steps are left out, the action and the displacement are unknown.
         steps: The steps by their numbers in the whole trace, ascending. In words, steps of several
             drives are named by their drives.
-        facts: Clingo facts for the pairs of steps that by the displacements are not at one dstate,
-            or not at one place. Empty if no steps are left out between the first and the last.
+        facts: Clingo facts for the pairs of steps that displacements exclude from being at one
+            dstate, or at one place. Empty if no steps are left out between the first and the last.
     """
 
     problem: Problem

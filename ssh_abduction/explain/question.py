@@ -72,7 +72,7 @@ class LimitedQuestion(ABC, Generic[_Answer]):
 
     @abstractmethod
     def known(self, why: Stop | None = None) -> _Answer:
-        """Return what is known so far; `why` is about to end the search, if not None."""
+        """Return what is known so far. `why` is the limit that is about to end the search."""
 
     @abstractmethod
     def _find_out(self) -> None:
@@ -93,7 +93,7 @@ class LimitedQuestion(ABC, Generic[_Answer]):
         return self.stopped is not None
 
     def _solved(self, trace: Trace, theory: Theory, maps: int | None, seconds: float) -> Search:
-        """Make a search for maps."""
+        """Make a search for maps that ends at the limits of this question."""
 
         def end_with_this(_: Progress) -> None:
             if self._over():

@@ -5,9 +5,9 @@
 >>> print(explain_place(corner, 2, 0))
 place 2 lies right of path 0+: step 1 turned right from path 0+ onto path 1+ at place 1, and place 2 is ahead on path 1+
 
-Numbers are those of the first minimal map. In another map, the same place is the one where that map
-has the first step at the place. The same path is the one that the robot faces in that map at the
-first step along the path.
+Numbers are those of the first minimal map. Other maps may number differently, so places and paths
+are identified by steps: take the first step at the place in the first map, and then the place of
+this step in the other map. Likewise for a path, by the first step along it.
 """  # noqa: E501 - one line of output
 
 from __future__ import annotations

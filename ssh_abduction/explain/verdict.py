@@ -52,10 +52,7 @@ class Side:
     nats: float | None = None
 
     def dearness(self, theory: Theory) -> tuple[float, ...] | None:
-        """Return the numbers by which the best maps of two sides are compared; None without a map.
-
-        Lower numbers are better. The first number decides, then the next.
-        """
+        """Return a sort key of the cost of the best map; None without a map. Lower is better."""
         if self.nats is not None:
             return (self.nats,)
         return None if self.cost is None else self.cost.preferred_by(theory)
@@ -83,7 +80,7 @@ class PairExplanation:
         clash: Why the trace has no map; None if it has one, or if the reason is not known.
         stopped: The limit that ended the search; None if it ended by itself.
         theory: The theory, with each "auto" replaced by the value that was used.
-        loop: How far off the loop between the steps closes, in words; None without displacements.
+        loop: The closing error of the loop between the steps, in words; None if unknown.
         changes: Sentences about the gateways at the places of the steps that changed between drives
             in the best map, and what a map costs without changes.
     """

@@ -68,9 +68,10 @@ class Words:
         }
 
     def of(self, conclusion: tuple[str, tuple[int, ...]], *, would: bool) -> str:
-        """Put a conclusion, a name and steps by their numbers in the piece, into a clause.
+        """Put a conclusion into a clause.
 
-        If it is only supposed, `would` writes "would be" instead of "is".
+        A conclusion is a name and steps, numbered as in the piece. With `would`, the clause says
+        "would be" instead of "is", for a conclusion that is only supposed.
         """
         name, steps = conclusion
         if name in (

@@ -72,8 +72,8 @@ class Choice:
     Attributes:
         questions: Some of the questions in `Comparison.deciding`.
         options: The ways in which maps answer these questions, the way of map 1 first.
-        differing: For each sort (faults, dstates, places, paths, courses) the steps that maps group
-            differently, if how a map groups them depends only on this choice.
+        differing: For each sort (faults, dstates, places, paths, courses) the steps whose grouping
+            depends on this choice and on no other.
     """
 
     questions: tuple[Question, ...]
@@ -150,8 +150,7 @@ class Comparison:
         listed: What the listed maps share.
         variants: For each sort, the number of different groupings of the steps by listed maps.
         choices: The independent choices. Each combination of their options is one listed map.
-        together: For each sort, the steps that maps group differently, if how a map groups them
-            depends on several choices together.
+        together: For each sort, the steps whose grouping depends on several choices together.
         deciding: Questions that distinguish all listed maps, in the order in which to ask them. The
             first ones distinguish all labelings. None is superfluous, but a smaller set may exist.
         sizes: Pairs of a size (numbers of dstates, places and paths) and the number of maps with
@@ -332,7 +331,7 @@ def _depending(
 
 
 def _in_order(steps: dict[Matter, set[int]]) -> dict[Matter, tuple[int, ...]]:
-    """Sort the sorts in the order of causes, and the steps of each in ascending order."""
+    """Order steps by sort, causes before effects. List the steps of each sort ascending."""
     return {sort: tuple(sorted(steps[sort])) for sort in MATTERS if sort in steps}
 
 
@@ -341,7 +340,10 @@ def _choice(
     option: NDArray[np.intp],
     differing: dict[Matter, tuple[int, ...]],
 ) -> Choice:
-    """Make a choice."""
+    """Make the choice that consists of the questions `asked`.
+
+    `option` has the number of the option of each map. `differing` is that of the choice.
+    """
     members = members_of(option.tolist())
     options = [
         Option(tuple(bool(a.column[maps[0]]) for a in asked), tuple(i + 1 for i in maps))

@@ -3,10 +3,10 @@
 If the action was tried at a dstate, its link is known. Otherwise the axioms, or the order of a
 path, may still tell where the action leads:
 
-- A turn, if places have frames (numbered directions): it leads to the slot that lies one, two or
-  three quarters on (axiom turn_rotates). At most one dstate has that slot as its heading
-  (one_dstate_per_heading). If the map has none, the star there is still known: the star of another
-  dstate at the place, rotated by the turns between the two.
+- A turn, if places have frames (four directions, the slots 0 to 3): it leads to the slot one, two
+  or three quarters further clockwise (axiom turn_rotates). At most one dstate has that slot as its
+  heading (one_dstate_per_heading). If the map has none, the star there is still known: the star of
+  another dstate at the place, rotated by the turns between the two.
 - A turn around at a dstate along a path: it leads back along the path (turn_around_reverses), and
   at most one dstate is there (one_dstate_per_course).
 - A travel along a path: it leads to the next place in the order of the path. This is only expected,
@@ -54,7 +54,7 @@ class Consequence:
         return self.how in ("link", "implied")
 
     def clashes(self, other: Consequence) -> bool:
-        """Tell whether any outcome refutes this map or the map of the other prediction."""
+        """Tell whether every outcome refutes at least one of the two predicting maps."""
         if not (self.is_sure and other.is_sure and self.seen and other.seen):
             return False
         one, two = self.seen, other.seen
@@ -121,7 +121,7 @@ class Consequences:
         return OPEN
 
     def sure_ends(self, actions: Sequence[Action]) -> tuple[tuple[int, str, int], ...]:
-        """List the untried actions whose ends the axioms imply: dstate, action, dstate reached."""
+        """List the untried turns whose end the axioms imply: (dstate, action, dstate reached)."""
         turns = [action for action in actions if action.kind == "turn"]
         if not (self._framed or (self._turns_back and self._at)):
             return ()

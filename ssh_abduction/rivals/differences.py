@@ -267,7 +267,7 @@ def _changes(table: Table, sort: Sort) -> Iterable[Change]:
 
 
 def _groups(classes: Sequence[int], ones: Sequence[int]) -> list[list[int]]:
-    """Group the classes that are one in a map, by its row in `Table.ones`.
+    """Group classes as a map does. `ones` is the row of the map in `Table.ones`.
 
     Classes without a place, path or course in the map are left out.
     """

@@ -48,7 +48,10 @@ class DriveJoin:
 
 @dataclass(frozen=True, slots=True)
 class DrivePair:
-    """The places that two drives share: for each two places of the first map, the surest join.
+    """The places that two drives share.
+
+    For each place of one drive and place of the other, by the first map, there is at most one join,
+    the surest one.
 
     Attributes:
         first: The name of the earlier drive.
@@ -109,7 +112,7 @@ def joins_of_drives(listing: Listing) -> tuple[DrivePair, ...]:
     """Find what each pair of drives has in common in the maps of a joint trace.
 
     Args:
-        listing: The maps. If they were weighed, all their rivals count.
+        listing: The maps. If they are compared by cost, rivals with a higher cost count, too.
 
     Returns:
         A value for each pair of drives, in order; empty for the maps of a single drive.
@@ -178,7 +181,7 @@ def _pair(
 def _visits(drive: Drive, placings: Sequence[_Placing]) -> list[list[int]]:
     """List the steps of a drive at each place of the first map.
 
-    Of steps that no map tells apart, list the first one.
+    Of several steps that every map has at one place, list only the first.
     """
     first: dict[tuple[int, ...], int] = {}
     for t in range(drive.first, drive.stop):

@@ -69,7 +69,7 @@ Can: TypeAlias = Callable[[Seen], Iterable[str]]
 
 
 def _entry(entry: Any) -> Any:
-    """Return an entry of a star as JSON has it. An opening is 1 if it is open, else 0."""
+    """Convert an entry of a star for JSON. An open opening becomes 1, a closed one 0."""
     return (
         entry.to_json()
         if hasattr(entry, "to_json")
@@ -338,7 +338,7 @@ class Walk:
     Args:
         table: All machines.
         group: The indices of the machines to follow.
-        start: The state of each of these machines at first.
+        start: The state in which each of these machines begins.
         limits: Limits of the search; None for none.
 
     >>> blind = Machine((0, 0), ((("a", 1),), (("a", 0),)))

@@ -97,8 +97,9 @@ class AnsweredQuestion:
     Attributes:
         question: The question.
         column: The answer of each map.
-        steps: For each sort of question, the later step of each question of this sort that all maps
-            answer as they answer this one, or all the other way round.
+        steps: For each sort of question, the later steps of the equivalent questions of this sort.
+            A question is equivalent if all maps give it the same answers as this one, or all give
+            it the opposite answers.
     """
 
     question: Question

@@ -32,7 +32,9 @@ _Side: TypeAlias = Literal["right", "left"]
 
 @dataclass(frozen=True, slots=True)
 class Beside:
-    """A place that lies beside a path, as the robot faces along the path at a step.
+    """A place that lies right or left of a path.
+
+    Right and left are those of the robot at the step `along`.
 
     Attributes:
         step: The first step at the place.

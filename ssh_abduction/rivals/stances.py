@@ -115,9 +115,10 @@ class Stances:
         return found
 
     def _rooms(self) -> list[tuple[int, float]]:
-        """Group dstates that turns link into rooms: each one's room and heading, in degrees.
+        """Return the room and the heading, in degrees clockwise, of each dstate.
 
-        The headings of two dstates differ by the angle of the turn between them.
+        Dstates that are linked by turns are one room. Their headings differ by the angles of the
+        turns. The first dstate of a room faces 0 degrees.
         """
         turns: dict[int, list[tuple[int, float]]] = {n: [] for n in self._links}
         for n, tried in self._links.items():
@@ -202,8 +203,8 @@ class Stances:
     def _turned(self, n: int, degrees: float) -> int:
         """Find the stance after a clockwise turn of this many degrees from stance n.
 
-        If no stance of the room is as close to that heading as the spread of bearings in the star,
-        a new stance is added.
+        If all stances of the room differ from that heading by more than the spread of bearings in
+        the star, a new stance is added.
         """
         (room, before), star, frame = self._at[n], self._stars[n], self._frames[n]
         assert star is not None
@@ -226,7 +227,7 @@ class Stances:
 
 
 def _frame(star: Star | None) -> Frame | None:
-    """Return the first frame of a star; None without a star."""
+    """Return the first frame (reading of the gateways) of a star; None without a star."""
     return None if star is None else star.frames[0]
 
 

@@ -77,7 +77,7 @@ class Table:
         return len(np.unique(self.ones[sort], axis=0))
 
     def heads(self, sort: Sort) -> Ints:
-        """Give each class the first class that all maps treat in the same way: shape (classes,).
+        """For each class, find the first class that all maps treat in the same way, (classes,).
 
         Two classes are treated in the same way if in each map they are one, or both have no
         place, path or course.
@@ -88,11 +88,12 @@ class Table:
         return first[inverse.reshape(-1)].astype(np.int32)
 
     def questions(self, sort: Sort) -> Iterator[tuple[int, int, Bools]]:
-        """Yield questions that distinguish maps: are two classes, the earlier first, one in each?
+        """Yield questions that distinguish maps: two classes, and the answer of each map.
 
-        Each class is paired only with the first class of its group in each map. Two maps
-        that agree on these pairs group all classes in the same way. If both classes are the
-        same: for each map, whether the class has a place, or a path.
+        The answer says whether the two classes are one in the map. The earlier class comes
+        first. Each class is paired only with the first class of its group in each map. Two maps
+        that agree on these pairs group all classes in the same way. If a class is paired with
+        itself, the answer says whether it has a place, path or course at all.
         """
         ones = self.ones[sort]
         for c in np.flatnonzero((ones != ones[0]).any(axis=0)).tolist():
