@@ -124,8 +124,8 @@ def warn_of_doubts(labels: ArrayLike, sure: ArrayLike, quality: float) -> None:
         )
         warnings.warn(
             (
-                f"{text}: their views may be wrong, and the map with them; look whether something "
-                "stood before the laser"
+                f"{text}: their views may be wrong, and so may the map; check whether something "
+                "stood in front of the laser"
             ),
             ImageWarning,
             2,

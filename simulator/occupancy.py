@@ -293,7 +293,7 @@ def _cells(fields: MapFile, path: Path) -> Cells:
     # Damaged images and impossible paths raise these.
     except (ValueError, SyntaxError, IndexError, OverflowError) as error:
         raise SimulatorError(
-            f"{where}: expected {kinds}: {error}; the file is damaged, or is none"
+            f"{where}: expected {kinds}: {error}; the file is damaged, or is no image"
         ) from None
     if fields.mode == "raw":
         value = np.rint(shade * 255)

@@ -183,7 +183,7 @@ def disagreement(log: RobotLog, track: Track) -> str | None:
         ]
     causes.append("the odometer jumps, slips or is out of scale")
     if found.parted:
-        differences.append(f"they part in {found.parted} of {found.of} stretches of a metre")
+        differences.append(f"they diverge in {found.parted} of {found.of} stretches of a metre")
     return (
         f"Scan matching and odometry disagree: {'; '.join(differences)}. The map may be "
         f"wrong. Likely causes: {'; '.join(causes)}."

@@ -251,7 +251,7 @@ def _of_one_source(track: RecordedTrack, called: str, notes: list[str]) -> Recor
     notes.append(
         f"Several sources publish {called}, whose poses alternate, up to {apart:.1f} m apart: "
         f"{len(sources[0])} and {len(sources[1])} of {len(table)} messages. "
-        "The first of these is read; stop the other, and record again, if it is the better one."
+        "The first source is read. If the other one is better, stop the first and record again."
     )
     return first
 

@@ -252,8 +252,8 @@ def meaning_of(
         return "restarts"
     if survey.wandered > (1 - MOST_SCANS) * survey.scans:
         notes.append(
-            f"The first pose in {kind} wanders from the second: the first is used as "
-            "the corrected pose, the second as odometry."
+            f"The two poses in {kind} drift apart: the first is used as the corrected pose, "
+            "the second as odometry."
         )
         return "first corrected"
     return "raw"

@@ -66,8 +66,8 @@ class Rules:
             line, column = text.count("\n", 0, stray) + 1, stray - text.rfind("\n", 0, stray)
             if text.startswith("#script", stray):
                 raise TheoryError(
-                    f"{self.name}:{line}: expected rules, got #script; say it in rules, as no "
-                    "program runs in them"
+                    f"{self.name}:{line}: expected rules, got #script; write rules instead, as "
+                    "scripts are not run"
                 )
             mend = (
                 "save it as UTF-8"
