@@ -52,8 +52,8 @@ class Clash:
 def clashes(sights: Sequence[Sight], turns: Turns, axioms: Collection[str]) -> Iterator[Clash]:
     """Yield a minimal set of sights (dstate and star) for each place where they fit no frame.
 
-    A frame numbers the gateways. The sights are those of a map, sorted by first step. `turns`
-    has those from one sight to another at one place. `axioms` names those that hold.
+    The sights are those of a map, sorted by first step. `turns` has the turns between sights of one
+    place. `axioms` has the names of the axioms that hold.
     """
     hard = [name for name in NAMES if name in axioms]
     for place, seen in by_place(sights).items():
@@ -78,15 +78,15 @@ def _clashes_of(m: Reading) -> list[Clash]:
 
 
 def _sights_of(m: Reading) -> tuple[list[Sight], Turns]:
-    """Return the sights of a map; with a price of changes, each drive has its own."""
+    """Return the sights of a map. If gateways may change, each drive has sights of its own."""
     return sights_of(m.trace, m.map, m.onward, bool(m.theory.changed))
 
 
 def bearing_changes(m: Reading) -> Iterator[tuple[int, int, int, str, str]]:
-    """Yield each gateway at a bearing that differs between a drive and the one before at its place.
+    """Yield the gateways that differ between a drive and the drive before it at the same place.
 
-    Each is a place, a bearing, the first step of the later drive there, and what the earlier and
-    the later drive saw, in words.
+    Each has the place, the bearing, the first step of the later drive there, and what the earlier
+    and the later drive saw, in words.
     """
     names = [drive.name for drive in drives_of(m.trace)]
     for found in changes_of(*_sights_of(m), m.axioms):

@@ -203,7 +203,7 @@ def _changes(m: Reading) -> Iterator[tuple[int, int, int, str, str]]:
 
 
 def _key(fault: Fault) -> tuple[object, ...]:
-    """Return the values of a change that a map lists."""
+    """Return a change that a map lists, in the form in which `_changes` yields it."""
     where = fault.gateway if fault.bearing is None else fault.bearing
     return fault.place, where, fault.step, fault.expected, fault.seen
 

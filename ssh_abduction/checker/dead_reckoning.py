@@ -102,7 +102,7 @@ class ErrorFilter:
         return covariance
 
     def new_until(self, end: int) -> Array:
-        """Return the covariance at `end` of the noise up to each step, (end + 1, 9)."""
+        """For each step, return the covariance at `end` of the noise up to it, (end + 1, 9)."""
         steps = np.arange(end + 1)
         onward = self.onward(steps, np.full(end + 1, end))
         covariance: Array = (onward @ self.white[: end + 1] @ onward.swapaxes(-1, -2)).reshape(
@@ -111,7 +111,7 @@ class ErrorFilter:
         return covariance
 
     def repeated_since(self, first: Any, last: Any) -> Array:
-        """Return how loops end if scale, or drift, is one standard deviation off, (m, 3, 2)."""
+        """Compute the closing errors, (m, 3, 2), from one sigma of the scale and of the drift."""
         moved: Array = (
             self.repeated[last] - self.onward(first, last) @ self.repeated[first]
         ) * self.sigma

@@ -91,7 +91,10 @@ def one_pose(m: Reading) -> Found:
 
 
 def closure(m: Reading) -> Found:
-    """Check that each closure agrees with one pose per dstate and one position per place."""
+    """Check that closures agree with one pose per dstate and one position per place.
+
+    A closure is a measured displacement between two steps of the trace.
+    """
     labels, odometry = m.map.dstate_at, m.trace.odometry or Odometry()
     for match in m.trace.closures:
         i, j = match.first, match.last
@@ -115,7 +118,7 @@ def closure(m: Reading) -> Found:
 
 
 def _p_value(match: Closure, odometry: Odometry, freedom: int) -> float:
-    """Compute how probable a closure at least this far from zero is if both poses are one.
+    """Compute the probability of a closure at least this far from zero if both poses are equal.
 
     `freedom` is 2 to compare positions, 3 to compare poses.
     """

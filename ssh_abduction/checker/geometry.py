@@ -162,7 +162,8 @@ def _returns(
 ) -> Iterator[Return]:
     """Yield the returns with a known closing error: first step, last step, degrees of freedom.
 
-    Returns to places have first steps of visits. With `of_arrivals`, returns to dstates do, too.
+    Returns to places are between the first steps of visits. So are returns to dstates with
+    `of_arrivals`; else they are between any steps.
     """
     place = {s.id: s.place for s in ssh_map.dstates}
     size = min(len(trace), len(ssh_map.dstate_at))
@@ -255,8 +256,9 @@ def _refused_together(
 def _sets(rows: Steps, filtered: ErrorFilter, most: float) -> Iterator[tuple[Steps, Steps]]:
     """Yield the pairs of returns whose loops overlap and that need a test, in portions.
 
-    A portion is two arrays of indices into `rows`: first step, last step and degrees of freedom of
-    each return, sorted by last step, (m, 3). `most` is the least chi-square that may be rejected.
+    A portion is two arrays, each with the indices in `rows` of one return of each pair. `rows` has
+    the first step, last step and degrees of freedom of each return, sorted by last step, (m, 3).
+    `most` is the least chi-square that may be rejected.
     """
     alone = _EachReturn(filtered, rows)
     found = []

@@ -215,7 +215,7 @@ class _JoinCollector:
         return tuple(sorted(found, key=lambda join: (join.second, join.first)))
 
     def _is_forced(self, first: int, second: int) -> bool:
-        """Whether it is known that two steps are one dstate, given that they are in the map."""
+        """Whether it is known that two steps are one dstate. In the map, they must be one."""
         if second in self.asserted:
             return True
         if self.map.dstates[self.map.dstate_at[second]].place is None:

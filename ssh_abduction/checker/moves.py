@@ -39,7 +39,7 @@ class MapLink:
 
 
 def course_of(s: DState) -> Course | None:
-    """Return the path of a dstate and its direction (+1 or -1); None if it has not both."""
+    """Return the path of a dstate and its direction (+1 or -1); None if it lacks one of them."""
     return (s.path, s.direction) if s.path is not None and s.direction in (1, -1) else None
 
 

@@ -290,7 +290,10 @@ def _is_turned(faced: Mapping[int, int], turn: tuple[int, int, int]) -> bool:
 
 
 def _goes_round(order: Sequence[Arm], sequence: Sequence[Arm]) -> bool:
-    """Whether gateways of a sequence are distinct, and those in `order` are clockwise in it."""
+    """Whether a sequence has distinct gateways that `order` has in the same cyclic order.
+
+    Gateways that are not in `order` yet do not count.
+    """
     there = [order.index(gateway) for gateway in sequence if gateway in order]
     return (
         len(set(sequence)) == len(sequence)
@@ -299,7 +302,7 @@ def _goes_round(order: Sequence[Arm], sequence: Sequence[Arm]) -> bool:
 
 
 def _orders(gateways: Sequence[Arm], sequences: Sequence[Sequence[Arm]]) -> list[tuple[Arm, ...]]:
-    """List all clockwise orders of gateways that agree with sequences that were told.
+    """List all clockwise orders of gateways that agree with sequences known to be clockwise.
 
     Orders that differ by a rotation are listed once: each starts with the first gateway.
     """

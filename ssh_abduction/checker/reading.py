@@ -76,7 +76,10 @@ class Reading:
                 self.links.setdefault((label, step.action.name, labels[i + 1]), i)
 
     def named(self, step: int) -> int:
-        """Return a step that in words has the name of its drive; unchanged if not in the trace."""
+        """Return a step as a number that prints with its drive, if there are several drives.
+
+        A step outside the trace is returned unchanged.
+        """
         return self.steps[step] if 0 <= step < len(self.steps) else step
 
     def once(self, compute: Callable[[Reading], _T]) -> _T:
@@ -178,7 +181,8 @@ class Reading:
     def onward(self, s: DState) -> tuple[int, ...]:
         """Find the bearings at which the path of a dstate continues: 0 (ahead) and 180 (behind).
 
-        It does if a place comes after, or before, that of the dstate on its path.
+        It continues ahead if a place on the path comes after the dstate's place, and behind if one
+        comes before it.
         """
         course = course_of(s)
         if course is None or s.place is None or course[0] not in self.orders:

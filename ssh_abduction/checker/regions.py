@@ -44,7 +44,7 @@ def known_sides(m: Reading) -> Mapping[Course, Mapping[int, RightBranch]]:
 
 
 def _beside(m: Reading) -> dict[_Places, str]:
-    """Find the regions that single courses bound, each with a sentence."""
+    """Find the regions right of one course each, and a sentence for each region."""
     sides = m.once(known_sides)
     return {
         frozenset(places): f"They are what is known to lie right of {along(course)}."
@@ -54,7 +54,10 @@ def _beside(m: Reading) -> dict[_Places, str]:
 
 
 def _between(m: Reading) -> dict[_Places, str]:
-    """Find the regions that all courses beside a place bound together, each with a sentence."""
+    """Find the region of each place right of courses: all places right of the same courses.
+
+    Each region comes with a sentence.
+    """
     sides = m.once(known_sides)
     found = {}
     for p in {p for places in sides.values() for p in places}:
@@ -80,7 +83,7 @@ def _behind(m: Reading) -> dict[_Places, int]:
 
 
 def _links(m: Reading) -> dict[_Node, set[_Node]]:
-    """Link each place with its paths, and with what lifts and travels along no path reach."""
+    """Link places with their paths, and with places reached by lifts or travels along no path."""
     links: dict[_Node, set[_Node]] = defaultdict(set)
     pairs: list[tuple[_Node, _Node]] = [
         (("place", s.place), ("path", course[0], s.floor))
@@ -152,7 +155,10 @@ def region_beside(m: Reading) -> Found:
 
 
 def region_between(m: Reading) -> Found:
-    """Check each place's region: all places right of every directed path it lies right of."""
+    """Check that for each place, the places right of all courses that it is right of are a region.
+
+    A course is a path and a direction.
+    """
     yield from _missing(m, m.once(_between))
 
 

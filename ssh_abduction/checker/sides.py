@@ -151,10 +151,7 @@ def is_pair(pair: object) -> bool:
 
 
 def _sides(name: str, m: Reading) -> Found:
-    """Find the side of a path in each map, by the first steps at a place and along a path.
-
-    It is None if the map does not know it. Pairs that no map knows are left out.
-    """
+    """Check the axiom `name` about sides: yield the conflicts in which it takes part."""
     for conflict in m.once(_conflicts):
         if name in conflict.axioms:
             yield conflict.steps, conflict.message

@@ -108,7 +108,10 @@ def _rotated(star: Openings, quarters: int) -> Openings:
 
 
 def _one_star(seen: Iterable[tuple[DState, Openings, int]], how: str) -> Found:
-    """Check that the stars seen at each place are equal, in a form that all steps there share."""
+    """Check that the stars seen at each place are equal.
+
+    The caller has rotated the stars to be comparable. `how` says so at the end of the message.
+    """
     known: dict[int, tuple[Openings, int]] = {}
     for s, star, i in seen:
         if s.place is not None:

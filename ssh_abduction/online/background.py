@@ -84,7 +84,8 @@ def solved(
 ) -> Solved:
     """Run `solve` on a trace with a settled theory, and return the needed parts of the solution.
 
-    `limit` is in seconds. `in_process` passes a `watch` as the last argument; it is not used.
+    `limit` is in seconds. `watch` is not used; `in_process` passes one to each function that it
+    runs.
     """
     found = solve(
         trace, theory.of_steps(0, len(trace)), time_limit=limit, max_maps=maps, speedups=speedups
@@ -93,10 +94,10 @@ def solved(
 
 
 class BackgroundSearch:
-    """A search in another process, by `solved`, until this object is garbage collected.
+    """A call of `solved` in another process. The process ends when this object is deleted.
 
     Args:
-        arguments: The arguments of `solved`, but for the watch.
+        arguments: The arguments of `solved`, without the watch.
     """
 
     def __init__(self, *arguments: object) -> None:
@@ -180,7 +181,7 @@ class FaultSolver:
     def begin_in_background(self, trace: Trace, theory: Theory) -> bool:
         """Start a search in another process, and return whether one is running.
 
-        False without `processes`, or with only one processor.
+        False if the speed-up `processes` is off, or if there is only one processor.
         """
         maps, speedups = self._options.max_maps, self._options.speedups
         if not self._background and speedups.processes and has_processors():

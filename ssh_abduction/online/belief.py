@@ -56,8 +56,8 @@ class Observation:
     Attributes:
         where: The ids of k dstates, (k,), or a slice of all dstates.
         ratio: f(o|x) / q(o) for each of these dstates, (k,). For all other dstates it is 0.
-        novel: Probability, given o, that an unknown place looks like no dstate of the map. Before
-            o, it is as likely to look like each dstate as like none.
+        novel: Probability, given o, that an unknown place looks like no dstate of the map. A
+            priori, the N + 1 cases are equally likely: it looks like one of the dstates, or none.
     """
 
     where: NDArray[np.intp] | slice

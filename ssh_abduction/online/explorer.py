@@ -104,7 +104,7 @@ class Exploration:
             "done": one map is left, nothing in it is untried, and no return is in doubt.
             "inseparable": nothing that the robot can do distinguishes the remaining minimal maps,
             or the minimal map from `rival`.
-            "steps": all actions that it was allowed are spent.
+            "steps": the robot did the largest number of actions that was allowed.
             "time": there was no time to prove which maps are minimal, or to weigh a doubt.
             "contradicted": no map explains what was seen.
         is_unique: Whether all minimal maps have the same dstates and the same places.

@@ -87,7 +87,7 @@ class MapKeeper:
         return self.solver.searches
 
     def restarted(self, problem: Problem) -> MapKeeper:
-        """Make a keeper for a theory that changed with the last step, which `problem` has.
+        """Make a keeper for the theory of `problem`, which changed with the last step.
 
         The minimal maps so far need not be minimal by the new theory. They become drafts
         (maps to be extended step by step) if the old theory already used displacements.

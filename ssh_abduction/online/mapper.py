@@ -317,7 +317,7 @@ class TheorySettler:
         return count_returns(Problem(trace, theory, evidence))
 
     def check_star(self, step: Step, number: int) -> None:
-        """Raise TraceError if, with star="auto", only this step and not the first has a star."""
+        """Raise TraceError if star="auto" and this step has a star but the first step has none."""
         if self._refuses_stars and step.star is not None:
             raise TraceError(
                 f"step {number}: star: expected none, as the first step has none; "

@@ -23,10 +23,11 @@ the logical representation can be restored" (Kuipers & Beeson 2002). This module
 * **Minimal maps**, proven, with their faults. As long as some of them predict what is seen, these
   stay minimal by the claim in `mapper.py`. The claim also holds with faults: suppose that a minimal
   map of the longer trace treats the last step as wrong. Without that step it would cost less than
-  the minimum, which is impossible. If an action was never tried, the causal theory loses no minimal
-  map, as a new link to a dstate that looks right costs nothing, and nothing else does. If no
-  minimal map predicts the step, the trace is solved again: within the time of a step, or in another
-  process while the robot drives (`background.py`).
+  the minimum, which is impossible. An action that was never tried loses no minimal map in the
+  causal theory either. A map is extended by a link to each dstate that looks right. These
+  extensions cost nothing, and all others cost more. If no minimal map predicts the step, the trace
+  is solved again: within the time of a step, or in another process while the robot drives
+  (`background.py`).
 * **Rivals** (`rival_maps.py`): besides the minimal maps, explanations that cost a little more,
   each with its probability (`hypotheses.py`).
 * **Where the robot is** (`standing.py`), by Markov localisation in the best map. It begins just

@@ -30,8 +30,8 @@ class ReturnDoubts:
 
     Attributes:
         undecided: Returns for which there was too little time to decide.
-        twins: For each such return, a map without it that no experiment distinguishes from the
-            minimal map. The caller adds them.
+        twins: The returns that no experiment can test, each with a map without the return that
+            always predicts the same as the minimal map. The caller adds them.
     """
 
     def __init__(self, margin: int, time_limit: float | None) -> None:
@@ -64,10 +64,10 @@ class ReturnDoubts:
                 yield doubt
 
     def rival(self, doubt: Doubt, trace: Trace, theory: Theory, dstates: int) -> SSHMap | None:
-        """Return the best map without a return. Without such a map, stop doubting the return.
+        """Find the best map without a return. Stop doubting the return if there is none.
 
-        None if the map has more than `margin` dstates more than `dstates`, the number in a
-        minimal map, or was not found in time. The theory is settled.
+        `dstates` is the number in a minimal map. A map counts if it has at most `margin` more and
+        is found in time. Otherwise return None. The theory is settled.
         """
         kind = "different" if theory.level == "causal" else "elsewhere"
         denied = theory.replace(**{kind: (*getattr(theory, kind), doubt)})

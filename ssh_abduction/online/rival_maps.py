@@ -137,7 +137,7 @@ class RivalMaps:
     def absorb(self, found: Solved) -> None:
         """Use a result of the solver: add its maps to the rivals, and record what is proven.
 
-        If it is for the first of the steps so far, its maps are extended by the later ones.
+        If the result is about fewer steps than there are now, its maps are extended by the others.
         """
         steps, self.solved = len(self._trace), found
         if (found.bound.tenths or 0) >= (self.bound.tenths or 0):

@@ -93,8 +93,8 @@ class Route:
         place: The place of the start; None if the dstate has no place.
         moves: The moves, in order.
         agree: The numbers, from 1, of the maps in which the same actions lead to the same views.
-            Each map begins where it has the robot at the steps that this map has at `start`. Empty
-            if some move was never tried.
+            In another map, the route begins at the dstates of the steps that are at `start` in
+            this map. Empty if some move was never tried.
         maps: The number of maps that were compared.
         legs: The coarse route: the regions to leave and to enter, and the paths to pass. Empty if
             the map has no regions.
@@ -332,7 +332,7 @@ def _agreeing(
 ) -> tuple[int, ...]:
     """The numbers, from 1, of the maps in which the moves of a route lead to the same views.
 
-    Each map begins where it has the robot at the steps that `ssh_map` has at `start`.
+    In each map, the route begins at the dstates of the steps that are at `start` in `ssh_map`.
     """
     steps = [t for t, label in enumerate(ssh_map.dstate_at) if label == start]
     agree = []

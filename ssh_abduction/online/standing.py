@@ -105,8 +105,8 @@ class Confidence:
         theory: A theory that allows faults, and in which no field is "auto" any more.
 
     Attributes:
-        known: The last map that was certain. As long as none was, the best map of the first answer,
-            and None before that answer.
+        known: The last map that was certain. If none was certain yet, the best map of the first
+            answer. None before the first answer.
     """
 
     def __init__(self, theory: Theory) -> None:
