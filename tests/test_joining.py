@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import changes
 import pytest
 import truth
@@ -68,7 +70,7 @@ def test_a_gateway_that_closes_and_opens_again_changes_twice() -> None:
         )
         for is_open, length in ((1, 5), (0, 5), (1, 4))
     ]
-    problem = settle(together(drives), Theory(changed=1.2))
+    problem = settle(together(drives), Theory(changed=0.9))
     *_, ssh_map = joined(problem)
     assert ssh_map.dstate_at == (*range(5), *range(5), *range(4))
     assert [(fault.step, fault.place, fault.gateway) for fault in ssh_map.faults] == [
@@ -107,6 +109,34 @@ def test_drives_that_show_other_things_stay_apart() -> None:
         joint = together([monday, tuesday])
     (apart,) = joined(settle(joint, Theory()))
     assert [len(piece) for piece in apart.pieces] == [3, 3]
+
+
+@pytest.mark.parametrize("apart", [4.0, 9.0])
+def test_drives_that_cross_share_places(apart: float) -> None:
+    """One drive leads east to a dead end, through a crossing. The other drive crosses it twice."""
+    ahead, left = (4.0, 0.0, 0.0), (0.0, 0.0, math.pi / 2)
+    east = Trace.from_steps(
+        "abc",
+        ["travel"] * 2,
+        displacements=[ahead] * 2,
+        stars=[(1, 0, 0, 0), (1, 1, 1, 1), (0, 1, 1, 1)],
+    )
+    corner = [(0, 0, 1, 1), (1, 0, 0, 1)]  # as seen before and after the turn
+    south_and_north = Trace.from_steps(
+        "defghijk",
+        ["travel", "travel", "left", "travel", "left", "travel", "travel"],
+        displacements=[ahead, ahead, left, (apart, 0.0, 0.0), left, ahead, ahead],
+        stars=[(1, 0, 0, 0), (1, 1, 1, 1), *corner, *corner, (1, 0, 1, 1), (0, 0, 1, 0)],
+    )
+    with pytest.warns(UserWarning, match="no view in common"):
+        trace = together([east, south_and_north])
+    problem = settle(trace, Theory(star="frame"))
+    *_, ssh_map = joined(problem)
+    assert len(ssh_map.dstates) == len(trace)
+    places = [s.place for s in ssh_map.dstates]
+    crossings = [(1, 4), (2, 9)] if apart == 4.0 else []
+    assert [(t, u) for t in range(3) for u in range(3, 11) if places[t] == places[u]] == crossings
+    assert not [*violations(problem.trace, ssh_map, problem.theory)]
 
 
 def test_a_drive_is_joined_where_no_later_step_contradicts_it() -> None:

@@ -2,7 +2,9 @@
 
 Each drive has a map of its own: a hypothesis with the poses of its places and dstates. An *anchor*
 is a dstate of one map and a dstate of another map that may be one. It says how one map lies on the
-other. An anchor is good if many other dstates then coincide with dstates that show the same. The
+other. An anchor is good if many other dstates then coincide with dstates that show the same. Drives
+that cross may share places, but no dstate. So an anchor may also be two places whose stars agree if
+one map is turned. It is good if many other places then coincide with places that may be one. The
 two maps with the best anchor are joined first: `overlaying.py` merges the places and dstates that
 coincide. Then the joint map may be joined to others. Maps that no anchor joins stay pieces. Some
 of the maps may be the pieces of a map of old drives that must be kept.
@@ -15,10 +17,10 @@ Reference:
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations, pairwise
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,8 +41,27 @@ from ssh_abduction.theory.settle import Problem
 
 Array = NDArray[np.float64]
 _Pair: TypeAlias = tuple[Part, Part]
-# Anchors: how good they are, and their two dstates.
-_Anchors: TypeAlias = dict[_Pair, list[tuple[float, int, int]]]
+
+
+class _Anchor(NamedTuple):
+    """A way to lay a map on another one.
+
+    Attributes:
+        good: How many more dstates (or places) coincide that may be one than that may not.
+        old: A dstate of the first map.
+        new: A dstate of the second map, which is laid on `old`.
+        turn: By how many radians the second map is turned counterclockwise.
+        by_places: Whether only the places of the two dstates are one, and not the dstates.
+    """
+
+    good: int
+    old: int
+    new: int
+    turn: float
+    by_places: bool
+
+
+_Anchors: TypeAlias = dict[_Pair, list[_Anchor]]
 
 # The width of the beam that maps each drive alone.
 ALONE = 4
@@ -49,6 +70,8 @@ ALONE = 4
 TURNED, SHIFTED = 0.4, 0.4
 # Try the VOTED ways with the most votes to lay a map on another one.
 VOTED = 64
+# Try this many of the best ways that lay two places on each other.
+CROSSED = 8
 # Begin with each of the STARTS pairs of drives that have the best anchors.
 STARTS = 3
 
@@ -135,54 +158,83 @@ class Joining:
             return None
         return Part.of(beam.best, drive.first, self._log, self.sights)
 
-    def _anchors(self, first: Part, second: Part) -> list[tuple[float, int, int]]:
-        """List anchors of two maps, the best one first.
-
-        Returns:
-            Triples: the number of coinciding dstates that show the same, minus the number of those
-            that do not; the dstate of the first map; and that of the second one.
-        """
+    def _anchors(self, first: Part, second: Part) -> list[_Anchor]:
+        """List anchors of two maps, the best one first."""
         look_at_clock()
-        alike = np.array([[bool(seen & other) for other in second.seen] for seen in first.seen])
-        ways = [(s, x) for s, x in np.argwhere(alike) if self._may_be_one(first, s, second, x)]
-        if not ways:
-            return []
-        s, x = np.array(ways).T
-        (at, facing), (there, turned) = first.poses, second.poses
+        changes = np.array(
+            [[self.sights.merged(seen, other) for other in second.sights] for seen in first.sights]
+        )
         near = SHIFTED * second.usual_travel(self._problem.trace)
-        turn = facing[s] - turned[x]
-        # Anchors that lay the second map in about the same way put its centre into one cell.
-        centre = at[s] + _turned(there.mean(0) - there[x], turn)
-        around = np.round(turn / TURNED) % round(math.tau / TURNED)
-        cells = np.column_stack([np.round(centre / near), around]).astype(int)
-        _, one, votes = np.unique(cells, axis=0, return_index=True, return_counts=True)
-        found = []
-        for i in one[np.argsort(-votes)[:VOTED]]:
-            moved = at[s[i]] + _turned(there - there[x[i]], turn[i])
-            apart = np.hypot(*np.moveaxis(at[:, None] - moved, -1, 0))
-            twist = facing[:, None] - turned - turn[i]
-            twist -= math.tau * np.round(twist / math.tau)
-            meets = (apart < near) & (np.abs(twist) < TURNED)
-            good = (meets & alike).sum() - (meets & ~alike).sum()
-            found.append((float(good), int(s[i]), int(x[i])))
+        found = [
+            *self._by_dstates(first, second, changes, near),
+            *self._by_places(first, second, changes == 0, near),
+        ]
         return sorted(found, reverse=True)
 
-    def _may_be_one(self, first: Part, s: int, second: Part, x: int) -> bool:
-        """Whether the stars let dstate s of a map and dstate x of another one be one dstate."""
-        places = first.sights[first.places[s]], second.sights[second.places[x]]
-        return self.sights.merged(*places) < math.inf and self.sights.are_alike(
-            first.stars[s], second.stars[x]
-        )
+    def _by_dstates(
+        self, first: Part, second: Part, changes: Array, near: float
+    ) -> Iterator[_Anchor]:
+        """Yield anchors that make two dstates one.
 
-    def _joined(
-        self, first: Part, second: Part, ways: Sequence[tuple[float, int, int]]
-    ) -> Part | None:
+        Args:
+            first: A map.
+            second: Another map.
+            changes: What changed gateways cost if each place of the first map is each place of the
+                second one; inf if it cannot be.
+            near: Dstates coincide if they are nearer than this many metres.
+        """
+        alike = np.array([[bool(seen & other) for other in second.seen] for seen in first.seen])
+        (at, facing), (there, turned) = first.poses, second.poses
+        ways = [
+            (s, x, facing[s] - turned[x])
+            for s, x in np.argwhere(alike).tolist()
+            if changes[first.places[s], second.places[x]] < math.inf
+            and self.sights.are_alike(first.stars[s], second.stars[x])
+        ]
+        for s, x, turn in _voted(first, second, ways, near):
+            twist = facing[:, None] - turned - turn
+            twist -= math.tau * np.round(twist / math.tau)
+            meets = _meeting(at, at[s] + _turned(there - there[x], turn), near)
+            meets &= np.abs(twist) < TURNED
+            good = (meets & alike).sum() - (meets & ~alike).sum()
+            yield _Anchor(int(good), s, x, turn, by_places=False)
+
+    def _by_places(
+        self, first: Part, second: Part, same: NDArray[np.bool_], near: float
+    ) -> list[_Anchor]:
+        """List the best anchors that make two places one, by the gateways there.
+
+        A single place that coincides tells too little, unless no other pair of places agrees.
+
+        Args:
+            first: A map.
+            second: Another map.
+            same: Whether each place of the first map may be each place of the second.
+            near: Places coincide if they are nearer than this many metres.
+        """
+        facing, turned = first.poses[1], second.poses[1]
+        step, other = first.step_at, second.step_at
+        ways = []
+        for p, q in np.argwhere(same).tolist():
+            s, x = first.places.index(p), second.places.index(q)
+            turns = self.sights.turns(step[s], other[x])
+            ways += [(s, x, facing[s] + turn - turned[x]) for turn in turns]
+        found = []
+        for s, x, turn in _voted(first, second, ways, near):
+            moved = first.poses[0][s] + _turned(second.positions - second.poses[0][x], turn)
+            meets = _meeting(first.positions, moved, near)
+            good = (meets & same).sum() - (meets & ~same).sum()
+            found.append(_Anchor(int(good), s, x, turn, by_places=True))
+        least = 1 if same.sum() == 1 else 2
+        return sorted((way for way in found if way.good >= least), reverse=True)[:CROSSED]
+
+    def _joined(self, first: Part, second: Part, ways: Sequence[_Anchor]) -> Part | None:
         """Join two maps by the anchor that costs least; None if all break axioms."""
         found: list[Part] = []
-        for _, s, x in ways:
+        for way in ways:
             look_at_clock()
             overlay = Overlay(first, second, self._problem, self.sights)
-            if overlay.merge(s, x):
+            if overlay.merge(way.old, way.new, way.turn if way.by_places else None):
                 found.append(overlay.part())
         found.sort(key=lambda joined: joined.nats)
         return next((joined for joined in found if self._map(joined)), None)
@@ -210,7 +262,38 @@ class Joining:
         return trace, [part.labels[t] for t in steps]
 
 
-def _turned(vectors: Array, angle: Array) -> Array:
+def _voted(
+    first: Part, second: Part, ways: Iterable[tuple[int, int, float]], near: float
+) -> Iterator[tuple[int, int, float]]:
+    """Yield one of all ways that lay a map on another in about the same way, the most votes first.
+
+    Args:
+        first: A map.
+        second: The map that is laid on it.
+        ways: The dstates that are laid on each other, and the turn of the second map.
+        near: Ways are about the same if they differ by less than about this many metres.
+    """
+    listed = [*ways]
+    if not listed:
+        return
+    at, there = first.poses[0], second.poses[0]
+    turn = np.array([turn for _, _, turn in listed])
+    s, x = np.array([way[:2] for way in listed]).T
+    # Such ways put the centre of the second map into one cell.
+    centre = at[s] + _turned(there.mean(0) - there[x], turn)
+    around = np.round(turn / TURNED) % round(math.tau / TURNED)
+    cells = np.column_stack([np.round(centre / near), around]).astype(int)
+    _, one, votes = np.unique(cells, axis=0, return_index=True, return_counts=True)
+    yield from (listed[i] for i in one[np.argsort(-votes)[:VOTED]])
+
+
+def _meeting(here: Array, there: Array, near: float) -> NDArray[np.bool_]:
+    """Whether each of some points is near each of others."""
+    met: NDArray[np.bool_] = np.hypot(*np.moveaxis(here[:, None] - there, -1, 0)) < near
+    return met
+
+
+def _turned(vectors: Array, angle: Array | float) -> Array:
     """Turn vectors, (n, 2), counterclockwise."""
     x, y, cos, sin = vectors[:, 0], vectors[:, 1], np.cos(angle), np.sin(angle)
     return np.stack([cos * x - sin * y, sin * x + cos * y], 1)

@@ -126,10 +126,19 @@ class Part:
         )
 
     @property
+    def step_at(self) -> dict[int, int]:
+        """A step at each dstate."""
+        return {label: t for t, label in self.labels.items()}
+
+    @property
+    def positions(self) -> Array:
+        """The position of each place."""
+        return np.stack([self.mean[self.position], self.mean[self.position + 1]], 1)
+
+    @property
     def poses(self) -> tuple[Array, Array]:
         """The position and the heading of each dstate."""
-        at = self.position[self.places]
-        return np.stack([self.mean[at], self.mean[at + 1]], 1), self.mean[self.heading]
+        return self.positions[self.places], self.mean[self.heading]
 
     def usual_travel(self, trace: Trace) -> float:
         """Return the median length in metres of the moves of these drives that are no turns."""
@@ -224,15 +233,22 @@ class Overlay:
         for (p, seen), (q, others) in combinations(enumerate(both.sights), 2):
             self._changes[p, q] = sights.merged(seen, others)
 
-    def merge(self, old: int, new: int) -> bool:
+    def merge(self, old: int, new: int, turn: float | None = None) -> bool:
         """Merge a dstate of the standing map with one of the drive, and then all that coincide.
 
+        Args:
+            old: A dstate of the standing map.
+            new: A dstate of the drive.
+            turn: None to merge the two dstates; or by how many radians the map of the drive is
+                turned, to merge only their places.
+
         Returns:
-            Whether the two can be one dstate.
+            Whether the two can be one dstate, or one place.
         """
         new += self._old[0]
-        self._lay(old, new)
-        if not self._tried([(old, new)]):
+        self._lay(old, new, turn)
+        places = self._both.places[old], self._both.places[new]
+        if not (self._tried([(old, new)]) if turn is None else self._tried([], places)):
             return False
         while pair := self._surest():
             if not self._tried([], pair):
@@ -268,16 +284,18 @@ class Overlay:
             kept,
         )
 
-    def _lay(self, old: int, new: int) -> None:
+    def _lay(self, old: int, new: int, turn: float | None) -> None:
         """Turn and shift the new drive so that its dstate `new` has the pose of the dstate `old`.
 
         All poses of the drive get a large common covariance, as the pose of its frame is unknown.
+        With a `turn`, only the positions become equal, and the turn is known up to TURNED.
         """
         both, state = self._both, self._state
         headings = both.heading[self._old[0] :]
         x = both.position[self._old[1] :]
         at, there = (both.position[both.places[s]] for s in (old, new))
-        angle = both.mean[both.heading[old]] - both.mean[both.heading[new]]
+        equal = both.mean[both.heading[old]] - both.mean[both.heading[new]]
+        angle = equal if turn is None else turn
         cos, sin = math.cos(angle), math.sin(angle)
         mean, covariance = both.mean.copy(), both.covariance.copy()
         dx, dy = mean[x] - mean[there], mean[x + 1] - mean[there + 1]
@@ -293,7 +311,7 @@ class Overlay:
         by[x, 0], by[x + 1, 1] = 1.0, 1.0
         by[x, 2], by[x + 1, 2] = -dy, dx
         by[headings, 2] = 1.0
-        by *= ANYWHERE
+        by *= ANYWHERE if turn is None else np.array([*ANYWHERE[:2], TURNED])
         self._state = replace(state, mean=mean, covariance=covariance + by @ by.T)
 
     def _surest(self) -> tuple[int, int] | None:

@@ -9,12 +9,14 @@ from functools import lru_cache
 from itertools import combinations, pairwise, product
 from typing import TypeAlias
 
+import numpy as np
+
 from ssh_abduction.data.drives import starts_of
 from ssh_abduction.data.star import Frame, Star
 from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.solver.guesses.reckoning import Hypothesis
 from ssh_abduction.solver.steps.chart import numbered
-from ssh_abduction.solver.steps.frames import may_face, rotation_bits
+from ssh_abduction.solver.steps.frames import may_face, members, rotation_bits
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.theory import Theory
 
@@ -52,6 +54,7 @@ class Sights:
         starts = starts_of(trace)
         self.seen = numbered(trace.views) if theory.changed else log.seen
         self.shown = [_shown(step, theory.star) for step in trace.steps]
+        self._steps, self._star = trace.steps, theory.star
         self.drive = [bisect_right(starts, t) for t in range(len(trace))]
         self._misreads, self._price = misreads, theory.prices[0] * theory.changed
         self.dearest = DEAREST + CHANGES * self._price
@@ -86,6 +89,24 @@ class Sights:
         if not isinstance(first, Star) or not isinstance(second, Star):
             return True  # the views, and the stars of four, are compared as `seen`
         return _may_face_alike(first, second, CHANGES if self._price else 0)
+
+    def turns(self, t: int, u: int) -> Iterator[float]:
+        """Yield by how much the robot may be turned at step u from step t if both are at one place.
+
+        Turns are in radians, counterclockwise. Gateways do not change between the steps. Only stars
+        with directions (frame, gateways) tell turns.
+        """
+        first, then = self._steps[t], self._steps[u]
+        if self._star == "frame" and first.openings and then.openings:
+            for k in range(4):
+                if then.openings == first.openings[k:] + first.openings[:k]:
+                    yield -k * math.pi / 2
+        elif self._star == "gateways" and first.gateways and then.gateways:
+            for frame, other in _equally_large(first.gateways, then.gateways):
+                for shift in range(frame.slots):
+                    if degrees := [*members(rotation_bits(frame, other, shift))]:
+                        angles = np.radians(degrees)
+                        yield -math.atan2(np.sin(angles).sum(), np.cos(angles).sum())
 
     def _along(self, seen: Mapping[int, Sight]) -> float:
         """Return the cost in nats of the changes from each drive to the next at one place."""
