@@ -377,9 +377,10 @@ class _Sort:
     def edges(
         self, hops: Iterable[int], edge: Callable[[int, Hashable, Hashable], Hashable]
     ) -> tuple[float | None, float | None]:
-        """Precision and recall of edges, made of `hops` (steps t with an edge to t + 1).
+        """Compute the precision and recall of edges. Equal edges count once.
 
-        Equal ones are one.
+        `hops` are the steps t that have an edge to step t + 1. `edge` makes the edge of t from the
+        things at both of its ends.
         """
         if not self.of_map:
             return None, None

@@ -88,8 +88,8 @@ class MapPairs:
     Attributes:
         things: The number of places (or dstates) of the map.
         joined: The number of judged pairs that the map has at one place (or dstate).
-        right: The number of joined pairs that are truly at one.
-        returns: The number of judged pairs that are truly at one, joined or not.
+        right: The number of joined pairs that are truly at one place (or dstate).
+        returns: The number of judged pairs that are truly at one place (or dstate), joined or not.
     """
 
     things: int
@@ -370,7 +370,7 @@ def _verdicts(
 
 
 def _pairs(verdicts: Verdicts, visit: Steps) -> JudgedPairs:
-    """Count pairs of visits by verdict. `verdicts` is (n, n), `visit` is that of each row."""
+    """Count pairs by verdict. `verdicts` is (n, n); `visit` has the visit of each row, (n,)."""
     counts = Counter(verdicts[visit[:, None] < visit].tolist())
     return JudgedPairs(
         counts[APART] + counts[RETURN], counts[RETURN], counts[STAYED], counts[UNKNOWN]

@@ -117,10 +117,9 @@ def map_of(
 def fitting_best(
     maps: Sequence[SSHMap], drives: Sequence[Drive], vectors: NDArray[np.float64]
 ) -> list[SSHMap]:
-    """Find the joint maps by which most images are at the dstate of the most similar image.
+    """Choose the joint maps that put most images at the same dstate as their most similar image.
 
-    Only the images of other drives are compared with an image. `vectors` has the vector of each
-    image, (n, d).
+    The most similar image is one of another drive. `vectors` has the vector of each image, (n, d).
     """
     nearest = np.zeros(len(vectors), np.intp)
     steps = np.arange(len(vectors))

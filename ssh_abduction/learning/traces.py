@@ -59,7 +59,10 @@ class Traces:
 
     @cached_property
     def images(self) -> NDArray[np.float64]:
-        """The images of all n steps, (n, d), or PerceptionError if a step lacks one of length d."""
+        """The images of all n steps, (n, d).
+
+        Raises PerceptionError if a step has no image, or one of another length.
+        """
         tables = [images_of(trace) for trace in self.each]
         for i, table in enumerate(tables):
             if table.shape[1] != tables[0].shape[1]:
@@ -71,7 +74,7 @@ class Traces:
 
     @property
     def features(self) -> Any:
-        """The transformer of these images to vectors, not fitted yet, or PerceptionError."""
+        """The transformer of these images to vectors, not fitted yet. Raises PerceptionError."""
         kinds = [features_of(trace) for trace in self.each]
         for i, kind in enumerate(kinds):
             if (type(kind), kind.get_params()) != (type(kinds[0]), kinds[0].get_params()):
@@ -83,7 +86,7 @@ class Traces:
 
     @property
     def joint(self) -> Trace:
-        """The traces as drives of one joint trace, without images, or TraceError."""
+        """The traces as drives of one joint trace, without images. Raises TraceError."""
         if len(self.each) == 1:
             return self.each[0]
         names = [trace.name or "" for trace in self.each]

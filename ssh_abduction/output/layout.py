@@ -223,7 +223,7 @@ class _Drawing:
         return Layout({}, tuple((float(x), float(y), None) for x, y in at / nearest))
 
     def _course(self, s: DState, whole: bool) -> tuple[Course, float]:
-        """The course of a dstate, and the radians from its heading to that of the dstate.
+        """The course of a dstate, and the angle from the course to the dstate in radians, 0 or pi.
 
         A course is drawn straight. It is a `whole` path, or a part of one.
         """

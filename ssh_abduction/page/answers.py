@@ -17,7 +17,8 @@ def pair_explained(
 ) -> PairExplanation:
     """Explain in `limit` seconds why two steps are one dstate (place and heading), or not.
 
-    A function that runs in a process takes a watch. The server ends the process instead.
+    `watch` is not used, as the server ends the process itself. `in_process` passes one to each
+    function that it runs.
     """
     return explain_pair(trace, first, second, theory, time_limit=limit)
 
@@ -27,6 +28,7 @@ def solved_with(
 ) -> Solution:
     """Find the minimal maps by a theory with assumptions about pairs of steps.
 
-    At most `maps` are listed; None lists all. `limit` is in seconds. `watch` is not used.
+    At most `maps` are listed; None lists all. `limit` is in seconds. `watch` is as in
+    `pair_explained`.
     """
     return solve(trace, theory, max_maps=maps, time_limit=limit)

@@ -49,7 +49,11 @@ def assumptions(
     left: list[tuple[Pair, bool]] = []
 
     def tell(pair: Pair, one: bool, lost: Side) -> None:
-        """Record the costs for a pair. All minimal maps have `one` dstate; `lost`: the opposite."""
+        """Record the costs for a pair.
+
+        `one` says whether its steps are one dstate in all minimal maps, `lost` what is known
+        about the maps in which it is the other way round.
+        """
         won = Side(possible=True, cost=best, proven=True)
         same, different = (won, lost) if one else (lost, won)
         verdict = Verdict.SAME_IN_MINIMAL if one else Verdict.DIFFERENT_IN_MINIMAL

@@ -255,8 +255,8 @@ def _layouts(
 ) -> list[tuple[int, Layout]]:
     """Draw the first map and, if time and size allow, the maps with other dstates or places.
 
-    The entry of a drawn map in `told` gets the key `layout`: the index in the returned list of
-    pairs of the index of a map and its drawing.
+    `entries` has a dict for each map. Return a list of drawings, each with the index of its map.
+    If a map has a drawing, its entry gets the key `layout`, the index of the drawing in this list.
     """
     layouts: list[tuple[int, Layout]] = []
     drawn: dict[Hashable, int] = {}

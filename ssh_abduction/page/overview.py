@@ -21,8 +21,8 @@ Pair: TypeAlias = frozenset[Steps]
 class _Counts:
     """Counts the maps that have each dstate, place and street, given by its steps.
 
-    `along` counts, for each dstate or street and each set of steps along its path, the maps with
-    both. A key has a number in place of these steps.
+    `along` counts the maps in which a dstate or street is on a path with certain steps. Its keys
+    are pairs: the dstate or street, and a number that stands for the steps of the path.
     """
 
     def __init__(self) -> None:

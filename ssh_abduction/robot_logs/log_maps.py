@@ -248,7 +248,7 @@ def seconds_left(log: RobotLog, imported: Imported) -> float:
 
 
 def how_it_ended(solution: Solution, allowed: float) -> str | None:
-    """Say why a search yielded no map, or no proof that no map costs less."""
+    """Say why a search found no map or proved none minimal; None if there is nothing to say."""
     if solution.status is Status.UNSATISFIABLE:
         return (
             "No map satisfies the axioms. Let some steps be wrong (--set misread=4), or ask why: "
@@ -302,7 +302,7 @@ def map_log(
     Args:
         log: The robot's log; or the logs of several drives through one building. Nothing needs to
             be known of where a drive starts.
-        theory: The axioms. None is BARE, which has neither stars nor sides.
+        theory: The axioms; None for BARE, which uses neither stars nor sides.
         choices: Values of fields of Theory, by name. They replace those of the theory.
         width: The width of the robot in metres. It cannot pass narrower parts of the free space.
         name: The name of the trace, or the names of the drives. None for no name, or for "drive 1",
@@ -380,7 +380,7 @@ def map_log(
 
 
 def _doubted(solution: Solution) -> Solution:
-    """Return a solution without confidence, for a log that does not show how the robot moved."""
+    """Mark the costs of the maps of a solution as doubtful, because the track is unreliable."""
     if solution.weighed is None:
         return solution
     weighed = replace(solution.weighed, doubt="the track is unreliable")

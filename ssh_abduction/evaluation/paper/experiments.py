@@ -382,7 +382,11 @@ def notched(depth: float) -> World:
 def _driven(
     notch: float, seed: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[Any]]:
-    """Drive all tours. Return mean pose at its dstate, offset, both (n, 3), and dstate by step."""
+    """Simulate all tours in the rectangle with this notch.
+
+    Return for each of the n steps the mean pose at its true dstate, (n, 3), the offset of its own
+    pose from this mean, (n, 3), and the name of the dstate, (n,).
+    """
     trace = simulate(notched(notch), EXPERIMENTS["notched-rectangle"].tours, seed)
     truth = true_dstates(trace)
     poses = np.array([step.truth["pose"] for step in trace.steps])

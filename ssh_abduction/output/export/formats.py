@@ -172,7 +172,10 @@ def _level(ssh_map: SSHMap, to: str, level: str | None) -> str:
 
 
 def nav2(roads: Roads, name: str, frame: str) -> str:
-    """Write a map as the GeoJSON text of a route graph. `frame` is that of the positions."""
+    """Write a map as the GeoJSON text of a route graph.
+
+    `frame` is the name of the coordinate frame of the positions.
+    """
     # All ids must differ, so the ids of edges follow those of nodes.
     first = max(stop.id for stop in roads.stops) + 1
     at = {stop.id: [round(stop.x, DIGITS), round(stop.y, DIGITS)] for stop in roads.stops}

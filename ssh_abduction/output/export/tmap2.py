@@ -29,7 +29,7 @@ RADIUS = 0.75
 def tmap2(roads: Roads, name: str, frame: str, updated: datetime | None = None) -> str:
     """Write a map as the YAML text of a topological map.
 
-    The name is that of the map and of its pointset, the frame that of the positions. `updated`
+    `name` names the map and its pointset, `frame` the coordinate frame of the positions. `updated`
     is the time when the map was made; None for now.
     """
     title = {"places": "place", "dstates": "dstate"}[roads.level]
