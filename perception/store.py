@@ -28,7 +28,7 @@ from perception.reciprocal import ReciprocalTransformer
 from perception.recognition import PlaceRecogniser
 from perception.views import ViewClusterer
 from ssh_abduction.data.errors import brief, is_whole
-from ssh_abduction.data.files import write_file
+from ssh_abduction.data.files import save_file
 
 FORMAT, VERSION = "ssh-recogniser", 1
 OURS = (
@@ -105,17 +105,7 @@ def save(model: Any, path: str | os.PathLike[str]) -> None:
     Its types are of this package or of scikit-learn. Raises PerceptionError if `load` would
     reject it, or the file cannot be written.
     """
-    data = written(model, str(path))
-    try:
-        write_file(path, data)
-    except OSError as error:
-        raise PerceptionError(
-            f"{path}: cannot write the recogniser: {error.strerror or error}; check the folder"
-        ) from None
-    except ValueError as error:
-        raise PerceptionError(
-            f"{brief(str(path))}: cannot write the recogniser: {error}; name a file"
-        ) from None
+    save_file(path, written(model, str(path)), "recogniser", PerceptionError)
 
 
 def written(model: Any, name: str = "recogniser") -> bytes:

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from perception.errors import LogError
 from perception.readers.scans import LaserScanner, Scan
 from ssh_abduction.data.errors import named
-from ssh_abduction.data.files import write_file
+from ssh_abduction.data.files import save_file
 from ssh_abduction.data.odometry import Pose, displacement_between, moved
 
 HEADER = (
@@ -78,13 +78,8 @@ def write_carmen(
     )
     text = head + "".join(map(_carmen_lines, *_numbered(scans)))
     data = text.encode("ascii")
-    try:
-        write_file(path, gzip.compress(data, mtime=0) if os.fspath(path).endswith(".gz") else data)
-    except (OSError, ValueError) as error:
-        raise LogError(
-            f"{named(path)}: expected a file that can be written: "
-            f"{getattr(error, 'strerror', None) or error}; check the path"
-        ) from None
+    packed = gzip.compress(data, mtime=0) if os.fspath(path).endswith(".gz") else data
+    save_file(path, packed, "log", LogError)
 
 
 def write_bag(

@@ -214,7 +214,7 @@ def _write_log(options: argparse.Namespace, drive: RecordedDrive) -> int:
     from pathlib import Path
 
     from perception.readers.writers import write_bag, write_carmen
-    from ssh_abduction.data.files import write_file
+    from ssh_abduction.data.files import save_file
 
     target = Path(options.output)
     if options.log == "carmen":
@@ -229,12 +229,7 @@ def _write_log(options: argparse.Namespace, drive: RecordedDrive) -> int:
     truth = target.with_name(
         f"{name if Path(name).suffix not in ENDINGS else Path(name).stem}.truth.json"
     )
-    try:
-        write_file(truth, json.dumps(drive.truth).encode() + b"\n")
-    except OSError as error:
-        raise AbductionError(
-            f"{named(truth)}: cannot write the truth: {error.strerror or error}; check the folder"
-        ) from None
+    save_file(truth, json.dumps(drive.truth).encode() + b"\n", "truth", AbductionError)
     print(
         f"{counted(len(drive), 'scans')} along {drive.metres:.0f} m of {printable(drive.name)} in "
         f"{named(target)}, and the truth in {named(truth)}"
@@ -297,16 +292,11 @@ def _with_table(trace: Trace, target: str) -> Trace:
 
     import numpy as np
 
-    from ssh_abduction.data.files import write_file
+    from ssh_abduction.data.files import save_file
 
     path = Path(target).with_suffix(".npz")
     packed = io.BytesIO()
     np.savez_compressed(packed, images=np.array([step.image for step in trace.steps], np.uint8))
-    try:
-        write_file(path, packed.getvalue())
-    except (OSError, ValueError) as error:
-        raise AbductionError(
-            f"{named(path)}: cannot write the images: {error}; check the folder"
-        ) from None
+    save_file(path, packed.getvalue(), "images", AbductionError)
     steps = tuple(replace(step, image=i) for i, step in enumerate(trace.steps))
     return replace(trace, steps=steps, images=path.name)

@@ -25,7 +25,7 @@ from ssh_abduction.data.corrections import (
 )
 from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.errors import MapError, brief, named
-from ssh_abduction.data.files import read_at_most, write_file
+from ssh_abduction.data.files import read_at_most, save_file
 from ssh_abduction.data.map_parts import NAMED
 from ssh_abduction.data.maps import SSHMap
 
@@ -69,13 +69,8 @@ def save_corrections(corrections: Corrections, path: str | os.PathLike[str]) -> 
         MapError: The file cannot be written.
     """
     file = file_in(path)
-    try:
-        write_file(str(file), (HEAD + to_yaml(checked_corrections(corrections))).encode())
-    except (OSError, ValueError) as error:
-        why = getattr(error, "strerror", None) or error
-        raise MapError(
-            f"{named(file)}: cannot write the corrections: {why}; check the folder"
-        ) from None
+    data = (HEAD + to_yaml(checked_corrections(corrections))).encode()
+    save_file(str(file), data, "corrections", MapError)
 
 
 def file_in(path: str | os.PathLike[str]) -> Path:

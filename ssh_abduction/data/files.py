@@ -14,6 +14,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from ssh_abduction.data.errors import AbductionError, brief, named
+
 # Levels of nested objects and lists. Python's own functions fail at thousands of levels.
 DEEPEST = 100
 # Digits of a whole number. A much longer one is no floating-point number.
@@ -151,6 +153,20 @@ def write_file(path: str | os.PathLike[str], data: bytes) -> None:
     finally:
         with suppress(OSError):  # if the folder does not exist, or is a file
             draft.unlink(missing_ok=True)
+
+
+def save_file(
+    path: str | os.PathLike[str], data: bytes, what: str, error: type[AbductionError]
+) -> None:
+    """Write a file as `write_file`. If it cannot be written, raise `error`, which names `what`."""
+    try:
+        write_file(path, data)
+    except OSError as found:
+        why = found.strerror or found
+        raise error(f"{named(path)}: cannot write the {what}: {why}; check the folder") from None
+    except ValueError as found:
+        where = brief(str(path))
+        raise error(f"{where}: cannot write the {what}: {found}; name a file") from None
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

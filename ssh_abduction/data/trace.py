@@ -24,7 +24,7 @@ from ssh_abduction.data.action import STANDARD_ACTIONS, Action, Kind, TurnDirect
 from ssh_abduction.data.checks import a_list, a_path, a_text, a_whole_number, an_instance, an_object
 from ssh_abduction.data.closure import Closure, checked_closures, closures_among
 from ssh_abduction.data.errors import RangeError, TraceError, brief, checked_index, named
-from ssh_abduction.data.files import json_line, write_file
+from ssh_abduction.data.files import json_line, save_file
 from ssh_abduction.data.notebook import in_output
 from ssh_abduction.data.observation import View, checked_probability, view_or_unknown
 from ssh_abduction.data.odometry import Covariance, Odometry
@@ -425,21 +425,13 @@ class Trace:
         path = a_path("path", path, TraceError)
         lines = "".join(line + "\n" for line in self.to_lines())
         try:
-            write_file(path, lines.encode("utf-8"))
+            data, _ = lines.encode("utf-8"), os.fsencode(path)
         except UnicodeEncodeError as error:
             half = f"half a character, \\u{ord(error.object[error.start]):04x}"
             raise TraceError(
                 f"trace: expected texts and file names in UTF-8, got {half}; rename it"
             ) from None
-        except OSError as error:
-            raise TraceError(
-                f"{named(path)}: cannot write the trace: {error.strerror or error}; "
-                f"check the folder"
-            ) from None
-        except ValueError as error:
-            raise TraceError(
-                f"{brief(str(path))}: cannot write the trace: {error}; name a file"
-            ) from None
+        save_file(path, data, "trace", TraceError)
 
     @property
     def digest(self) -> str:
