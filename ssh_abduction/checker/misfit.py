@@ -139,7 +139,8 @@ class _Errors:
         # off its dstate at each step, scale and drift.
         self._begin = 3 * (size + len(self._closures))
         self._size = self._begin + self._off.size + 2
-        # The loops: the last step at the same place, a step, and whether their dstate is the same.
+        # A loop: the last earlier step at the dstate or place of a step, the step, and whether both
+        # are at one dstate.
         self._loops: list[tuple[int, int, bool]] = []
         at_place: dict[int, int] = {}
         at_dstate: dict[int, int] = {}
@@ -183,7 +184,7 @@ class _Errors:
             [cos * gone[:, 0] - sin * gone[:, 1], sin * gone[:, 0] + cos * gone[:, 1]], axis=1
         )
         pose = np.column_stack([np.cumsum(onward, axis=0), heading])
-        # The derivative of each movement by its own unknowns: (x, y, heading) x (noise, 2 more).
+        # The derivatives of each movement, (x, y, heading), by its three errors, scale and drift.
         own = np.zeros((size, 3, 5))
         own[:, 0, 0], own[:, 0, 1] = cos / (1 + scale), -sin / (1 + scale)
         own[:, 1, 0], own[:, 1, 1] = sin / (1 + scale), cos / (1 + scale)

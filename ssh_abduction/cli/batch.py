@@ -45,8 +45,8 @@ from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 
 # A process is lost if it has no answer after GUARDED times its time limit plus OVERDUE seconds.
-# This is a last resort, as its own guard should end it earlier. On a busy machine that takes it
-# several seconds.
+# This is a last resort: a process should end itself earlier, by its `Guard`. On a busy machine the
+# Guard may be several seconds late.
 GUARDED, OVERDUE = 1.2, 10.0
 
 

@@ -136,7 +136,7 @@ def _localiser(options: argparse.Namespace) -> Localiser:
 
 
 def _headline(beliefs: Sequence[Mapping[str, Any]]) -> str:
-    """List the steps at which the robot was located, unsure, lost or nowhere, and the collapses."""
+    """List the steps with each verdict, such as "located", and those where the belief collapsed."""
     steps: dict[str, list[int]] = {}
     for step, belief in enumerate(beliefs):
         steps.setdefault(belief["verdict"], []).append(step)

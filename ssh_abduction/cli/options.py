@@ -132,7 +132,7 @@ def check_output(target: str, what: str) -> None:
     """Raise AbductionError before long work if a file cannot be written into its folder."""
     folder, path = Path(target).absolute().parent, Path(target)
     if target == "-" or not (path.is_dir() or path.is_file() or not path.exists()):
-        return  # a device has no draft beside it
+        return  # a device such as /dev/null is written directly, not by a temporary file beside it
     if path.is_dir():
         why = "it is a folder; name a file in it"
     elif not folder.is_dir():

@@ -58,7 +58,7 @@ def derive(
 ) -> Derivation:
     """Find an argument that two steps are one dstate in all maps (`one`), or in none.
 
-    The caller must already have proved this for the piece: steps that suffice for the proof.
+    The steps of `piece` must suffice for the proof; the caller must have proved that they do.
     The argument may cite displacements of the whole trace. `stop` is called now and then. If it
     returns True, Interrupted is raised.
     """

@@ -349,8 +349,9 @@ class Axioms:
         self._control.ground([(name, [])])
 
     def sentences(self, clash: Sequence[tuple[str, int]]) -> tuple[str, ...]:
-        """Describe the returns that displacements reject in a clash, by axioms and steps.
+        """Describe the returns that displacements reject in a clash.
 
+        `clash` is a set of pairs (axiom, step) that no map satisfies, as from `smallest_clash`.
         Without displacements the axioms of the clash have models. Each of these models has
         a return (two steps at one dstate or at one place) that displacements reject. This
         method describes the return that is rejected most clearly, forbids it, and repeats

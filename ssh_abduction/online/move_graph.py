@@ -234,7 +234,10 @@ class MoveGraph:
         return move + (self._travel_cost if travels else 0.0)
 
     def _only_action(self, *, onward: bool) -> str | None:
-        """The action that leads onward along a path (or turns around); None unless exactly one."""
+        """Return the action that leads along paths or, if not `onward`, turns around on them.
+
+        None if the map has no such action, or several.
+        """
         dstates, names = self.map.dstates, set()
         for source, action, target in self.map.links:
             s, x = dstates[source], dstates[target]

@@ -157,7 +157,7 @@ class RivalMaps:
             self.is_complete = self.is_complete and (self._lists_links or not has_unknown)
         if optimal and not any(self.is_minimal(rival) for rival in rivals):
             self.is_proven = self.is_complete = False
-        # Keep the other rivals. If all minimal maps are listed, drop those that seem as cheap.
+        # Keep the other rivals. But if all minimal maps are listed, no other rival can be as cheap.
         known = {(rival.labels, rival.faults) for rival in rivals}
         others = [
             rival

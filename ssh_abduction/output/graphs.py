@@ -92,7 +92,7 @@ def to_graphml(ssh_map: SSHMap) -> str:
         graph.add_node(s, **{**data, **texts})
     for source, target, action in causal.edges(data="action"):
         name = key = xml_text(action)
-        if graph.has_edge(source, target, name):  # two names that differ in what XML cannot hold
+        if graph.has_edge(source, target, name):  # XML lacks the characters in which names differ
             key = f"{name} ({graph.number_of_edges(source, target)})"
         graph.add_edge(source, target, key=key, action=name)
     return "\n".join(nx.generate_graphml(graph))

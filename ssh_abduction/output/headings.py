@@ -63,8 +63,8 @@ def turns_between(
     """Yield the known turns between dstates.
 
     They follow from the headings of dstates at one place, and from the actions of links.
-    `degrees` has what each action turns, clockwise, and its weight. `spot` has a number for
-    each dstate that is equal at one place.
+    `degrees` has, for each action's name, the degrees clockwise that it turns, and their weight.
+    `spot` has a number for each dstate. Dstates at one place have the same number.
     """
     dstates = ssh_map.dstates
     in_slots = max((s.heading or 0 for s in dstates), default=0) < 4

@@ -199,7 +199,7 @@ class _Drawing:
                     program = StreetProgram(self.spots, self._streets(headings, whole))
                     if wrong + program.bent < fewest:
                         best, fewest = (headings, program), wrong + program.bent
-        assert best is not None  # as the first drawing has fewer than infinitely many
+        assert best is not None  # the first drawing is better than `fewest`, which began as inf
         headings, at = best[0], self._packed(best[1].put_apart())
         return Layout(
             {p: at[p] for p in self.map.places},

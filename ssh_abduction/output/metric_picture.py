@@ -417,8 +417,8 @@ def _spots(ssh_map: SSHMap, poses: Sequence[Pose]) -> list[Point]:
 def _scale(spots: Sequence[Point], nearest: float) -> tuple[float, float]:
     """The units of the page for each metre, and the factor for the size of marks, at most 1.
 
-    The usual distance between neighbours becomes APART units. The scale is smaller if the page
-    would exceed LARGEST units, or the two nearest places would be over `nearest` units apart.
+    The two nearest places are `nearest` units apart. The scale is smaller if neighbours would
+    usually be more than APART units apart, or the map larger than LARGEST units.
     """
     extent = max((max(numbers) - min(numbers) for numbers in zip(*spots, strict=True)), default=0.0)
     if extent < 1e-3:  # one place, or all in one spot

@@ -13,8 +13,8 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.regions import Region, course_named, ids_at, list_in_words
 from ssh_abduction.output.drawing import Point, element, line, svg_text, titled
 
-# The colour and the opacity of bands. WIDER is by how many times the width of the innermost band a
-# band around another one is wider.
+# The colour and the opacity of bands. Each band around another one is wider by WIDER times the
+# width of the innermost band.
 BAND, OPACITY, WIDER = "#8a6d00", 0.13, 0.5
 
 

@@ -24,7 +24,7 @@ from ssh_abduction.data.words import counted
 from ssh_abduction.rivals.listing import Listing
 from ssh_abduction.solver import probability_in_words
 
-ALMOST = 1 - 1e-9  # a join that some map has not
+ALMOST = 1 - 1e-9  # the largest share of a join that some map lacks
 SHOWN = 6  # a sentence names at most this many joins of a kind
 
 _Placing: TypeAlias = Sequence[int]  # the place of each step by one map; without places, the dstate

@@ -271,9 +271,9 @@ class Laboratory:
     ) -> tuple[list[int], dict[int, tuple[list[int], list[int]]]] | None:
         """Find the sequence of actions up to a difference with the greatest gain per action.
 
-        The gain is log(n / m) if m of n rivals are left in the worst case. Returns the actions and,
-        by what is then seen, indices of `machines` and states. None if no known links distinguish
-        them.
+        The gain is log(n / m) if m of n rivals are left in the worst case. Returns the actions, and
+        a dict from each observation after them to the machines that predict it, as indices of
+        `machines`, and the states of these machines. None if no known links distinguish them.
         """
         weights = np.array([len(self._groups[m]) for m in machines])
         total, least = int(weights.sum()), int(weights.max())
