@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -19,7 +20,7 @@ from simulator.tours import record, simulate
 from simulator.world import World
 from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
-from ssh_abduction.data import Action, MapError, TheoryError, TraceError
+from ssh_abduction.data import Action, MapError, TheoryError, TraceError, together
 from ssh_abduction.online import route
 from ssh_abduction.output import to_networkx, to_svg
 from ssh_abduction.output.export import export_map
@@ -262,3 +263,16 @@ def test_a_route_changes_floors_by_the_lift_only(without: tuple[str, ...]) -> No
     found = route(ssh_map, 0, 3, by="places")
     assert found is not None
     assert found.actions == ("travel", "up", "travel")
+
+
+@pytest.mark.parametrize(("kind", "warned"), [("lift", 0), ("travel", 1)])
+def test_drives_may_take_different_lifts(kind: str, warned: int) -> None:
+    """Lifts to different floors have different names."""
+    drives = [
+        Trace.from_steps("ab", [{"name": name, "kind": kind}], name=f"{name}-drive")
+        for name in ("one", "other")
+    ]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        together(drives)
+    assert len(caught) == warned

@@ -338,11 +338,14 @@ def _warn_of_repeats(traces: Sequence[Trace]) -> None:
 
 
 def _warn_of_other_names(traces: Sequence[Trace]) -> None:
-    """Warn if traces have different names for actions that are alike in all else."""
+    """Warn if traces have different names for actions that are alike in all else.
+
+    Lifts are left out, as those to different floors have different names.
+    """
     known: dict[Action, tuple[int, set[str]]] = {}
     for i, trace in enumerate(traces):
         named: dict[Action, set[str]] = {}
-        for action in {a for a in trace.actions if not a.starts and a.kind is not None}:
+        for action in {a for a in trace.actions if a.kind in ("travel", "turn")}:
             named.setdefault(replace(action, name="?", extra={}), set()).add(action.name)
         for alike, names in named.items():
             first, others = known.setdefault(alike, (i, names))
