@@ -292,7 +292,8 @@ def test_view_writes_a_page_with_beliefs(
 ) -> None:
     trace = Trace.from_steps("abcbabcb", ["on"] * 7)
     maps, run, page = (str(tmp_path / name) for name in ("maps.json", "it's.jsonl", "page.html"))
-    solve(trace, Theory.causal()).save(maps)
+    solution = solve(trace, Theory.causal())
+    solution.save(maps)
     trace.save(run)
     assert main(["localise", maps, run, "--json"]) == 0
     (tmp_path / "beliefs.json").write_text(capsys.readouterr().out)
@@ -303,13 +304,15 @@ def test_view_writes_a_page_with_beliefs(
     assert shown["replays"][0]["beliefs"]["0"] == again["replays"][0]["beliefs"]["0"]
     assert shown["flags"] == " --theory causal"
     assert shown["trace"] == f"'{tmp_path}/it'\"'\"'s.jsonl'"
-    for wrong, said in (
-        (["--serve"], "expected the trace that was mapped"),
-        (["--belief", maps], "beliefs: expected a list"),
+    assert main(["view", maps, "-o", page]) == 0  # solve -o puts the trace into the file
+    assert shown_in(page)["assuming"] == shown["assuming"]
+    bare = tmp_path / "bare.json"
+    bare.write_text(json.dumps(solution.to_dict()))
+    for words, said in (
+        ([str(bare), "--serve"], "expected the trace that was mapped"),
+        ([maps, run, "--belief", maps], "beliefs: expected a list"),
     ):
-        assert (
-            main(["view", maps, *([run] if wrong[1:] else []), *wrong, "--set", "open=false"]) == 1
-        )
+        assert main(["view", *words, "--set", "open=false"]) == 1
         assert said in capsys.readouterr().err
 
 

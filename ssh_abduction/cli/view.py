@@ -8,7 +8,14 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ssh_abduction.cli.options import add_maps, flags_of, output, trace_beside, trace_path
+from ssh_abduction.cli.options import (
+    add_maps,
+    flags_of,
+    output,
+    trace_beside,
+    trace_of_maps,
+    trace_path,
+)
 from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.data.errors import AbductionError, MapError, brief, is_whole, named
 
@@ -37,7 +44,8 @@ def add_parser(verbs: Verbs) -> None:
     parser.add(
         "trace",
         "the trace that was mapped; adds actions and laser images, and is needed for --serve "
-        "(default: the trace in the folder of the maps, if map wrote it)",
+        "(default: the trace in the folder of the maps, if map wrote it, or in the file of maps, "
+        "if solve -o wrote it)",
         nargs="?",
         type=trace_path,
     )
@@ -54,7 +62,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.add(
         "--serve",
         "serve the page, on this computer only, so that it can explain why two steps are one "
-        "dstate or not, and solve again with assumptions; needs TRACE. Ctrl-C ends the server",
+        "dstate or not, and solve again with assumptions; needs the trace. Ctrl-C ends the server",
     )
     parser.add(
         "--time-limit S",
@@ -77,7 +85,8 @@ def run(options: argparse.Namespace) -> int:
     from ssh_abduction.theory.theory import Theory
 
     options.trace = options.trace or trace_beside(options.maps)
-    if options.serve and options.trace is None:
+    trace = trace_of_maps(options.maps) if options.trace is None else Trace.load(options.trace)
+    if options.serve and trace is None:
         raise AbductionError(
             "--serve: expected the trace that was mapped, got none; give it after the maps"
         )
@@ -90,7 +99,6 @@ def run(options: argparse.Namespace) -> int:
     data = read_json(options.maps)
     source = "standard input" if options.maps == "-" else options.maps
     listing = Listing.from_dict(data, source).named_beside(options.maps)
-    trace = Trace.load(options.trace) if options.trace is not None else None
     theory = (
         Theory.from_dict(data["theory"]) if isinstance(data, dict) and "theory" in data else None
     )
