@@ -288,8 +288,9 @@ def test_trace_of_other_maps_is_refused(rivals: Solution, route: Trace) -> None:
 
 
 def test_view_writes_a_page_with_beliefs(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("ssh_abduction.cli.view.ASSUMING", 1000.0)  # enough for all costs
     trace = Trace.from_steps("abcbabcb", ["on"] * 7)
     maps, run, page = (str(tmp_path / name) for name in ("maps.json", "it's.jsonl", "page.html"))
     solution = solve(trace, Theory.causal())
