@@ -109,12 +109,15 @@ class Bag:
 def bag_opened(path: str | os.PathLike[str], format: str) -> Iterator[Bag]:
     """Open a bag of the format `ros1`, `ros2` or `mcap`, or a folder. Raises LogError."""
     with bag_files.files_opened(Path(path), format) as files:
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+        yield Bag(files, typestore(files.format == "ros1"), named(path))
 
-        store = get_typestore(Stores.ROS1_NOETIC if files.format == "ros1" else Stores.ROS2_HUMBLE)
-        for kind in TRANSFORMS:
-            if kind not in store.fielddefs:
-                store.register(
-                    get_types_from_msg("geometry_msgs/TransformStamped[] transforms", kind)
-                )
-        yield Bag(files, store, named(path))
+
+def typestore(is_ros1: bool) -> Any:
+    """Make the store of rosbags with the types of messages, those of transforms among them."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+    for kind in TRANSFORMS:
+        if kind not in store.fielddefs:
+            store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", kind))
+    return store

@@ -34,6 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.errors import LogError
+from perception.readers.bag_topics import TRANSFORMS, typestore
 from perception.readers.scans import LaserScanner, Scan
 from ssh_abduction.data.errors import named
 from ssh_abduction.data.files import save_file
@@ -172,24 +173,17 @@ def _write_bag(path: Path, scans: Iterable[Scan], covariances: NDArray[np.float6
     """Write a bag to a new path; return the file or folder that is the result."""
     try:
         from rosbags import rosbag1, rosbag2
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError:
         raise LogError(
             "bag: expected the package rosbags, got none; pip install 'ssh-abduction[ros]'"
         ) from None
     is_ros1 = path.suffix == ".bag"
-    store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
-    transforms = "tf2_msgs/msg/TFMessage"
-    # The type store of ROS 1 lacks this message.
-    if transforms not in store.fielddefs:
-        store.register(
-            get_types_from_msg("geometry_msgs/TransformStamped[] transforms", transforms)
-        )
+    store = typestore(is_ros1)
     kinds = {
         "/scan": "sensor_msgs/msg/LaserScan",
         "/odom": "nav_msgs/msg/Odometry",
-        "/tf": transforms,
-        "/tf_static": transforms,
+        "/tf": TRANSFORMS[0],
+        "/tf_static": TRANSFORMS[0],
     }
     plugin = rosbag2.StoragePlugin.MCAP if path.suffix == ".mcap" else rosbag2.StoragePlugin.SQLITE3
     writer: Any = (

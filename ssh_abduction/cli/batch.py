@@ -35,6 +35,7 @@ from ssh_abduction.cli.outcome import (
     why_no_map,
 )
 from ssh_abduction.cli.text import headline
+from ssh_abduction.cli.verbosity import progress_bar
 from ssh_abduction.data.errors import AbductionError, named
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.trace import Trace
@@ -302,17 +303,7 @@ def _progress(total: int) -> Iterator[tuple[Callable[[str], None], Callable[[], 
     if not sys.stderr.isatty():
         yield partial(print, flush=True), lambda: None
         return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-    )
-    with Progress(*columns, console=console, redirect_stdout=False) as progress:
+    with progress_bar() as progress:
         task = progress.add_task("traces", total=total)
 
         def say(line: str) -> None:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 from ssh_abduction.cli.options import check_jobs, output
 from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import table
+from ssh_abduction.cli.verbosity import progress_bar
 from ssh_abduction.data.errors import AbductionError, brief, named
 
 # Each seed takes seconds. More than this many seeds are a typing error, and would fill the memory.
@@ -41,23 +41,12 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
     from ssh_abduction.evaluation.paper.report import reproduce, steps
 
     seeds = _seeds(options.seeds)
     check_jobs(options.jobs, "processes", default=2)
     folder = Path(options.output or f"out/{options.experiment}")
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-    )
-    with Progress(
-        *columns, console=Console(stderr=True), disable=not sys.stderr.isatty()
-    ) as progress:
+    with progress_bar() as progress:
         task = progress.add_task(
             options.experiment, total=steps(options.experiment, seeds, options.outcomes)
         )

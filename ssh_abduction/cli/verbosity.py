@@ -9,6 +9,7 @@ import os
 import sys
 import time
 from collections.abc import Iterator
+from typing import Any
 
 from ssh_abduction.data.errors import printable
 from ssh_abduction.runtime.loggers import PACKAGE, PROGRESS
@@ -59,6 +60,22 @@ def telling(options: argparse.Namespace, for_programs: bool) -> Iterator[None]:
     else:
         with _handled(PROGRESS, _NowAndThen(), logging.DEBUG):
             yield
+
+
+def progress_bar() -> Any:
+    """Make a bar of progress by rich, on stderr. It shows nothing if stderr is no terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        console=Console(stderr=True),
+        redirect_stdout=False,
+        disable=not sys.stderr.isatty(),
+    )
 
 
 @contextlib.contextmanager
