@@ -127,7 +127,7 @@ def test_what_is_unique_is_what_solve_lists() -> None:
 def test_steps_that_are_spent_are_said() -> None:
     found = Explorer(Streetwalker(RING, "a", "E", told=False), time_limit=None).explore(3)
     assert (found.steps, found.ending, found.is_true) == (3, "steps", None)
-    assert "its steps are spent" in found.sentence
+    assert "the robot did all the actions that were allowed" in found.sentence
 
 
 def test_rivals_that_nothing_tells_apart_are_said() -> None:
@@ -175,7 +175,7 @@ def test_a_rival_with_more_dstates_that_nothing_tells_apart_is_said() -> None:
     assert (found.ending, found.is_unique, found.is_true) == ("inseparable", True, False)
     assert found.rival is not None
     assert (len(found.solution.maps[0].dstates), len(found.rival.dstates)) == (2, 4)
-    assert "a map with 2 more dstates explains all, too" in found.sentence
+    assert "a map with 2 more dstates also explains everything" in found.sentence
     assert found.to_dict()["rival"]["labels"] == list(found.rival.labels)
 
 

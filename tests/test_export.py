@@ -270,7 +270,7 @@ def test_dstates_have_an_edge_a_link(square: SSHMap) -> None:
 def test_maps_without_poses_have_a_layout(to: str, level: str) -> None:
     ssh_map = solve(rectangle(8)).maps[0]
     if (to, level) == ("dot", "places"):
-        with pytest.raises(MapError, match="DOT has a node a dstate"):
+        with pytest.raises(MapError, match="DOT has a node for each dstate"):
             export_map(ssh_map, to, level=level)
         return
     if to == "svg":

@@ -97,7 +97,7 @@ def test_a_drive_is_added_in_the_shell(tmp_path: Path, capsys: pytest.CaptureFix
     capsys.readouterr()
     assert main(["solve", tuesday, "--onto", maps, "-o", maps]) == 0
     told = capsys.readouterr().out
-    assert "the map of monday stands; the map joins all 2 drives: monday, tuesday" in told
+    assert "the map of monday is kept; the map joins all 2 drives: monday, tuesday" in told
     assert "0 (kitchen)" in told
     loaded = Solution.load(maps)
     assert [drive.name for drive in loaded.drives] == ["monday", "tuesday"]

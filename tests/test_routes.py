@@ -103,7 +103,7 @@ def test_what_is_avoided_is_gone_round() -> None:
     assert route(ssh_map, 0, 3).dstates == (0, 1, 3)
     with pytest.raises(
         MapError,
-        match="avoid: expected a way round what is avoided, got none to dstate 3; avoid less",
+        match="avoid: expected a way around what is avoided, got none to dstate 3; avoid less",
     ):
         route(ssh_map, 0, 3, avoid=[1])
     with pytest.raises(MapError, match="those of to"):

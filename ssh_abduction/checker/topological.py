@@ -204,8 +204,8 @@ def course_needs_travel(m: Reading) -> Found:
         if course_of(s) and s.id not in supported:
             yield (
                 m.steps_of(s.id),
-                f"Dstate {s.id} is along {going(s)}, but no travel starts or ends at it, nor "
-                "where turning around leads.",
+                f"Dstate {s.id} is along {going(s)}, but no travel starts or ends at it, nor at "
+                "the dstate after a turn around.",
             )
 
 

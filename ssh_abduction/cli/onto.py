@@ -43,8 +43,8 @@ def run(options: argparse.Namespace) -> int:
     if options.json:
         print(json_line(solution.to_dict()))
         return exit_code(solution)
-    stands = ", ".join(solution.support.onto)
+    kept = ", ".join(solution.support.onto)
     print(headline(solution, len(solution.maps), None))
-    print(printable(f"the map of {stands} stands; {pieces_in_words(solution.drives, solution[0])}"))
+    print(printable(f"the map of {kept} is kept; {pieces_in_words(solution.drives, solution[0])}"))
     print(f"\n{'map 1' if len(solution) > 1 else 'map'}\n{describe(solution[0])}")
     return exit_code(solution)

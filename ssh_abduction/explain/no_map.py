@@ -104,8 +104,8 @@ def explain(
     theory = problem.theory
     if theory.jumped:
         raise TheoryError(
-            "jumped: expected displacements that hold where a trace is explained; "
-            "leave it out (--set jumped=0)"
+            f"jumped: expected 0, as an explanation treats no displacement as wrong, got "
+            f"{theory.jumped:g}; leave it out (--set jumped=0)"
         )
     theory.check_steps(trace)
     check_rules(theory)

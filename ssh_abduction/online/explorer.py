@@ -71,7 +71,7 @@ Ending: TypeAlias = Literal["done", "inseparable", "steps", "time", "contradicte
 _ENDINGS: dict[Ending, str] = {
     "done": "one map is left, nothing in it is untried, and no return in it is in doubt",
     "inseparable": "several maps are left, and nothing that the robot can do tells them apart",
-    "steps": "its steps are spent",
+    "steps": "the robot did all the actions that were allowed",
     "time": "there was no time to prove which maps are minimal, or to weigh a doubt",
     "contradicted": "no map explains what was seen",
 }
@@ -134,8 +134,8 @@ class Exploration:
         if self.is_unique and self.rival:
             more = len(self.rival.dstates) - len(self.solution.maps[0].dstates)
             why = (
-                f"a map with {counted(more, 'more dstates')} explains all, too, "
-                "and nothing that the robot can do tells them apart"
+                f"a map with {counted(more, 'more dstates')} also explains everything, "
+                "and nothing that the robot can do tells the two apart"
             )
         unique = "" if self.is_unique else "not "
         after = f"after {counted(self.steps, 'steps')}"

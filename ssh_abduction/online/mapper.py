@@ -128,8 +128,9 @@ class OnlineMapper:
         theory = checked_theory(theory)
         if theory.jumped:
             raise TheoryError(
-                "jumped: expected displacements that hold while a robot drives; leave it out, "
-                "and give no displacement at a step where the odometry is lost"
+                "jumped: expected 0, as no displacement is treated as wrong while a robot drives, "
+                f"got {theory.jumped:g}; leave it out, and give no displacement at a step where "
+                "the odometry is lost"
             )
         check_limit("time_limit", "seconds", time_limit)
         checked_speedups(speedups)
@@ -171,8 +172,8 @@ class OnlineMapper:
         """
         if self._keeper.standing is None:
             raise TheoryError(
-                "theory: expected faults, as without them nothing is disbelieved, got none; "
-                "take misread or slipped, or read the solution"
+                "theory: expected one that allows faults, as else no map is in doubt, got one "
+                "without; set misread or slipped, or read `solution`"
             )
         return self._keeper.standing
 

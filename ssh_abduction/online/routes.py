@@ -217,7 +217,7 @@ def route(
     if not isinstance(by, str) or by not in BY:
         raise MapError(
             f"by: expected {', '.join(BY[:-1])} or {BY[-1]}, got {brief(by)}; "
-            "say what the route shall have the fewest of"
+            "say what the route minimises"
         )
     listing = Listing.of(maps)
     number = listing.number(str(map))
@@ -232,7 +232,7 @@ def route(
         if nodes <= closed:
             raise MapError(
                 f"avoid: expected other dstates and places than those of {name}, got the same; "
-                "take it out of what is avoided"
+                "do not avoid them"
             )
     start_place, goal_place = _place_of(graph, here), _place_of(graph, there)
     aside: set[Node] = set()
@@ -316,7 +316,7 @@ def _raise_no_route(
     """Raise MapError with the reason why there is no route, and what to do about it."""
     if closed and graph.shortest(here, there, set()) is not None:
         raise MapError(
-            f"avoid: expected a way round what is avoided, got none to {named}; avoid less"
+            f"avoid: expected a way around what is avoided, got none to {named}; avoid less"
         )
     mend = "drive on: next says what to try"
     if graph.by != "places" and graph.map.paths:

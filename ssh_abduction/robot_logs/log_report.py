@@ -83,7 +83,7 @@ def _summary(solution: Solution, run: Mapping[str, Any]) -> str:
     """Say in two sentences how long the log is, and how large the map is."""
     log, cost = run["log"], solution.cost
     seen = (
-        f"{log['scans']} scans on a way of {log['metres']:g} m; "
+        f"{log['scans']} scans along {log['metres']:g} m; "
         f"{run['visits']} visits to distinctive places, {run['steps']} steps."
     )
     if cost is None:

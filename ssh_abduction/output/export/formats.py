@@ -119,8 +119,8 @@ def _graph_of_places(ssh_map: SSHMap, to: str, turns: Trace | Turns | None) -> n
         )
     if to == "dot":
         raise MapError(
-            "level: expected dstates, got places: DOT has a node a dstate, and a cluster a place; "
-            "leave the level out"
+            "level: expected dstates, got places: DOT has a node for each dstate, and a cluster "
+            "for each place; leave the level out"
         )
     graph = in_text(to_networkx(ssh_map, "places", turns))
     for _, data in graph.nodes(data=True):
