@@ -356,7 +356,7 @@ def test_what_does_not_fit_is_refused_and_changes_nothing() -> None:
         mapper.observe({"name": "right", "kind": "travel"}, "v2")
     assert mapper.solution is before
     assert repr(mapper) == "<OnlineMapper: 2 steps, optimal, 2 dstates>"
-    with pytest.raises(TheoryError, match="expected faults"):
+    with pytest.raises(TheoryError, match="expected one that allows faults"):
         _ = OnlineMapper("v0", Theory.causal()).standing
 
 
