@@ -62,14 +62,15 @@ def with_partings(
     middles.
     """
     drive = _DrivePoints(track, visits)
-    moves = _agreed(drive, [*_closed(drive, closings), *_tracked(drive)])
+    relations = [*_closed(drive, closings), *_tracked(drive)]  # no middle of a visit changes them
+    moves = _agreed(drive, relations)
     visits = [*map(_moved, visits, moves)]
     closings = [
         replace(one, match=replace(one.match, shift=one.match.shift + _change(one, moves)))
         for one in closings
     ]
     drive = _DrivePoints(track, visits)
-    every = [*visits, *(drive.visit(*some) for some in _added(drive, closings))]
+    every = [*visits, *(drive.visit(*some) for some in _added(drive, relations))]
     order = sorted(range(len(every)), key=lambda k: every[k].scan)
     number = {k: n for n, k in enumerate(order)}
     return tuple(every[k] for k in order), [
@@ -194,9 +195,8 @@ def _tracked(drive: _DrivePoints) -> Iterator[_Alignment]:
             yield _Alignment(way, other, 0.0, np.zeros(2), np.zeros(2))
 
 
-def _added(drive: _DrivePoints, closings: Sequence[VisitMatch]) -> list[_Pass]:
+def _added(drive: _DrivePoints, relations: Sequence[_Alignment]) -> list[_Pass]:
     """List the passes of partings that are at no place."""
-    relations = [*_closed(drive, closings), *_tracked(drive)]
     found: list[_Pass] = []
     for one in relations:
         for pair in drive.partings(one):
