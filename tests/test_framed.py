@@ -120,7 +120,6 @@ def test_lists_the_maps_of_the_plain_encoding(
     fitted = {
         "BETTERING": data.draw(st.sampled_from([0, framed_paths.BETTERING]), label="bettering"),
         "CLASHES": data.draw(st.sampled_from([1, framed_paths.CLASHES]), label="clashes"),
-        "MANY_DSTATES": data.draw(st.sampled_from([0, framed_paths.MANY_DSTATES]), label="many"),
     }
     many_pairs = data.draw(st.sampled_from([5, framed.MANY_PAIRS]), label="many pairs")
     off = off - {"names"}

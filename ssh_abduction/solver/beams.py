@@ -113,8 +113,10 @@ class Beams:
             parts.report()
         for width in widths:
             began = watch.elapsed()
-            if width < widths[-1] and self._has_time_for(widths[-1], time, began):
-                continue  # leave this one out
+            # A beam of width n takes about n times as long as the first one.
+            last, first = widths[-1], self._took[0] if self._took else math.inf
+            if width < last and began + last * first < time.end(WIDTHS[last]):
+                continue  # there is time for the last one, so leave this one out
             watch.end_stage_after(time.end(WIDTHS[width]))
             if (beam := parts.candidates.beam(width)) is None:
                 break
@@ -126,13 +128,6 @@ class Beams:
                 return False
             self._took.append(watch.elapsed() - began)
         return True
-
-    def _has_time_for(self, width: int, time: _Time, now: float) -> bool:
-        """Whether a beam of this width probably ends in its share of the time.
-
-        It takes about `width` times as long as the first beam did.
-        """
-        return bool(self._took) and now + width * self._took[0] < time.end(WIDTHS[width])
 
     def _search_without_axioms(self, time: _Time) -> None:
         """Find how many nats broken axioms save, if unknown, by the widest beam that ended."""

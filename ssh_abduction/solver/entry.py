@@ -175,7 +175,8 @@ def find_backbone(
     cost, proven = solution.costs[0].preferred_by(solution.theory), False
     with suppress(LimitError, KeyboardInterrupt), heeding(watch.check):
         task = Task.of(Problem.of(trace, solution.theory), watch)
-        if _is_known_by_mending_alone(task):
+        mends = row("mending").holds_for(task.theory) and may_name(task)
+        if mends and len(task.trace) > READABLE:  # no engine finds the maps of such a search
             return known
         engine = _labelling_engine(task, solution)
         judging = Judging(task.problem)
@@ -183,12 +184,6 @@ def find_backbone(
     # The search may have seen more maps than the solution holds.
     has_learnt = proven or sharing.maps > len(minimal)
     return replace(sharing.backbone(proven=proven), drives=known.drives) if has_learnt else known
-
-
-def _is_known_by_mending_alone(task: Task) -> bool:
-    """Whether a search would find the maps only by mending the trace. No engine finds such maps."""
-    mends = row("mending").holds_for(task.theory) and may_name(task)
-    return mends and len(task.trace) > READABLE
 
 
 def _labelling_engine(task: Task, solution: Solution) -> Engine | None:

@@ -107,7 +107,12 @@ def late_clash(
         return None
     said = (*task.theory.same, *task.theory.same_place)
     ends = dict.fromkeys((*parts.candidates.contradicting, *(max(pair) for pair in said)))
-    stretches = _stretches_before(ends, len(task.trace))
+    stretches = (
+        range(max(t + 1 - length, 0), t + 1)
+        for length in STRETCHES
+        for t in ends
+        if length < len(task.trace)
+    )
     part = Watch().part(CLASHING, time.thread_time)
     with suppress(LimitError, KeyboardInterrupt), heeding(part.check):
         clash = clash_in(task.trace, task.theory, stretches, maps_of)
@@ -161,14 +166,3 @@ def overtime(parts: Parts) -> float:
     if parts.known.stopped != "time limit" or limit is None:
         return INTERRUPTED
     return max(parts.watch.left() + OVERTIME_SHARE * limit + OVERTIME, 0.0)
-
-
-def _stretches_before(ends: Iterable[int], steps: int) -> Iterator[range]:
-    """Yield stretches of consecutive steps that end with one of these steps, short ones first.
-
-    Args:
-        ends: The last steps.
-        steps: The number of steps of the trace. Each stretch has fewer.
-    """
-    for length in STRETCHES:
-        yield from (range(max(t + 1 - length, 0), t + 1) for t in ends if length < steps)

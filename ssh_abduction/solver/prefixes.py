@@ -112,10 +112,6 @@ class Prefixes:
         self._in_tolerance = task.theory.star == "gateways"
         self.start = len(task.trace) if self._at_once else FIRST_PREFIX
 
-    def go_on_with(self, engine: Engine, start: int) -> None:
-        """Use another engine from now on, beginning with a prefix of `start` steps."""
-        self.engine, self.start = engine, start
-
     def find_minimum(self) -> None:
         """Extend the prefix until one of its minimal maps replays to the end, or it has no map.
 

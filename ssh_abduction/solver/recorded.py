@@ -17,7 +17,6 @@ from ssh_abduction.data.errors import MapError, TheoryError
 from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.trace_file import read_trace
-from ssh_abduction.solver.sharing import Backbone
 from ssh_abduction.solver.steps.certificate import Basis, Certificate
 from ssh_abduction.solver.values import Bound, Cost, Effort, Grounding, Level, Seconds
 from ssh_abduction.solver.weighed import Weighed
@@ -116,13 +115,6 @@ class Support:
         if self.recorded is not None:
             return self.recorded.certificate
         return self.basis.certificate if self.basis else None
-
-
-def backbone_in(read: FieldReader, record: Mapping[str, Any], steps: int) -> Backbone | None:
-    """Read the backbone (what all minimal maps share); None if there is none. Raises MapError."""
-    if record.get("backbone") is None:
-        return None
-    return Backbone.from_dict(record["backbone"], steps, f"{read.where}: backbone")
 
 
 def trace_in(record: Mapping[str, Any], where: str) -> Trace | None:

@@ -29,7 +29,6 @@ from ssh_abduction.solver.ranking import weights
 from ssh_abduction.solver.recorded import (
     Recorded,
     Support,
-    backbone_in,
     bound_in,
     cost_in,
     effort_in,
@@ -429,7 +428,9 @@ class Solution(MapSequence):
             else SSHMap.from_dict(record["partial"], f"{where}: partial"),
             within=read.integer(record.get("within", 0), "within"),
             levels=levels_in(read, record, len(maps)),
-            shared=backbone_in(read, record, steps),
+            shared=None
+            if record.get("backbone") is None
+            else Backbone.from_dict(record["backbone"], steps, f"{where}: backbone"),
             trace=trace,
             support=Support(
                 recorded=recorded,

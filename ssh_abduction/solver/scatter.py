@@ -95,7 +95,8 @@ def least_cost(problem: Problem, visit: Sequence[int], most: float) -> float:
         estimate, numbers = _best_numbers(shares, pays, near, far)
         best = max(best, (estimate, numbers, losses), key=lambda found: found[0])
     _, numbers, losses = best
-    bounds = [x.bound(c) for x, c in zip(losses, _divided(numbers, losses), strict=True)]
+    ends = np.cumsum([len(x.most) for x in losses])
+    bounds = (x.bound(c) for x, c in zip(losses, np.split(numbers, ends), strict=False))
     return min(track.nats + sum(bounds), most - UNPROVEN)
 
 
@@ -299,7 +300,7 @@ class _Losses:
         is_near, is_far = may_share & (apart < gap), may_share & (apart >= gap)
         near = [part.near_loss(i, others) for i, others in enumerate(is_near)]
         # If two far points share a facility, the point that loses more gives up its share.
-        sizes = _each_largest(np.array([far(i, others) for i, others in enumerate(is_far)]))
+        sizes = [_largest(far(i, others)) for i, others in enumerate(is_far)]
         rank = np.argsort(np.argsort(sizes))
         is_far &= rank < rank[:, None]
         return cls(part, most, np.array(near), np.array([far(i, o) for i, o in enumerate(is_far)]))
@@ -351,11 +352,6 @@ def _best_numbers(shares: Array, pays: Array, near: Array, far: Array) -> tuple[
     return float((least + (pays * c / (1 + c)).sum(1))[kept].sum()), c
 
 
-def _divided(numbers: Array, losses: Sequence[_Losses]) -> list[Array]:
-    """Divide numbers of all points among the parts."""
-    return np.split(numbers, np.cumsum([len(x.most) for x in losses])[:-1]) if losses else []
-
-
 def _positive(form: Array) -> Array:
     """Return a quadratic form without its negative part."""
     values, vectors = np.linalg.eigh(form)
@@ -379,8 +375,3 @@ def _dominating(moves: Array) -> Array:
 def _largest(form: Array) -> float:
     """Return the largest eigenvalue of a quadratic form, at least a tiny number."""
     return max(float(np.linalg.eigvalsh(form)[-1]), 1e-9)
-
-
-def _each_largest(forms: Array) -> Array:
-    """Return the largest eigenvalue of each of n quadratic forms, (n,)."""
-    return np.array([_largest(form) for form in forms])

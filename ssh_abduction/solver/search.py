@@ -357,10 +357,6 @@ class Search:
             The minimal maps (none if the trace has no map) and True; or the best map known after
             that time and False.
         """
-
-        def end_with_this_search(_: Progress) -> None:
-            self._parts.watch.check()
-
         search = Search(
             mended,
             theory,
@@ -368,7 +364,7 @@ class Search:
             max_maps=most or None,
             memory_limit=self.limits.memory_limit,
             speedups=self._parts.speedups,
-            on_progress=end_with_this_search,
+            on_progress=lambda _: self._parts.watch.check(),
         )
         maps = tuple(search.unranked())
         if search.stopped == "interrupted":

@@ -162,4 +162,5 @@ class Stages:
                 "finding dstates before places and paths, from a map of %d dstates",
                 len(parts.known.best.dstates),
             )
-            parts.prefixes.go_on_with(FramelessEngine(parts.task, labels), len(parts.task.trace))
+            parts.prefixes.engine = FramelessEngine(parts.task, labels)
+            parts.prefixes.start = len(parts.task.trace)

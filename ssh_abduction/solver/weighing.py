@@ -263,7 +263,9 @@ class Weighing:
             Equalities: returns and believed displacements; None if no map left is worth finding.
         """
         look_at_clock()
-        self._check_patience()
+        watch = self._parts.watch
+        if watch.left() == math.inf and watch.elapsed() > PATIENCE + MORE * self._improved:
+            raise LimitError("no proof")
         least = self._cost_of_others(ssh_map)
         self.bound = max(self.bound, min(least, self.candidates[0].nats if self.candidates else 0))
         if self.candidates and least >= self._most:
@@ -280,12 +282,6 @@ class Weighing:
         displacement = displacement_of(task.problem)
         believed = displacement.believed(task.trace, returns, wrong) if displacement else ()
         return frozenset((*returns, *believed)) or None
-
-    def _check_patience(self) -> None:
-        """Raise LimitError if there is no time limit and no better map was found for long."""
-        watch = self._parts.watch
-        if watch.left() == math.inf and watch.elapsed() > PATIENCE + MORE * self._improved:
-            raise LimitError("no proof")
 
     @property
     def _most(self) -> float:

@@ -140,7 +140,8 @@ class Blocks:
                 return None
             low, high, stride = high, high + stride, 2 * stride
         high = min(high, steps)
-        low = max(low, high - 2 * exact) if self._fails(begin, high - 2 * exact, low, most) else low
+        if high - 2 * exact > low and not self._takes_fault(begin, high - 2 * exact, most):
+            low = high - 2 * exact
         while high - low > exact:
             middle = (low + high) // 2
             if self._takes_fault(begin, middle, most):
@@ -148,10 +149,6 @@ class Blocks:
             else:
                 low = middle
         return high
-
-    def _fails(self, begin: int, end: int, low: int, most: int) -> bool:
-        """Whether `end` is after `low` and the block from `begin` to `end` needs no fault."""
-        return end > low and not self._takes_fault(begin, end, most)
 
     def _takes_fault(self, begin: int, end: int, most: int) -> bool:
         """Whether a block needs a fault: more than `most` steps are pairwise different."""

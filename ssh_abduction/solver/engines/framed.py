@@ -105,7 +105,6 @@ class FramedEngine:
         """Make the first `size` steps the prefix."""
         if size != self.size:
             self._best = None
-            self._fitting.forget_time()
         self._framed = self._visits.grow(size)
         self._unframed_size = size
 

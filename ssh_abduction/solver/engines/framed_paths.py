@@ -11,7 +11,6 @@ the previous answer. And clingo searches for the next answer while a map is made
 
 from __future__ import annotations
 
-import time
 from collections.abc import Collection, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -29,15 +28,6 @@ from ssh_abduction.theory.evidence import Equality
 # Give clingo up to this many clashes at once. Each of them saves a question, and one control lists
 # them all.
 CLASHES = 30
-# If labels have more dstates than this, first try paths that are separate if possible. Grounding
-# all ways to merge paths takes long.
-MANY_DSTATES = 50
-# For n dstates, grounding all ways to merge paths takes about ALL_PATHS * n times as long as
-# grounding separate paths.
-ALL_PATHS = 0.1
-# Clasp cannot be stopped while it prepares to solve. That takes this many times as long as
-# grounding took.
-PREPARED = 3.5
 
 
 @dataclass(frozen=True)
@@ -75,42 +65,14 @@ class FramedPaths:
         self.task = task
         self.forbidden: list[Collection[Equality]] = []
         self._asker = asker
-        self._seconds = 0.0  # how long grounding the last control for paths took
 
     @property
     def paths(self) -> Paths:
         """The program with the axioms of places and paths for this trace."""
         return Paths(self.task, tuple(self.forbidden))
 
-    @property
-    def preparing(self) -> float:
-        """An estimate of the seconds for which clingo cannot be stopped while it prepares."""
-        return PREPARED * self._seconds
-
-    def forget_time(self) -> None:
-        """Forget how long grounding took. Call this before the labels of another prefix."""
-        self._seconds = 0.0
-
     def some(self, chart: FramedChart, labels: Sequence[int]) -> Fitted | None:
         """Find a map with these dstates, as `Fitted`; None if no paths fit them."""
-        return self.found_soon(chart, labels) or self.any(chart, labels)
-
-    def found_soon(self, chart: FramedChart, labels: Sequence[int]) -> Fitted | None:
-        """Find a map with these dstates and separate paths, if there are many dstates.
-
-        Returns:
-            The map and its labels. None if there are few dstates, or no separate paths fit; then
-            `any` may still find a map.
-        """
-        found = self.separate(chart, labels) if len(set(labels)) > MANY_DSTATES else None
-        return Fitted(found, NodeLabels(chart, list(labels))) if found else None
-
-    def any(self, chart: FramedChart, labels: Sequence[int]) -> Fitted | None:
-        """Find a map with these dstates, with a control for all ways to merge segments to paths.
-
-        Returns:
-            The map and the labels with that control; None if no paths fit.
-        """
         naming = NodeLabels(chart, list(labels), self.control(chart, labels))
         found = next(self.maps(naming, "ignore"), None)
         return Fitted(found, naming) if found else None
@@ -194,16 +156,10 @@ class FramedPaths:
             nodes: The nodes whose labels the paths have to fit; None for all.
             single: Merge places and segments only if they must be one.
         """
-        self._asker.watch.check(0.0 if single else self.preparing)
-        # Time of the processor counts, so that a busy machine does not make the estimate larger.
-        worked = time.thread_time()
+        self._asker.watch.check()
         with self._asker.grounding_timed():
             control = self.paths.settled(chart, labels, options, nodes, single=single)
         self._asker.watch.check()
-        seconds = time.thread_time() - worked
-        if single:  # estimate the time for all paths, unless it is known
-            seconds = self._seconds or ALL_PATHS * len(set(labels)) * seconds
-        self._seconds = seconds
         return control
 
     def clashing(self, chart: FramedChart, labels: Sequence[int]) -> list[list[int]]:

@@ -60,7 +60,7 @@ def intransitive(pairs: Sequence[Pair], fits: Set[Pair], chart: FramedChart) -> 
         )
         for first, (middle, half), (last, turn) in apart_yet_joined((i, j, r), turned):
             found[_in_order((first, 0), (middle, half), (last, turn))] = None
-            follows.append(ordered_pair(first, last, turn))
+            follows.append((first, last, turn) if first < last else (last, first, -turn % 4))
         for pair in follows:
             if pair in fits and pair[1] not in turned.get(pair[0], ()):
                 take(turned, pair)
@@ -138,11 +138,6 @@ def apart_yet_joined(
         for k, q in of_i.items()
         if k != j and of_j.get(k) != (q - r) % 4
     ]
-
-
-def ordered_pair(i: int, j: int, r: int) -> Pair:
-    """Make a pair of two visits, the earlier first. Slot 0 of visit `i` is slot `r` of `j`."""
-    return (i, j, r) if i < j else (j, i, -r % 4)
 
 
 def _in_order(*visits: tuple[int, int]) -> Three:

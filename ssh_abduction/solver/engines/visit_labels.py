@@ -111,7 +111,8 @@ class VisitLabels:
             grown = self._charted(size, self.chart) if self.size else None
             if grown is not None and len(grown.seen) <= GROWN * self._nodes_at_start:
                 program = self.program
-                new = range(len(self.chart.stars), len(grown.stars)) if program.knows_all else ()
+                has_all = len(program.visits) == len(self.chart.stars)
+                new = range(len(self.chart.stars), len(grown.stars)) if has_all else ()
                 self._give(grown, {*program.visits, *new}, range(len(grown.seen)))
             else:
                 chart = self._charted(size, None)

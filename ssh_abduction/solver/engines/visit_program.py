@@ -97,11 +97,6 @@ class VisitProgram:
         return self._known.visits
 
     @property
-    def knows_all(self) -> bool:
-        """Whether clingo has all visits of the chart."""
-        return len(self._known.visits) == len(self.chart.stars)
-
-    @property
     def fits(self) -> frozenset[Pair]:
         """The pairs of visits that clingo may put at one place."""
         return self._known.fits
