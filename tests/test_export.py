@@ -21,7 +21,7 @@ from ssh_abduction.cli import main
 from ssh_abduction.data import MapError
 from ssh_abduction.data.map_parts import Name
 from ssh_abduction.data.maps import DState
-from ssh_abduction.output import to_networkx
+from ssh_abduction.output import to_networkx, to_svg
 from ssh_abduction.output.export import formats
 from ssh_abduction.output.export.roads import TURN, Road, Roads, Stop
 from ssh_abduction.output.export.tmap2 import tmap2
@@ -429,3 +429,23 @@ def test_dot_nests_regions_behind_a_place() -> None:
     assert text.count("{") == text.count("}")
     corner = solve(Trace.from_steps("abcd", ["travel", "right", "travel"]))[0]
     assert 'label="place 2\\nright of path 0+"' in export_map(corner, "dot")
+
+
+@pytest.mark.filterwarnings("ignore:views. trace 2 has no view in common")
+def test_pieces_keep_their_metres_and_are_drawn_below_each_other() -> None:
+    """Two drives share nothing, so nothing says how their pieces lie."""
+    ways, hall = [(10, 0, 0), (12, 0, 0)], [(1, 0, 0, 0), (1, 0, 1, 0), (0, 0, 1, 0)]
+    doors = [(ahead, 1, back, left) for ahead, _, back, left in hall]
+    drives = (("abc", hall), ("xyz", doors))
+    ssh_map = solve(
+        [Trace.from_steps(v, ["travel"] * 2, stars=s, displacements=ways) for v, s in drives]
+    ).maps[0]
+    assert len(ssh_map.pieces) == 2
+    features = json.loads(export_map(ssh_map, "nav2"))["features"]
+    spots = [f["geometry"]["coordinates"] for f in features if f["geometry"]["type"] == "Point"]
+    assert [x for x, _ in spots] == [0, 10, 22] * 2
+    assert len({y for _, y in spots}) == 2
+    assert [said[:26] for said in formats.export_doubts(ssh_map, "nav2")] == [
+        "the map is in 2 pieces, wh"
+    ]
+    assert 'stroke-dasharray="2 5"' not in to_svg(ssh_map)  # no line leads from piece to piece

@@ -84,9 +84,9 @@ def layout(ssh_map: SSHMap, turns: Trace | Turns | None = None) -> Layout:
 def drawable_poses(ssh_map: SSHMap) -> tuple[Pose, ...] | None:
     """Return the poses of the dstates if the map can be drawn at them; None otherwise.
 
-    A map cannot be drawn at its poses if displacements between its parts are missing. Each part
-    then has poses relative to its own first dstate. Floors are moved, so that each is drawn below
-    the one before.
+    Each floor, and each piece of a joint map, has poses relative to its own first dstate. They are
+    moved, so that each is drawn below the one before. A map cannot be drawn at its poses if other
+    displacements between its parts are missing.
     """
     poses = ssh_map.fit.poses if ssh_map.fit else ()
     if not poses or any(
@@ -95,30 +95,49 @@ def drawable_poses(ssh_map: SSHMap) -> tuple[Pose, ...] | None:
         return None
     if set(ssh_map.places) - {s.place for s in ssh_map.dstates}:
         return None
-    first = {ssh_map.dstates[s].floor: ssh_map.dstates[s] for s in reversed(ssh_map.dstate_at)}
-    for s in ssh_map.dstates:
-        pose, here = poses[s.id], first[s.floor]
-        is_origin = pose.x == pose.y == pose.heading == 0.0 and not any(pose.spread)
-        if is_origin and s.id != here.id and (s.place is None or s.place != here.place):
-            return None
-    moves = _moves_of_floors(ssh_map, [(pose.x, pose.y) for pose in poses])
+    parts = _parts(ssh_map, poses)
+    for part in parts:
+        here = ssh_map.dstates[_first(ssh_map, part)]
+        for s in (ssh_map.dstates[s] for s in part if s != here.id and _is_origin(poses[s])):
+            if s.place is None or s.place != here.place:
+                return None
+    moves = _moves_of(parts, [(pose.x, pose.y) for pose in poses])
     return tuple(
         replace(pose, x=pose.x + moves[s.id][0], y=pose.y + moves[s.id][1])
         for s, pose in zip(ssh_map.dstates, poses, strict=True)
     )
 
 
-def _moves_of_floors(ssh_map: SSHMap, at: Sequence[Point], least: float = 0.0) -> list[Point]:
-    """Find how far to move each dstate, so that each floor is below the one before."""
+def _first(ssh_map: SSHMap, part: Sequence[int]) -> int:
+    """Return the dstate of a part that the robot visited first."""
+    return next((s for s in ssh_map.dstate_at if s in part), part[0])
+
+
+def _is_origin(pose: Pose) -> bool:
+    """Whether other poses are relative to this one."""
+    return pose.x == pose.y == pose.heading == 0.0 and not any(pose.spread)
+
+
+def _parts(ssh_map: SSHMap, poses: Sequence[Pose]) -> tuple[tuple[int, ...], ...]:
+    """List the dstates of each floor; without floors, those of each piece with poses of its own."""
+    is_apart = all(_is_origin(poses[_first(ssh_map, piece)]) for piece in ssh_map.pieces)
+    pieces = ssh_map.pieces if is_apart else (tuple(range(len(ssh_map.dstates))),)
+    return ssh_map.floors or pieces
+
+
+def _moves_of(
+    parts: Sequence[Sequence[int]], at: Sequence[Point], least: float = 0.0
+) -> list[Point]:
+    """Find how far to move each dstate, so that each floor or piece is below the one before."""
     moves = [(0.0, 0.0)] * len(at)
-    boxes = [_box([at[s] for s in floor]) for floor in ssh_map.floors]
+    boxes = [_box([at[s] for s in part]) for part in parts]
     extent = max((max(x1 - x0, y1 - y0) for x0, y0, x1, y1 in boxes), default=0.0)
     gap = max(STOREY * extent, least)
-    below = None  # the least y of the floor above, where it is drawn
-    for floor, (x0, y0, _, y1) in zip(ssh_map.floors, boxes, strict=True):
+    below = None  # the least y of the part above, where it is drawn
+    for part, (x0, y0, _, y1) in zip(parts, boxes, strict=True):
         move = (0.0, 0.0) if below is None else (boxes[0][0] - x0, below - gap - y1)
         below = y0 + move[1]
-        for s in floor:
+        for s in part:
             moves[s] = move
     return moves
 
@@ -131,7 +150,7 @@ def _box(points: Sequence[Point]) -> tuple[float, float, float, float]:
 
 def _floor_by_floor(ssh_map: SSHMap, found: Layout) -> Layout:
     """Move the floors of a drawing, so that each is below the one before."""
-    moves = _moves_of_floors(ssh_map, [(x, y) for x, y, _ in found.dstates], GAP)
+    moves = _moves_of(ssh_map.floors, [(x, y) for x, y, _ in found.dstates], GAP)
     of_place = {s.place: moves[s.id] for s in ssh_map.dstates}
     places = {
         p: (x + of_place[p][0], y + of_place[p][1]) if p in of_place else (x, y)
@@ -154,6 +173,18 @@ def travelled(ssh_map: SSHMap, path: MapPath) -> list[tuple[int, int]]:
     return sorted(
         {(min(p, q), max(p, q)) for p, q in pairs if p is not None and q is not None and p != q}
     )
+
+
+def untravelled(ssh_map: SSHMap, path: MapPath) -> list[tuple[int, int]]:
+    """List the neighbours on a path between which nobody travelled, but that ways connect."""
+    streets = travelled(ssh_map, path)
+    parts = ssh_map.floors or ssh_map.pieces
+    part = {ssh_map.dstates[s].place: i for i, part in enumerate(parts) for s in part}
+    return [
+        (p, q)
+        for p, q in pairwise(path.order)
+        if (min(p, q), max(p, q)) not in streets and part.get(p) == part.get(q)
+    ]
 
 
 class _Drawing:

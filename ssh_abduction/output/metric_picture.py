@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from statistics import median
 
 from ssh_abduction.data.maps import DState, Pose, SSHMap
@@ -29,7 +28,7 @@ from ssh_abduction.output.drawing import (
     svg_text,
     titled,
 )
-from ssh_abduction.output.layout import travelled
+from ssh_abduction.output.layout import travelled, untravelled
 from ssh_abduction.output.region_marks import place_title, region_marks
 
 # In units of the page. NEAREST is the distance of the two nearest places, if the limits allow it.
@@ -211,15 +210,13 @@ class _Picture:
         In the world, a dotted part of a path need not be straight. The order of places may be one
         of several that fit, as the robot may have passed places without noticing them.
         """
-        orders, travels = [], []
-        u, floor = self.unit, {s.place: s.floor for s in self.map.dstates}
+        orders, travels, u = [], [], self.unit
         for path in self.map.paths:
-            colour, streets = COLOURS[path.id % len(COLOURS)], travelled(self.map, path)
-            for p, q in pairwise(path.order):
-                if (min(p, q), max(p, q)) not in streets and floor.get(p) == floor.get(q):
-                    dotted = {"stroke_dasharray": "2 5", "opacity": 0.7}
-                    orders.append(_line(spots[p], spots[q], colour, 2 * u, **dotted))
-            for p, q in streets:
+            colour = COLOURS[path.id % len(COLOURS)]
+            for p, q in untravelled(self.map, path):
+                dotted = {"stroke_dasharray": "2 5", "opacity": 0.7}
+                orders.append(_line(spots[p], spots[q], colour, 2 * u, **dotted))
+            for p, q in travelled(self.map, path):
                 broad = {"stroke_linecap": "round", "opacity": 0.4}
                 travels.append(_line(spots[p], spots[q], colour, 8 * u, **broad))
         return orders + travels

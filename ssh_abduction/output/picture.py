@@ -7,7 +7,6 @@ A dstate (distinctive state) is a place and a heading. A map with poses is drawn
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 
 from ssh_abduction.data.maps import DState, MapPath, SSHMap, checked_map
 from ssh_abduction.data.trace import Trace
@@ -28,7 +27,7 @@ from ssh_abduction.output.drawing import (
     titled,
 )
 from ssh_abduction.output.headings import Turns, degrees_of
-from ssh_abduction.output.layout import Layout, drawable_poses, layout, travelled
+from ssh_abduction.output.layout import Layout, drawable_poses, layout, travelled, untravelled
 from ssh_abduction.output.metric_picture import metric_svg
 from ssh_abduction.output.region_marks import place_title, region_marks
 
@@ -103,15 +102,9 @@ def _path(ssh_map: SSHMap, path: MapPath, spots: dict[int, Point]) -> list[str]:
     colour, streets = COLOURS[path.id % len(COLOURS)], travelled(ssh_map, path)
     dotted = {"stroke_width": 2, "stroke_dasharray": "2 6", "opacity": 0.7}
     broad = {"stroke_width": 9, "stroke_linecap": "round", "opacity": 0.55}
-    floor = {s.place: s.floor for s in ssh_map.dstates}
-    untravelled = [
-        (p, q)
-        for p, q in pairwise(path.order)
-        if (min(p, q), max(p, q)) not in streets and floor.get(p) == floor.get(q)
-    ]
     return [
         element("path", d=line(spots[p], spots[q]), stroke=colour, **style)
-        for pairs, style in ((untravelled, dotted), (streets, broad))
+        for pairs, style in ((untravelled(ssh_map, path), dotted), (streets, broad))
         for p, q in pairs
     ]
 

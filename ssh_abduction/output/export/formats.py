@@ -151,6 +151,11 @@ def export_doubts(
             "the map has no poses: its positions are of a layout, and no metres; "
             "solve a trace with displacements"
         )
+    if len(ssh_map.pieces) > 1:
+        found.append(
+            f"the map is in {len(ssh_map.pieces)} pieces, which are put below each other: nothing "
+            "says how they lie relative to each other; log a drive that joins them"
+        )
     if together := roads.together:
         mend = (
             "export places (export --set level=places)"

@@ -45,9 +45,13 @@ function mapOf(i) {
     return { id: s, view, steps, place, path, direction, at, heading: spot[2] };
   });
   const travelled = new Map(),
-    leaps = new Set(told.leaps);
+    leaps = new Set(told.leaps),
+    joined = new Map(); // from each place towards one place of its piece of the map
+  const pieceOf = (place) => (joined.has(place) ? pieceOf(joined.get(place)) : place);
   for (let t = 1; t < labels.length; t++) {
     const [a, b] = [dstates[labels[t - 1]], dstates[labels[t]]];
+    if (!leaps.has(t) && pieceOf(a.place) !== pieceOf(b.place))
+      joined.set(pieceOf(a.place), pieceOf(b.place));
     if (
       a.place !== null &&
       b.place !== null &&
@@ -68,6 +72,7 @@ function mapOf(i) {
       if (
         places.has(order[k - 1]) &&
         places.has(order[k]) &&
+        pieceOf(order[k - 1]) === pieceOf(order[k]) &&
         !travelled.has(pairKey(order[k - 1], order[k]))
       )
         streets.push({ path, from: order[k - 1], to: order[k], travelled: false });
