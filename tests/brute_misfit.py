@@ -8,11 +8,14 @@ of each dstate, how far the robot is off at each step, the scale and the drift.
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from functools import cache
+from itertools import combinations
 
 import numpy as np
 from scipy.optimize import least_squares
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.trace import Trace
@@ -123,3 +126,24 @@ class LeastSquares:
                 seen_headings.add(headings[t])
                 unknown[2 * places + headings[t]] = facing
         return unknown
+
+
+def layings(trace: Trace, positions: Sequence[Hashable]) -> int:
+    """How often drives, or groups of drives that closures join, are laid on others.
+
+    positions  the position of each step
+    """
+
+    def groups(ties: Iterable[tuple[int, int]]) -> int:
+        whole = [t - 1 for t, action in enumerate(trace.actions, 1) if not action.starts]
+        ends = np.array([*((t, t + 1) for t in whole), *ties]).reshape(-1, 2).T
+        graph = coo_array((np.ones(ends.shape[1]), ends), shape=(len(trace), len(trace)))
+        return int(connected_components(graph, directed=False)[0])
+
+    closures = [(closure.first, closure.last) for closure in trace.closures]
+    equal = [
+        pair
+        for pair in combinations(range(len(trace)), 2)
+        if len({positions[t] for t in pair}) == 1
+    ]
+    return groups(closures) - groups([*closures, *equal])

@@ -11,7 +11,7 @@ from unittest.mock import patch
 import pytest
 import truth
 from brute_force import Key, consistent_maps, key
-from brute_misfit import LeastSquares
+from brute_misfit import LeastSquares, layings
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import TOYS, theories, traces
@@ -47,6 +47,7 @@ def cheapest(trace: Trace, theory: Theory) -> tuple[float, set[Key]]:
         prices = zip(theory.prices, (counts.dstates, counts.places, counts.paths), strict=True)
         nats = sum(price * count for price, count in prices)
         nats += squares.misfit(labels, positions) / 2
+        nats += theory.price_of_laying * layings(trace, [positions[s] for s in labels])
         known = found.get((labels, places))
         if known is None or counts.paths < known[1]:
             known = found[labels, places] = nats, counts.paths, set()

@@ -102,10 +102,32 @@ def false_costs(
         true = theory.prices[0] * len(set(dstates)) + theory.prices[1] * count + square / 2
         tenths = [theory.fault_tenths(kind, trace.steps[step]) for kind, step in faults]
         true += theory.prices[0] * sum(tenths) / 10
+        true += theory.price_of_laying * _layings(trace, at)
         # The paths of a rival are not listed.
         true += paths if name == "weighed.nats" or not theory.prices[2] else math.nan
         if abs(true - claimed) > EXACT + SHARE * square:
             yield f"{name}: expected {true:.3f} nats, by the displacements, got {claimed}"
+
+
+def _layings(trace: Trace, places: Sequence[int]) -> int:
+    """Count how often drives are laid on others to which no closure ties them.
+
+    This is how many groups of drives that closures tie there are, less the groups of drives that
+    closures or places tie.
+    """
+    drive = [0]
+    for action in trace.actions:
+        drive.append(drive[-1] + action.starts)
+    tied = [{drive[closure.first], drive[closure.last]} for closure in trace.closures]
+    shared = [{drive[t] for t, p in enumerate(places) if p == place} for place in set(places)]
+    counts = []
+    for sets in (tied, tied + shared):
+        groups = [{number} for number in set(drive)]
+        for some in sets:
+            apart = [group for group in groups if not group & some]
+            groups = [*apart, some.union(*(group for group in groups if group & some))]
+        counts.append(len(groups))
+    return counts[0] - counts[1]
 
 
 class _Errors:

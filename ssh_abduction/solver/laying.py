@@ -56,19 +56,19 @@ def laid(
     joint, theory = problem.trace, problem.theory
     ranking, judging = Ranking(joint), Judging(problem)
     fitted = map(ranking.fitted, _joint_maps(old, ssh_map, trace, problem))
-    found = sorted(fitted, key=lambda m: _nats(m, Cost.of(m), theory))
+    found = sorted(fitted, key=lambda m: _nats(m, problem))
     while found and not judging.accepts_grown(found[0], len(old)):
         del found[0]
     if not found:
         return None
     best = Deriving(joint, theory).mapped(found[0])
-    kept = ssh_map if ssh_map.fit else Ranking(old).fitted(ssh_map)
+    kept = (ssh_map if ssh_map.fit else Ranking(old).fitted(ssh_map)).fit
+    assert kept is not None
     weighed = Weighed(
-        bound=_nats(kept, replace(Cost.of(kept), paths=0), theory),
+        bound=nats_of(replace(Cost.of(ssh_map), paths=0), theory) + kept.chi2 / 2,
         within=0.0,
         rivals=tuple(
-            replace(rival_of(m, _nats(m, Cost.of(m), theory)), estimated=i > 0)
-            for i, m in enumerate(found)
+            replace(rival_of(m, _nats(m, problem)), estimated=i > 0) for i, m in enumerate(found)
         ),
         drives=drives_of(joint),
     )
@@ -115,10 +115,11 @@ def unproven(
     )
 
 
-def _nats(ssh_map: SSHMap, cost: Cost, theory: Theory) -> float:
-    """Compute what a map with a fit costs in nats, if this is what is counted."""
+def _nats(ssh_map: SSHMap, problem: Problem) -> float:
+    """Compute the cost in nats of a map that has a fit."""
     assert ssh_map.fit is not None
-    return nats_of(cost, theory) + ssh_map.fit.chi2 / 2
+    nats = nats_of(Cost.of(ssh_map), problem.theory) + problem.overlap.of_map(ssh_map)
+    return nats + ssh_map.fit.chi2 / 2
 
 
 def _joint_maps(old: Trace, ssh_map: SSHMap, trace: Trace, problem: Problem) -> Iterator[SSHMap]:

@@ -6,6 +6,9 @@ return have one pose, or one position (`solver/fit.py`). More returns leave less
 set never has a smaller misfit than a part of it, and a map never has a smaller misfit than a set of
 its returns.
 
+Laying drives on each other has a price (`theory/overlap.py`), and more returns never lower it. So
+twice this price is a part of the misfit.
+
 A visit to a place has several steps, as turns stay at their place. So these steps have one position
 in each topological map, also without a return. But if displacements may be wrong, the
 displacement of a turn may be wrong, too. Then each step is a visit of its own, and a turn is a
@@ -43,7 +46,7 @@ class Misfit:
         Args:
             problem: The trace, and its theory with all defaults filled in.
         """
-        self.trace = problem.trace
+        self.trace, self._overlap = problem.trace, problem.overlap
         theory = problem.theory
         stays = theory.level == "topological" and "turn_stays" in theory.hard and not theory.jumped
         self.visit = [0]
@@ -133,9 +136,10 @@ class Misfit:
             trace = self.trace.without_displacements_at(wrong)
             number = {heading: i for i, heading in enumerate(dict.fromkeys(headings))}
             position = dict(zip(headings, positions, strict=True))
-            self._known[groups] = Poses(
+            poses = Poses(
                 trace, [number[heading] for heading in headings], [position[h] for h in number]
-            ).misfit()
+            )
+            self._known[groups] = poses.misfit() + 2 * self._overlap.nats(positions)
         return self._known[groups]
 
 

@@ -334,6 +334,7 @@ class Weighing:
         best = self.candidates[0].map
         returns = self._misfit.returns_of(best)
         square = self._misfit.of_map(best) - self._misfit.of_returns([], jumped(best))
+        square -= 2 * self._parts.task.problem.overlap.of_map(best)
         freedom = sum(3 if found.of == "dstate" else 2 for found in returns)
         if not freedom or gammaincc(freedom / 2, max(square, 0.0) / 2) >= IMPROBABLE:
             return 1.0

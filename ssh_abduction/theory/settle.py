@@ -17,6 +17,7 @@ from ssh_abduction.data.errors import TheoryError, TraceError
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.theory.evidence import Displacement, Evidence, evidence_of, pairs_of
 from ssh_abduction.theory.fields import AUTO, can_weigh, choice
+from ssh_abduction.theory.overlap import Overlap
 from ssh_abduction.theory.pairs import Pairs
 from ssh_abduction.theory.theory import Theory, checked_theory
 
@@ -50,6 +51,11 @@ class Problem:
         Evidence that may be wrong, because the theory allows a fault of it, is left out.
         """
         return pairs_of(self.trace, self.theory, self.evidence)
+
+    @cached_property
+    def overlap(self) -> Overlap:
+        """The price of laying drives on each other."""
+        return Overlap(self.trace, self.theory)
 
     def changed(self, trace: Trace | None = None, theory: Theory | None = None) -> Problem:
         """Return this problem with another trace or settled theory; None keeps it.

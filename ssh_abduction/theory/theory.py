@@ -30,6 +30,7 @@ from ssh_abduction.theory.fields import (
     CAUSAL,
     EXCUSED,
     FAULTS,
+    LAID,
     PREFERRED,
     PRICES,
     SPOKEN_FOR,
@@ -209,6 +210,13 @@ class Theory:
         if self.boundary == "defeasible" and "excuses" not in prefer:
             return ("excuses", *prefer)
         return prefer
+
+    @property
+    def price_of_laying(self) -> float:
+        """The price in nats of laying a drive on others: that of LAID dstates, and their places."""
+        dstate, place, _ = self.prices
+        number = 1 if self.star == "alike" else LAID
+        return number * (dstate + place if self.level == "topological" else dstate)
 
     @property
     def has_faults(self) -> bool:

@@ -249,7 +249,8 @@ class Beam:
     def _price_of(self, found: Hypothesis) -> float:
         """Return the price of the dstates, places and faults of a hypothesis, in nats."""
         price = self._prices[0] * len(found.places) + self._prices[1] * len(found.position)
-        price += found.changes + sum(self._fault[kind][t] for t, kind in found.faults)
+        price += found.changes + self._problem.overlap.of_steps(found.labels, found.places)
+        price += sum(self._fault[kind][t] for t, kind in found.faults)
         if "misread" in self._fault:
             price += sum(map(nats_of_misread, found.seen))
         return price
@@ -349,12 +350,19 @@ class Beam:
         """List the ways to extend the hypotheses of a beam by step t, sorted by cost."""
         look_at_clock()
         options = [
-            option
+            self._laid(option) if option.of.pieces is not moved.pieces else option
             for found in beam
             for moved in self._moves(found, t)
             for option in self._options(moved, t, joins)
         ]
         return sorted(options, key=lambda option: option.nats)
+
+    def _laid(self, option: _Extension) -> _Extension:
+        """Add the price if an option lays the drive of the robot on others."""
+        places = [option.of.places[s] for s in option.of.labels]
+        nats = self._problem.overlap.nats
+        price = nats([*places, option.place]) - nats(places)
+        return replace(option, nats=option.nats + price)
 
     def _moves(self, found: Hypothesis, t: int) -> Iterator[Hypothesis]:
         """Yield a hypothesis after the move to step t, without and with a fault of the move."""
@@ -371,7 +379,7 @@ class Beam:
     def _options(self, moved: Hypothesis, t: int, joins: bool) -> list[_Extension]:
         """List the cheap ways to extend a hypothesis whose robot has moved to step t."""
         here, action = moved.labels[-1], self._log.actions[t - 1]
-        slips = _slips(moved, t)
+        slips = moved.slips(t)
         known = None if slips else moved.links.get((here, action))
         if known is not None:
             place = moved.places[known]
@@ -470,7 +478,7 @@ class Beam:
             places, seen = [*places, place], [*seen, {}]
             heading = [*heading, len(pose[0]) - 4]
         number, links = self._sights.seen[t], moved.links
-        if not _slips(moved, t):
+        if not moved.slips(t):
             links = {**links, (moved.labels[-1], self._log.actions[t - 1]): there}
         if number not in seen[there] or "misread" in self._fault:
             doubt = self._doubt(t) + seen[there].get(number, 0.0)
@@ -490,8 +498,3 @@ class Beam:
             moved.faults,
             moved.pieces.grown(place=option.place is None, dstate=option.dstate is None),
         )
-
-
-def _slips(moved: Hypothesis, t: int) -> bool:
-    """Whether the hypothesis says that the action to step t, the newest step, slipped."""
-    return moved.faults[-1:] == ((t - 1, "slipped"),)

@@ -229,13 +229,18 @@ class Joining:
         return sorted((way for way in found if way.good >= least), reverse=True)[:CROSSED]
 
     def _joined(self, first: Part, second: Part, ways: Sequence[_Anchor]) -> Part | None:
-        """Join two maps by the anchor that costs least; None if all break axioms."""
+        """Join two maps by the anchor that costs least, without breaking axioms.
+
+        Returns:
+            The joint map; None if each costs at least as much as the two maps apart.
+        """
         found: list[Part] = []
         for way in ways:
             look_at_clock()
             overlay = Overlay(first, second, self._problem, self.sights)
-            if overlay.merge(way.old, way.new, way.turn if way.by_places else None):
-                found.append(overlay.part())
+            begun = overlay.merge(way.old, way.new, way.turn if way.by_places else None)
+            if begun and (part := overlay.part()).nats < first.nats + second.nats:
+                found.append(part)
         found.sort(key=lambda joined: joined.nats)
         return next((joined for joined in found if self._map(joined)), None)
 

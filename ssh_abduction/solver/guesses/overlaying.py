@@ -224,7 +224,7 @@ class Overlay:
             links,
             both.mean,
             both.covariance,
-            both.nats,
+            both.nats + problem.overlap.between(standing.labels, drive.labels),
             both.kept,
             frozenset(both.places[s] for s in both.kept),
         )

@@ -80,6 +80,10 @@ class Hypothesis:
     faults: tuple[tuple[int, str], ...] = ()
     pieces: Pieces = field(default_factory=Pieces)
 
+    def slips(self, t: int) -> bool:
+        """Whether the action to step t, the newest step, slipped."""
+        return self.faults[-1:] == ((t - 1, "slipped"),)
+
 
 class HypothesisPoses:
     """Updates the poses of hypotheses by the displacements and closures of a trace.

@@ -1,0 +1,71 @@
+"""What it costs that a map lays drives on each other.
+
+Nothing is known of where a drive starts. So it can be laid on a map of other drives in very many
+ways, and some of them make a place or two coincide by chance. A map pays for this choice each time
+that it joins drives which neither closures nor other places join. Then only drives are joined that
+have more in common than chance explains.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Collection, Hashable, Iterable, Sequence
+
+from ssh_abduction.data.drives import starts_of
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.trace import Trace
+from ssh_abduction.theory.theory import Theory
+
+
+class Overlap:
+    """Computes the price of laying the drives of one trace on each other."""
+
+    def __init__(self, trace: Trace, theory: Theory) -> None:
+        """Find the drives that closures join.
+
+        Args:
+            trace: The trace.
+            theory: The theory, which has the price.
+        """
+        starts = starts_of(trace)
+        self._price = theory.price_of_laying
+        self._drive = [bisect_right(starts, t) for t in range(len(trace))]
+        closures = ((self._drive[c.first], self._drive[c.last]) for c in trace.closures)
+        self._tied = _joined(range(len(starts) + 1), closures)  # a group for each drive
+
+    def nats(self, at: Sequence[Hashable]) -> float:
+        """Return the price of joining drives that have places in common.
+
+        Args:
+            at: The place of each step, or of each of the first steps; without places, its dstate.
+        """
+        if len(self._tied) == 1:
+            return 0.0
+        first: dict[Hashable, int] = {}
+        pairs = {*zip(at, self._drive, strict=False)}
+        shared = ((first.setdefault(place, drive), drive) for place, drive in pairs)
+        return self._price * (len({*self._tied}) - len({*_joined(self._tied, shared)}))
+
+    def of_steps(self, labels: Sequence[int], places: Sequence[Hashable]) -> float:
+        """Return the price by the dstates of the first steps and the places of dstates."""
+        return self.nats([places[s] for s in labels]) if len(self._tied) > 1 else 0.0
+
+    def of_map(self, ssh_map: SSHMap) -> float:
+        """Return the price for a map of the whole trace."""
+        places = [s.id if s.place is None else s.place for s in ssh_map.dstates]
+        return self.of_steps(ssh_map.dstate_at, places)
+
+    def between(self, some: Collection[int], others: Collection[int]) -> float:
+        """Return the price of joining two pieces of a map, given by their steps."""
+        groups = [{self._tied[self._drive[t]] for t in steps} for steps in (some, others)]
+        return 0.0 if groups[0] & groups[1] else self._price
+
+
+def _joined(groups: Sequence[int], pairs: Iterable[tuple[int, int]]) -> list[int]:
+    """Merge the groups of the members of each pair. Return the group of each member."""
+    found = [*groups]
+    for one, other in pairs:
+        kept, gone = found[one], found[other]
+        if kept != gone:
+            found = [kept if group == gone else group for group in found]
+    return found
