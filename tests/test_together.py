@@ -521,3 +521,22 @@ def test_at_most_twelve_weights_are_printed() -> None:
     many = replace(solution, maps=solution.maps * 20)
     told = "\n".join(by_displacements(many))
     assert told.endswith(f"{', '.join(['0.05'] * 12)}, and 8 more")
+
+
+@pytest.mark.parametrize("words", [[], ["--json"]])
+def test_what_differs_is_told_by_the_steps_of_drives(
+    words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The route through ACES3 is cut into two drives that share some places."""
+    aces = Trace.load(Path(__file__).parent.parent / "examples" / "aces3-route.jsonl")
+    files = []
+    for name, drive in (("monday", aces[:14]), ("tuesday", aces[8:])):
+        files.append(str(tmp_path / f"{name}.jsonl"))
+        replace(drive, name=name).save(files[-1])
+    assert main(["solve", *files, "--together", "-n", "0", *words]) == 0
+    out = capsys.readouterr().out
+    assert "6 minimal maps: the dstates of steps tuesday:0–5 and tuesday:8 differ" in out
+    if not words:
+        told = out.partition("what tells the maps apart")[2]
+        assert "the paths of steps tuesday:10–14" in told
+        assert "tell all 6 maps apart, and 1 the 3 labelings" in told

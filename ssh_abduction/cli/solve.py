@@ -394,7 +394,7 @@ def _lines(
             else f" (of the first {len(solution.maps)} found)"
         )
         yield f"\nwhat tells the maps apart{some}"
-        yield from compared(compare(Listing(solution.maps)))
+        yield from compared(compare(Listing(solution.maps, drives=solution.drives)))
 
 
 @contextlib.contextmanager

@@ -262,7 +262,7 @@ def compared(found: Comparison) -> Iterator[str]:
         else f"questions 1 to {len(found.deciding)}, asked in this order, tell"
     )
     some = (
-        f", and 1 to {causes} the {found.variants['dstates']} labelings"
+        f", and 1{f' to {causes}' * (causes > 1)} the {found.variants['dstates']} labelings"
         if 0 < causes < len(found.deciding)
         else ""
     )

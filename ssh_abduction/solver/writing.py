@@ -43,7 +43,7 @@ def summary_of(solution: Solution, count: int, backbone: Backbone | None) -> str
         )
     # A single map differs from no other one.
     if not (listed and minimal == 1):
-        text += f": {backbone.sentence}" + (
+        text += f": {replace(backbone, drives=solution.drives).sentence}" + (
             "" if backbone.proven else ", as far as is known: other maps may differ in more"
         )
     more = sum(level.count for level in solution.levels[1:])
