@@ -275,6 +275,9 @@ def test_a_stopped_search_does_not_claim_to_be_sure(route: truth.Known) -> None:
     assert solution.confidence is not None
     assert solution.confidence < 0.5
     assert "nats less may exist" in solution.weighed.sentence
+    assert f"among the {len(solution.weighed.rivals)} maps found)" in solution.weighed.sentence
+    alone = replace(solution.weighed, rivals=solution.weighed.rivals[:1])
+    assert "no other map was found, so it is unknown which joins are doubtful" in alone.sentence
 
 
 def test_more_returns_never_fit_better_and_a_core_is_minimal(route: truth.Known) -> None:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
@@ -19,7 +18,7 @@ from ssh_abduction.runtime.clock import heeding
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver import choosing
 from ssh_abduction.solver.asp.facts import answer_maps
-from ssh_abduction.solver.asp.limits import LimitError, Watch, now
+from ssh_abduction.solver.asp.limits import LimitError, Watch, processor_clock
 from ssh_abduction.solver.engines.base import Found, Task
 from ssh_abduction.solver.guesses.gated import sketch_beyond, sketches_of
 from ssh_abduction.solver.guesses.mended import first_contradiction, mended_sketch
@@ -40,9 +39,8 @@ FRAMING, UNMAPPED = 30.0, 2.0
 # sketches.
 SKETCH_SHARE = 0.4
 # The sketch that succeeds most often may take this many seconds of processor time even if less time
-# is left. Otherwise a slow or busy machine would find no map. It may wait for the processor, or for
-# another thread, until WAITING times as many seconds are over.
-SUREST, WAITING = 1.0, 4.0
+# is left. Otherwise a slow or busy machine would find no map.
+SUREST = 1.0
 # The width of a broad beam of hypotheses. Make a beam only for at most LONGEST steps, as its time
 # grows with the cube of their number.
 BROAD, LONGEST = 4, 2000
@@ -166,7 +164,7 @@ class Candidates:
                     1.0 if attempt in (surest, *smaller[-1:]) else SKETCH_SHARE,
                 )
                 part = (
-                    Watch().part(max(seconds, SUREST), _processor_clock())
+                    Watch().part(max(seconds, SUREST), processor_clock())
                     if attempt is surest
                     else whole.part(share * whole.left())
                 )
@@ -296,16 +294,3 @@ def _with_all_views(task: Task) -> Task:
     )
     theory = replace(task.theory, unknown_views=False)
     return Task.of(task.problem.changed(trace, theory), task.watch, task.speedups)
-
-
-def _processor_clock() -> Callable[[], float]:
-    """Make a clock that counts the processor time of this thread.
-
-    On a busy machine it counts at least 1 / WAITING of the wall-clock time.
-    """
-    used, began = time.thread_time(), now()
-
-    def clock() -> float:
-        return max(time.thread_time() - used, (now() - began) / WAITING)
-
-    return clock

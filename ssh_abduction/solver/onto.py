@@ -49,6 +49,10 @@ from ssh_abduction.theory.settle import Problem, settle
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory, checked_theory
 
+# New drives may be laid on a map for this many seconds of processor time, even if the time limit is
+# over. That is enough for a drive of some hundred steps. Without it, a busy machine would leave the
+# drive apart, and all later ones, too.
+LAYING = 5.0
 _LIMITS = ("time limit", "memory limit", "interrupted")  # what ends a search early
 
 
@@ -99,7 +103,7 @@ def solve_onto(
     if solving.speedups.greedy and len(joint) > READABLE and can_lay(in_use):
         on_map = None
         try:
-            with suppress(LimitError), heeding(solving.watch.check):
+            with suppress(LimitError), heeding(solving.watch.later(LAYING)):
                 on_map = laid(old, ssh_map, trace, problem, solving.watch)
         except KeyboardInterrupt:
             if (grown := _grown(ssh_map, old, problem)) is None:

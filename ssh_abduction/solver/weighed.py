@@ -183,10 +183,12 @@ class Weighed:
         if not self.joins:
             return f"{text}; the best map joins no two visits"
         first, second, probability = self.joins[0]
-        return (
-            f"{text}; the most doubtful join is of steps {first} and {second} "
-            f"({probability_in_words(probability)})"
-        )
+        sure = probability_in_words(probability)
+        if not (self.proven or self.searched):
+            if len(self.rivals) == 1:
+                return f"{text}; no other map was found, so it is unknown which joins are doubtful"
+            sure += f" among the {len(self.rivals)} maps found"
+        return f"{text}; the most doubtful join is of steps {first} and {second} ({sure})"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the costs as plain data."""

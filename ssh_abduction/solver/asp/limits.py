@@ -22,6 +22,9 @@ LAST = 0.05
 POLL = 0.05
 # Seconds between two reports of progress. A person cannot read them faster.
 TICK = 0.5
+# Work that is limited by processor time may wait for the processor, or for another thread, until
+# WAITING times as many seconds are over.
+WAITING = 4.0
 
 Stop: TypeAlias = Literal["time limit", "memory limit", "interrupted", "maps limit", "no proof"]
 
@@ -29,6 +32,19 @@ Stop: TypeAlias = Literal["time limit", "memory limit", "interrupted", "maps lim
 def now() -> float:
     """Return the time in seconds, by the clock that time limits use."""
     return time.perf_counter()
+
+
+def processor_clock() -> Callable[[], float]:
+    """Make a clock that counts the processor time of this thread.
+
+    On a busy machine it counts at least 1 / WAITING of the wall-clock time.
+    """
+    used, began = time.thread_time(), now()
+
+    def clock() -> float:
+        return max(time.thread_time() - used, (now() - began) / WAITING)
+
+    return clock
 
 
 def check_limit(name: str, unit: str, limit: object) -> None:
@@ -178,6 +194,22 @@ class Watch:
         if self.elapsed() > self._stage_ends:
             self._stage_ends = math.inf
             raise StageTimeError
+
+    def later(self, seconds: float) -> Callable[[], None]:
+        """Make a `check` that overlooks the time limit for some seconds of the processor.
+
+        So the work that it limits has the same result on a busy machine.
+        """
+        used = processor_clock()
+
+        def check() -> None:
+            try:
+                self.check()
+            except LimitError as limit:
+                if limit.reason != "time limit" or used() > seconds:
+                    raise
+
+        return check
 
     def allows(self, seconds: float) -> bool:
         """Whether there is time for work that takes this many seconds and cannot be interrupted."""
