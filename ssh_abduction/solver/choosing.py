@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from ssh_abduction.solver import prefixes
 from ssh_abduction.solver.asp.facts import readable
 from ssh_abduction.solver.engines.base import AT_ONCE, Engine, Task
@@ -53,6 +55,21 @@ def new_engine(task: Task) -> Engine:
 
         return FramedEngine(task)
     return step_engine(task)
+
+
+def labelling_engine(task: Task, labels: Sequence[int]) -> Engine:
+    """Make the engine that suits the theory. It finds dstates before places and paths if it can.
+
+    Args:
+        task: The problem, the limits and the speed-ups.
+        labels: The dstate of each step in a map of the trace; empty if none is known.
+    """
+    engine = new_engine(task)
+    if labels and isinstance(engine, StepEngine) and takes_all(task) and task.speedups.ways:
+        from ssh_abduction.solver.engines.frameless import FramelessEngine
+
+        return FramelessEngine(task, labels)
+    return engine
 
 
 def step_engine(task: Task) -> StepEngine:

@@ -23,8 +23,8 @@ from ssh_abduction.runtime.clock import heeding
 from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver.asp.limits import LimitError, Watch, check_limit
 from ssh_abduction.solver.backbone import prove_backbone
-from ssh_abduction.solver.choosing import READABLE, may_name, new_engine, takes_all
-from ssh_abduction.solver.engines.base import Engine, Task
+from ssh_abduction.solver.choosing import READABLE, labelling_engine, may_name
+from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.obeying import obeyed, with_names
@@ -178,28 +178,13 @@ def find_backbone(
         mends = row("mending").holds_for(task.theory) and may_name(task)
         if mends and len(task.trace) > READABLE:  # no engine finds the maps of such a search
             return known
-        engine = _labelling_engine(task, solution)
+        # A search that needed only a prefix used no engine that finds dstates first.
+        is_whole = solution.effort.prefix == solution.steps
+        engine = labelling_engine(task, solution.maps[0].dstate_at if is_whole else ())
+        if not isinstance(engine, StepEngine):
+            engine.grow(solution.effort.prefix)
         judging = Judging(task.problem)
         proven = prove_backbone(task, judging, cost, sharing, engine)
     # The search may have seen more maps than the solution holds.
     has_learnt = proven or sharing.maps > len(minimal)
     return replace(sharing.backbone(proven=proven), drives=known.drives) if has_learnt else known
-
-
-def _labelling_engine(task: Task, solution: Solution) -> Engine | None:
-    """Make an engine that finds dstates before places and paths, for the prefix that was solved.
-
-    Return None if the search needed no such engine, or the theory has none.
-    """
-    engine = new_engine(task)
-    if isinstance(engine, StepEngine):
-        # The search needed only a prefix, or the theory has no such engine.
-        if not (
-            takes_all(task) and task.speedups.ways and solution.effort.prefix == solution.steps
-        ):
-            return None
-        from ssh_abduction.solver.engines.frameless import FramelessEngine  # loads numpy
-
-        engine = FramelessEngine(task, solution.maps[0].dstate_at)
-    engine.grow(solution.effort.prefix)
-    return engine

@@ -38,9 +38,8 @@ from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.limits import LimitError
 from ssh_abduction.solver.beams import Beams
-from ssh_abduction.solver.choosing import READABLE, new_engine, takes_all
-from ssh_abduction.solver.engines.base import Engine, Found, Task
-from ssh_abduction.solver.engines.stepwise import StepEngine
+from ssh_abduction.solver.choosing import READABLE, labelling_engine
+from ssh_abduction.solver.engines.base import Found
 from ssh_abduction.solver.equations import spreads_of
 from ssh_abduction.solver.estimating import (
     CostOf,
@@ -164,7 +163,9 @@ class Weighing:
         if parts.task.theory.has_faults and len(parts.task.trace) > READABLE:
             raise LimitError("no proof")
         task = replace(parts.task, speedups=replace(parts.task.speedups, prefixes=False))
-        judging, engine = _CostJudging(task.problem, self), _engine(task, parts)
+        best = parts.known.best
+        engine = labelling_engine(task, best.dstate_at if best else ())
+        judging = _CostJudging(task.problem, self)
         engine.grow(len(task.trace))
         prefixes = Prefixes(task, Known(task.theory), judging, engine, 1, parts.report)
         last = prefixes.minimise()
@@ -440,14 +441,3 @@ class _CostJudging(Judging):
         """Return equalities of a map that contradict evidence; None if no evidence rejects it."""
         found = super().refusal(ssh_map)
         return found[1] if found else None
-
-
-def _engine(task: Task, parts: Parts) -> Engine:
-    """Make a new engine for the whole trace, of the kind that minimises counts for it."""
-    engine = new_engine(task)
-    best = parts.known.best
-    if isinstance(engine, StepEngine) and takes_all(task) and task.speedups.ways and best:
-        from ssh_abduction.solver.engines.frameless import FramelessEngine  # loads numpy
-
-        return FramelessEngine(task, best.dstate_at)
-    return engine

@@ -206,6 +206,11 @@ def maps_of_labels(
     return (yield from mapped(lambda answer: Found.of(reader.map_of(answer), theory), answers))
 
 
+def listing(cost: tuple[int, ...]) -> str:
+    """Return clingo's opt-mode for listing the maps of this cost, with given dstates."""
+    return f"enum,{','.join(map(str, (0, *cost[1:])))}"
+
+
 def next_charted_size(size: int, failed: int, steps: int) -> int:
     """Return the size to grow to, for an engine that compares all pairs of steps beforehand.
 

@@ -36,7 +36,7 @@ from itertools import chain, islice
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.limits import Watch
-from ssh_abduction.solver.engines.base import Found, Task, next_charted_size
+from ssh_abduction.solver.engines.base import Found, Task, listing, next_charted_size
 from ssh_abduction.solver.engines.doubts import Settled
 from ssh_abduction.solver.engines.framed_paths import Fitted, FramedPaths, NodeLabels
 from ssh_abduction.solver.engines.refusing import all_accepted, first_accepted
@@ -167,7 +167,7 @@ class FramedEngine:
         """Yield the maps of the prefix that have this cost: `enough` of them, or all if it is 0."""
         if not self._framed:
             return
-        mode = _listing(cost)
+        mode = listing(cost)
         found = (
             found
             for naming in self._namings_of_cost(cost)
@@ -179,7 +179,7 @@ class FramedEngine:
         """Yield the maps of this cost, grouped by their labelling."""
         if not self._framed:
             return
-        mode = _listing(cost)
+        mode = listing(cost)
         for naming in self._namings_of_cost(cost):
             settled = self._fitting.settled(naming, mode)
             if settled.has_map():
@@ -268,8 +268,3 @@ def maps_with_frames(problem: Problem, watch: Watch, speedups: Speedups) -> Iter
     engine.grow(len(problem.trace))
     for found in engine.improving_maps():
         yield found.map.without_headings()
-
-
-def _listing(cost: tuple[int, ...]) -> str:
-    """Return clingo's opt-mode for listing the maps of this cost, with given dstates."""
-    return f"enum,{','.join(map(str, (0, *cost[1:])))}"

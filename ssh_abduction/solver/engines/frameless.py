@@ -30,7 +30,7 @@ from itertools import chain, islice
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.asp.control import Asker
-from ssh_abduction.solver.engines.base import Found, Task, next_charted_size
+from ssh_abduction.solver.engines.base import Found, Task, listing, next_charted_size
 from ssh_abduction.solver.engines.doubts import Settled
 from ssh_abduction.solver.engines.frameless_paths import PARTS, PlacesAndPaths
 from ssh_abduction.solver.engines.refusing import all_accepted
@@ -98,11 +98,7 @@ class FramelessEngine:
         self._best = best.cost, as_good
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
-        every = (
-            self._best[1] if self._best and self._best[0] == cost else self._all_that_fit(cost[0])
-        )
-        mode = f"enum,{','.join(map(str, (0, *cost[1:])))}"
-        yield from islice(self._listed(every, mode), enough or None)
+        yield from islice(self._listed(self._labels_of(cost), listing(cost)), enough or None)
 
     def _listed(self, every: Iterable[list[int]], mode: str) -> Iterator[Found]:
         """Yield the maps with these labels.
@@ -131,13 +127,16 @@ class FramelessEngine:
         )
 
     def labellings(self, cost: tuple[int, ...]) -> Iterator[Settled]:
-        mode = f"enum,{','.join(map(str, (0, *cost[1:])))}"
-        for labels in (
-            self._best[1] if self._best and self._best[0] == cost else self._all_that_fit(cost[0])
-        ):
-            settled = self._fitting.settled(labels, mode)
+        for labels in self._labels_of(cost):
+            settled = self._fitting.settled(labels, listing(cost))
             if settled.has_map():
                 yield settled
+
+    def _labels_of(self, cost: tuple[int, ...]) -> Iterable[list[int]]:
+        """Return the labels that maps of this cost have, known ones if there are any."""
+        if self._best and self._best[0] == cost:
+            return self._best[1]
+        return self._all_that_fit(cost[0])
 
     def _all_that_fit(self, dstates: int, besides: Sequence[int] = ()) -> Iterator[list[int]]:
         """Yield all labels with this many dstates that places and paths fit, except `besides`."""
