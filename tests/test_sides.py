@@ -19,9 +19,7 @@ from ssh_abduction.rivals import Listing, difference, shared_sides
 ACES3 = Path(__file__).parent.parent / "examples" / "aces3-route.jsonl"
 
 
-SHARED = (
-    "all maps know 16 times that a place lies right or left of a path, and some maps 15 times more"
-)
+SHARED = "all maps know in 16 cases on which side of a path a place lies, and some maps in 15 more"
 
 
 @pytest.mark.parametrize(

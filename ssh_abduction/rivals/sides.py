@@ -74,14 +74,14 @@ class SharedSides:
     def __str__(self) -> str:
         maps = "maps" if self.proven else "maps that were found"
         forced = (
-            f"all {maps} know {counted(len(self.forced), 'times')} that a place lies right or left "
-            "of a path"
+            f"all {maps} know in {counted(len(self.forced), 'cases')} on which side of a path a "
+            "place lies"
         )
         if not self.possible:
             return forced
         more = len(self.possible) - SHOWN
         some = [*map(str, self.possible[:SHOWN]), *([f"and {more} more"] if more > 0 else [])]
-        return f"{forced}, and some maps {len(self.possible)} times more: {'; '.join(some)}"
+        return f"{forced}, and some maps in {len(self.possible)} more: {'; '.join(some)}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data, as `compare --json` prints it."""
