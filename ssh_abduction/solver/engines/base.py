@@ -32,13 +32,7 @@ BETTERING = 20_000
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """A map of a prefix, with its cost.
-
-    Attributes:
-        map: The map.
-        cost: The counts that the theory minimises, such as dstates, places and paths. The count
-            that is minimised first comes first.
-    """
+    """A map of a prefix, with the counts that the theory minimises, the most important first."""
 
     map: SSHMap
     cost: tuple[int, ...]
@@ -51,14 +45,7 @@ class Found:
 
 @dataclass(frozen=True)
 class Task:
-    """The problem that an engine solves, with the limits and speed-ups for it.
-
-    Attributes:
-        problem: The whole trace, the theory with all its defaults filled in, and the evidence.
-        log: The trace as integers.
-        watch: The limits of the search.
-        speedups: The speed-ups that are on and hold for the theory.
-    """
+    """The problem that an engine solves, with the limits and the speed-ups that may be used."""
 
     problem: Problem
     log: Log
@@ -77,13 +64,7 @@ class Task:
 
     @staticmethod
     def of(problem: Problem, watch: Watch | None = None, speedups: Speedups | None = None) -> Task:
-        """Make a task, with only those speed-ups that hold for the theory.
-
-        Args:
-            problem: The trace, the theory and the evidence.
-            watch: The limits of the search; None for no limit.
-            speedups: The speed-ups that are on; None for the default ones.
-        """
+        """Make a task with those speed-ups that hold for the theory; by default without limits."""
         speedups = (speedups or Speedups()).that_hold_for(problem.theory)
         # `sides` treats each link between visits as a travel.
         if speedups.sides and any(action.leaves_paths for action in problem.trace.actions):
@@ -100,9 +81,6 @@ class Engine(Protocol):
     """The protocol of an engine, which asks clingo for maps of a prefix.
 
     The prefix is the first `size` steps of the trace. The engine grounds the axioms for them.
-
-    Attributes:
-        asker: Asks clingo.
     """
 
     asker: Asker
@@ -129,10 +107,7 @@ class Engine(Protocol):
         """Yield maps of the prefix, each cheaper than the one before.
 
         When the iteration ends, the last map is minimal. If there was none, the prefix has no map
-        (within `most`).
-
-        Args:
-            most: An upper bound on the cost of the maps; empty if none is known.
+        (within `most`). `most` is an upper bound on the cost of the maps; empty if none is known.
         """
         ...
 
@@ -143,8 +118,7 @@ class Engine(Protocol):
     def forbid(self, equalities: Collection[Equality]) -> bool:
         """Exclude all maps in which all of these equalities of steps hold, from now on.
 
-        Returns:
-            False if the engine cannot forbid such equalities; then nothing has changed.
+        Returns False, and changes nothing, if the engine cannot forbid such equalities.
         """
         ...
 
@@ -160,10 +134,7 @@ class GrowingEngine(Protocol):
 
 @runtime_checkable
 class LabellingEngine(Protocol):
-    """The protocol of an engine that finds dstates before places and paths.
-
-    It can only list maps with the fewest dstates.
-    """
+    """The protocol of an engine that finds dstates first, and lists only maps with the fewest."""
 
     def labellings(self, cost: tuple[int, ...]) -> Iterator[Settled]:
         """Yield the maps of this cost, grouped by their labelling.
@@ -182,18 +153,10 @@ def maps_of_labels(
     mode: str,
     conflicts: int = -1,
 ) -> Generator[Found, None, bool]:
-    """Yield maps with given dstates.
+    """Yield maps with given dstates, and return whether clingo ended before the limit of conflicts.
 
-    Args:
-        asker: Asks clingo.
-        control: Its answers are the places and paths that fit these dstates.
-        reader: Reads the answers.
-        theory: Its preference says what a map costs.
-        mode: Clingo's opt-mode; "ignore" for a single map.
-        conflicts: Stop after this many conflicts; -1 for no limit.
-
-    Returns:
-        Whether clingo ended before the limit of conflicts.
+    The answers of the control are the places and paths that fit the dstates. The theory says what a
+    map costs. `mode` is clingo's opt-mode; "ignore" for a single map. -1 conflicts mean no limit.
     """
     answers = asker.answers(
         reader.read,
@@ -214,12 +177,8 @@ def listing(cost: tuple[int, ...]) -> str:
 def next_charted_size(size: int, failed: int, steps: int) -> int:
     """Return the size to grow to, for an engine that compares all pairs of steps beforehand.
 
-    After the first prefix this is the whole trace, if it has at most `AT_ONCE` steps.
-
-    Args:
-        size: The number of steps in the prefix.
-        failed: The step that no map of the prefix explains.
-        steps: The number of steps in the trace.
+    After the first prefix this is the whole trace, if it has at most `AT_ONCE` steps. `failed` is
+    the step that no map of the prefix explains.
     """
     if size < FIRST_PREFIXES:
         return min(steps, max(failed + 1, FIRST_PREFIXES))

@@ -54,7 +54,6 @@ class Blocks:
         price: For each kind of fault that is allowed, its cost at each step in tenths of dstates.
         faults: For each kind, the steps at which the known map has a fault, in order.
         dstates: The number of dstates of the known map.
-        watch: The limits.
     """
 
     seen: Sequence[int]
@@ -73,10 +72,7 @@ class Blocks:
         return 10 * self.dstates + self._known_cost(0, len(self.seen))
 
     def bound(self) -> int:
-        """Compute a lower bound on the cost of all maps, in tenths of dstates.
-
-        The result is at most the cost of the known map.
-        """
+        """Return a lower bound on the cost of all maps, in tenths; at most the known map's cost."""
         bound = self.cost
         most = -(-bound // 10) - 1  # the dstates of a larger map alone cost this bound
         while most > 0:
@@ -88,13 +84,10 @@ class Blocks:
         return bound
 
     def least_faults(self, most: int) -> int:
-        """Compute a lower bound on the cost of faults in maps with at most `most` dstates.
+        """Return the least cost, in tenths, that faults of maps with at most `most` dstates have.
 
         The trace is divided into blocks from its first step on. Each block ends as soon as it needs
         a fault. The least costs of the faults of all blocks are added up.
-
-        Returns:
-            The bound in tenths of dstates.
         """
         total = begin = 0
         steps, places = (
@@ -122,15 +115,11 @@ class Blocks:
         return total
 
     def _shortest(self, begin: int, fault: int, reach: int, most: int) -> int | None:
-        """Find the shortest block from `begin` that needs a fault.
+        """Return the step after the shortest block from `begin` that needs a fault.
 
-        Args:
-            fault: The block ends after this step.
-            reach: The expected number of steps from `fault` to the end. The search starts there.
-
-        Returns:
-            The step after the last one of the block. The block may be a few steps longer than the
-            shortest one. None if even the block to the end of the trace needs no fault.
+        The block ends after the step `fault`, and may be a few steps longer than the shortest one.
+        The search starts at the expected end, `reach` steps after `fault`. None if even the block
+        to the end of the trace needs no fault.
         """
         steps = len(self.seen)
         exact = 1 + max(most - self.dstates, 0) // COARSE
@@ -164,9 +153,8 @@ class Blocks:
     ) -> tuple[int, int] | None:
         """Widen a block to include the next faults of the known map, if they are close together.
 
-        Returns:
-            The end of the wider block and the cost of the known map's faults in it, in tenths;
-            None if there are no such faults, or no proof that this cost is the least.
+        Returns the end of the wider block and the cost of these faults in tenths; None if there are
+        no such faults, or no proof that this cost is the least.
         """
         first = behind = bisect_left(places, begin)
         while behind < len(places) and places[behind] < max(

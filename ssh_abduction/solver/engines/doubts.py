@@ -36,11 +36,8 @@ class Doubts:
     ) -> None:
         """Begin without any doubt.
 
-        Args:
-            asker: Asks clingo.
-            control: The control that gets the doubts and is asked.
-            condition: Given a sort and two steps (or dstates), returns the body of a rule, which
-                says that they share a thing of that sort; None if they never do.
+        Given a sort and two steps (or dstates), `condition` returns the body of a rule, which says
+        that they share a thing of that sort; None if they never do.
         """
         self._asker, self._control, self._condition = asker, control, condition
         self._number_of: dict[Doubt, int] = {}  # the number of each doubt that clingo has
@@ -50,16 +47,7 @@ class Doubts:
     def answer(
         self, doubts: Collection[Doubt], read: Callable[[clingo.Model], Answer], mode: str
     ) -> Answer | None:
-        """Find an answer in which at least one of the doubts holds.
-
-        Args:
-            doubts: The doubts.
-            read: Reads an answer of clingo.
-            mode: Clingo's opt-mode.
-
-        Returns:
-            The answer as `read` gives it; None if there is none.
-        """
+        """Return an answer, as `read` gives it, in which a doubt holds; None if there is none."""
         doubts = set(doubts)
         if not doubts:
             return None
@@ -93,10 +81,7 @@ class Doubts:
 
 
 class Settled:
-    """Questions about the best maps with one labelling (the dstate of each step).
-
-    Engines that find dstates before places and paths use it.
-    """
+    """Questions about the best maps with one labelling, for engines that find dstates first."""
 
     def __init__(
         self,
@@ -105,14 +90,7 @@ class Settled:
         mode: str,
         reader: path_reader.PathReader,
     ) -> None:
-        """Prepare the questions, without asking clingo yet.
-
-        Args:
-            asker: Asks clingo.
-            control: Its answers are the places and paths for the labelling.
-            mode: Clingo's opt-mode for the best maps.
-            reader: Reads the answers.
-        """
+        """Prepare the questions for a control whose answers are places and paths."""
         self._asker, self._control, self._mode = asker, control, mode
         self._reader = reader
         self._doubts = Doubts(asker, control, reader.condition)

@@ -46,18 +46,10 @@ GUESSING_SHARE = 0.1
 
 
 class FaultyEngine:
-    """The engine for the causal theory with faults.
-
-    It minimises the cost of dstates and faults together.
-    """
+    """The engine for the causal theory with faults. It minimises dstates and faults together."""
 
     def __init__(self, task: Task, most_faults: int | None = None) -> None:
-        """Begin with an empty prefix.
-
-        Args:
-            task: The problem, the limits and the speed-ups.
-            most_faults: If given, a map may have up to this many faults, and they cost nothing.
-        """
+        """Begin with an empty prefix. If given, `most_faults` is how many may occur, at no cost."""
         self.asker = Asker(task.watch)
         self._most_faults = most_faults
         self.size = 0
@@ -157,10 +149,7 @@ class FaultyEngine:
             self._raise_bound([blocks.bound()])
 
     def _asked(self) -> Iterator[Found]:
-        """Yield maps of the whole trace, made from clingo's answers for the given steps.
-
-        At the end, the cheapest map known is minimal.
-        """
+        """Yield maps made from clingo's answers. At the end, the cheapest map known is minimal."""
         self._bound_by_blocks()
         while self._best is None or self._best > (self.bound or 0):
             answer = None
@@ -217,9 +206,7 @@ class FaultyEngine:
     def _machine(self, answer: FaultyAnswer) -> tuple[dict[int, int], PartialMachine]:
         """Make a machine, which is dstates and links, from an answer.
 
-        Returns:
-            A dict from the name of each dstate to its number, in the order of first visits; and
-            the machine.
+        Returns, first, the number of each dstate by its name, in the order of first visits.
         """
         number: dict[int, int] = {}
         for t in sorted(answer.where):
@@ -235,9 +222,8 @@ class FaultyEngine:
     def _followed(self, answer: FaultyAnswer) -> tuple[list[int] | None, int]:
         """Follow the links of an answer through the steps that clingo was not given.
 
-        Returns:
-            The dstate of each step, and -1. Or None, and the step to give to clingo next: the links
-            do not explain this step, or evidence contradicts its dstate.
+        Returns the dstate of each step, and -1. If the links do not explain a step, or evidence
+        contradicts its dstate, it returns None, and this step to give to clingo next.
         """
         number, machine = self._machine(answer)
         labels: list[int] = []
@@ -264,9 +250,8 @@ class FaultyEngine:
     def _explained(self, answer: FaultyAnswer) -> tuple[Found | None, list[int]]:
         """Explain the whole trace by the dstates and links of an answer, with the cheapest faults.
 
-        Returns:
-            The map of the whole trace, or None if it is not allowed; and up to PLACES steps that
-            have a fault or an action without a link, and that clingo was not given.
+        Returns the map, or None if it is not allowed, and up to PLACES steps that have a fault or
+        an action without a link, and that clingo was not given.
         """
         _, machine = self._machine(answer)
         if not machine.shows:  # all given steps are lost
@@ -280,11 +265,10 @@ class FaultyEngine:
         return self._map_of(self._explainer.completed(machine)), doubted[:PLACES]
 
     def _map_of(self, explained: Explained) -> Found | None:
-        """Make a map of an explanation of the trace.
+        """Make a map of an explanation of the trace, with its cost.
 
-        Returns:
-            The map with its cost. None if its faults are not allowed, a dstate never has its view,
-            or the map breaks an equality of the evidence or a forbidden set.
+        Returns None if its faults are not allowed, a dstate never has its view, or the map breaks
+        an equality of the evidence or a forbidden set.
         """
         labels, shows = explained.labels, explained.machine.shows
         if (explained.misread and "misread" not in self._price) or (
@@ -315,9 +299,8 @@ class FaultyEngine:
     ) -> Found:
         """Make a map of the whole trace, with its cost.
 
-        Args:
-            number: A dict from the name of each dstate to its number. Used if `shows` is None.
-            shows: The view of each dstate; None to derive it from its name.
+        `number` has the number of each dstate by its name. `shows` has the view of each dstate;
+        None to derive it from the name.
         """
         view_of = dict(faulty_lp.faulty_names(self._control.names))
         shown = self._shown_somewhere(labels, shows or [view_of[name] for name in number])
@@ -329,10 +312,7 @@ class FaultyEngine:
         )
 
     def _shown_somewhere(self, labels: Sequence[int], shown: Sequence[int]) -> list[int]:
-        """Correct the views of dstates, so that each dstate has a view that is seen there.
-
-        A dstate whose view is always misread gets the view that is seen there most often.
-        """
+        """Give each dstate whose view is always misread the view that is seen there most often."""
         views = list(shown)
         for s in set(labels) - {s for t, s in enumerate(labels) if shown[s] == self._seen[t]}:
             views[s] = Counter(

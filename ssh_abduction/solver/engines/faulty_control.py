@@ -62,8 +62,6 @@ class _Given:
         names: The number of names of each view.
         full: The steps that may be at any dstate.
         steps: The given steps, in the order in which clingo got them.
-        batches: The number of batches of steps.
-        forbidden: The number of forbidden sets of equalities.
     """
 
     names: dict[int, int] = field(default_factory=dict)
@@ -95,12 +93,9 @@ class FaultyControl:
     ) -> None:
         """Begin without any given step.
 
-        Args:
-            task: The problem, the limits and the speed-ups.
-            asker: Asks clingo.
-            price: For each kind of fault, its cost at each step in tenths of dstates.
-            most_faults: If given, a map may have up to this many faults, and they cost nothing.
-            on_bound: Called with each bound that clingo proves.
+        `price` has, for each kind of fault, its cost at each step in tenths of dstates. If
+        `most_faults` is given, a map may have up to this many faults, and they cost nothing.
+        `on_bound` is called with each bound that clingo proves.
         """
         self.names = dict.fromkeys(range(max(task.log.seen) + 1), NAMES)
         self.given: set[int] = set()
@@ -177,23 +172,12 @@ class FaultyControl:
         given.batches += 1
 
     def answers(self, mode: str) -> Iterator[FaultyAnswer]:
-        """Yield answers for the given steps, each cheaper than the one before.
-
-        The last answer is minimal.
-
-        Args:
-            mode: Clingo's opt-mode.
-        """
+        """Yield answers, each cheaper than the one before. The last one is minimal."""
         self._prepare()
         yield from self._asker.answers(self._read, mode, 0, on_bound=self._on_bound)
 
     def answers_of_cost(self, cost: int, enough: int) -> Iterator[FaultyAnswer]:
-        """Yield each answer for the given steps that has the least cost, once.
-
-        Args:
-            cost: The least cost, in tenths of dstates.
-            enough: The number of answers after which to stop; 0 for all.
-        """
+        """Yield answers of the least cost, in tenths of dstates; at most `enough`, or all if 0."""
         self._prepare()
         seen: set[tuple[frozenset[tuple[int, int]], frozenset[int]]] = set()
         # The bound of a long trace comes from blocks. Clingo cannot prove it from the given steps.

@@ -86,11 +86,7 @@ class FramedEngine:
         return self._visits.chart
 
     def over(self, task: Task) -> FramedEngine:
-        """Go on with a longer trace, and return this engine itself.
-
-        Args:
-            task: The longer trace, with new limits.
-        """
+        """Go on with a longer trace and new limits, and return this engine itself."""
         self._task = self._fitting.task = task
         self.asker.watch = task.watch
         self._visits.work_on(task)
@@ -146,14 +142,8 @@ class FramedEngine:
     def map_mended_from(self, known: Sequence[int]) -> Found | None:
         """Make a map of the whole trace that keeps known dstates of the first steps if possible.
 
-        All other steps get new dstates.
-
-        Args:
-            known: The dstates of the first steps.
-
-        Returns:
-            The map; None if the steps fit no frames, or no paths fit. Paths are only merged if they
-            must be one.
+        All other steps get new dstates. Paths are only merged if they must be one. Returns None if
+        the steps fit no frames, or no paths fit.
         """
         chart = Chart.framed(self._task.trace, self._task.log)
         if chart is None:
@@ -237,13 +227,9 @@ class FramedEngine:
     def _charted(self, size: int, before: FramedChart | None) -> FramedChart | None:
         """Chart the first steps, with the pairs of nodes that must be at different places.
 
-        The pairs are those that follow from the trace alone, by the axioms of order and sides.
-
-        Args:
-            before: The chart of fewer steps, if there is one. Then only its pairs are taken.
-
-        Returns:
-            The chart; None if the steps fit no frames.
+        The pairs are those that follow from the trace alone, by the axioms of order and sides. If
+        `before`, the chart of fewer steps, is given, only its pairs are taken. Returns None if the
+        steps fit no frames.
         """
         chart = Chart.framed(self._task.trace, self._task.log, size)
         return None if chart is None else self._fitting.charted(chart, before)
@@ -257,11 +243,6 @@ def maps_with_frames(problem: Problem, watch: Watch, speedups: Speedups) -> Iter
     frames, a good map of thousands of steps takes seconds. Each map of `Theory.with_frames` is also
     a map of the theory with star=pattern. So if the world has frames, this finds the true map or
     one that is about as small.
-
-    Args:
-        problem: The trace, and a theory with star=pattern and all defaults filled in.
-        watch: The limits.
-        speedups: The speed-ups that are on.
     """
     task = Task.of(problem.changed(theory=problem.theory.with_frames()), watch, speedups)
     engine = FramedEngine(task)

@@ -32,13 +32,7 @@ CLASHES = 30
 
 @dataclass(frozen=True)
 class NodeLabels:
-    """Labels, for which clingo is then asked for places and paths.
-
-    Attributes:
-        chart: The chart of the nodes.
-        labels: The dstate of each node.
-        control: A control whose answers are the paths that fit the labels; None to make a new one.
-    """
+    """The dstates of the nodes of a chart, and a control for their paths; None to make one."""
 
     chart: FramedChart
     labels: Sequence[int]
@@ -57,7 +51,6 @@ class FramedPaths:
     """Asks clingo for the places and paths that fit labels.
 
     Attributes:
-        task: The problem, the limits and the speed-ups.
         forbidden: Sets of equalities of steps. In no map do all equalities of one set hold.
     """
 
@@ -78,11 +71,7 @@ class FramedPaths:
         return Fitted(found, naming) if found else None
 
     def separate(self, chart: FramedChart, labels: Sequence[int]) -> Found | None:
-        """Find a map with these dstates that merges places and segments only if they must be one.
-
-        Returns:
-            The map; None if there is no such map.
-        """
+        """Find a map with these dstates in which places and segments merge only if they must."""
         naming = NodeLabels(chart, list(labels), self.control(chart, labels, single=True))
         return next(self.maps(naming, "ignore"), None)
 
@@ -103,16 +92,7 @@ class FramedPaths:
     def maps(
         self, naming: NodeLabels, mode: str, conflicts: int = -1
     ) -> Generator[Found, None, bool]:
-        """Yield maps with these dstates.
-
-        Args:
-            naming: The dstate of each node, and the control if there is one.
-            mode: Clingo's opt-mode; "ignore" for a single map.
-            conflicts: Stop after this many conflicts; -1 for no limit.
-
-        Returns:
-            Whether clingo ended before the limit of conflicts.
-        """
+        """Yield maps with these dstates, as `maps_of_labels` does."""
         control = naming.control or self.control(naming.chart, naming.labels)
         reader = self._reader(naming, control)
         return (
@@ -122,12 +102,7 @@ class FramedPaths:
         )
 
     def settled(self, naming: NodeLabels, mode: str) -> Settled:
-        """Prepare questions about what the best maps with these dstates share.
-
-        Args:
-            naming: The dstate of each node, and the control if there is one.
-            mode: Clingo's opt-mode for the best maps.
-        """
+        """Prepare questions on what the best maps share, by clingo's opt-mode `mode`."""
         control = naming.control or self.control(naming.chart, naming.labels)
         reader = self._reader(naming, control)
         return Settled(self._asker, control, mode, reader)
@@ -147,14 +122,10 @@ class FramedPaths:
         *,
         single: bool = False,
     ) -> clingo.Control:
-        """Make a control whose answers are the places and paths that fit labels.
+        """Make a control whose answers are the places and paths that fit the labels of some nodes.
 
-        Args:
-            chart: The chart of the nodes.
-            labels: The dstate of each node.
-            options: Options of clasp.
-            nodes: The nodes whose labels the paths have to fit; None for all.
-            single: Merge places and segments only if they must be one.
+        `options` are those of clasp. If `nodes` is None, the paths have to fit the labels of all
+        nodes. If `single`, places and segments are merged only if they must be one.
         """
         self._asker.watch.check()
         with self._asker.grounding_timed():
@@ -163,11 +134,7 @@ class FramedPaths:
         return control
 
     def clashing(self, chart: FramedChart, labels: Sequence[int]) -> list[list[int]]:
-        """Find clashes, which are minimal sets of nodes whose labels no paths fit.
-
-        Returns:
-            At least one and at most `CLASHES` lists of nodes.
-        """
+        """Find up to `CLASHES` clashes: minimal sets of nodes whose labels no paths fit."""
         control = self.paths.clashing(chart, labels)
         clashes = list(
             self._asker.answers(
@@ -191,11 +158,8 @@ class FramedPaths:
     def charted(self, chart: FramedChart, before: FramedChart | None = None) -> FramedChart:
         """Return the chart with pairs of nodes added that cannot be at one place.
 
-        The pairs follow from the trace alone, by the axioms of order and sides.
-
-        Args:
-            chart: The chart of the nodes.
-            before: The chart of fewer steps, with its pairs. If given, only these pairs are added.
+        The pairs follow from the trace alone, by the axioms of order and sides. If `before`, the
+        chart of fewer steps, is given, only its pairs are added.
         """
         if before is not None:
             return chart.with_elsewhere(before.elsewhere)

@@ -43,19 +43,10 @@ SOONER = 1000
 
 
 class FramelessEngine:
-    """The engine for the topological theory without frames, for a trace that has a map.
-
-    It minimises the dstates first.
-    """
+    """The engine for a trace with a map, without frames. It minimises the dstates first."""
 
     def __init__(self, task: Task, known: Sequence[int] = ()) -> None:
-        """Begin with an empty prefix.
-
-        Args:
-            task: The problem, the limits and the speed-ups.
-            known: The dstate of each step of the trace in a map with few dstates; empty if none
-                is known.
-        """
+        """Begin with an empty prefix. `known` has the dstates of a small map; empty if unknown."""
         self.asker = Asker(task.watch)
         self._task = task
         self._fitting = PlacesAndPaths(task, self.asker, known)
@@ -105,9 +96,6 @@ class FramelessEngine:
 
         If displacements are used, maps that differ in their places come first. How well a map fits
         the displacements depends only on its dstates and places.
-
-        Args:
-            mode: Clingo's opt-mode for the best maps of one labelling.
         """
         left, sooner, first = iter(every), list[list[int]](), set[SSHMap]()
         while (

@@ -53,7 +53,6 @@ class _Far:
     Mostly there is only one pair.
 
     Attributes:
-        pairs: The pairs of dstates.
         placed: The steps that the evidence names, each with its dstate.
     """
 
@@ -64,9 +63,8 @@ class _Far:
     def of(cls, labels: Sequence[int], equalities: Collection[Equality]) -> _Far | None:
         """Translate a forbidden set of equalities of steps to a constraint on dstates.
 
-        Returns:
-            The constraint. None if it cannot be violated: an equality of dstates does not hold in
-            the labels, or the prefix does not have all the steps yet.
+        Returns None if it cannot be violated: an equality of dstates does not hold in the labels,
+        or the prefix does not have all the steps yet.
         """
         steps = dict.fromkeys(
             step for equality in equalities for step in (equality.first, equality.second)
@@ -105,14 +103,7 @@ class PlacesAndPaths:
     """
 
     def __init__(self, task: Task, asker: Asker, known: Sequence[int] = ()) -> None:
-        """Begin with an empty prefix.
-
-        Args:
-            task: The problem, the limits and the speed-ups.
-            asker: Asks clingo.
-            known: The dstate of each step of the trace in a map with few dstates; empty if none
-                is known.
-        """
+        """Begin with an empty prefix. `known` has the dstates of a small map; empty if unknown."""
         self.named = NamedLabels(task, asker, known, self)
         self._task, self._asker = task, asker
         self._actions = dict(zip(task.log.actions, task.trace.actions, strict=True))
@@ -152,11 +143,7 @@ class PlacesAndPaths:
             self._forget_tight()
 
     def _give_axioms(self, dstates: Collection[tuple[int, int]]) -> None:
-        """Ground the axioms of order and sides for the paths of these dstates.
-
-        Args:
-            dstates: Dstates without these axioms so far, as keys of `NameProgram.names`.
-        """
+        """Ground axioms of order and sides for dstates, given as keys of `NameProgram.names`."""
         with self._asker.grounding_timed():
             control, names = self._asker.control, self.named.program.names()
             parts: list[tuple[str, list[clingo.Symbol]]] = []
@@ -175,11 +162,7 @@ class PlacesAndPaths:
         return self._tightly(labels) is not None or self._has_paths(self._path_control(labels))
 
     def _tightly(self, labels: Sequence[int]) -> Found | None:
-        """Find a best map with these dstates by the shortcut of `engines/homes.py`.
-
-        Returns:
-            The map; None if the shortcut does not apply, or fails.
-        """
+        """Find a best map by the shortcut of `engines/homes.py`; None if it does not work."""
         key = tuple(labels)
         if key in self._tight:
             return self._tight[key][1]
@@ -212,11 +195,8 @@ class PlacesAndPaths:
     def _best_at_home(self, labels: Sequence[int], control: Control, fewest: int) -> Found | None:
         """Find the best map that merges each place with one of its homes (`engines/homes.py`).
 
-        Args:
-            fewest: A lower bound on the number of paths.
-
-        Returns:
-            The map; None if it is not proven to be the best of all maps with these dstates.
+        `fewest` is a lower bound on the number of paths. Returns None if the map is not proven to
+        be the best of all maps with these dstates.
         """
         places_first = (
             next(count for count in self._task.theory.priorities if count in ("places", "paths"))
@@ -306,10 +286,9 @@ class PlacesAndPaths:
     ) -> Control:
         """Make a control whose answers are places and paths of dstates.
 
-        Args:
-            far: Constraints that evidence puts on the places of dstates.
-            single: Merge places and segments only if they must be one.
-            labels: The dstate of each step, so that paths stay on one floor; empty to ignore that.
+        `far` has constraints that evidence puts on the places. If `single`, places and segments are
+        merged only if they must be one. `labels` has the dstate of each step, so that paths stay on
+        one floor; empty to ignore that.
         """
         control = Control(options, self._asker.watch.check, PREPARING)
         control.load_encodings("paths_frameless", "preference")
@@ -333,10 +312,7 @@ class PlacesAndPaths:
         options: Sequence[str] = (),
         parts: Sequence[str] = (*PARTS, *EACH),
     ) -> clingo.Control:
-        """Make a control whose answers are the places and paths that fit labels.
-
-        The last control is kept, as the next question often needs the same one.
-        """
+        """Make a control for the places and paths of labels, or reuse the last one."""
         key = tuple(labels), tuple(options), tuple(parts)
         if self._asked is None or self._asked[0] != key:
             with self._asker.grounding_timed():
@@ -356,20 +332,12 @@ class PlacesAndPaths:
         return self._asked[1]
 
     def settled(self, labels: Sequence[int], mode: str) -> Settled:
-        """Prepare questions about what the best maps with these dstates share.
-
-        Args:
-            labels: The dstate of each step.
-            mode: Clingo's opt-mode for the best maps.
-        """
+        """Prepare questions on what the best maps share, by clingo's opt-mode `mode`."""
         control = self._path_control(labels)
         return Settled(self._asker, control, mode, self._reader(control, labels))
 
     def improving_maps(self, labels: Sequence[int]) -> Iterator[Found]:
-        """Yield maps with these dstates, none more expensive than the one before.
-
-        The last map is the best one. There is none if no places and paths fit.
-        """
+        """Yield maps with these dstates, none costlier than the one before; nothing if none fit."""
         if (best := self._tightly(labels)) is not None:
             yield best
             return
@@ -385,18 +353,10 @@ class PlacesAndPaths:
         options: Sequence[str] = (),
         parts: Sequence[str] = (*PARTS, *EACH),
     ) -> Generator[Found, None, bool]:
-        """Yield maps with these dstates.
+        """Yield maps with these dstates, as `maps_of_labels` does.
 
-        Args:
-            labels: The dstate of each step.
-            mode: Clingo's opt-mode; "ignore" for a single map.
-            conflicts: Stop after this many conflicts; -1 for no limit.
-            options: Options of clasp.
-            parts: The parts of the program. Without `EACH` there is one map for each choice of
-                places.
-
-        Returns:
-            Whether clingo ended before the limit of conflicts.
+        `options` are those of clasp. Without `EACH` in `parts`, the parts of the program, there is
+        one map for each choice of places.
         """
         control = self._path_control(labels, options, parts)
         reader = self._reader(control, labels)
@@ -414,11 +374,7 @@ class PlacesAndPaths:
 
 
 def _go_on_at_home(control: Control, homes: Mapping[int, list[int]], parts: Iterable[str]) -> None:
-    """Ground the remaining parts of a control, and restrict each place to its homes.
-
-    Args:
-        homes: For each place, the fixed places that it may be.
-    """
+    """Ground the other parts, and restrict each place to its homes: fixed places that it may be."""
     control.add("homes", [], paths_lp.tight_facts(homes))
     control.ground(
         [(part, []) for part in ("homes", *(part for part in parts if part not in BEFORE_MERGING))]

@@ -34,12 +34,8 @@ from ssh_abduction.solver.engines.paths import pairwise_distinct
 def homes_of(segments: Segments) -> Mapping[int, list[int]] | None:
     """Find the possible homes of each place, if a map has only as many places as fixed ones.
 
-    Args:
-        segments: The places and segments, and which of them are known to be different.
-
-    Returns:
-        For each place, the fixed places that it may be. None if some place cannot be any of them,
-        or if no places fit these dstates at all.
+    Homes of a place are the fixed places that it may be. Returns None if some place has none, or if
+    no places fit these dstates at all.
     """
     if any(c == p for c, p in segments.elsewhere):
         return None  # the segments contradict each other: no places fit these dstates
@@ -71,11 +67,7 @@ def homes_of(segments: Segments) -> Mapping[int, list[int]] | None:
 
 
 def fewest_paths(segments: Segments) -> int:
-    """Compute a lower bound on the number of paths, from pairwise distinct segments.
-
-    Args:
-        segments: The segments, and which of them are known to be different paths.
-    """
+    """Return a lower bound on the number of paths, from pairwise distinct segments."""
     return len(pairwise_distinct(segments.segments, segments.distinct))
 
 
@@ -88,15 +80,10 @@ def _by_segment(steps: list[tuple[int, int, int]]) -> Mapping[int, list[tuple[in
 
 
 def _may_follow(pairs: list[tuple[int, int]], columns: list[int]) -> NDArray[np.bool_]:
-    """Find which fixed places may come after which others on the path of a segment.
+    """Return which fixed places may come after which on the path of a segment, (fixed, fixed).
 
-    Args:
-        pairs: For each travel of the segment, the places where it begins and where it ends.
-        columns: The numbers of the fixed places.
-
-    Returns:
-        A matrix, fixed x fixed: whether the place of the column may come after the place of the
-        row.
+    `pairs` has where each travel of the segment begins and ends, and `columns` the numbers of the
+    fixed places. The result tells whether the place of the column may come after that of the row.
     """
     members = sorted({place for pair in pairs for place in pair})
     number = {place: i for i, place in enumerate(members)}

@@ -101,13 +101,8 @@ class NameProgram:
     ) -> None:
         """Make a control that has the names, but no node yet.
 
-        Args:
-            task: The trace and the speed-ups that are on.
-            asker: Asks the control.
-            pinned: The nodes, their links and the clique.
-            spares: The number of spare names of each view, not counting the rest.
-            forbidden: The forbidden sets of pairs, as in the attribute.
-            fitting: Further axioms for labels; None in the causal theory.
+        `spares` has the number of spare names of each view, not counting the rest. `fitting` has
+        further axioms for labels; None in the causal theory.
         """
         self.pinned, self.forbidden = pinned, forbidden
         self._task, self._asker, self._fitting = task, asker, fitting
@@ -227,21 +222,13 @@ class NameProgram:
         self._asker.control.ground([(part, [])])
 
     def give_forbidden(self, number: int) -> None:
-        """Give clingo the rule that excludes a forbidden set of pairs, and the nodes in it.
-
-        Args:
-            number: The position of the set in `forbidden`.
-        """
+        """Give clingo the rule against the set at an index of `forbidden`, and its nodes."""
         pairs = self.forbidden[number]
         self.add_links_at({step for pair in pairs for step in pair})
         self.add_rules(f"not_together_{number}", names_lp.not_together(number, pairs))
 
     def is_allowed(self, labels: Sequence[int]) -> bool:
-        """Whether the labels of a map agree with evidence about pairs of nodes.
-
-        Args:
-            labels: The dstate of each node.
-        """
+        """Whether the labels of a map agree with evidence about pairs of nodes."""
         if any(all(labels[i] == labels[j] for i, j in pairs) for pairs in self.forbidden):
             return False
         return not self.chart.excluded or self.chart.is_map(labels)
@@ -260,11 +247,7 @@ class NameProgram:
         }
 
     def rests(self, answer: dict[int, int]) -> set[int]:
-        """Return the views whose rest an answer uses.
-
-        Args:
-            answer: The name of each node.
-        """
+        """Return the views whose rest an answer, which names the nodes, uses."""
         used = set(answer.values())
         return {view for view, spare in self._known.spare.items() if spare[-1] in used}
 
@@ -321,13 +304,9 @@ class NameProgram:
     def follow(self, answer: dict[int, int]) -> tuple[list[int], list[Link]]:
         """Follow the links of an answer through all nodes of the chart.
 
-        Args:
-            answer: The name of each node that clingo has.
-
-        Returns:
-            The name of each node, -1 if it is unknown; and links that clingo lacks and should get
-            next, as the answer contradicts or does not explain them. If there are none, the names
-            make a map.
+        Returns the name of each node, -1 if it is unknown; and links that clingo lacks and should
+        get next, as the answer contradicts or does not explain them. If there are none, the names
+        make a map.
         """
         if self.has_all_links and not self.rests(answer):
             return [answer[node] for node in range(len(answer))], []

@@ -29,12 +29,7 @@ FEWER = (20_000, 40_000)
 
 
 class Incumbent:
-    """The best known labels and a lower bound.
-
-    Attributes:
-        bound: A lower bound on the dstates; None if unknown.
-        labels: Labels of a map with few dstates; None if no map is known.
-    """
+    """The labels with the fewest dstates so far, and a lower bound on dstates; None if unknown."""
 
     def __init__(self) -> None:
         """Begin with no labels and no bound."""
@@ -61,15 +56,7 @@ class NameSearch:
         incumbent: Incumbent,
         fitting: Fitting | None,
     ) -> None:
-        """Prepare a search.
-
-        Args:
-            task: The trace and the speed-ups that are on.
-            asker: Asks clingo.
-            program: The control that assigns names of dstates to nodes.
-            incumbent: The best labels and the bound. The search improves them.
-            fitting: Further axioms for labels; None in the causal theory.
-        """
+        """Prepare a search that improves the incumbent. `fitting` is None in the causal theory."""
         self._task, self._asker, self._program = task, asker, program
         self._incumbent, self._fitting = incumbent, fitting
         self._small = SmallMaps(task, program.pinned)
@@ -104,13 +91,9 @@ class NameSearch:
         yield labels or self._incumbent.labels or []
 
     def _cheapest_answer(self) -> Generator[list[int], None, dict[int, int] | None]:
-        """Find the cheapest answer for the links that clingo has.
+        """Find the cheapest answer for the links that clingo has; None if a known map is as good.
 
-        Yields:
-            If the search takes long, labels that were found in other ways.
-
-        Returns:
-            The names of the nodes that clingo has; None if a known map is as good.
+        If the search takes long, labels that were found in other ways are yielded.
         """
         while True:
             names, proven = self._cheapest(self._patience)
@@ -122,11 +105,7 @@ class NameSearch:
             self._program.add(self._program.more_links())
 
     def _cheapest(self, conflicts: int) -> tuple[dict[int, int] | None, bool]:
-        """Find the best answer within a number of conflicts.
-
-        Returns:
-            The answer, or None if there is none yet; and whether it is proven to be the best.
-        """
+        """Find the best answer within a number of conflicts, and whether it is proven the best."""
         pinned = len(self._program.pinned.clique)
         answer = None
         answers = self._asker.answers(
@@ -144,10 +123,7 @@ class NameSearch:
                 return answer, bool(end.value)
 
     def _labels_by(self, names: dict[int, int]) -> list[int] | None:
-        """Return the labels of all nodes by an answer.
-
-        None if the answer is no map. Then clingo gets what it lacked.
-        """
+        """Return the labels by an answer, or give clingo what it lacked if that is no map."""
         program = self._program
         if views := program.rests(names):
             program.name_more(views)
@@ -225,9 +201,7 @@ class NameSearch:
     ) -> tuple[dict[int, int] | None, bool]:
         """Ask for an answer with fewer dstates, first for one without rests.
 
-        Returns:
-            The name of each node; None if clingo found none. And whether it proved that there is
-            none.
+        Returns the answer, if clingo found one, and whether it proved that there is none.
         """
         most = len(set(labels)) - 1 - len(self._program.pinned.clique)
         if most < 0:

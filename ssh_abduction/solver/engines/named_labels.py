@@ -60,11 +60,7 @@ WHOLE = 100_000
 
 
 class NamedLabels:
-    """Finds labels with the fewest dstates for the first steps of a trace.
-
-    Attributes:
-        size: The number of these steps.
-    """
+    """Finds labels with the fewest dstates for the first `size` steps of a trace."""
 
     def __init__(
         self,
@@ -75,12 +71,8 @@ class NamedLabels:
     ) -> None:
         """Begin without any steps.
 
-        Args:
-            task: The trace and the speed-ups that are on.
-            asker: Asks clingo.
-            given_map: The dstate of each step of the trace in a map with few dstates; empty if
-                none is known.
-            fitting: Further axioms for labels; None in the causal theory.
+        `given_map` has the dstate of each step in a map with few dstates; empty if none is known.
+        `fitting` has further axioms for labels; None in the causal theory.
         """
         self.size = 0
         self._task, self._asker, self._given_map, self._fitting = task, asker, given_map, fitting
@@ -165,10 +157,7 @@ class NamedLabels:
         self._program.give_links(links)
 
     def _first_spares(self, pinned: Pinned) -> dict[int, int]:
-        """Return the number of spare names that each view has at first.
-
-        It is the number that the given map needs and one more, but at least `SPARES`.
-        """
+        """Give each view one spare name more than the given map needs, but at least `SPARES`."""
         seen = pinned.chart.seen
         found = Counter(dict(zip(self._given_map, seen, strict=False)).values())
         taken = Counter(seen[node] for node in pinned.clique)
@@ -200,10 +189,8 @@ class NamedLabels:
     def all_of(self, dstates: int, enough: int) -> Generator[list[int], None, None]:
         """Yield each labelling with a number of dstates once. A known labelling comes first.
 
-        Args:
-            dstates: The number of dstates.
-            enough: Ask clingo for at most this many labellings; 0 for all. If this is 1 and a
-                labelling is known, clingo is not asked.
+        Clingo is asked for at most `enough` labellings; 0 for all. It is not asked if this is 1 and
+        a labelling is known.
         """
         known = self._incumbent.labels
         if known and len(set(known)) != dstates:
@@ -256,11 +243,7 @@ class NamedLabels:
                 return
 
     def _needs_rest(self, spares: int) -> bool:
-        """Look for an answer of this cost that uses a rest. If there is one, add spare names.
-
-        Args:
-            spares: The cost, as a number of spare names.
-        """
+        """Look for an answer of this cost that uses a rest. If there is one, add spare names."""
         answers = self._asker.answers(
             names_lp.read_names,
             f"enum,{spares},{spares}",

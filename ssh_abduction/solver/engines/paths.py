@@ -35,12 +35,7 @@ class Paths:
     """The axioms of places and paths, for charts of one trace."""
 
     def __init__(self, task: Task, forbidden: Sequence[Collection[Equality]]) -> None:
-        """Prepare questions about a trace.
-
-        Args:
-            task: The problem, the limits and the speed-ups.
-            forbidden: Sets of equalities of steps. In no map do all equalities of one set hold.
-        """
+        """Prepare questions. In no map do all equalities of steps of one `forbidden` set hold."""
         self._task, self._trace, self._theory = task, task.trace, task.theory
         self._forbidden = forbidden
 
@@ -81,15 +76,7 @@ class Paths:
         *,
         single: bool,
     ) -> clingo.Control:
-        """Make a control whose answers are the places and paths that fit labels.
-
-        Args:
-            chart: The chart of the nodes.
-            labels: The dstate of each node.
-            options: Options of clasp.
-            nodes: The nodes whose labels have to fit; all of them by default.
-            single: Whether to merge places and segments only if they must be one.
-        """
+        """Make a control for the places and paths of labels, as `FramedPaths.control` does."""
         control = self.control(chart, options)
         control.load_encodings("preference")
         nodes = range(len(labels)) if nodes is None else nodes
@@ -111,10 +98,7 @@ class Paths:
         return control
 
     def apart(self, chart: FramedChart) -> clingo.Control:
-        """Make a control whose answer has the pairs of nodes that are at different places.
-
-        These pairs follow from the trace alone, so they are at different places in each map.
-        """
+        """Make a control for the pairs of nodes that the trace alone puts at different places."""
         control = self.control(chart)
         control.add("base", [], paths_lp.settled_labels(enumerate(range(len(chart.seen)))))
         control.ground([("base", []), ("apart", [])])
@@ -124,10 +108,8 @@ class Paths:
 def pairwise_distinct(members: Sequence[int], pairs: Iterable[tuple[int, int]]) -> list[int]:
     """Find a large clique: a list of segments, or places, that are pairwise distinct.
 
-    Args:
-        members: All segments or places.
-        pairs: The pairs that are not one. A pair of a member with itself, which means that the
-            labels contradict the axioms, is ignored.
+    `pairs` are not one. A pair of a member with itself, which means that the labels contradict the
+    axioms, is ignored.
     """
     number = {member: i for i, member in enumerate(members)}
     rivals = np.zeros((len(members), len(members)), dtype=bool)

@@ -29,12 +29,9 @@ class Pinned:
 
     @classmethod
     def of_steps(cls, log: Log, steps: int, *, largest: bool = True) -> Pinned:
-        """Chart the first steps, and give each step of a clique a name of its own.
+        """Chart the first steps, and give each step of a largest clique a name of its own.
 
-        Args:
-            log: The trace as integers.
-            steps: The number of steps.
-            largest: Take a largest clique; if False, take only the first step.
+        If `largest` is False, only the first step gets one.
         """
         chart = Chart.of_steps(log, steps)
         clique = chart.continuations.clique() if largest else [0]

@@ -20,15 +20,10 @@ def first_accepted(
     refuse: Callable[[Answer], Reason | None],
     forbid: Callable[[Reason], None],
 ) -> Answer | None:
-    """Ask for answers until one is accepted.
+    """Ask for answers until one is accepted; None if there is no answer left.
 
-    Args:
-        ask: Returns the next answer that is not forbidden so far; None if there is none.
-        refuse: Returns the reason to reject an answer; None if it is accepted.
-        forbid: Forbids all answers that have this reason to be rejected.
-
-    Returns:
-        The first accepted answer; None if there is no answer left.
+    `refuse` returns the reason to reject an answer, if there is one, and `forbid` forbids all
+    answers with this reason.
     """
     while (answer := ask()) is not None:
         reason = refuse(answer)
@@ -45,14 +40,10 @@ def all_accepted(
     key: Callable[[Answer], Hashable],
     known: set[Hashable],
 ) -> Generator[Answer, None, None]:
-    """Yield all accepted answers, each once.
+    """Yield all accepted answers, each once, by `refuse` and `forbid` as in `first_accepted`.
 
-    Args:
-        ask: Lists all answers that are not forbidden so far.
-        refuse: Returns the reason to reject an answer; None if it is accepted.
-        forbid: Forbids all answers that have this reason to be rejected.
-        key: Returns a key that is equal for answers that are the same.
-        known: The keys of answers to leave out. The keys of accepted answers are added to it.
+    `key` is equal for answers that are the same. Answers with `known` keys are left out, and the
+    keys of accepted answers are added to them.
     """
     while True:
         reason: Reason | None = None
@@ -71,11 +62,7 @@ def all_accepted(
 
 
 def minimal_part(suffices: Callable[[list[Member]], bool], members: list[Member]) -> list[Member]:
-    """Find a minimal part of some members that still suffices.
-
-    Args:
-        suffices: Says whether some members suffice. If they do, so do more members.
-        members: Members that suffice.
+    """Find a minimal part of the members that still suffices. With more members it always does.
 
     Reference:
         Junker 2004, "QuickXplain: preferred explanations and relaxations for over-constrained

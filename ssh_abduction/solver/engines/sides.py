@@ -35,11 +35,7 @@ class FramedSides:
         self._batch = -1
 
     def extend(self, batch: int) -> None:
-        """Extend the axioms of the paths added so far to the visits of a new batch.
-
-        Args:
-            batch: The number of the batch.
-        """
+        """Extend the axioms of the paths added so far to the visits of a new batch."""
         self._batch = batch
         if self._said:
             paths = [
@@ -56,17 +52,10 @@ class FramedSides:
         labels: Sequence[int],
         standing: Mapping[int, tuple[int, int]],
     ) -> bool:
-        """Add the axioms of a path that these labels contradict.
+        """Add the axioms of a path that these labels contradict, and return whether there was one.
 
-        Args:
-            paths: The program with the axioms of places and paths.
-            chart: The chart of the nodes.
-            labels: The dstate of each node.
-            standing: For each dstate that has a node in clingo, the visit and the slot (direction)
-                of such a node.
-
-        Returns:
-            True if axioms were added; False if there is no such path without axioms.
+        `standing` has, for each dstate that has a node in clingo, the visit and the slot
+        (direction) of such a node.
         """
         contrary, twice = next(
             self._asker.answers(
@@ -86,11 +75,7 @@ class FramedSides:
         return False
 
     def _say_once(self, part: str, *arguments: int) -> bool:
-        """Ground a part of sides_framed.lp for some arguments, unless that was done before.
-
-        Returns:
-            Whether the part was grounded now.
-        """
+        """Ground a part of sides_framed.lp for arguments, and return whether that was new."""
         if (part, arguments) in self._said:
             return False
         control, batches = self._asker.control, range(self._batch + 1)

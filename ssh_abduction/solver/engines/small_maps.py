@@ -33,12 +33,7 @@ class SmallMaps:
     """Finds small maps of first steps by merging and guessing, for a search that stops early."""
 
     def __init__(self, task: Task, pinned: Pinned) -> None:
-        """Prepare for a chart.
-
-        Args:
-            task: The trace and the speed-ups that are on.
-            pinned: The chart of the first steps, each of them a node.
-        """
+        """Prepare for a chart of the first steps, each of them a node."""
         self._task, self._pinned = task, pinned
 
     def merged(self, check: Callable[[], None]) -> Iterator[list[int]]:
@@ -85,11 +80,9 @@ class SmallMaps:
         return merged_near(pinned.chart.apart(), pinned.chart.links, guess, check)
 
     def _guessed(self, pinned: Pinned, check: Callable[[], None]) -> list[int] | None:
-        """Guess the dstates of these steps.
+        """Guess the dstates of these steps, -1 if the guess is not sure.
 
-        Returns:
-            A label for each step, -1 if the guess is not sure; None if a guess would take too much
-            memory.
+        Returns None if a guess would take too much memory.
         """
         steps = pinned.chart
         chart = Chart.turned(self._task.trace, self._task.log, len(steps.seen))
@@ -111,15 +104,9 @@ class SmallMaps:
 def mended(guess: Sequence[int], chart: Chart) -> list[int]:
     """Correct a guess by a vote: what does an action at a dstate mostly lead to?
 
-    Each node gets the label to which the label and action before it mostly lead in the guess. So
-    all labels after a right one become right, if only a few were wrong.
-
-    Args:
-        guess: The label of each node, -1 if it is unknown.
-        chart: The chart of the nodes and links.
-
-    Returns:
-        The new labels. A label stays as it was if the view at the node contradicts the new one.
+    Each node gets the label to which the label and action before it mostly lead in the guess,
+    unless the view at the node contradicts it. So all labels after a right one become right, if
+    only a few were wrong. In the guess, -1 is an unknown label.
     """
     keys = [
         None if label < 0 else (view, label) for view, label in zip(chart.seen, guess, strict=True)

@@ -123,15 +123,7 @@ class StepEngine:
         return self.asker.answers(self._read, f"enum,{bound}" if bound else "ignore", 0)
 
     def map_with(self, doubts: Collection[Doubt], cost: tuple[int, ...]) -> SSHMap | None:
-        """Find a map of the prefix in which at least one of these doubts holds.
-
-        Args:
-            doubts: Each says that two steps are one in some respect, or that they are not.
-            cost: The most that the map may cost.
-
-        Returns:
-            The map; None if there is none.
-        """
+        """Find a map of the prefix, within the cost, in which one of these doubts holds."""
         found = self._doubts.answer(
             doubts, self._read, f"enum,{','.join(map(str, cost))}" if cost else "ignore"
         )
@@ -143,13 +135,9 @@ class StepEngine:
         return True
 
     def ask_for(self, number: int, count: Count) -> None:
-        """Ask only for maps with an exact number of dstates, places or paths, from now on.
+        """From now on, ask only for maps with an exact number of dstates, places or paths.
 
         The prefix must not grow any more.
-
-        Args:
-            number: The number.
-            count: What is counted: "dstates", "places" or "paths".
         """
         if self._number is not None:
             self.asker.control.release_external(further_rules.of_number(*self._number))
@@ -182,10 +170,7 @@ class StepEngine:
 def paths_needed(task: Task, size: int, cost: tuple[int, ...] | None) -> int:
     """Return how many names for paths are enough to prove a cost, and to list all maps with it.
 
-    Args:
-        task: The problem and the speed-ups.
-        size: The number of steps in the prefix.
-        cost: The cost of the maps of the prefix; None if it is unknown.
+    `cost` is that of the maps of the prefix; None if it is unknown.
     """
     theory = task.theory
     segments = readable.most_paths(task.trace, theory, size)

@@ -32,15 +32,9 @@ Turned: TypeAlias = dict[int, dict[int, int]]
 def intransitive(pairs: Sequence[Pair], fits: Set[Pair], chart: FramedChart) -> list[Three]:
     """Find the triples of visits at which an answer is not transitive.
 
-    Pairs that follow from the answer by the axioms are also checked.
-
-    Args:
-        pairs: The pairs of visits that are at one place in the answer.
-        fits: The pairs that clingo may put at one place.
-        chart: The chart of the visits, with the action that ends each of them.
-
-    Returns:
-        The triples; empty if the answer is transitive.
+    `pairs` of visits are at one place in the answer, and `fits` are those that clingo may put at
+    one place. Pairs that follow from the answer by the axioms are also checked. The chart has the
+    action that ends each visit.
     """
     found: dict[Three, None] = {}
     turned: Turned = {}
@@ -83,10 +77,6 @@ def scattered(pairs: Sequence[Pair], visits: int) -> list[Pair]:
 
     A group is all visits that pairs connect to each other. It is consistent if each two of its
     visits are a pair, and the slots of all pairs agree.
-
-    Args:
-        pairs: The pairs of visits that are at one place.
-        visits: The number of all visits.
     """
     first, second, turns = np.array(pairs, dtype=int).reshape(-1, 3).T
     group = np.arange(visits)  # for each visit, the first visit that it is paired with
@@ -117,14 +107,10 @@ def apart_yet_joined(
 ) -> list[tuple[int, tuple[int, int], tuple[int, int]]]:
     """Find triples of visits in which two pairs are at one place, but not the third pair.
 
-    Args:
-        pair: A pair of visits at one place. Each triple includes both of them.
-        turned: All pairs that are known.
-
-    Returns:
-        Triples (first, (middle, slot), (last, slot)). The middle visit is at one place with each of
-        the others. The pair of the first and the last visit is missing, or differs in its slot.
-        A slot is the one of its visit that is slot 0 of the first visit.
+    Each triple includes both visits of `pair`, which are at one place, and reads (first, (middle,
+    slot), (last, slot)). The middle visit is at one place with each of the others. The pair of the
+    first and the last visit is missing, or differs in its slot. A slot is the one of its visit that
+    is slot 0 of the first visit.
     """
     i, j, r = pair
     of_i, of_j = turned[i], turned[j]
@@ -141,10 +127,6 @@ def apart_yet_joined(
 
 
 def _in_order(*visits: tuple[int, int]) -> Three:
-    """Make a triple of three visits at one place, in their order.
-
-    Args:
-        *visits: For each visit, its number and the slot there that is slot 0 of the first argument.
-    """
+    """Sort visits at one place, each with its slot that is slot 0 of the first argument."""
     (i, a), (j, b), (k, c) = sorted(visits)
     return i, j, k, (b - a) % 4, (c - b) % 4

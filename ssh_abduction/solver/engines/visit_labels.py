@@ -66,12 +66,9 @@ class VisitLabels:
     ) -> None:
         """Begin without any steps.
 
-        Args:
-            task: The trace and the speed-ups that are on.
-            asker: Asks clingo.
-            charted: Makes a chart of this many first steps, given a chart of fewer steps or None.
-                It returns None if the steps fit no frames.
-            sides: Adds axioms of order and sides. It is called for each new control and batch.
+        `charted` makes a chart of this many first steps, given a chart of fewer steps or None, and
+        returns None if the steps fit no frames. `sides` adds axioms of order and sides to each new
+        control and batch.
         """
         self.bound: int | None = None
         self.clique: list[int] = []
@@ -100,10 +97,8 @@ class VisitLabels:
     def grow(self, size: int) -> bool:
         """Chart the first `size` steps, and give clingo their new visits.
 
-        If there are many new nodes, make a new control.
-
-        Returns:
-            True if this is done. False if the steps fit no frames; then nothing has changed.
+        If there are many new nodes, make a new control. Returns False, and changes nothing, if the
+        steps fit no frames.
         """
         if size == self.size:
             return True
@@ -146,11 +141,7 @@ class VisitLabels:
     def _give(
         self, chart: FramedChart, visits: set[int], order: Iterable[int], *, anew: bool = False
     ) -> None:
-        """Give clingo all that it lacks about these visits of a chart.
-
-        Args:
-            anew: Make a new control first.
-        """
+        """Give clingo (if `anew`, a new control) all that it lacks about these visits."""
         known = 0 if anew else len(self.program.fits)
         fits = fits_in_time(self._asker.watch, chart, visits, known)
         size, self.size = self.size, 0  # an error may leave this prefix incomplete
@@ -185,11 +176,8 @@ class VisitLabels:
     def _first_labels(self, ask: Callable[[], list[Pair] | None]) -> tuple[int, ...] | None:
         """Return the labels of all nodes by the first answer that is a map of the chart.
 
-        After any other answer, clingo gets what it lacked: rules, or visits.
-
-        Args:
-            ask: Returns the pairs of visits that are at one place in the next answer; None if
-                there is none.
+        After any other answer, clingo gets what it lacked: rules, or visits. `ask` returns the
+        pairs of visits that are at one place in the next answer.
         """
         while (pairs := ask()) is not None:
             program = self.program
@@ -219,13 +207,10 @@ class VisitLabels:
         return pairs
 
     def all_of(self, dstates: int) -> Generator[list[int], None, None]:
-        """Yield all labels with this many dstates, each once.
+        """Yield all labels with the fewest possible number of dstates, each once.
 
         Clingo gets a rule against each labelling that was found, and the same question as for the
         fewest dstates. So it soon proves that there are no others.
-
-        Args:
-            dstates: The number of dstates, the fewest possible.
         """
         program = self.program
         if self.fewest() is None or (self.bound or 0) > dstates:
@@ -258,10 +243,6 @@ class VisitLabels:
         """Exclude all labels that agree with the given ones on the nodes of some clash.
 
         To agree means that two nodes of the clash share a dstate exactly if they have one label.
-
-        Args:
-            labels: The dstate of each node.
-            clashes: Sets of nodes.
         """
         program = self.program
         clashing = {self.chart.facing[node][0] for clash in clashes for node in clash}
@@ -283,14 +264,10 @@ class VisitLabels:
     def forbid_together(
         self, pairs: Collection[tuple[int, int]], places: Collection[tuple[int, int]] = ()
     ) -> None:
-        """Exclude labels with each of `pairs` at one dstate, and each of `places` at one place.
+        """Exclude labels with all these pairs of nodes at one dstate, or at one place.
 
         If places are given, labels found before are not removed, as labels do not show which nodes
         are at one place. The search for their paths rejects them later.
-
-        Args:
-            pairs: Pairs of nodes.
-            places: Pairs of nodes.
         """
         program, facing = self.program, self.chart.facing
         apart = [(a, b) for a, b in pairs if a != b]

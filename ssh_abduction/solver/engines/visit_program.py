@@ -70,15 +70,7 @@ class VisitProgram:
     """
 
     def __init__(self, task: Task, asker: Asker, chart: FramedChart, sides: Sides) -> None:
-        """Make a control without visits.
-
-        Args:
-            task: The trace and the speed-ups that are on.
-            asker: Asks the control.
-            chart: The chart of the first steps, with their visits and nodes.
-            sides: Adds axioms of order and sides. It is called for the new control, and for each
-                batch.
-        """
+        """Make a control without visits. `sides` adds axioms to it and to each batch."""
         self.chart = chart
         self.batch = -1
         self._asker, self._trace, self._sides = asker, task.trace, sides
@@ -111,11 +103,9 @@ class VisitProgram:
     ) -> None:
         """Give clingo a new batch: all that it lacks about these visits.
 
-        Args:
-            chart: The chart with all visits and nodes.
-            visits: The visits that clingo shall have, including those that it has already.
-            order: Nodes in the order of choice. Those new to clingo come after all others.
-            fits: The pairs of these visits that may be at one place.
+        The visits include those that it has already. `order` has nodes in the order of choice;
+        those new to clingo come after all others. `fits` are the pairs of these visits that may be
+        at one place.
         """
         control, known = self._asker.control, self._known
         if self.batch >= 0:
@@ -175,15 +165,10 @@ class VisitProgram:
         return [self._pair_of[symbol] for symbol in model.symbols(shown=True)]
 
     def add_rules(self, rules: str, part: str | None = None, number: int = 0) -> None:
-        """Give clingo more rules.
+        """Give clingo more rules. If a program part is given, ground it with a number.
 
         This does not check the limits of time and memory. If it were stopped halfway, clingo might
         have relaxed an unsat core, but lack the rule that limits how many members are violated.
-
-        Args:
-            rules: The rules.
-            part: A program part to ground; None for none.
-            number: The argument of that part.
         """
         with self._asker.grounding_timed():
             name = f"told_{self._parts}"
@@ -202,13 +187,9 @@ class VisitProgram:
         return intransitive(pairs, self._known.fits, self.chart)
 
     def located(self, pairs: Iterable[Pair]) -> Located:
-        """Locate all visits of the chart by a transitive answer.
+        """Locate all visits of the chart by the pairs that are at one place in a transitive answer.
 
-        Args:
-            pairs: The pairs of visits that are at one place in the answer.
-
-        Returns:
-            The places of all visits; or, if they do not all follow, the visits needed next.
+        If the places of all visits do not follow, the visits needed next are returned.
         """
         first: dict[int, tuple[int, int]] = {}
         for i, j, r in sorted(pairs):
@@ -221,32 +202,17 @@ class VisitProgram:
         return located(self.chart, states)
 
     def labels(self, everywhere: Located) -> tuple[int, ...]:
-        """Return the dstate of each node. Dstates are numbered in the order of their first nodes.
-
-        Args:
-            everywhere: The places of all visits.
-        """
+        """Return the dstate of each node, numbered in the order of their first nodes."""
         return tuple(
             numbered(faced(everywhere.states[visit], slot) for visit, slot in self.chart.facing)
         )
 
     def standing(self, labels: Sequence[int]) -> dict[int, tuple[int, int]]:
-        """For each dstate, return the visit and slot (direction) of some node there.
-
-        Dstates without a node in clingo are left out.
-
-        Args:
-            labels: The dstate of each node.
-        """
+        """Return a visit and its slot (direction) for each dstate that has a node in clingo."""
         return {labels[node]: self.chart.facing[node] for node in self._known.place_of}
 
     def spanning(self, labels: Sequence[int], nodes: Iterable[int]) -> list[Pair]:
-        """List the pairs of visits that have to be at one place so that nodes have these labels.
-
-        Args:
-            labels: The dstate of each node.
-            nodes: The nodes.
-        """
+        """List the pairs of visits that have to be at one place so that nodes have these labels."""
         first: dict[int, int] = {}
         return [
             self.pair(other, node)
@@ -261,19 +227,10 @@ class VisitProgram:
 
 
 def fits_in_time(watch: Watch, chart: FramedChart, visits: set[int], known: int) -> frozenset[Pair]:
-    """List the pairs of some visits that may be at one place, if there is time to ground them.
+    """Return the pairs of some visits that may be at one place, as `FramedChart.fits` does.
 
-    Args:
-        watch: The limits.
-        chart: The chart of the prefix, with all its visits.
-        visits: The visits that clingo shall have.
-        known: The number of pairs that clingo has grounded already. Their time is not counted.
-
-    Returns:
-        Triples (I, J, R), as from `FramedChart.fits`.
-
-    Raises:
-        LimitError: Grounding the other pairs would take longer than the time that is left.
+    `known` pairs have been grounded already, and their time is not counted. Raises LimitError if
+    grounding the others would take longer than the time that is left.
     """
     numbers = sorted(visits)
     if len(numbers) == len(chart.stars):  # the number of pairs is known before they are listed
