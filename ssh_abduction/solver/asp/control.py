@@ -85,14 +85,11 @@ class Control(clingo.Control):
         check: Callable[[], None] = lambda: None,
         preparing: tuple[float, float] = PREPARING,
     ) -> None:
-        """Make a control without a program.
+        """Make a control without a program, with command-line options of clingo.
 
-        Args:
-            options: Command-line options of clingo.
-            check: A function that is called now and then while clingo grounds an encoding with
-                `@go_on`. If it raises an exception, the grounding ends and the control is unusable.
-            preparing: The time and the memory that clasp takes to prepare the program, as multiples
-                of what grounding took.
+        `check` is called now and then while clingo grounds an encoding with `@go_on`. If it raises
+        an exception, the grounding ends and the control is unusable. `preparing` is as in the
+        attribute.
         """
         super().__init__(["--warn=none", *options])
         self.preparing = preparing
@@ -170,10 +167,7 @@ class _GroundingCheck:
         self._next = time.perf_counter() + POLL
 
     def go_on(self, *_: clingo.Symbol) -> clingo.Symbol:
-        """Return 1, unless `check` raises.
-
-        `check` is called only every POLL seconds, as clingo may call this method millions of times.
-        """
+        """Return 1, unless `check` raises. That is called only every POLL seconds, to save time."""
         try:
             if time.perf_counter() > self._next:
                 self._check()
@@ -188,8 +182,6 @@ class Asker:
     """Lets a clingo control search for answers, under limits.
 
     Attributes:
-        control: The control. It may be replaced.
-        watch: The limits. They may be replaced.
         intact: False after an error during which clingo may have missed rules.
         ground_seconds: The seconds that clingo has grounded so far.
         solve_seconds: The seconds that clingo has solved so far.
@@ -213,10 +205,7 @@ class Asker:
 
     @property
     def grounding(self) -> Grounding:
-        """The numbers of rules and atoms in the last ended search of clingo; 0 before the first.
-
-        This takes a millisecond, as clingo returns all its statistics.
-        """
+        """The numbers of rules and atoms in the last search; 0 before. This takes a millisecond."""
         try:
             program = self.control.statistics["problem"]["lp"]
         except (RuntimeError, KeyError):  # no search has ended
@@ -284,18 +273,9 @@ class Asker:
     ) -> tuple[Answer | None, list[int] | None]:
         """Find an answer in which some literals are true, or an unsat core of these literals.
 
-        Args:
-            read: Makes a value from an answer.
-            assumed: The literals.
-            conflicts: The number of conflicts after which the search ends; -1 for no limit.
-            mode: The value of clingo's option --opt-mode.
-
-        Returns:
-            The value and None; or None and the core, a list of literals that cannot all be true.
-            Both are None if `conflicts` ended the search.
-
-        Raises:
-            LimitError: A limit is reached.
+        Returns the value that `read` makes and None; or None and the core, a list of literals that
+        cannot all be true. Both are None if `conflicts` ended the search; -1 conflicts mean no
+        limit. `mode` is clingo's option --opt-mode. Raises LimitError if a limit is reached.
         """
         with self._solving(self.control, assumed, mode, 1, "no", conflicts) as handle:
             self._has_come(handle, lambda: False)
@@ -348,11 +328,7 @@ class Asker:
     def _has_come(self, handle: clingo.SolveHandle, until: Callable[[], bool]) -> bool:
         """Wait until clingo has an answer or ends, or until `until` returns True.
 
-        Returns:
-            Whether clingo has an answer or ended; False if `until` ended the wait.
-
-        Raises:
-            LimitError: A limit is reached.
+        Returns False if `until` ended the wait. Raises LimitError if a limit is reached.
         """
         began = time.perf_counter()
         try:
@@ -369,11 +345,7 @@ class Asker:
 def mapped(
     function: Callable[[Answer], Made], answers: Generator[Answer, None, bool]
 ) -> Generator[Made, None, bool]:
-    """Yield the result of a function for each answer.
-
-    Returns:
-        What `Asker.answers` returns: whether the search was exhaustive.
-    """
+    """Yield the result for each answer. Return whether the search was exhaustive."""
     with closing(answers):
         while True:
             try:
@@ -384,11 +356,7 @@ def mapped(
 
 
 def _result(handle: clingo.SolveHandle, conflicts: int) -> clingo.SolveResult:
-    """Return the result of a search that has ended.
-
-    Raises:
-        LimitError: The search was interrupted, although it had no limit of conflicts.
-    """
+    """Return the result of a search. Raises LimitError if it was interrupted without a limit."""
     result = handle.get()
     if result.interrupted and conflicts < 0:
         raise LimitError("interrupted")
@@ -396,13 +364,7 @@ def _result(handle: clingo.SolveHandle, conflicts: int) -> clingo.SolveResult:
 
 
 def new_control(encoding: str, base: str, options: Sequence[str]) -> Control:
-    """Make a control and ground an encoding with some facts.
-
-    Args:
-        encoding: The name of the encoding.
-        base: The facts, which are added to the program part base.
-        options: Command-line options of clingo.
-    """
+    """Make a control, and ground an encoding with the facts `base` by options of clingo."""
     control = Control(options)
     control.load_encodings(encoding)
     control.add("base", [], base)

@@ -79,11 +79,9 @@ def can_be_asked(theory: Theory) -> bool:
 
 
 def keeps_own_rules(problem: Problem, ssh_map: SSHMap) -> bool:
-    """Whether a map satisfies the user's own rules. Call this only if `can_be_asked` is True.
+    """Whether a map of all steps, which satisfies all other axioms, obeys the user's own rules.
 
-    Args:
-        problem: The trace, and its theory with the rules.
-        ssh_map: A map of all steps of the trace that satisfies all other axioms.
+    Call this only if `can_be_asked` is True.
     """
     trace, theory = problem.trace, problem.theory
     if not theory.rules:

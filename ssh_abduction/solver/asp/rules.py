@@ -59,9 +59,7 @@ def check_rules(theory: Theory) -> None:
 def _check(rules: Rules, others: tuple[Rules, ...], files: tuple[str, ...]) -> None:
     """Check a file of rules. Raises TheoryError if a rule is not allowed.
 
-    Args:
-        others: Other files of rules. The file may read the predicates that they define.
-        files: The names of the encodings. The file may read the predicates that they define.
+    It may read the predicates that other files of rules define, and those of the encodings.
     """
     of_steps, known, numbers = _predicates(files)
     statements = _statements(rules)
@@ -152,12 +150,7 @@ def _check(rules: Rules, others: tuple[Rules, ...], files: tuple[str, ...]) -> N
 
 
 def read_by(rules: Rules, every: Iterable[Rules]) -> frozenset[str]:
-    """Return the names of the predicates that a file of rules reads but no file of rules defines.
-
-    Args:
-        rules: The file, which passed `check_rules`.
-        every: All files of rules.
-    """
+    """Return the predicates (names) that a file of rules reads but none of the files defines."""
     own = {
         name
         for other in every
@@ -177,12 +170,8 @@ def read_by(rules: Rules, every: Iterable[Rules]) -> frozenset[str]:
 def _statements(rules: Rules) -> list[tuple[ast.AST, str, str]]:
     """Parse a file of rules.
 
-    Returns:
-        Each statement, with the name of its program part and the parameter of that part ("" for
-        none).
-
-    Raises:
-        TheoryError: Clingo cannot read the rules, or a program part is never grounded.
+    Raises TheoryError if clingo cannot read the rules, or a program part is never grounded. Each
+    statement comes with the name of its program part and the parameter of that part ("" for none).
     """
     found: list[tuple[ast.AST, str, str]] = []
     messages: list[str] = []
@@ -242,9 +231,8 @@ def _predicates(
 ) -> tuple[frozenset[str], frozenset[str], dict[str, frozenset[int]]]:
     """Find the predicates of some encodings.
 
-    Returns:
-        The names of the predicates about steps; the names of all predicates that the encodings
-        define; and for each predicate that they define or read, its possible numbers of arguments.
+    Returns the names of those about steps; the names of all that the encodings define; and for each
+    that they define or read, its possible numbers of arguments.
     """
     of_steps = set(OF_STEPS)
     defined, numbers = set[str](), dict[str, set[int]]()

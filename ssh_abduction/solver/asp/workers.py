@@ -84,11 +84,8 @@ class Worker:
     def done(self, number: int, work: Callable[..., Any], arguments: tuple[object, ...]) -> Any:
         """Let the process call `work`. Return the result of `work`, or Lost if the process ends.
 
-        Args:
-            number: The number of the task, for Lost.
-            work: A function that can be pickled. Its last argument is a function that returns
-                whether to stop early.
-            arguments: The other arguments of `work`.
+        `number` is that of the task, for Lost. `work` can be pickled. After `arguments`, it gets a
+        function that returns whether to stop early.
         """
         self._send((work, arguments))
         output = self._process.stdout
@@ -145,14 +142,9 @@ def answers(
 ) -> Iterator[Any]:
     """Yield what `work` returns for each task, as soon as it is ready; Lost if it has no answer.
 
-    Args:
-        work: The function to call, as in `Worker.done`.
-        tasks: The arguments of `work` for each task. The first one is the number of the task.
-        processes: The number of processes that work at once.
-        stopped: Returns whether to stop. Once it returns True, no further task begins, and running
-            tasks are asked to end soon.
-        seconds: The time for a task, after which its process is killed; None for no limit.
-        patience: The seconds that a running task may take after it was asked to end.
+    `work` is as in `Worker.done`. A task has its arguments, first the number of the task. Once
+    `stopped` returns True, no further task begins, and running tasks may take `patience` seconds
+    more. `seconds` is the time for a task, after which its process is killed; None for no limit.
     """
     waiting = queue.SimpleQueue[tuple[Any, ...]]()
     for task in tasks:

@@ -15,13 +15,7 @@ from ssh_abduction.theory.theory import Theory
 
 
 def read_map(model: Model, trace: Trace, theory: Theory) -> SSHMap:
-    """Make the map that an answer set of the readable encodings describes.
-
-    Args:
-        model: The answer set. It may have only the first steps of the trace.
-        trace: The trace.
-        theory: The theory, in which no field is "auto".
-    """
+    """Make a map from an answer set of the readable encodings, perhaps of the first steps only."""
     is_at: dict[int, int] = {}
     place: dict[int, int] = {}
     course: dict[int, tuple[int, int]] = {}
@@ -58,11 +52,7 @@ def read_map(model: Model, trace: Trace, theory: Theory) -> SSHMap:
 
 
 def read_steps(model: Model) -> tuple[tuple[int, ...], tuple[int | None, ...]]:
-    """Read the dstate and the place of each step from an answer set, which may break axioms.
-
-    Returns:
-        The dstate of each step; and the place of each step, or None in a causal theory.
-    """
+    """Read the dstate and the place (or None) of each step from an answer that may break axioms."""
     found: dict[str, dict[int, int]] = {"is": {}, "at": {}}
     for name, args in map(read_atom, model.symbols(shown=True)):
         if name in found:
@@ -84,11 +74,9 @@ def _map(
 ) -> SSHMap:
     """Make a map from the atoms of an answer, which name a dstate or place by its first step.
 
-    Args:
-        course: The path and the direction of each step that is along a path.
-        heading: The heading of each step, if places have frames or gateways.
-        before: Triples of a path and two places on it, the earlier one first.
-        theory: The theory, for the costs of faults; None for a map without faults.
+    `course` has the path and the direction of each step that is along a path. `heading` has that of
+    each step, if places have frames or gateways. `before` has triples of a path and two places on
+    it, the earlier one first. The theory has the costs of faults; None for a map without faults.
     """
     views = views_of(is_at, trace, faults)
     names = sorted(set(is_at.values()))
@@ -132,13 +120,7 @@ def views_of(
 ) -> dict[int, View | None]:
     """Return the view of each dstate: the first view there that is known and not treated as wrong.
 
-    Args:
-        labels: The dstate of each step.
-        trace: The trace.
-        faults: Steps and kinds of faults.
-
-    Returns:
-        For each dstate its view, or None if it has no such view.
+    `faults` are steps and kinds. The view is None if a dstate has no such view.
     """
     misread = {t for t, kind in faults if kind == "misread"}
     views: dict[int, View | None] = dict.fromkeys(labels.values())
@@ -149,12 +131,7 @@ def views_of(
 
 
 def causal_map(labels: Sequence[int], trace: Trace) -> SSHMap:
-    """Make a causal map (without places) from labels. Dstates are numbered by first visit.
-
-    Args:
-        labels: The dstate of each step, under any number.
-        trace: The trace.
-    """
+    """Make a causal map (without places) from labels. Dstates are numbered by first visit."""
     number: dict[int, int] = {}
     first: list[int] = []
     for t, label in enumerate(labels):
@@ -171,13 +148,9 @@ def causal_map(labels: Sequence[int], trace: Trace) -> SSHMap:
 def faulty_map(
     labels: Sequence[int], trace: Trace, faults: Sequence[tuple[int, str]], theory: Theory
 ) -> SSHMap:
-    """Make a causal map with faults from labels. Dstates are numbered by first visit.
+    """Make a causal map from labels, with faults: steps and kinds, which cost what the theory says.
 
-    Args:
-        labels: The dstate of each step, under any number.
-        trace: The trace.
-        faults: Steps and kinds of faults.
-        theory: The theory, for the costs of faults.
+    Dstates are numbered by first visit.
     """
     number: dict[int, int] = {}
     found = tuple(number.setdefault(label, len(number)) for label in labels)
@@ -195,11 +168,7 @@ def faulty_map(
 def _paths(
     count: int, dstates: Iterable[DState], before: Iterable[tuple[int, int, int]]
 ) -> tuple[MapPath, ...]:
-    """Make the paths of a map, each with its places in order.
-
-    Args:
-        before: Triples of a path and two places, the earlier one first.
-    """
+    """Make paths from triples of a path and two of its places, the earlier place first."""
     on: list[set[int]] = [set() for _ in range(count)]
     for s in dstates:
         if s.path is not None and s.place is not None:
@@ -214,12 +183,7 @@ def _paths(
 
 
 def places_in_order(places: Iterable[int], before: Iterable[tuple[int, int]]) -> list[int]:
-    """Sort places by how many places come before each.
-
-    Args:
-        places: The places.
-        before: All pairs of places, the earlier one first. It is a strict order.
-    """
+    """Sort places by a strict order: `before` has all pairs of places, the earlier one first."""
     behind = dict.fromkeys(places, 0)
     for _, q in before:
         behind[q] += 1

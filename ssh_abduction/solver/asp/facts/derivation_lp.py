@@ -40,11 +40,10 @@ def conclusions_of(control: Control) -> list[Symbol]:
 
 
 def read_argument(model: Model) -> tuple[frozenset[Symbol], frozenset[Symbol], frozenset[Symbol]]:
-    """Read an answer in which axioms may be broken.
+    """Read three sets of atoms from an answer in which axioms may be broken.
 
-    Returns:
-        Three sets of atoms: the conclusions that hold; `active(N,T)` for each axiom N that is
-        broken at step T; and `same(I,T)` for each pair of steps at one dstate.
+    The sets are the conclusions that hold; `active(N,T)` for each axiom N that is broken at step T;
+    and `same(I,T)` for each pair of steps at one dstate.
     """
     conclusions, broken, one = set[Symbol](), set[Symbol](), set[Symbol]()
     for symbol in model.symbols(atoms=True):

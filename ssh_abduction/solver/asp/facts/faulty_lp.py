@@ -20,8 +20,7 @@ from ssh_abduction.theory.evidence import Equality, Pairs
 def faulty_names(names: Mapping[int, int]) -> Iterator[tuple[int, int]]:
     """Yield all names, each with its view. The last one of each view is its rest.
 
-    Args:
-        names: For each view, the number of its names without the rest.
+    `names` has, for each view, the number of its names without the rest.
     """
     first = 0
     for view, count in names.items():
@@ -42,12 +41,7 @@ def at_most_faults(most: int) -> str:
 
 
 def dstates_and_faults_up_to(dstates: int, tenths: int) -> str:
-    """Return the rules that limit the number of dstates and the cost of faults.
-
-    Args:
-        dstates: The greatest number of dstates.
-        tenths: The greatest cost of all faults, in tenths of a dstate.
-    """
+    """Return rules that limit the number of dstates, and the cost of all faults in tenths."""
     faults = (
         "W,T,misread : misreads(T), price(misread,T,W); W,T,slipped : slips(T), price(slipped,T,W)"
     )
@@ -60,10 +54,8 @@ def dstates_and_faults_up_to(dstates: int, tenths: int) -> str:
 def faulty_base(actions: Iterable[int], names: Mapping[int, int], kinds: Iterable[str]) -> str:
     """Return the facts for the names, the actions and the allowed kinds of faults.
 
-    Args:
-        actions: The actions as numbers.
-        names: For each view, the number of its names without the rest.
-        kinds: The kinds of faults that are allowed: "misread", "slipped".
+    Actions are numbers. `names` has, for each view, the number of its names without the rest.
+    `kinds` are of "misread" and "slipped".
     """
     found = [f"action({action})." for action in sorted(set(actions))]
     found += [f"allowed({kind})." for kind in kinds]
@@ -87,15 +79,10 @@ def faulty_batch(
 ) -> str:
     """Return the facts for a batch: some further steps of a trace.
 
-    Args:
-        batch: The number of the batch.
-        seen: The view of each step of the trace, as a number.
-        actions: The action after each step, as a number.
-        steps: The steps of this batch, in the order in which they are given.
-        known: The steps of earlier batches, in their order.
-        pairs: Evidence about pairs of steps.
-        price: For each kind of fault, its cost at each step, in tenths of a dstate.
-        full: Steps for which an answer says at which dstate they are, even if they are misread.
+    `seen` has the view of each step, and `actions` the action after it, as numbers. `steps` are
+    those of this batch, and `known` those of earlier ones, in the order in which they are given.
+    `price` has, for each kind of fault, its cost at each step, in tenths of a dstate. At `full`
+    steps an answer names the dstate even if they are misread.
     """
     given = {*known, *steps}
     new = set(steps)
@@ -132,9 +119,8 @@ def not_all_one(equalities: Collection[Equality]) -> str:
 def read_faulty(model: Model) -> tuple[dict[int, int], frozenset[int], frozenset[int]]:
     """Read an answer of faulty.lp.
 
-    Returns:
-        A dict from steps to the names of their dstates; the steps whose action slipped; and the
-        misread steps whose dstate is left open.
+    Returns the names of the dstates of steps; the steps whose action slipped; and the misread steps
+    whose dstate is left open.
     """
     where: dict[int, int] = {}
     steps: dict[str, set[int]] = {"slips": set(), "lost": set()}

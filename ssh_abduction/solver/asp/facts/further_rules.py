@@ -23,12 +23,7 @@ def are_one(first: int, second: int) -> Symbol:
 
 
 def forbidden_equalities(equalities: Iterable[Equality], where: Symbol | None = None) -> str:
-    """Return the rule that some equalities of steps do not all hold.
-
-    Args:
-        equalities: The equalities.
-        where: The rule applies only if this atom is true. None if it always applies.
-    """
+    """Return the rule that equalities of steps do not all hold, or only if `where` is true."""
     atoms = [str(where)] if where else []
     for e in equalities:
         if e.of == "displacement":
@@ -45,15 +40,11 @@ def rests_on(axiom: str, t: int, other: str) -> str:
 
 
 def doubt(number: int, part: int, condition: str | None, *, one: bool) -> str:
-    """Return the rules for a doubt about two things, such as two steps.
+    """Return the rules of a program part for a doubt whether two things, such as steps, are one.
 
-    If the doubt is open and true in an answer, `some_doubt` is true.
-
-    Args:
-        number: The number of the doubt.
-        part: The number of the program part that the rules are for.
-        condition: The body of a rule that holds if the two things are one; None if they never are.
-        one: Whether the doubt is that the two things are one. If False, that they are not.
+    If the doubt is open and true in an answer, `some_doubt` is true. `condition` is the body of a
+    rule that holds if the two things are one; None if they never are. The doubt is that they are
+    one or, if `one` is False, that they are not.
     """
     rules = [f"#external {open_doubt(number)}."]
     rules += (
@@ -82,11 +73,8 @@ def doubts_before(part: int) -> str:
 def steps_are_one(sort: str, i: int, j: int) -> str:
     """Return the body of a rule that holds if two steps share a dstate, place, path or course.
 
-    Args:
-        sort: What they share: "dstates", "places", "paths" or "courses".
-        i: The earlier step.
-        j: The later step. For "paths" it may be the same step: then the body holds if the step is
-            along a path.
+    `sort` is "dstates", "places", "paths" or "courses", and step `i` the earlier one. For "paths"
+    both may be one step: then the body holds if the step is along a path.
     """
     return {
         "dstates": f"same({i},{j})",
@@ -107,12 +95,7 @@ def some_doubt(part: int) -> Symbol:
 
 
 def exactly(number: int, count: Count) -> str:
-    """Return the rule that a map has this many dstates, places or paths, if `of_number` is true.
-
-    Args:
-        number: The number.
-        count: What is counted: "dstates", "places" or "paths".
-    """
+    """Return the rule that a map has this many dstates, places or paths, if `of_number` is true."""
     counted = {
         "dstates": "T : is(T,T)",
         "places": "T : at(T,T)",

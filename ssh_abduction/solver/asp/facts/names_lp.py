@@ -24,11 +24,9 @@ def name_facts(
 ) -> str:
     """Return the facts that hold for all batches.
 
-    Args:
-        names: Pairs of a name and its view.
-        spares: For each view its spare names; the last one is the rest.
-        links: Triples of a node, an action, and the node that the action leads to.
-        choices: For each node, the names that it can have.
+    `names` are pairs of a name and its view. `spares` has the spare names of each view; the last
+    one is the rest. `links` are triples of a node, an action, and the node that it leads to.
+    `choices` has the names that each node can have.
     """
     view_of = dict(names)
     rests = {spare[-1] for spare in spares}
@@ -62,12 +60,9 @@ def batch_facts(
 ) -> str:
     """Return the facts for one batch of nodes.
 
-    Args:
-        batch: The number of the batch.
-        nodes: For each node, its number, its view, the names that it can have, and the last node of
-            that view that was given before; None if there is no such node.
-        links: Triples of a node, an action, and the node that the action leads to.
-        apart: Pairs of nodes that are different dstates.
+    Each node has its number, its view, the names that it can have, and the last node of that view
+    that was given before, or None. `links` are triples of a node, an action, and the node that it
+    leads to. Nodes that are `apart` are different dstates.
     """
     facts = []
     for t, view, names, before in nodes:
@@ -96,10 +91,7 @@ def read_names(model: Model) -> dict[int, int]:
 
 @lru_cache(maxsize=2**16)
 def _named(symbol: Symbol) -> tuple[int, int]:
-    """Read a step and its name from an atom.
-
-    Results are cached, as successive answers share most atoms.
-    """
+    """Read a step and its name from an atom. This is cached, as answers share most atoms."""
     step, name = symbol.arguments
     return step.number, name.number
 
@@ -108,11 +100,8 @@ class NameReader:
     """Reads answers of names.lp, if clingo was given all links of a trace.
 
     It reads only where actions lead, and follows the trace along these links. This takes fewer
-    calls of clingo than reading the name of each step.
-
-    Args:
-        actions: The action after each step but the last, as a number.
-        choices: For each step, the names that it can have.
+    calls of clingo than reading the name of each step. `actions` has the action after each step but
+    the last, as a number, and `choices` the names that each step can have.
     """
 
     def __init__(self, actions: Sequence[int], choices: Sequence[Sequence[int]]) -> None:
@@ -153,14 +142,7 @@ class NameReader:
 
 
 def not_together(number: int, pairs: Sequence[tuple[int, int]]) -> str:
-    """Return the rules that forbid that all of some pairs of steps are one dstate.
-
-    Two steps at a rest do not count as one dstate.
-
-    Args:
-        number: A number that no other such rule has.
-        pairs: Pairs of steps that clingo was given.
-    """
+    """Return rules against answers with each of these pairs at one dstate that is not a rest."""
     together = [
         f"together({number},{k}) :- is({i},S), is({j},S), not rest(S)."
         for k, (i, j) in enumerate(pairs)
@@ -175,9 +157,8 @@ def forbidden_links(
 ) -> str:
     """Return the rule that some links do not all hold while some steps are at certain dstates.
 
-    Args:
-        links: Triples of a name, an action, and the name that it leads to.
-        placed: Pairs of a step and the name of its dstate.
+    Links are triples of a name, an action, and the name that it leads to. `placed` are pairs of a
+    step and the name of its dstate.
     """
     body = [f"goes({s},{a},{x})" for s, a, x in links] + [f"is({t},{s})" for t, s in placed]
     return f":- {', '.join(body)}."

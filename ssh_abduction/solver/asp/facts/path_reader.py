@@ -84,13 +84,8 @@ class PathReader:
     def condition(self, sort: str, i: int, j: int) -> str | None:
         """Return the body of a rule that holds if two dstates share a place, path or course.
 
-        Args:
-            sort: "places", "paths" or "courses".
-            i: The number of one dstate.
-            j: The number of the other.
-
-        Returns:
-            The body; None if they never share one, as a dstate is along no path.
+        `sort` is "places", "paths" or "courses". Returns None if they never share one, as a dstate
+        is along no path.
         """
         if sort == "places":
             return f"at({self._dstates[i][1]},P,_), at({self._dstates[j][1]},P,_)"

@@ -27,12 +27,7 @@ def paths_framed_facts(
 ) -> str:
     """Return the facts for paths_framed.lp about the nodes of a chart: turns, travels and evidence.
 
-    Args:
-        trace: The trace.
-        theory: The theory, in which no field is "auto".
-        chart: The chart of the trace or of its first steps.
-        forbidden: Sets of equalities of steps. Evidence says that the equalities of a set do not
-            all hold.
+    The equalities of steps in a `forbidden` set do not all hold, as evidence says.
     """
     unlinked = {
         chart.node_of[t]
@@ -67,14 +62,10 @@ def paths_frameless_facts(
 ) -> str:
     """Return the facts for paths_frameless.lp about dstates and their links.
 
-    Args:
-        theory: The theory, in which no field is "auto".
-        dstates: The numbers of the dstates.
-        links: Triples of a dstate, the number of an action, and the dstate that it leads to.
-        actions: The actions by number.
-        far: Sets of pairs of dstates. In each set, at least one pair is at different places.
-        single: Whether to merge only those places, and those segments of paths, that the axioms
-            force to be one. This is solved faster.
+    `links` are triples of a dstate, the number of an action, and the dstate that it leads to. In
+    each set of `far`, at least one pair of dstates is at different places. If `single`, only those
+    places, and those segments of paths, are merged that the axioms force to be one. This is solved
+    faster.
     """
     facts = [
         sides_framed_facts(theory),
@@ -98,9 +89,8 @@ def paths_frameless_facts(
 def read_contrary(model: Model) -> tuple[list[int], list[int]]:
     """Read the dstates that show that the labels have no places and paths.
 
-    Returns:
-        A dstate of each segment that shows it, the shortest segment first; and the dstates at which
-        two paths cross, if the paths seem to meet again.
+    These are one of each segment that shows it, the shortest segment first; and those at which two
+    paths cross, if the paths seem to meet again.
     """
     atoms = list(map(read_atom, model.symbols(shown=True)))
     contrary = sorted((args[1], args[0]) for name, args in atoms if name == "contrary")
@@ -117,15 +107,9 @@ def settled_facts(
     *,
     single: bool = False,
 ) -> str:
-    """Return the facts for paths_framed.lp about the labels of some nodes.
+    """Return the facts for paths_framed.lp about the labels of some nodes of a chart.
 
-    Args:
-        theory: The theory, in which no field is "auto".
-        chart: The chart of the nodes.
-        labels: The dstate of each node.
-        nodes: The nodes whose labels to use.
-        single: Whether to merge only those places, and those segments of paths, that the axioms
-            force to be one. This is solved faster.
+    `single` is as in `paths_frameless_facts`.
     """
     facts = [
         settled_labels((node, labels[node]) for node in nodes),
@@ -142,10 +126,8 @@ def settled_facts(
 def stretch_facts(trace: Trace, theory: Theory, labels: Iterable[int]) -> str:
     """Return the facts that say on which stretch, between two rides in lifts, each dstate is.
 
-    Args:
-        trace: The trace.
-        theory: The theory. If it lets a path lead to another floor, there are no such facts.
-        labels: The dstate of each step, or of each of the first steps.
+    There are none if the theory lets a path lead to another floor. `labels` has the dstate of each
+    of the first steps, or of all.
     """
     if "path_on_one_floor" not in theory.axioms:
         return ""
@@ -229,11 +211,7 @@ def read_elsewhere(model: Model) -> list[tuple[int, int]]:
 
 
 def settled_labels(labels: Iterable[tuple[int, int]]) -> str:
-    """Return the facts that give some nodes their dstates.
-
-    Args:
-        labels: Pairs of a node and its dstate.
-    """
+    """Return the facts that give nodes their dstates, from pairs of both."""
     return "\n".join(f"is({node},{label})." for node, label in labels)
 
 
@@ -241,9 +219,6 @@ def open_labels(labels: Sequence[int]) -> str:
     """Return the rules that let clingo keep or drop the label of each node.
 
     An answer is a set of kept labels that no places and paths fit.
-
-    Args:
-        labels: The dstate of each node.
     """
     return "\n".join(
         [

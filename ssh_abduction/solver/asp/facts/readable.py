@@ -29,12 +29,7 @@ def encoding_names(theory: Theory) -> tuple[str, ...]:
 
 
 def theory_facts(theory: Theory, paths: int) -> str:
-    """Return the facts for a theory: its axioms, its preference, and names for paths.
-
-    Args:
-        theory: The theory, in which no field is "auto".
-        paths: The number of names for paths.
-    """
+    """Return the facts for a theory: axioms, preference, and this many names for paths."""
     facts = [f"axiom({name})." for name in theory.axioms]
     facts += [f"path(1..{paths})."] if theory.level == "topological" else []
     facts += preferred(theory)
@@ -65,12 +60,7 @@ def most_paths(trace: Trace, theory: Theory, steps: int) -> int:
     """Return the greatest number of paths that a map of the first steps can have.
 
     A path can begin only at the first step of a drive, and where a turn right or left, a lift, or
-    an action that slipped ends.
-
-    Args:
-        trace: The trace.
-        theory: The theory. If it lacks some axioms, there may be a path for each step.
-        steps: The number of first steps.
+    an action that slipped ends. If the theory lacks some axioms, there may be a path for each step.
     """
     if TRAVELS_AND_TURNS & theory.given_up:
         return steps

@@ -15,13 +15,7 @@ _DIRECTION = {1: "pos", -1: "neg"}
 
 
 def region_facts(ssh_map: SSHMap, trace: Trace, axioms: Collection[str]) -> str:
-    """Return the facts for regions.lp.
-
-    Args:
-        ssh_map: A map with places.
-        trace: The trace, which tells travels and turns.
-        axioms: The names of the axioms that hold, of the theory and of regions.lp.
-    """
+    """Return the facts for regions.lp about a map with places, with the axioms that hold."""
     actions = {action.name: action for action in trace.actions}
     facts = [f"axiom({name})." for name in sorted(axioms)]
     for s in ssh_map.dstates:
@@ -42,11 +36,7 @@ def region_facts(ssh_map: SSHMap, trace: Trace, axioms: Collection[str]) -> str:
 
 
 def members_in(control: Control) -> dict[Reason, set[int]]:
-    """Return the places of each region, by the reason that makes them a region.
-
-    Args:
-        control: A control that has grounded regions.lp. Grounding decides all its atoms.
-    """
+    """Return the places of each region by its reason, from a control that grounded regions.lp."""
     members: dict[Reason, set[int]] = {}
     reasons: dict[Symbol, Reason] = {}
     for atom in control.symbolic_atoms.by_signature("member", 2):

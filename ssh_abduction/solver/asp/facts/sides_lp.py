@@ -21,12 +21,7 @@ def sides_framed_facts(theory: Theory) -> str:
 
 
 def sides_frameless_facts(theory: Theory, actions: Mapping[int, Action]) -> str:
-    """Return the facts for sides_frameless.lp: the kind of each action, and the axioms about sides.
-
-    Args:
-        theory: The theory.
-        actions: The actions by number.
-    """
+    """Return the facts for sides_frameless.lp: kinds of actions, and the axioms about sides."""
     kinds = [
         f"turns({a},{action.turn})." if action.turn else f"travels({a})."
         for a, action in actions.items()
@@ -38,13 +33,9 @@ def sides_frameless_facts(theory: Theory, actions: Mapping[int, Action]) -> str:
 def turn_facts(
     batch: int, chart: FramedChart, visits: Iterable[int], turns: Iterable[tuple[int, str, int]]
 ) -> str:
-    """Return the facts for sides_framed.lp about the visits and the turns of one batch.
+    """Return the facts for sides_framed.lp about the new visits and the turns of one batch.
 
-    Args:
-        batch: The number of the batch.
-        chart: The chart of the visits.
-        visits: The new visits.
-        turns: The new turns: triples of a node, the direction of the turn, and the node after it.
+    Turns are triples of a node, the direction of the turn, and the node after it.
     """
     facts = [f"visit({batch},{visit})." for visit in visits]
     for s, turn, x in turns:

@@ -24,14 +24,10 @@ def visit_facts(
 ) -> str:
     """Return the facts for one batch.
 
-    Args:
-        batch: The number of the batch.
-        nodes: For each node (the steps of a visit that face one slot), its number, visit and slot.
-        leaves: For each visit that ends, the visit, the slot that it leaves through, and the
-            action.
-        fits: Pairs of visits (I, J, R) that may be at one place.
-        unfit: Pairs (I, J, R) of earlier batches that are now known not to be at one place.
-        joined: Pairs (I, J, R) that the user says are at one place.
+    Each node (the steps of a visit that face one slot) has its number, visit and slot. `leaves` has
+    each visit that ends, with the slot that it leaves through, and the action. Pairs of visits read
+    (I, J, R): `fits` may be at one place, `unfit` of earlier batches are now known not to be, and
+    `joined` are, as the user says.
     """
     new = {"node": nodes, "leaves": leaves, "fits": fits, "unfit": unfit, "joined": joined}
     return "\n".join(
@@ -53,21 +49,15 @@ def listing_atom(batch: int) -> Symbol:
 
 
 def first(place: int) -> Symbol:
-    """Return the atom that says that a node is the first at its dstate.
-
-    Args:
-        place: The number of the node, which is its position in the order of nodes.
-    """
+    """Return the atom that the node at an index in the order of nodes is first at its dstate."""
     return Function("first", number_symbols(place))
 
 
 def three_facts(batch: int, threes: Iterable[tuple[int, ...]]) -> str:
     """Return the facts for triples of visits for which "is at one place" has to be transitive.
 
-    Args:
-        batch: The number of the program part. Each call has a new one.
-        threes: Tuples (I, J, J2, R, Q): the pairs (I, J, R) and (J, J2, Q) imply that I and J2 are
-            at one place.
+    Each call has a new `batch`. In a triple (I, J, J2, R, Q), the pairs (I, J, R) and (J, J2, Q)
+    imply that I and J2 are at one place.
     """
     return "\n".join(f"via({batch},{','.join(map(str, three))})." for three in threes)
 
@@ -77,12 +67,10 @@ def forbidden_pairs(
     different: Iterable[tuple[int, int, int]] = (),
     listed: int | None = None,
 ) -> str:
-    """Return the rule that forbids answers with all pairs of one set and none of another set.
+    """Return the rule against answers with all of `pairs` and none of `different` at one place.
 
-    Args:
-        pairs: Pairs (I, J, R) that are all at one place in the forbidden answers.
-        different: Pairs (I, J, R) that are not at one place in the forbidden answers.
-        listed: The rule applies only while answers up to this batch are listed; None for always.
+    Pairs of visits read (I, J, R). The rule applies only while answers up to the batch `listed` are
+    listed; None for always.
     """
     body = [
         *(f"same({i},{j},{r})" for i, j, r in pairs),
@@ -94,8 +82,6 @@ def forbidden_pairs(
 def forbidden_places(equalities: Sequence[Sequence[tuple[int, int, int]]]) -> str:
     """Return the rules that some equalities do not all hold.
 
-    Args:
-        equalities: For each equality, pairs of visits (I, J, R). The equality holds if one of its
-            pairs is at one place.
+    Each equality has pairs of visits (I, J, R), and holds if one of them is at one place.
     """
     return "\n".join(forbidden_pairs(pairs) for pairs in product(*equalities))
