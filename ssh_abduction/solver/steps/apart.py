@@ -59,11 +59,9 @@ class Continuations:
     ) -> None:
         """Sort the steps of a trace.
 
-        Args:
-            seen: The view at each step, as a number.
-            actions: The action after each step but the last, numbered from 0.
-            excluded: Pairs of steps that evidence says are different dstates. If the same actions
-                lead from two steps to such a pair, these two are different dstates, too.
+        `seen` has the view at each step, and `actions` the action after each but the last, as
+        numbers from 0. `excluded` are pairs of steps that evidence says are different dstates. If
+        the same actions lead from two steps to such a pair, these two are different dstates, too.
         """
         shown, done = np.asarray(seen), np.append(np.asarray(actions, dtype=int), -1) + 1
         steps = len(shown)
@@ -146,11 +144,7 @@ def _spread(excluded: Collection[tuple[int, int]], done: NDArray[np.int_]) -> Ma
     """Find all pairs of steps that are different dstates by evidence, as a matrix, steps x steps.
 
     A pair is different if it is excluded, or if the same actions at both steps lead to an excluded
-    pair.
-
-    Args:
-        excluded: The pairs that evidence names.
-        done: The action after each step, numbered from 1; 0 for the last step.
+    pair. `done` has the action after each step, numbered from 1; 0 for the last step.
     """
     found = np.zeros((len(done), len(done)), dtype=bool)
     first, second = np.array(list(excluded)).T
@@ -175,12 +169,9 @@ class _Clique:
     group: int
 
     def joined(self, other: _Clique, *, apart: bool) -> _Clique:
-        """Return a largest clique of the union of two groups.
+        """Return a largest clique of the union of this group and another one.
 
-        Args:
-            other: A largest clique of the other group.
-            apart: Whether each step of one group is apart from each step of the other. If False, no
-                such pair is apart.
+        If `apart`, each step of one group is apart from each step of the other. If not, none is.
         """
         group = self.group + other.group
         if apart:
@@ -201,10 +192,7 @@ def clique(apart: Matrix, seen: Sequence[int]) -> list[int]:
     """Find a large clique of nodes greedily: a sorted list of nodes that are pairwise apart.
 
     Nodes with different views are always apart. So grow a clique for each view and join them.
-
-    Args:
-        apart: Which nodes are apart, as a matrix of nodes x nodes.
-        seen: The view of each node, as a number.
+    `apart` is a matrix of nodes x nodes.
     """
     shown = np.asarray(seen)
     found: list[int] = []
@@ -215,10 +203,7 @@ def clique(apart: Matrix, seen: Sequence[int]) -> list[int]:
 
 
 def large_clique(apart: Matrix) -> list[int]:
-    """Grow a clique greedily from each node, and return the largest one, sorted.
-
-    This is for few nodes. `apart` is a matrix of nodes x nodes.
-    """
+    """Grow a clique greedily from each of a few nodes, and return the largest, sorted."""
     random = np.random.default_rng(0)
     found = [_grown(apart, [node], random) for node in range(len(apart))]
     largest: list[int] = max(found, key=len, default=[])
@@ -240,12 +225,9 @@ def _greedy_clique(apart: Matrix) -> list[int]:
 
 
 def _grown(apart: Matrix, kept: list[int], random: np.random.Generator) -> list[int]:
-    """Grow a clique from some nodes until no node can be added.
+    """Grow a clique from the nodes `kept`, which are pairwise apart, until no node can be added.
 
     Each time add the candidate that is apart from the most other candidates. Chance breaks ties.
-
-    Args:
-        kept: The nodes to begin with, which are pairwise apart.
     """
     left = np.flatnonzero(apart[kept].all(axis=0)) if kept else np.arange(len(apart))
     found = list(kept)

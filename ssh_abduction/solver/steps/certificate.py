@@ -140,11 +140,7 @@ class Basis:
 
 
 def _word(trace: Trace, i: int, j: int) -> tuple[str, ...]:
-    """Return the names of the actions that lead from both steps i and j to different views.
-
-    Raises:
-        SolverError: No sequence of actions does that.
-    """
+    """Return actions that lead from both steps to different views; SolverError if none do."""
     word: list[str] = []
     while True:
         here, there = trace.steps[i + len(word)], trace.steps[j + len(word)]

@@ -80,14 +80,10 @@ class Chart:
         return Continuations(self.seen, [action for _, action, _ in self.links], self.excluded)
 
     def is_map(self, labels: Sequence[int]) -> bool:
-        """Whether labels make a causal map.
+        """Whether labels make a causal map. They do not if one is unknown, which is negative.
 
         Each dstate must have one observation, each action at a dstate must lead to one dstate, and
         the nodes of an excluded pair must have different labels.
-
-        Args:
-            labels: The dstate of each node, negative if unknown. With an unknown dstate the result
-                is False.
         """
         view: dict[int, int] = {}
         leads: dict[tuple[int, int], int] = {}
@@ -109,22 +105,18 @@ class Chart:
         """Make the chart of the first `size` steps of a trace without stars, as if it had frames.
 
         The observations ahead, right, back and left are used instead of a star (the openings seen).
-        This is a guess, as turns need not rotate the robot in the causal theory.
-
-        Returns:
-            The chart; None if `around` finds no views, or if some visit contradicts them.
+        This is a guess, as turns need not rotate the robot in the causal theory. Returns None if
+        `around` finds no views, or if some visit contradicts them.
         """
         around = Chart.around(trace, log, size)
         return None if around is None else Chart.framed(trace, log, size, around)
 
     @staticmethod
     def around(trace: Trace, log: Log, size: int) -> dict[int, list[int]] | None:
-        """For each observation, find the four observations that a robot makes by turning there.
+        """For each observation, find those that a robot makes ahead, right, back and left there.
 
-        Returns:
-            For each observation, the observations ahead, right, back and left. None if some action
-            is neither turn nor travel, if a turn leads from one observation to two different ones,
-            or if some of the four observations are unknown.
+        Returns None if some action is neither turn nor travel, if a turn leads from one observation
+        to two different ones, or if some of the four observations are unknown.
         """
         # For an observation and a number of quarters clockwise: the observation after that turn.
         after: dict[tuple[int, int], int] = {}
@@ -155,17 +147,11 @@ class Chart:
         size: int | None = None,
         around: Mapping[int, Sequence[int]] | None = None,
     ) -> FramedChart | None:
-        """Make the chart of the first steps, for places with frames.
+        """Make the chart of the first steps, or of all, for places with frames.
 
-        Args:
-            trace: The trace.
-            log: The same trace as integers.
-            size: The number of steps; all by default.
-            around: For each observation, the four observations ahead, right, back and left of a
-                robot that makes it. They replace the stars of the trace. None to use the stars.
-
-        Returns:
-            The chart; None if some visit contradicts itself, so that there is no map with frames.
+        `around` has, for each observation, the four observations ahead, right, back and left of a
+        robot that makes it. They replace the stars of the trace. Returns None if some visit
+        contradicts itself, so that there is no map with frames.
         """
         size = len(trace) if size is None else size
         node: dict[tuple[int, int], int] = {}
@@ -287,14 +273,10 @@ class FramedChart(Chart):
         return np.cumsum([0, *np.count_nonzero(np.triu(~self.misfits, 1), axis=(0, 1))])
 
     def fits(self, visits: Sequence[int]) -> list[tuple[int, int, int]]:
-        """List the pairs of some visits that may be at one place.
+        """List the pairs of some visits, given in order, that may be at one place.
 
-        Args:
-            visits: The visits, in order.
-
-        Returns:
-            Triples (I, J, R) with I < J: visits I and J may be at one place, and then slot 0 of I
-            is slot R of J.
+        A triple (I, J, R) with I < J means: visits I and J may be at one place, and then slot 0 of
+        I is slot R of J.
         """
         import numpy as np
 
@@ -363,12 +345,8 @@ def numbered(labels: Iterable[Hashable]) -> list[int]:
 def _views_around(seen: int, after: Mapping[tuple[int, int], int]) -> list[int] | None:
     """Find the observations ahead, right, back and left of a robot that makes an observation.
 
-    Args:
-        seen: The observation ahead.
-        after: For (observation, quarters clockwise), the observation after that turn.
-
-    Returns:
-        Four observations; None if some of them are unknown, or if turns contradict each other.
+    `after` has, for (observation, quarters clockwise), the observation after that turn. Returns
+    None if some are unknown, or if turns contradict each other.
     """
     views = {0: seen}
     waiting = [0]

@@ -26,15 +26,7 @@ def faults_of(
     trace: Trace,
     theory: Theory,
 ) -> tuple[Fault, ...]:
-    """Make the faults of a map.
-
-    Args:
-        faults: Pairs of a step and a kind of fault.
-        labels: The dstate of each step.
-        views: The view of each dstate.
-        trace: The trace.
-        theory: The theory, for the costs of faults.
-    """
+    """Make the faults of a map from pairs of a step and a kind, with the costs of the theory."""
     found = []
     for t, kind in sorted(faults):
         cost = theory.fault_tenths(kind, trace.steps[t]) / 10
@@ -58,12 +50,8 @@ def links_of(
 ) -> tuple[tuple[int, str, int], ...]:
     """List the distinct links (dstate, action, dstate) that labels make, sorted.
 
-    An action that slipped makes no link, nor does the start of a drive.
-
-    Args:
-        labels: The dstate of each step.
-        trace: The trace.
-        faults: Pairs of a step and a kind of fault.
+    An action that slipped makes no link, nor does the start of a drive. `labels` has the dstate of
+    each step. `faults` are pairs of a step and a kind.
     """
     none = {t for t, kind in faults if kind == "slipped"}
     none |= {t for t, action in enumerate(trace.actions) if action.starts}
@@ -81,13 +69,8 @@ def view_at(trace: Trace, step: int) -> str | int:
 def with_changes(ssh_map: SSHMap, trace: Trace, theory: Theory) -> SSHMap | None:
     """Add a fault of kind "changed" to a map for each gateway that differs between drives.
 
-    Args:
-        ssh_map: A map of the first steps of the trace, with the heading of each dstate as a slot.
-        trace: The trace.
-        theory: The theory. If it allows no changes, the map is returned as it is.
-
-    Returns:
-        The map; None if a gateway differs within a drive.
+    The map, of the first steps, has the heading of each dstate as a slot. It is returned as it is
+    if the theory allows no changes. Returns None if a gateway differs within a drive.
     """
     if not theory.changed:
         return ssh_map
@@ -155,12 +138,7 @@ def with_compass(ssh_map: SSHMap) -> SSHMap:
 
 
 def turned_to_frame(openings: tuple[bool, ...], heading: int) -> tuple[bool, ...]:
-    """Turn openings seen ahead, right, back and left into slots of the place.
-
-    Args:
-        openings: The openings.
-        heading: The slot that the robot faces.
-    """
+    """Turn openings ahead, right, back and left into slots of a place, given the slot ahead."""
     return tuple(openings[(slot - heading) % 4] for slot in range(len(openings)))
 
 
@@ -169,12 +147,6 @@ def with_faults(ssh_map: SSHMap, trace: Trace, mended: Trace, theory: Theory) ->
 
     Each dstate gets the view that most of its steps have, weighted by the cost of a wrong view.
     The steps at which the map differs from the trace become its faults.
-
-    Args:
-        ssh_map: The map of the mended trace.
-        trace: The trace itself.
-        mended: The mended trace.
-        theory: The theory, with the costs of faults.
     """
     votes: dict[int, Counter[View]] = {}
     for label, step in zip(ssh_map.dstate_at, trace.steps, strict=True):

@@ -37,11 +37,8 @@ WAYS = {"alike": 0, "opposite": 180}  # the rotation of each way, in degrees
 class Frames:
     """The stars and frames of a trace, numbered in the order of the first steps that see them.
 
-    Args:
-        trace: The trace.
-        stop: Use only this many first steps; None for all.
-        changes: Whether gateways may change between drives. Then a star has more frames, with
-            gateways that are closed on its drive.
+    Only the first `stop` steps are used; None for all. With `changes`, gateways may change between
+    drives. Then a star has more frames, with gateways that are closed on its drive.
 
     Attributes:
         stars: The number of the star of each step.
@@ -79,13 +76,8 @@ class Frames:
 def rotation_bits(first: Frame, then: Frame, shift: int) -> int:
     """Find the rotations by which the robot may have turned between two frames at one place.
 
-    Args:
-        first: The earlier frame.
-        then: The later frame, with the same number of slots.
-        shift: Slot K of `then` is slot K + shift of `first`.
-
-    Returns:
-        A set of rotations as an integer: bit R is 1 if R degrees clockwise are in the set.
+    The frames have the same number of slots, and slot K of `then` is slot K + shift of `first`. In
+    the set of rotations, an integer, bit R is 1 if R degrees clockwise are in the set.
     """
     n = first.slots
     found = FULL
@@ -102,14 +94,9 @@ def may_face(first: Frame, then: Frame, shift: int) -> list[str]:
     """List how the robot may face in the later frame, compared to the earlier one.
 
     Slots that the trace declares opposite belong to one path, at any angle. So the robot may face
-    the same way if it faces the same direction of such a path in both frames, and the opposite way
-    if it faces opposite directions of it.
-
-    Arguments are as for `rotation_bits`.
-
-    Returns:
-        A list with "alike" if it may face the same way, and "opposite" if it may face the opposite
-        way.
+    the same way ("alike") if it faces the same direction of such a path in both frames, and the
+    opposite way ("opposite") if it faces opposite directions of it. Arguments are as for
+    `rotation_bits`.
     """
     found = rotation_bits(first, then, shift)
     return [
@@ -201,9 +188,8 @@ def _turned_by(action: Action, first: Frame) -> int:
 def _declared(first: Frame, then: Frame, shift: int) -> str | None:
     """Say how the robot faces along its path in the later frame, by slots declared opposite.
 
-    Returns:
-        "alike" if it faces the same direction of the path as in the first frame, "opposite" if the
-        opposite one; None if declared slots do not decide this.
+    It is "alike" if it faces the same direction of the path as in the first frame, "opposite" if
+    the opposite one; None if declared slots do not decide this.
     """
     here, there = _way(first), _way(then)
     if here is None or there is None or not rotation_bits(first, then, shift):

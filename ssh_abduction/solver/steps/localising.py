@@ -45,13 +45,10 @@ class Located:
 
 
 def located(chart: FramedChart, states: Mapping[int, State]) -> Located:
-    """Localise all visits by the states of some of them.
+    """Localise all visits of a chart by the states of some of them, among them the first visit.
 
-    Args:
-        chart: The chart of the visits.
-        states: The states of some visits, among them the first visit. They must make a map: visits
-            at one place do not contradict each other, and an action leads from a state to one
-            state.
+    The states must make a map: visits at one place do not contradict each other, and an action
+    leads from a state to one state.
     """
     if len(states) == len(chart.stars):
         return Located(tuple(states[visit] for visit in range(len(states))))
@@ -150,15 +147,7 @@ class _VisitLocaliser:
 
 
 def faced(state: State, slot: int) -> State:
-    """Convert a slot of a visit into a slot of its place.
-
-    Args:
-        state: The state of the visit.
-        slot: The slot, as the visit numbers it.
-
-    Returns:
-        4 times the number of the place, plus the slot, as the place numbers it.
-    """
+    """Convert a slot of a visit into one of its place: 4 times the place plus the slot there."""
     return state - state % 4 + (state + slot) % 4
 
 

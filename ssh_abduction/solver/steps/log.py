@@ -81,13 +81,9 @@ class Log:
         pairs: Pairs | None = None,
         evidence: tuple[Evidence, ...] | None = None,
     ) -> None:
-        """Number the actions and observations.
+        """Number the actions and observations. The theory has no field that is "auto".
 
-        Args:
-            trace: The trace.
-            theory: The theory, in which no field is "auto".
-            pairs: The evidence about pairs of steps; None to find it when it is first used.
-            evidence: The evidence of the theory; None to make it.
+        If `pairs`, the evidence about pairs of steps, is None, it is found when it is first used.
         """
         self._pairs, self._find = pairs, partial(pairs_of, trace, theory, evidence)
         actions: dict[str, int] = {}
@@ -115,14 +111,8 @@ class Log:
     ) -> Replay:
         """Replay the trace over the map that `labels` make of its first steps.
 
-        Args:
-            labels: The dstate of each of the first steps.
-            known: Make the map only from this many first steps; from all labels by default.
-            place_of: The place of each dstate, to check the evidence about places; None if the map
-                has no places.
-
-        Returns:
-            The labels of all steps that the map explains, and how the replay ended.
+        If `known` is given, the map is made only from this many labels. `place_of` has the place of
+        each dstate, to check the evidence about places; None if the map has no places.
         """
         actions, seen = self.actions, self.seen
         known = len(labels) if known is None else known
@@ -158,9 +148,6 @@ class Log:
         unless a step contradicts it earlier. Let the action lead to the dstate that predicts the
         most steps without contradiction, or else to a new dstate. So no link has to be undone.
         After STEPS_TRIED predicted steps, let all unknown actions lead to new dstates.
-
-        Returns:
-            The dstate of each step.
         """
         actions, seen = self.actions, self.seen
         shows = [seen[0]]

@@ -61,12 +61,7 @@ class Noise:
 
 
 def noise_in(views: Sequence[int], actions: Sequence[int]) -> Noise | None:
-    """Find the step that looks like noise; None if there is none. Takes n log³ n for n steps.
-
-    Args:
-        views: The view at each step, as a number.
-        actions: The action after each step but the last, as a number.
-    """
+    """Find the step that looks like noise; None if there is none. Takes n log³ n for n steps."""
     if len(views) <= LEAST:
         return None
     fewest = len(_clique(views, actions, len(views))) / 2
