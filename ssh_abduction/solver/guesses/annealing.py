@@ -99,17 +99,11 @@ class Guess:
 
 
 def annealed(chart: FramedChart, check: Callable[[], None] = lambda: None) -> Guess:
-    """Guess the states of all visits.
+    """Guess the states of all visits of a chart.
 
-    A travel is bad if it leads elsewhere than most travels with the same state and action.
-
-    Args:
-        chart: The chart of the visits.
-        check: Called now and then; may raise to stop.
-
-    Returns:
-        The first guess in which at most one in FEW travels is bad. If none comes within SECONDS,
-        the guess with the fewest bad travels.
+    A travel is bad if it leads elsewhere than most travels with the same state and action. The
+    result is the first guess in which at most one in FEW travels is bad. If none comes within
+    SECONDS, it is the guess with the fewest bad travels.
     """
     found: dict[int, Guess] = {}
     began = time.perf_counter()
@@ -139,13 +133,9 @@ def annealed_steps(
 ) -> Iterator[list[int]]:
     """Yield better and better guesses at the dstates of all steps; -1 if a guess is not sure.
 
-    Yield none if the transitions would take too much memory.
-
-    Args:
-        chart: The chart of the steps.
-        clique: Steps that are pairwise distinct. Clique step number K is pinned to dstate K.
-        may_be: For each step, the dstates of the clique that it may be at.
-        check: Called now and then; may raise to stop.
+    Yield none if the transitions would take too much memory. The steps of `clique` are pairwise
+    distinct, and its step number K is pinned to dstate K. `may_be` has, for each step, the dstates
+    of the clique that it may be at.
     """
     options = _step_options(chart, clique, may_be)
     leaves = [(0, action) for _, action, _ in chart.links]
@@ -159,13 +149,9 @@ def annealed_steps(
 
 
 def _options(chart: FramedChart, spares: int) -> States:
-    """List the possible states of each visit.
+    """List the possible states of each visit, in a row padded with -1.
 
-    Args:
-        spares: The least number of spare names of each kind of place.
-
-    Returns:
-        An array with a row for each visit, padded with -1.
+    Each kind of place has at least `spares` spare names.
     """
     misfits = chart.misfits
     # turned[visit][r] is the star of the visit in a frame whose slot r is slot 0 of the visit. The
@@ -192,13 +178,10 @@ def _options(chart: FramedChart, spares: int) -> States:
 
 
 def _step_options(chart: Chart, clique: Sequence[int], may_be: Sequence[Sequence[int]]) -> States:
-    """List the possible states of each step, if each step is a visit.
+    """List the possible states of each step, if each step is a visit, in a row padded with -1.
 
     A step of the clique has only its own state. Any other step also has the spare names of its
     view. Arguments are as for `annealed_steps`.
-
-    Returns:
-        An array with a row for each step, padded with -1.
     """
     pinned = set(clique)
     spare = _spare(chart.seen, clique, SPARES)
@@ -211,11 +194,7 @@ def _step_options(chart: Chart, clique: Sequence[int], may_be: Sequence[Sequence
 
 
 def _spare(kinds: Sequence[_Kind], pinned: Sequence[int], spares: int) -> dict[_Kind, range]:
-    """Return the spare names of each kind of place. Lower numbers are names of pinned visits.
-
-    Args:
-        spares: The least number of spare names of a kind.
-    """
+    """Return the spare names of each kind of place, at least `spares`."""
     named = Counter(kinds[visit] for visit in pinned)
     spare: dict[_Kind, range] = {}
     names = len(pinned)

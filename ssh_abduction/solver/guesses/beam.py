@@ -91,13 +91,7 @@ class Beam:
     """
 
     def __init__(self, problem: Problem, log: Log, width: int) -> None:
-        """Prepare the search. `maps` runs it.
-
-        Args:
-            problem: The trace, the theory and the evidence.
-            log: The trace as integers.
-            width: The number of hypotheses in the beam.
-        """
+        """Prepare the search with this many hypotheses in the beam. `maps` runs it."""
         trace, theory = problem.trace, problem.theory
         self._trace, self._log, self._width, self._problem = trace, log, width, problem
         self._bare = theory.without_faults().replace(
@@ -189,11 +183,9 @@ class Beam:
         With several drives or floors, keep at most ALIKE hypotheses that join them in the same way,
         and at most LOST * ALIKE in all. Drop those that cost at least UNSURE more than the best.
         The last two limits apply separately to hypotheses whose present piece is not joined yet
-        (`Pieces.is_loose`), as they cost more until it is joined.
-
-        Args:
-            options: Ways to extend the beam by step t, sorted by cost.
-            checked: Whether to drop hypotheses that the checker refuses.
+        (`Pieces.is_loose`), as they cost more until it is joined. `options` are ways to extend the
+        beam by step t, sorted by cost. If `checked`, hypotheses that the checker refuses are
+        dropped.
         """
         most, several = width, bool(self._frames)
         if several:
@@ -258,9 +250,8 @@ class Beam:
     def _checked(self, beam: list[Hypothesis], end: int, joins: bool = True) -> list[Hypothesis]:
         """Extend a beam to its first `end` steps, and check each hypothesis at each step.
 
-        Args:
-            joins: Whether new dstates and places cost their prices, so that returns are cheaper. If
-                False, they are free, and the robot returns to a place only if it has to.
+        If `joins`, new dstates and places cost their prices, so that returns are cheaper. If not,
+        they are free, and the robot returns to a place only if it has to.
         """
         for t in range(len(beam[0].labels) if beam else end, end):
             options = self._options_of(beam, t, joins)
@@ -288,8 +279,7 @@ class Beam:
     def _map(self, found: Hypothesis, since: int) -> SSHMap | None:
         """Make the map of a hypothesis; None if it contradicts the axioms or the evidence.
 
-        Args:
-            since: The number of its first steps that were checked against the evidence already.
+        Its first `since` steps were checked against the evidence already.
         """
         look_at_clock()
         steps = len(found.labels)
@@ -430,11 +420,10 @@ class Beam:
     def _near(
         self, moved: Hypothesis, t: int, places: Sequence[int]
     ) -> Iterator[tuple[int, float, Hypothesis]]:
-        """For each of some places, compute how well the pose of the robot fits it at step t.
+        """Yield the chi-square of the pose of the robot at each of some places at step t.
 
-        Yields:
-            The place, the chi-square, and the hypothesis. If the place is in another piece, the
-            piece of the robot is turned to fit it.
+        The place comes first, the hypothesis last. If the place is in another piece, the piece of
+        the robot is turned to fit it.
         """
         own = [place for place in places if moved.pieces.of_place[place] == moved.pieces.here]
         squares = self._reckoning.squares(moved, t, own).tolist() if own else []

@@ -57,14 +57,10 @@ class Classes:
         check: Callable[[], None] = lambda: None,
         nodes: NDArray[np.int_] | None = None,
     ) -> None:
-        """Begin with a class for each step.
+        """Begin with a class for each step. The matrix `apart` has the shape steps x steps.
 
-        Args:
-            apart: The pairs of steps that are apart, as a matrix of steps x steps.
-            links: Triples (step, action, step).
-            check: Called now and then; may raise to stop.
-            nodes: If the "steps" are dstates of a map: the number of nodes at each. None for 1
-                each.
+        Links are triples (step, action, step). If the "steps" are dstates of a map, `nodes` has the
+        number of nodes at each; None for 1 each.
         """
         steps = len(apart)
         self._nodes = nodes
@@ -87,10 +83,7 @@ class Classes:
     def take(self, guess: Sequence[int]) -> None:
         """Merge the steps that share a label in a guess, if they can be one dstate.
 
-        Their classes become known dstates.
-
-        Args:
-            guess: The label of each step, -1 if it is unknown.
+        Their classes become known dstates. The label is -1 where it is unknown.
         """
         first = {label: node for node, label in reversed(list(enumerate(guess))) if label >= 0}
         self.known[list(first.values())] = True
@@ -139,11 +132,8 @@ class Classes:
         """Merge each class that is not known with its best known dstate, if that is clear enough.
 
         A class that fits no known dstate becomes known. The classes that fit the fewest known
-        dstates come first.
-
-        Args:
-            evidence: By how much the evidence for the best dstate has to exceed that for the next.
-            rivals: A class that fits more known dstates than this is left as it is.
+        dstates come first. The evidence for the best dstate has to exceed that for the next by
+        `evidence`. A class that fits more than `rivals` known dstates is left as it is.
         """
         steps = self.unsettled()
         fitting = (~self._apart[np.flatnonzero(self.known)][:, steps]).sum(axis=0)
@@ -172,12 +162,10 @@ class Classes:
             self.make(ranked[0][1] if ranked else root, root)
 
     def thin(self, evidence: int) -> None:
-        """Merge each known dstate with another one, if the evidence for it is clear enough.
+        """Merge each known dstate with another one, if the evidence for that one is clear enough.
 
-        Dstates with the fewest nodes come first.
-
-        Args:
-            evidence: By how much the evidence for the best dstate has to exceed that for the next.
+        Dstates with the fewest nodes come first. The evidence for the best dstate has to exceed
+        that for the next by `evidence`.
         """
         nodes = np.bincount(self.root, self._nodes)
         for root in sorted(np.flatnonzero(self.known).tolist(), key=lambda root: nodes[root]):
@@ -200,13 +188,9 @@ class Classes:
     def _ranked(
         self, root: int, fits: Sequence[int], *, forced: bool = False
     ) -> list[tuple[int, int]]:
-        """Try to merge a class with each of some dstates, and rank these by the evidence.
+        """Return possible merges of a class with dstates: pairs (evidence, dstate), the best first.
 
-        Args:
-            forced: Whether two known dstates may be merged.
-
-        Returns:
-            Pairs (evidence, dstate) of the merges that are possible, most evidence first.
+        If `forced`, two known dstates may be merged.
         """
         found = []
         for dstate in fits:
@@ -217,16 +201,10 @@ class Classes:
         return sorted(found, reverse=True)
 
     def merge(self, a: int, b: int, *, forced: bool = False) -> int | None:
-        """Merge two classes, and all classes that have to be merged with them.
+        """Merge the classes of two roots, and all classes that have to be merged with them.
 
-        Args:
-            a: The root of a class, the step that represents it.
-            b: The root of another class.
-            forced: Whether two known dstates may be merged.
-
-        Returns:
-            The evidence. None if this would merge steps that are apart, or two known dstates
-            without `forced`. Then nothing has changed.
+        Returns the evidence. If this would merge steps that are apart, or two known dstates without
+        `forced`, it returns None, and nothing has changed.
         """
         self._undo = []
         work = [(a, b)]
@@ -271,10 +249,8 @@ class Classes:
 
 
 def _is_ahead(ranked: Sequence[tuple[int, int]], evidence: int) -> bool:
-    """Whether the evidence for the best merge exceeds that for the next best by this much.
+    """Whether the evidence for the best merge exceeds that for the next best by at least this much.
 
-    Args:
-        ranked: Pairs (evidence, dstate), the best first. A single one is compared with 0.
-        evidence: The least difference.
+    `ranked` has pairs (evidence, dstate), the best first. A single one is compared with 0.
     """
     return ranked[0][0] >= evidence + (ranked[1][0] if len(ranked) > 1 else 0)

@@ -43,16 +43,11 @@ def completed(
 ) -> SSHMap | None:
     """Complete dstates and places to a map. The caller has to check it.
 
-    Args:
-        trace: The trace.
-        theory: The theory, with all defaults filled in.
-        labels: The dstate of each step of the trace.
-        places: The place of each dstate. A causal theory ignores it.
-        facing: The heading of each dstate in radians, counterclockwise. Only star=frame uses it.
-
-    Returns:
-        The map. None if an action leads from one dstate to two dstates, if a path would be a
-        circle, if a dstate would face both directions of its path, or if the stars fit no frames.
+    `labels` has the dstate of each step, and `places` the place of each dstate, which a causal
+    theory ignores. `facing` has the heading of each dstate in radians, counterclockwise; only
+    star=frame uses it. Returns None if an action leads from one dstate to two dstates, if a path
+    would be a circle, if a dstate would face both directions of its path, or if the stars fit no
+    frames.
     """
     links: dict[tuple[int, str], int] = {}
     for here, action, there in zip(labels, trace.actions, labels[1:], strict=False):
@@ -85,12 +80,7 @@ def completed(
 def _on(
     ssh_map: SSHMap, courses: Mapping[int, _Course], headings: Mapping[int, int] | None = None
 ) -> SSHMap:
-    """Add the courses and headings of dstates to a map.
-
-    Args:
-        courses: The path and direction of each dstate that is on a path.
-        headings: The heading of each dstate, as a slot; None if no dstate has one.
-    """
+    """Add to a map the path, direction and heading (a slot) of the dstates that have them."""
     dstates = []
     for s in ssh_map.dstates:
         path, direction = courses.get(s.id, (None, None))
@@ -104,10 +94,9 @@ def _facing(
 ) -> Facing | None:
     """Find which way each dstate faces at its place, by the stars or by its heading in radians.
 
-    Returns:
-        The slot of each dstate (the number of its direction in the frame of its place), and the
-        pairs of dstates that face opposite ways. Both are empty for a theory without frames. None
-        if no frame fits the stars.
+    Returns the slot of each dstate (the number of its direction in the frame of its place), and the
+    pairs of dstates that face opposite ways. Both are empty for a theory without frames. None if no
+    frame fits the stars.
     """
     if theory.star == "gateways":
         return gateways.facing(trace, ssh_map, theory.axioms, bool(theory.changed))
@@ -153,12 +142,8 @@ def _courses(
 ) -> dict[int, _Course] | None:
     """Find the paths: follow travels, turns around and opposite dstates from each dstate.
 
-    Args:
-        opposite: Pairs of dstates that face opposite ways at one place.
-
-    Returns:
-        The path and direction of each dstate that is on a path; None if some dstate would face both
-        directions of its path.
+    The pairs in `opposite` face opposite ways at one place. Returns the path and direction of each
+    dstate that is on a path; None if some dstate would face both directions of its path.
     """
     actions = {action.name: action for action in trace.actions}
     travels = [(s, x) for s, name, x in ssh_map.links if actions[name].kind == "travel"]
@@ -195,14 +180,10 @@ def _courses(
 def _orders(
     ssh_map: SSHMap, trace: Trace, courses: Mapping[int, _Course], ends: Sequence[tuple[int, int]]
 ) -> tuple[MapPath, ...] | None:
-    """Sort the places of each path by its travels, and put the ends of paths first or last.
+    """Sort the places of each path by its travels; None if a path would be a circle.
 
-    Args:
-        ends: Pairs (dstate, direction): the path of the dstate ends ahead of it (0) or behind it
-            (180).
-
-    Returns:
-        The paths with their places in order; None if a path would be a circle.
+    `ends` come first or last: pairs (dstate, direction) say that the path of the dstate ends ahead
+    of it (0) or behind it (180).
     """
     kinds = {action.name: action.kind for action in trace.actions}
     before: dict[int, dict[int, set[int]]] = defaultdict(dict)

@@ -49,14 +49,8 @@ def labels_continued(
 ) -> list[int] | None:
     """Label all steps of a trace by extending, and if need be correcting, a map of its first steps.
 
-    Args:
-        log: The trace.
-        labels: The dstate of each of the first steps in a map, numbered from 0.
-        check: Called now and then; may raise to stop.
-
-    Returns:
-        The dstate of each step. None if there are still contradictions after WALKS walks, or the
-        map has become too large.
+    `labels` has the dstate of each of the first steps, numbered from 0. Returns None if there are
+    still contradictions after WALKS walks, or the map has become too large.
     """
     known = _Map(log, labels, check)
     may_be_lost, furthest, back = True, 0, 1
@@ -99,14 +93,10 @@ class _Map:
         return len(self._shows) > self._most
 
     def walked(self, *, may_be_lost: bool) -> list[int]:
-        """Follow the trace along the links of the map, and add the links that are found.
+        """Follow the trace along the map, add links that are found, and return labels.
 
-        Args:
-            may_be_lost: What to do if it is unclear where the robot is. True: label the step -1.
-                False: add a new dstate to the map.
-
-        Returns:
-            The labels of the steps before the first one that contradicts the map.
+        The labels end before the first step that contradicts the map. If it is unclear where the
+        robot is, label the step -1 if `may_be_lost`; otherwise add a new dstate to the map.
         """
         labels: list[int] = []
         for t, seen in enumerate(self._seen):
@@ -149,13 +139,9 @@ class _Map:
     def _predicting(self, step: int, least: int, link: _Link | None = None) -> int | None:
         """Find the dstate at a step that predicts the most of the following steps.
 
-        Args:
-            least: The least number of steps that the dstate has to predict.
-            link: The unknown link to this step. Each try assumes that it leads to the dstate.
-
-        Returns:
-            The dstate. None if it predicts too few steps, if it does not predict AHEAD steps more
-            than any other, or if a contradiction ends its prediction.
+        Each try assumes that the unknown `link` to this step leads to the dstate. Returns None if
+        the dstate predicts fewer than `least` steps, or not AHEAD steps more than any other, or if
+        a contradiction ends its prediction.
         """
         self._check()
         # Keep the two longest predictions, to compare them in the end.
@@ -177,11 +163,10 @@ class _Map:
         )
 
     def _predicted(self, dstate: int, step: int) -> tuple[int, bool]:
-        """Follow the links from a dstate at a step.
+        """Return how many steps a dstate predicts, and whether it ends in a contradiction.
 
-        Returns:
-            How many steps the dstate predicts (at most LOOKED), and whether a contradiction ends
-            the prediction. Otherwise an unknown link or the end of the trace does.
+        It predicts at most LOOKED steps. Without a contradiction, an unknown link or the end of the
+        trace ends it.
         """
         for t in range(step + 1, min(step + LOOKED, len(self._seen))):
             there = self.leads.get((dstate, self._actions[t - 1]))

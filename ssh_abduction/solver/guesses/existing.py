@@ -31,23 +31,13 @@ class ExistingMap:
     """The map of old drives, with the poses of its dstates and places."""
 
     def __init__(self, old: Trace, ssh_map: SSHMap) -> None:
-        """Fit the poses.
-
-        Args:
-            old: The old drives.
-            ssh_map: Their map.
-        """
+        """Fit the poses to the old drives and their map."""
         with threadpool_limits(1, user_api="blas"):
             self._piece, self._mean, self._covariance = Poses.of_map(old, ssh_map).gaussian()
         self._places = numbered(-1 - s.id if s.place is None else s.place for s in ssh_map.dstates)
 
     def with_displacements(self, digest: Trace, labels: Sequence[int]) -> Trace:
-        """Give each link in a digest the displacement between the poses of its ends.
-
-        Args:
-            digest: The digest.
-            labels: The dstate of each of its steps.
-        """
+        """Give each link in a digest, with these dstates, the displacement between its ends."""
         positions = 2 * (max(self._places) + 1)
         at = self._mean[:positions].reshape(-1, 2)[self._places][list(labels)]
         facing = self._mean[positions:][list(labels)]
@@ -63,11 +53,8 @@ class ExistingMap:
     def maps(self, problem: Problem, labels: Sequence[int]) -> Iterator[SSHMap]:
         """Yield maps of a digest and new drives that keep this map, the one with most joins last.
 
-        The caller has to check them.
-
-        Args:
-            problem: The digest and then the new drives, with the theory.
-            labels: The dstate of each step of the digest.
+        The caller has to check them. The trace of the problem has the digest first. `labels` has
+        the dstates of its steps.
         """
         log = Log(problem.trace, problem.theory, problem.pairs)
         joining = Joining(problem, log)

@@ -84,11 +84,9 @@ class _PlaceSights:
     turns: dict[tuple[_Seen, _Seen], set[Action]] = field(default_factory=dict)
 
     def with_sight(self, seen: _Seen, step: int, move: tuple[_Seen, Action] | None) -> _PlaceSights:
-        """Return this place after a step there.
+        """Return this place after a step there that sees something.
 
-        Args:
-            seen: What the step sees.
-            move: What was seen before at this place, and the turn since; None if there was none.
+        `move` has what was seen before at this place, and the turn since.
         """
         turns = self.turns
         if move:
@@ -98,13 +96,10 @@ class _PlaceSights:
 
 
 class GatewaySketch(Sketch):
-    """A sketch of a trace with stars of any number of gateways.
+    """A sketch of a trace with stars of any number of gateways, begun with its first step.
 
-    Args:
-        first: The first step.
-        theory: The theory.
-        homing: Whether a travel may lead back to the place that the robot came from, even if it
-            may lead to a new place.
+    If `homing`, a travel may lead back to the place that the robot came from, even if it may lead
+    to a new place.
     """
 
     def __init__(self, first: Step, theory: Theory, homing: bool = True) -> None:

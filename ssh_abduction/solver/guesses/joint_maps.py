@@ -77,19 +77,10 @@ STARTS = 3
 
 
 class Joining:
-    """Joins the maps of the drives of one trace.
-
-    Attributes:
-        sights: What the steps of the trace show.
-    """
+    """Joins the maps of the drives of one trace."""
 
     def __init__(self, problem: Problem, log: Log) -> None:
-        """Prepare the search. `maps` runs it.
-
-        Args:
-            problem: The trace, the theory and the evidence.
-            log: The trace as integers.
-        """
+        """Prepare the search. `maps` runs it."""
         self._problem, self._log = problem, log
         self._bare = problem.theory.replace(displacement="none", weigh="count")
         self.sights = Sights(problem.trace, self._bare, log, misreads=False)
@@ -97,10 +88,8 @@ class Joining:
     def maps(self, standing: Sequence[Part] = ()) -> Iterator[SSHMap]:
         """Yield a map in which no drives are joined, and one in which they are.
 
-        The caller has to check them.
-
-        Args:
-            standing: The pieces of a map of the first drives that must be kept; empty if none must.
+        The caller has to check them. If `standing` is not empty, it has the pieces of a map of the
+        first drives that must be kept.
         """
         first = sum(len(part.labels) for part in standing)
         drives = [drive for drive in drives_of(self._problem.trace) if drive.first >= first]
@@ -123,10 +112,7 @@ class Joining:
     def _all_joined(self, parts: list[Part], anchors: _Anchors, start: _Pair) -> list[Part]:
         """Join maps, those with the best anchor first, until no more can be joined.
 
-        Args:
-            parts: The maps.
-            anchors: The anchors of each pair of them.
-            start: The pair that is joined first.
+        `anchors` are those of each pair of maps, and `start` is the pair that is joined first.
         """
         pair = start
         while anchors:
@@ -174,14 +160,10 @@ class Joining:
     def _by_dstates(
         self, first: Part, second: Part, changes: Array, near: float
     ) -> Iterator[_Anchor]:
-        """Yield anchors that make two dstates one.
+        """Yield anchors that make two dstates of two maps one.
 
-        Args:
-            first: A map.
-            second: Another map.
-            changes: What changed gateways cost if each place of the first map is each place of the
-                second one; inf if it cannot be.
-            near: Dstates coincide if they are nearer than this many metres.
+        `changes` has what changed gateways cost if each place of the first map is each place of the
+        second one; inf if it cannot be. Dstates coincide if they are nearer than `near` metres.
         """
         alike = np.array([[bool(seen & other) for other in second.seen] for seen in first.seen])
         (at, facing), (there, turned) = first.poses, second.poses
@@ -202,15 +184,11 @@ class Joining:
     def _by_places(
         self, first: Part, second: Part, same: NDArray[np.bool_], near: float
     ) -> list[_Anchor]:
-        """List the best anchors that make two places one, by the gateways there.
+        """List the best anchors that make two places of two maps one, by the gateways there.
 
         A single place that coincides tells too little, unless no other pair of places agrees.
-
-        Args:
-            first: A map.
-            second: Another map.
-            same: Whether each place of the first map may be each place of the second.
-            near: Places coincide if they are nearer than this many metres.
+        `same` tells whether each place of the first map may be each place of the second. Places
+        coincide if they are nearer than `near` metres.
         """
         facing, turned = first.poses[1], second.poses[1]
         step, other = first.step_at, second.step_at
@@ -272,11 +250,8 @@ def _voted(
 ) -> Iterator[tuple[int, int, float]]:
     """Yield one of all ways that lay a map on another in about the same way, the most votes first.
 
-    Args:
-        first: A map.
-        second: The map that is laid on it.
-        ways: The dstates that are laid on each other, and the turn of the second map.
-        near: Ways are about the same if they differ by less than about this many metres.
+    A way has the dstates that are laid on each other, and the turn of the second map, which is laid
+    on the first. Ways are about the same if they differ by less than about `near` metres.
     """
     listed = [*ways]
     if not listed:

@@ -36,13 +36,8 @@ from ssh_abduction.theory.theory import Theory
 def mended_sketch(trace: Trace, theory: Theory) -> SSHMap | None:
     """Make a map in which most steps are new dstates, with the faults that it needs.
 
-    Args:
-        trace: The trace. All its views are known.
-        theory: The theory.
-
-    Returns:
-        The map. None if a step contradicts the sketch, and the theory allows no fault that mends
-        it. The map may break axioms, so the caller has to check it.
+    All views of the trace are known. Returns None if a step contradicts the sketch, and the theory
+    allows no fault that mends it. The map may break axioms, so the caller has to check it.
     """
     mended = trace
     while True:
@@ -63,12 +58,7 @@ def mended_sketch(trace: Trace, theory: Theory) -> SSHMap | None:
 def first_contradiction(sketch: Sketch, trace: Trace) -> int | None:
     """Extend a sketch to the end of a trace.
 
-    Args:
-        sketch: The sketch, of some first steps.
-        trace: The trace.
-
-    Returns:
-        The first step that contradicts the sketch; None if it has grown to the end.
+    If a step contradicts it, stop there and return this step.
     """
     done = len(sketch.labels)
     later = each_looking(zip(trace.actions[done - 1 :], trace.steps[done:], strict=True))
@@ -79,11 +69,7 @@ def first_contradiction(sketch: Sketch, trace: Trace) -> int | None:
 def _mended(trace: Trace, mended: Trace, sketch: Sketch, theory: Theory) -> Trace | None:
     """Mend the step that contradicts a sketch: its view and star, or else the action before it.
 
-    Args:
-        trace: The trace itself.
-        mended: The trace with the faults that were mended before.
-        sketch: The sketch of all steps before.
-        theory: The theory.
+    `mended` is the trace with the faults that were mended before. The sketch has all steps before.
     """
     t, steps = len(sketch.labels), list(mended.steps)
     action = mended.actions[t - 1]
@@ -99,10 +85,7 @@ def _mended(trace: Trace, mended: Trace, sketch: Sketch, theory: Theory) -> Trac
 
 
 def _right(trace: Trace, sketch: Sketch, theory: Theory) -> Step | None:
-    """Return the step after a sketch, with the view and star that the sketch predicts for it.
-
-    None if the sketch predicts neither.
-    """
+    """Return the step after a sketch, with the view and star it predicts; None if neither."""
     t, action = len(sketch.labels), trace.actions[len(sketch.labels) - 1]
     there = sketch.leads_to(action)
     if there in sketch.labels:

@@ -46,16 +46,11 @@ def merged(
     clique: Sequence[int],
     check: Callable[[], None] = lambda: None,
 ) -> list[int]:
-    """Find a small map of the causal theory.
+    """Return the dstate of each node in a small map of the causal theory.
 
-    Args:
-        apart: The pairs of nodes that are apart, as a matrix of nodes x nodes.
-        links: Triples (node, action, node).
-        clique: Nodes that are pairwise distinct.
-        check: Called now and then; may raise to stop.
-
-    Returns:
-        The dstate of each node. Dstates are numbered in the order of their first nodes.
+    `apart` has the pairs of nodes that are apart, as a matrix of nodes x nodes. Links are triples
+    (node, action, node). The nodes of the clique are pairwise distinct. `check` is called now and
+    then; it may raise to stop. Dstates are numbered in the order of their first nodes.
     """
     classes = Classes(apart, links, check)
     classes.known[list(clique)] = True
@@ -69,17 +64,10 @@ def merged_near(
     guess: Sequence[int],
     check: Callable[[], None] = lambda: None,
 ) -> list[int]:
-    """Find a small map of the causal theory near a guess.
+    """Return the dstate of each node in a small map of the causal theory near a guess.
 
-    Args:
-        apart: The pairs of nodes that are apart, as a matrix of nodes x nodes.
-        links: Triples (node, action, node).
-        guess: The label of each node, -1 if it is unknown. A label is ignored if the node cannot
-            be one dstate with earlier nodes of that label.
-        check: Called now and then; may raise to stop.
-
-    Returns:
-        The dstate of each node.
+    `apart`, `links` and `check` are as for `merged`. In the guess, the label of a node is -1 if it
+    is unknown. It is ignored if the node cannot be one dstate with earlier nodes of that label.
     """
     classes = _from_guess(apart, links, guess, check)
     classes.settle_all()
@@ -90,15 +78,7 @@ def kept(apart: Matrix, links: Iterable[Link], guess: Sequence[int]) -> list[int
     """Make a map that keeps the labels of a guess as far as possible, and merges nothing else.
 
     Nodes whose label is unknown (-1) or cannot be kept are dstates of their own, unless the links
-    make them one with others.
-
-    Args:
-        apart: The pairs of nodes that are apart, as a matrix of nodes x nodes.
-        links: Triples (node, action, node).
-        guess: The label of each node, -1 if it is unknown.
-
-    Returns:
-        The dstate of each node.
+    make them one with others. `apart` and `links` are as for `merged`.
     """
     return _from_guess(apart, links, guess).labels()
 
@@ -110,14 +90,6 @@ def dstates_merged(
 
     Dstates with the fewest nodes are merged first, each with the dstate for which there is most
     evidence.
-
-    Args:
-        chart: The chart of the nodes and links.
-        labels: The dstate of each node in the map.
-        check: Called now and then; may raise to stop.
-
-    Returns:
-        The dstate of each node in the smaller map.
     """
     dstates = numbered(labels)
     first = np.unique(dstates, return_index=True)[1]
@@ -142,20 +114,11 @@ def thinned_map(
     check: Callable[[], None] = lambda: None,
     excluded: Sequence[tuple[int, int]] = (),
 ) -> list[int]:
-    """Merge dstates of a map until no two can be one.
+    """Merge dstates of a map until no two can be one, and return which dstate represents each.
 
-    Dstates with the fewest nodes are merged first, each with the dstate for which there is most
-    evidence.
-
-    Args:
-        shows: The view of each dstate.
-        links: Triples (dstate, action, dstate).
-        visits: The number of nodes at each dstate.
-        check: Called now and then; may raise to stop.
-        excluded: Pairs of dstates that must not be merged.
-
-    Returns:
-        For each dstate, the dstate that now represents it; itself if it was not merged.
+    This merges as `dstates_merged` does, but for a map without a chart: with the view of each
+    dstate, links (dstate, action, dstate), and the number of nodes at each dstate. `excluded` pairs
+    must not be merged. A dstate that was not merged represents itself.
     """
     classes = Classes(
         _apart_in_map(np.asarray(shows), links, excluded, check), links, check, np.asarray(visits)
@@ -172,17 +135,10 @@ def _apart_in_map(
     excluded: Sequence[tuple[int, int]],
     check: Callable[[], None],
 ) -> Matrix:
-    """Find the pairs of dstates of a map that are apart.
+    """Find the pairs of dstates of a map that are apart, as a matrix of dstates x dstates.
 
     Two dstates are apart if they show different views, if they are excluded, or if the same action
     leads from them to dstates that are apart.
-
-    Args:
-        links: Triples (dstate, action, dstate).
-        excluded: Pairs of dstates that must not be merged.
-
-    Returns:
-        A matrix of dstates x dstates.
     """
     leads: dict[int, NDArray[np.int_]] = {}
     for dstate, action, leads_to in links:

@@ -39,13 +39,8 @@ def wrong_displacements(
 ) -> tuple[int, ...]:
     """Find the displacements that are outliers.
 
-    Args:
-        trace: A trace with displacements.
-        labels: The dstate of each step, nearly right.
-        places: The place of each step; None if it is unknown.
-
-    Returns:
-        The steps that wrong displacements lead to, those with the most votes first.
+    `labels` has the dstate of each step, nearly right, and `places` its place, or None. Returns the
+    steps that wrong displacements lead to, those with the most votes first.
     """
     loops = Reckoning(trace).loops_of_unknown_drift()
     voters: list[tuple[int, int, float]] = []
@@ -79,9 +74,6 @@ def _returns(sites: Sequence[int | None]) -> Iterator[tuple[int, int]]:
     """Yield the returns: pairs of steps at one site, with only other sites in between.
 
     A site is a dstate or a place. Steps that follow each other are no return.
-
-    Args:
-        sites: The site of each step; None if it is unknown.
     """
     last: dict[int, int] = {}
     for t, site in enumerate(sites):
@@ -93,18 +85,11 @@ def _returns(sites: Sequence[int | None]) -> Iterator[tuple[int, int]]:
 
 
 def _votes(loops: Loops, pairs: Sequence[tuple[int, int]], with_heading: bool) -> list[float]:
-    """Compute the vote of each return, at most `MOST_VOTES`.
+    """Return the vote in nats of each return, at most `MOST_VOTES`.
 
-    A vote is the log likelihood ratio that one displacement of the loop is wrong.
-
-    Args:
-        loops: The displacements of the trace.
-        pairs: The first and last step of each return.
-        with_heading: True if the robot comes back to a dstate, so that headings have to agree.
-            False if it comes back to a place.
-
-    Returns:
-        A vote for each return, in nats.
+    A vote is the log likelihood ratio that one displacement of the loop is wrong. A return has a
+    first and a last step. With `with_heading`, the robot comes back to a dstate, so that headings
+    have to agree; otherwise it comes back to a place.
     """
     if not pairs:
         return []

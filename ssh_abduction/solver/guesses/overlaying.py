@@ -40,20 +40,12 @@ TURNED = 0.4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """A map of some drives. Its fields are like those of a `Hypothesis`.
+    """A map of some drives. Other fields than these are like those of a `Hypothesis`.
 
     Attributes:
-        labels: The dstate of each step of these drives.
-        places: The place of each dstate.
         seen: For each dstate, what its steps show, as numbers.
         stars: For each dstate, the star of its last step.
-        links: For each (dstate, action) with a link, the dstate that it leads to.
         sights: For each place, what each drive saw of it.
-        position: For each place, the index of its x in the means.
-        heading: For each dstate, the index of its heading in the means.
-        mean: The means of the poses.
-        covariance: The covariance of these.
-        nats: The cost.
         kept: The dstates of a map that must be kept.
     """
 
@@ -88,16 +80,10 @@ class Part:
         log: Log,
         sights: Sights,
     ) -> Part:
-        """Make a part of a map of some steps.
+        """Make a part from labels (the dstate of each step) and the place of each dstate.
 
-        Args:
-            labels: The dstate of each of these steps.
-            places: The place of each dstate.
-            poses: The means and the covariance of x and y of each place, in metres, and then of the
-                heading of each dstate, in radians.
-            nats: The cost.
-            log: All steps.
-            sights: What they show.
+        `poses` are the means and the covariance of x and y of each place, in metres, and then of
+        the heading of each dstate, in radians. `log` and `sights` are those of all steps.
         """
         seen: list[set[int]] = [set() for _ in places]
         stars: list[Sight] = [None for _ in places]
@@ -176,9 +162,6 @@ class _State:
         place: For each place, the first place that it is merged with.
         sights: For each first place, what each drive saw of it.
         links: For each first dstate, where its actions lead to.
-        mean: The means of the poses.
-        covariance: The covariance of these.
-        nats: The cost.
         kept: The dstates of a map that must be kept. A group with one of them is named by its
             first dstate.
         kept_places: The places of that map, in the same way.
@@ -236,14 +219,8 @@ class Overlay:
     def merge(self, old: int, new: int, turn: float | None = None) -> bool:
         """Merge a dstate of the standing map with one of the drive, and then all that coincide.
 
-        Args:
-            old: A dstate of the standing map.
-            new: A dstate of the drive.
-            turn: None to merge the two dstates; or by how many radians the map of the drive is
-                turned, to merge only their places.
-
-        Returns:
-            Whether the two can be one dstate, or one place.
+        With a `turn`, only their places are merged, and the map of the drive is turned by it, in
+        radians. Returns whether the two can be one dstate, or one place.
         """
         new += self._old[0]
         self._lay(old, new, turn)
@@ -336,8 +313,7 @@ class Overlay:
     def _tried(self, dstates: list[tuple[int, int]], places: tuple[int, int] | None = None) -> bool:
         """Merge some dstates or two places, and all that follows, if this costs less than before.
 
-        Returns:
-            Whether they are merged. If not, nothing changes.
+        Returns whether they are merged. If not, nothing changes.
         """
         before = self._state
         self._state = before.copy()

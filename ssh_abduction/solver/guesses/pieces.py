@@ -77,15 +77,8 @@ def fitted(found: Hypothesis, place: int, dstate: int | None = None) -> Hypothes
 
     The last three entries of the means are the pose. If only the position is known, the first place
     becomes the hinge, and the second one decides by how much to turn. Nothing is turned if the
-    place is in the piece of the robot already.
-
-    Args:
-        found: The hypothesis.
-        place: The place.
-        dstate: A dstate of this place; None to fit the position only.
-
-    Returns:
-        The hypothesis with the piece turned, and joined to the other piece.
+    place is in the piece of the robot already. Then the piece is joined to the other one. Without a
+    dstate of the place, only the position is fitted.
     """
     pieces = found.pieces
     other = pieces.of_place[place] if dstate is None else pieces.of_heading[dstate]
@@ -121,16 +114,11 @@ def headings_by_turn(found: Hypothesis) -> Iterator[list[float]]:
 
 
 def closed(found: Hypothesis, dstate: int, turn: float) -> Hypothesis:
-    """Turn the piece of the robot, and join it to the piece of a dstate, as a closure says.
+    """Turn the piece of the robot, and join it to that of a closure's earlier dstate.
 
     This comes before the update by the closure, which is linear in the heading of the piece and so
     needs a heading that is nearly right. If the dstate is in the piece of the robot, nothing
-    changes.
-
-    Args:
-        found: The hypothesis.
-        dstate: The dstate of the earlier step of the closure.
-        turn: By how many radians the robot is turned to the left of this dstate.
+    changes. `turn` is by how many radians the robot is turned to the left of this dstate.
     """
     pieces, n = found.pieces, len(found.mean) - 3
     other = pieces.of_heading[dstate]
@@ -145,10 +133,7 @@ def closed(found: Hypothesis, dstate: int, turn: float) -> Hypothesis:
 def _turned(found: Hypothesis, angle: float, centre: int) -> Hypothesis:
     """Turn all poses of the piece of the robot about a centre, with their covariance.
 
-    Args:
-        found: The hypothesis.
-        angle: The angle in radians, counterclockwise.
-        centre: The index of the x of the centre in the means.
+    The angle is in radians, counterclockwise. `centre` is the index of its x in the means.
     """
     n, pieces = len(found.mean) - 3, found.pieces
     places = zip(found.position, pieces.of_place, strict=True)

@@ -115,13 +115,8 @@ class HypothesisPoses:
     def moved(self, found: Hypothesis, t: int, believes: bool = True) -> Hypothesis:
         """Move the robot of a hypothesis to step t, and use the closures that end there.
 
-        Args:
-            found: The hypothesis about the steps before t.
-            t: The step.
-            believes: Whether to use the displacement to the step. If False, the move is unknown.
-
-        Returns:
-            The hypothesis. The last three entries of its means are the pose at step t.
+        If `believes` is False, the displacement to the step is not used: the move is unknown. The
+        last three entries of the new means are the pose at step t.
         """
         displacement = self._trace.steps[t].displacement if believes else None
         mean, n = found.mean, len(found.mean)
@@ -161,11 +156,7 @@ class HypothesisPoses:
         """Update a hypothesis by a closure between an earlier step and the present one.
 
         The pose of the robot at the earlier step is not kept, so the pose of its dstate stands for
-        it.
-
-        Returns:
-            The hypothesis with new means and covariance. Its cost includes the misfit of the
-            closure.
+        it. The cost includes the misfit of the closure.
         """
         noise = np.array(closure.covariance) + np.diag(self._spreads[closure.first])
         mean, n = moved.mean, len(moved.mean) - 3
@@ -194,12 +185,8 @@ class HypothesisPoses:
     def settled(self, found: Hypothesis, trace: Trace) -> tuple[float, Hypothesis]:
         """Fit all poses of a hypothesis anew, as the equations are linear only near the means.
 
-        Args:
-            found: The hypothesis.
-            trace: The trace of its steps, without the displacements that it treats as wrong.
-
-        Returns:
-            The chi-square, and the hypothesis with new means and covariances.
+        The trace lacks the displacements that the hypothesis treats as wrong. Returns the
+        chi-square, too.
         """
         poses = Poses(trace, found.labels, found.places)
         dstates, places = len(found.places), len(found.position)
@@ -229,14 +216,8 @@ class HypothesisPoses:
     ) -> Array:
         """Compute the chi-square of the robot being at each of some places at step t.
 
-        Args:
-            moved: The hypothesis, with its robot moved to step t.
-            t: The step.
-            places: The places.
-            dstate: A dstate at these places. If given, the heading of the robot has to fit, too.
-
-        Returns:
-            The chi-square for each place.
+        The hypothesis is moved to step t. If a dstate at these places is given, the heading of the
+        robot has to fit, too.
         """
         at = np.array([moved.position[p] for p in places])
         rows, last = np.stack([at, at + 1], 1), np.arange(-3, -1)
@@ -259,19 +240,12 @@ class HypothesisPoses:
     def met(
         self, moved: Hypothesis, t: int, position: int | None, heading: int | None
     ) -> tuple[Array, Array]:
-        """Condition the poses on the robot being at a place, and perhaps at a dstate, at step t.
+        """Condition the poses on the robot being at a place, and perhaps a dstate, at step t.
 
-        A new place or dstate gets the position or heading of the robot.
-
-        Args:
-            moved: The hypothesis, with its robot moved to step t.
-            t: The step.
-            position: The index in the means of the x of a known place; None for a new place.
-            heading: The index in the means of the heading of a known dstate; None for a new dstate.
-
-        Returns:
-            The means and the covariance. New entries, x and y before the heading, come just before
-            the pose of the robot.
+        A new place or dstate gets the position or heading of the robot. `position` is the index in
+        the means of the x of a known place, and `heading` that of a known dstate; None for new
+        ones. New entries, x and y before the heading, come just before the pose of the robot in the
+        new means and covariance.
         """
         n = len(moved.mean) - 3
         old = [] if position is None else [position, position + 1]
@@ -294,13 +268,9 @@ def conditioned(
 ) -> tuple[Array, Array, float]:
     """Condition a Gaussian on the equality of some entries with others, up to some variance.
 
-    Args:
-        first: The indices of entries: x and y, or a heading, or all three.
-        second: The indices of the entries that should be equal to them.
-        spreads: The variance of each difference, in square metres and square radians.
-
-    Returns:
-        The new means and covariance, and the chi-square of the differences.
+    `first` has the indices of x and y, or of a heading, or of all three, and `second` those of the
+    entries that should be equal. `spreads` has the variance of each difference, in square metres
+    and square radians. The chi-square of the differences comes last in the result.
     """
     off = mean[first] - mean[second]
     if len(off) % 2:

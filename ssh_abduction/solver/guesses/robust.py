@@ -65,8 +65,6 @@ class Explained:
     """An explanation of a trace by a machine: labels, and the faults that they imply.
 
     Attributes:
-        machine: The machine.
-        labels: The dstate of each step.
         misread: The steps whose views are treated as wrong.
         slips: The steps whose actions are treated as wrong.
         unknown: The steps whose actions have no link in the machine.
@@ -94,7 +92,6 @@ class Explainer:
         actions: The action after each step but the last, numbered from 0.
         price: For each allowed kind of fault ("misread", "slipped"), its cost at each step, in
             tenths of dstates.
-        check: Called now and then; may raise to stop.
     """
 
     seen: Sequence[int]
@@ -170,9 +167,6 @@ class Explainer:
 
         A dstate gets the view that is most expensive to treat as misread. An action leads where it
         leads most often.
-
-        Args:
-            labels: The dstate of each step.
         """
         labels = numbered(labels)
         views: list[Counter[int]] = [Counter() for _ in range(max(labels) + 1)]
@@ -192,9 +186,6 @@ class Explainer:
 
         Make a machine from the labels, explain the trace by it, and repeat this while the cost
         falls. Then merge all dstates that can be one, and begin again if that is cheaper.
-
-        Args:
-            labels: The dstate of each step.
         """
         best = self._settled(labels)
         while True:
@@ -218,12 +209,7 @@ class Explainer:
         return best
 
     def _explained(self, machine: PartialMachine, labels: Sequence[int]) -> Explained:
-        """Make an explanation of given labels: find their faults, and add up the cost.
-
-        Args:
-            machine: The machine. Its dstates include all labels.
-            labels: The dstate of each step.
-        """
+        """Make an explanation of given labels: find their faults, and add up the cost."""
         # A step is at fault if its view, or where its action leads, differs from the machine.
         misread = [t for t, s in enumerate(labels) if machine.shows[s] != self.seen[t]]
         leads = [
@@ -249,12 +235,9 @@ class Explainer:
 
 
 def robust_maps(explainer: Explainer) -> Iterator[Explained | None]:
-    """Yield explanations of a trace, each cheaper than the one before.
+    """Yield explanations of a trace, each cheaper than the one before, one for each start of EM.
 
-    Yield one item for each start of EM: None if that start led to no cheaper explanation.
-
-    Args:
-        explainer: The trace and the costs of faults.
+    The item is None if that start led to no cheaper explanation.
     """
     rng = np.random.default_rng(0)
     dearer = [round(DEARER * max(found)) for found in zip(*explainer.price.values(), strict=True)]
@@ -274,10 +257,7 @@ def robust_maps(explainer: Explainer) -> Iterator[Explained | None]:
 
 
 class _Model:
-    """A cloned hidden Markov model of one trace.
-
-    The transition probabilities have the shape (actions, from states, to states).
-    """
+    """A cloned hidden Markov model of a trace. Its arrays are (actions, from states, to states)."""
 
     def __init__(self, explainer: Explainer, clones: int, rng: np.random.Generator) -> None:
         self._explainer = explainer
@@ -349,13 +329,9 @@ class _Model:
         return labels[::-1]
 
     def _normal(self, counts: Floats) -> Floats:
-        """Turn counts into transition probabilities. A slip leads to each state equally often.
+        """Turn counts into transition probabilities, both of shape (actions, from, to states).
 
-        Args:
-            counts: Counts of transitions, with the shape (actions, from states, to states).
-
-        Returns:
-            The probabilities, in the same shape.
+        A slip leads to each state equally often.
         """
         chances: Floats = counts / counts.sum(axis=2, keepdims=True)
         slipping: Floats = (1 - self._slip) * chances + self._slip / counts.shape[2]

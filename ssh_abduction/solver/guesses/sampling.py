@@ -50,12 +50,9 @@ class _Transitions:
     ) -> None:
         """Count the transitions of a draw.
 
-        Args:
-            leaves: The slot and action at which each visit but the last ends.
-            ways: The number of states per place, 4 or 1. With 4, states 2 and 3 face opposite to 0
-                and 1.
-            states: The number of states.
-            labels: The state of each visit.
+        `leaves` has the slot and action at which each visit but the last ends. `ways` is the number
+        of states per place, 4 or 1. With 4, states 2 and 3 face opposite to 0 and 1. `labels` has
+        the state of each visit.
         """
         number: dict[int, int] = {}
         self._slot = np.array([slot for slot, _ in leaves], dtype=int)
@@ -74,12 +71,7 @@ class _Transitions:
         self._counted, self.counts, self.totals = self._tallied(labels)
 
     def rows(self, states: States, visits: States) -> States:
-        """Return, for each visit, the row of the table for its last step.
-
-        Args:
-            states: The states of the visits, in a shape that broadcasts with `visits`.
-            visits: The visits.
-        """
+        """Return the row of the table for the last step of each visit, by its state."""
         turned = (states + self._slot[visits]) % self._ways
         rows: States = (states - states % self._ways + turned) * self._actions + self._action[
             visits
@@ -89,14 +81,9 @@ class _Transitions:
     def entries(self, states: States) -> States:
         """Find where the table has the transitions from each visit to the next one.
 
-        Args:
-            states: The possible states of each visit, an array of visits x states, padded with -1.
-                Padding gets an extra last row or column of the table, where all probabilities are
-                0.
-
-        Returns:
-            Indices for `likely`, as an array of visits (without the last) x states x states of the
-            next visit.
+        `states` has the possible states of each visit, an array of visits x states, padded with -1.
+        Padding gets an extra last row or column of the table, where all probabilities are 0.
+        Returns indices for `likely`, visits (without the last) x states x states of the next visit.
         """
         rows = self.rows(states[:-1], self._visits[:, None])
         rows[states[:-1] < 0] = self._states * self._actions
@@ -105,15 +92,7 @@ class _Transitions:
         return entries
 
     def likely(self, entries: States, power: float) -> NDArray[np.float32]:
-        """Compute the probabilities of transitions from the counts and the prior.
-
-        Args:
-            entries: The transitions, as `entries` returns them.
-            power: The power to which the probabilities are raised.
-
-        Returns:
-            The probabilities, in the shape of `entries`.
-        """
+        """Compute the probabilities, to a power, of `entries` from the counts and the prior."""
         shape = self._states * self._actions + 1, self._states + 1
         totals = self.totals + np.float32(STATES * WEIGHT)
         table = np.zeros(shape, dtype=np.float32)
@@ -127,11 +106,8 @@ class _Transitions:
     def _tallied(self, labels: States) -> tuple[States, NDArray[np.float32], NDArray[np.float32]]:
         """Count the transitions of a draw. With 4 states per place, also count them backwards.
 
-        Args:
-            labels: The state of each visit.
-
-        Returns:
-            Each transition as an index into the flat table, the table, and the sums of its rows.
+        Returns each transition as an index into the flat table, the table, and the sums of its
+        rows.
         """
         here, there = labels[:-1], labels[1:]
         rows = self.rows(here, self._visits)
@@ -178,11 +154,8 @@ class Sampler:
     ) -> None:
         """Draw a state (a number for a placing) at random for each visit.
 
-        Args:
-            options: One row per visit: the numbers of its possible states, padded with -1.
-            leaves: The slot and action at which each visit but the last ends.
-            ways: The number of states per place: 4 with right angles, 1 without headings.
-            random: The source of random numbers.
+        `options` has the possible states of each visit in a row, padded with -1. `leaves` and
+        `ways` are as for `_Transitions`.
         """
         self._random = random
         self._options = options
@@ -195,10 +168,8 @@ class Sampler:
     def anneal(self, first: float, sweeps: int, check: Callable[[], None]) -> None:
         """Draw the states again and again, with rising power of probabilities.
 
-        Args:
-            first: The power of probabilities in the first sweep. It rises to COLD.
-            sweeps: The number of sweeps, before LAST more sweeps with the power QUENCHED.
-            check: Called before each sweep; may raise to stop.
+        The power rises from `first` to COLD in this many sweeps. LAST more sweeps have the power
+        QUENCHED.
         """
         for sweep in range(sweeps + LAST):
             check()
@@ -251,12 +222,7 @@ class Sampler:
         return _DrawnStates(states, self._transitions.entries(states), drawn)
 
     def _sweep(self, choice: _DrawnStates, power: float) -> None:
-        """Draw the states of all visits from a choice, all stretches at the same time.
-
-        Args:
-            choice: The states to draw from. Its field `drawn` is updated.
-            power: The power of probabilities.
-        """
+        """Draw all states, all stretches at once, from a choice, and update its field `drawn`."""
         likely = self._transitions.likely(choice.entries, power)
         starts, lengths = self._stretches(int(self._random.integers(STRETCH)))
         ahead = self._filtered(choice.states, likely, choice.drawn, starts, lengths)
@@ -276,13 +242,9 @@ class Sampler:
         self._transitions.count(self.labels)
 
     def _stretches(self, first: int) -> tuple[States, States]:
-        """Divide the visits into stretches of STRETCH visits.
+        """Divide the visits into stretches of STRETCH visits. Return first visits and lengths.
 
-        Args:
-            first: The first visit of the second stretch; with 0, of the first stretch.
-
-        Returns:
-            The first visit of each stretch, and its number of visits.
+        The second stretch begins at visit `first` or, if that is 0, the first one does.
         """
         starts = np.unique(np.append(0, np.arange(first, len(self._visits), STRETCH)))
         return starts, np.diff(np.append(starts, len(self._visits)))
@@ -298,17 +260,10 @@ class Sampler:
         """Compute the forward messages: the probability of each state of each visit.
 
         It is given the visits before it in its stretch, and the last draw of the visit before the
-        stretch.
-
-        Args:
-            states: The possible states: visits x states, padded with -1.
-            likely: The probabilities of transitions between these states.
-            drawn: For each visit, the column of its last drawn state.
-            starts: The first visit of each stretch.
-            lengths: The number of visits of each stretch.
-
-        Returns:
-            The messages: visits x states. Each row adds up to 1.
+        stretch. The states have the shape visits x states, padded with -1, and so have the
+        messages, whose rows add up to 1. `likely` has the probabilities of transitions between
+        these states. `drawn` has, for each visit, the column of its last drawn state. `starts` and
+        `lengths` are those of the stretches.
         """
         ahead = (states >= 0).astype(np.float32)
         for i in range(int(lengths.max())):

@@ -45,11 +45,8 @@ class Sights:
     def __init__(self, trace: Trace, theory: Theory, log: Log, *, misreads: bool) -> None:
         """Read the views and stars of all steps.
 
-        Args:
-            trace: The trace.
-            theory: The theory. Its field `changed` is the price of a changed gateway, in dstates.
-            log: The trace as integers.
-            misreads: Whether stars may be wrong. Then any step may be at any place.
+        The theory's field `changed` is the price of a changed gateway, in dstates. With `misreads`,
+        stars may be wrong. Then any step may be at any place.
         """
         starts = starts_of(trace)
         self.seen = numbered(trace.views) if theory.changed else log.seen
@@ -60,25 +57,15 @@ class Sights:
         self.dearest = DEAREST + CHANGES * self._price
 
     def changes(self, found: Hypothesis, place: int, t: int) -> float:
-        """Return the cost in nats of changed gateways if step t is at a place; inf if it cannot be.
-
-        Args:
-            found: The hypothesis, which says what was seen at the place before.
-            place: The place.
-            t: The step.
-        """
+        """Return the nats for changed gateways if step t is at a place; inf if it cannot be."""
         before, now = found.drives[place], self.drive[t]
         return self._between(found.sights[place], self.shown[t], is_one_drive=before == now)
 
     def merged(self, first: Mapping[int, Sight], second: Mapping[int, Sight]) -> float:
         """Return by how many nats changed gateways cost more if two places are one.
 
-        Args:
-            first: What each drive saw at the first place, as `shown`.
-            second: The same for the second place.
-
-        Returns:
-            The cost; inf if the two cannot be one place.
+        The result is inf if they cannot be one. Each place has what each drive saw there, as
+        `shown`.
         """
         if any(not agree(first[drive], second[drive]) for drive in first.keys() & second.keys()):
             return math.inf
@@ -164,10 +151,7 @@ def _fewest_changes(first: tuple[bool, ...], second: tuple[bool, ...]) -> int:
 
 @lru_cache(maxsize=2**14)
 def _fewest_closed(first: Star, second: Star) -> float:
-    """Return the fewest gateways that changed between two stars with bearings.
-
-    Without these gateways the stars agree. The result is inf if they are more than CHANGES.
-    """
+    """Count the fewest gateways that changed between two stars with bearings; inf above CHANGES."""
     return next(
         (
             count
@@ -180,12 +164,7 @@ def _fewest_closed(first: Star, second: Star) -> float:
 
 @lru_cache(maxsize=2**14)
 def _smaller(star: Star, less: int) -> tuple[Frame, ...]:
-    """Return the frames of a star without some of its gateways.
-
-    Args:
-        star: The star.
-        less: How many gateways are left out.
-    """
+    """Return the frames of a star without `less` of its gateways."""
     return tuple(
         Frame(
             tuple(frame.bearings[k] for k in kept),
@@ -202,10 +181,7 @@ def _smaller(star: Star, less: int) -> tuple[Frame, ...]:
 def _may_face_alike(first: Star, second: Star, changes: int) -> bool:
     """Whether a robot may face the same way where it sees two stars of one place.
 
-    Args:
-        first: The first star.
-        second: The second star.
-        changes: How many gateways may have changed.
+    Up to `changes` gateways may have changed.
     """
     return any(
         "alike" in may_face(frame, other, shift)

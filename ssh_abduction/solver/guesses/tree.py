@@ -57,7 +57,6 @@ class KnownDState:
     """A dstate of a sketch, as far as it is known.
 
     Attributes:
-        view: The view.
         seen: The observation: the view, and the star if the theory uses stars.
         place: The number of the place.
         heading: The heading in the frame of the place, in quarters clockwise.
@@ -275,8 +274,7 @@ class Sketch:
     def _known_ahead(self, place: int, path: int, direction: int, step: Step) -> int | None:
         """Return the dstate at which a travel to a known place ends.
 
-        Returns:
-            The dstate; None if the step contradicts what was seen at the place.
+        None if the step contradicts what was seen at the place.
         """
         there = self._along.get((place, path, direction))
         heading = 0

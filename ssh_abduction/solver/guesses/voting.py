@@ -77,11 +77,7 @@ class _Group:
 
     @staticmethod
     def joined(parts: Iterable[tuple[_Group, int]]) -> _Group:
-        """Make the union of groups.
-
-        Args:
-            parts: Pairs of a group, and the quarters by which to turn its visits further.
-        """
+        """Make the union of groups, each with the quarters by which to turn its visits further."""
         members: dict[int, int] = {}
         views: dict[int, Counter[View]] = {}
         stars: Counter[Openings] = Counter()
@@ -95,17 +91,7 @@ class _Group:
 
 
 class Merging:
-    """The visits of a trace in groups, which are merged to places.
-
-    Args:
-        trace: The trace.
-        theory: A theory with frames.
-        pairs: Pairs of steps that evidence says are different.
-        check: Called now and then; may raise to stop.
-
-    Attributes:
-        visits: The visits of the trace, in order.
-    """
+    """The visits of a trace, in order, in groups, which are merged to places with frames."""
 
     def __init__(
         self, trace: Trace, theory: Theory, pairs: Pairs, check: Callable[[], None]
@@ -119,8 +105,7 @@ class Merging:
     def start_from(self, places: Sequence[tuple[int, int] | None]) -> None:
         """Merge the visits that a map has at one place.
 
-        Args:
-            places: For each step, its place and the slot there that it faces; None if unknown.
+        Each step has its place and the slot there that it faces; None if unknown.
         """
         first: dict[int, _Turned] = {}
         for number, visit in enumerate(self.visits):
@@ -208,16 +193,10 @@ class Merging:
         return _Group({number: 0}, views, stars)
 
     def _misfitting(self, pairs: Pairs) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-        """Find the visits that cannot be at one place.
+        """Find the visits that cannot be at one place, as an array (4, visits, visits).
 
-        Each visit is a group at first.
-
-        Args:
-            pairs: Pairs of steps that evidence says are different.
-
-        Returns:
-            An array (4, visits, visits). Element [R, I, J] says that visits I and J cannot be at
-            one place such that slot K of I is slot K + R of J.
+        Each visit is a group at first. Element [R, I, J] says that visits I and J cannot be at one
+        place such that slot K of I is slot K + R of J. `pairs` of steps are different by evidence.
         """
         count = len(self.visits)
         misfits = np.zeros((4, count, count), dtype=bool)
@@ -238,10 +217,9 @@ class Merging:
         return misfits
 
     def _candidates(self) -> list[tuple[int, int, int]]:
-        """List the pairs of groups that may be one place, at most `MOST_PAIRS`.
+        """List at most `MOST_PAIRS` pairs of groups that may be one place.
 
-        Returns:
-            Triples (I, J, R): slot K of group I would be slot K + R of group J.
+        For (I, J, R), slot K of group I would be slot K + R of group J.
         """
         some = np.array(sorted(self._groups))
         turns, first, second = np.nonzero(
@@ -256,12 +234,9 @@ class Merging:
     def _beside(self, visit: int, other: int, turn: int) -> list[_Turned]:
         """Find how to turn the group of another visit before it is merged with that of this visit.
 
-        Args:
-            turn: Slot K of this visit shall be slot K + turn of the other.
-
-        Returns:
-            A list with the group of the other visit and the quarters to turn it by; empty if both
-            visits are in one group already.
+        Slot K of this visit shall be slot K + turn of the other. Returns a list with the group of
+        the other visit and the quarters to turn it by; empty if both visits are in one group
+        already.
         """
         mine, its = self._group_of[visit], self._group_of[other]
         if mine == its:
@@ -272,14 +247,11 @@ class Merging:
         return [(its, (here - turn - there) % 4)]
 
     def _gain(self, first: int, second: int, turn: int) -> tuple[int, list[list[_Turned]]]:
-        """Compute the gain of merging the groups of two visits, and all groups that follow.
+        """Compute the gain in tenths of merging two visits' groups, and all groups that follow.
 
-        Args:
-            turn: Slot K of the first visit shall be slot K + turn of the second.
-
-        Returns:
-            The gain in tenths of dstates; and for each merge a list of the groups to merge, with
-            their quarters. Zero and an empty list if the groups cannot be one place.
+        Slot K of the first visit shall be slot K + turn of the second. For each merge, a list of
+        the groups and their quarters is returned, too. Zero and an empty list if the groups cannot
+        be one place.
         """
         # For each group, the groups that become one place with it, and how many quarters to turn
         # each of them.
@@ -317,13 +289,9 @@ class Merging:
     ) -> list[tuple[int, int, int]]:
         """List the pairs of visits to merge next: one action leads to both from the same slot.
 
-        Args:
-            mine: Groups that become one place, with their quarters.
-            its: Further groups that become the same place, with their quarters.
-            shift: The quarters by which all of `its` are turned more.
-
-        Returns:
-            Triples (visit, visit, turn), as the arguments of `_gain`.
+        `mine` are groups that become one place, and `its` further groups that become the same
+        place, with their quarters; `its` are turned by `shift` more. Returns triples (visit, visit,
+        turn), as the arguments of `_gain`.
         """
         leads = dict(self._leads(mine, 0))
         return [(leads[key], there, 0) for key, there in self._leads(its, shift) if key in leads]
@@ -331,9 +299,8 @@ class Merging:
     def _leads(self, parts: Mapping[int, int], shift: int) -> Iterator[tuple[tuple[int, str], int]]:
         """Yield where actions lead from a place: pairs ((slot, action), next visit).
 
-        Args:
-            parts: The groups that become this place, with their quarters.
-            shift: Further quarters by which all of them are turned.
+        `parts` are the groups that become this place, with their quarters. `shift` turns them
+        further.
         """
         for x, t in parts.items():
             for visit, turn in self._groups[x].members.items():
@@ -341,11 +308,7 @@ class Merging:
                     yield ((leaves[0] + turn + t + shift) % 4, leaves[1]), visit + 1
 
     def _merge(self, parts: Sequence[_Turned]) -> None:
-        """Merge groups into the first of them.
-
-        Args:
-            parts: Pairs of a group and the quarters by which to turn it.
-        """
+        """Merge groups, each with the quarters by which to turn it, into the first of them."""
         (kept, by), *others = parts
         whole = _Group.joined([(self._groups[x], (t - by) % 4) for x, t in parts])
         for x, t in others:
