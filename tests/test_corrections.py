@@ -403,3 +403,22 @@ def test_steps_said_to_be_at_one_place(tmp_path: Path, capsys: pytest.CaptureFix
     assert main(solving_it) == 0
     assert "obeying 1 correction" in capsys.readouterr().err
     assert main([*solving_it, "--same-place", "0,3"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("first", "then", "left"),
+    [
+        ("different", "same", ["same"]),
+        ("elsewhere", "same", ["same"]),
+        ("same", "different", ["different"]),
+        ("same_place", "elsewhere", ["elsewhere"]),
+        ("different", "same_place", ["different", "same_place"]),
+        ("same", "same", ["same"]),
+    ],
+)
+def test_the_opposite_of_what_was_said_replaces_it(first: str, then: str, left: list[str]) -> None:
+    said = Corrections(MARKS).with_pair(first, "monday:0", "tuesday:1")
+    said = said.with_pair(first, "monday:2", "tuesday:1")
+    changed = said.with_pair(then, "tuesday:1", "monday:0")
+    assert [pair.kind for pair in changed.pairs if "monday:0" in pair.steps] == left
+    assert said.pairs[1] in changed.pairs

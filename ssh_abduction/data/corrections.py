@@ -38,6 +38,13 @@ from ssh_abduction.data.trace import Trace, checked_trace
 FORMAT, VERSION = "ssh-corrections", 1
 # The kinds of pairs of steps, which are fields of a theory.
 PAIRS = ("same", "different", "elsewhere", "same_place")
+# The kinds that contradict a kind if they are said of the same steps.
+_AGAINST = {
+    "same": ("different", "elsewhere"),
+    "different": ("same",),
+    "elsewhere": ("same", "same_place"),
+    "same_place": ("elsewhere",),
+}
 # How the command line writes the number of a dstate, place, path or region. No name may look so.
 _NUMBER = re.compile(r"((p|place|path|region) ?)?[0-9]+")
 # The directions of gateways by name, in degrees clockwise from ahead.
@@ -153,6 +160,8 @@ class Corrections:
     def with_pair(self, kind: str, first: str, second: str) -> Corrections:
         """Say that two steps are one dstate or at one place, or that they are different ones.
 
+        What was said before of these steps, and contradicts it, is replaced.
+
         Args:
             kind: "same", "different", "elsewhere" or "same_place".
             first: A step, such as "monday:12".
@@ -165,7 +174,10 @@ class Corrections:
         said = Said(kind, (_a_step("first", first), _a_step("second", second)))
         if said.steps[0] == said.steps[1]:
             raise MapError(f"second: expected a step other than {first}, got it again; name two")
-        return self if said in self.pairs else replace(self, pairs=(*self.pairs, said))
+        about = [other for other in self.pairs if set(other.steps) == set(said.steps)]
+        new = () if any(other.kind == kind for other in about) else (said,)
+        wrong = [other for other in about if other.kind in _AGAINST[kind]]
+        return replace(self, pairs=(*(pair for pair in self.pairs if pair not in wrong), *new))
 
     def with_gateway(self, is_open: bool, seen: Iterable[tuple[str, float]]) -> Corrections:
         """Say that a gateway is open or closed. What was said about it before is replaced.
