@@ -171,8 +171,8 @@ def _margin(model: Any, images: Floats, second: NDArray[np.bool_]) -> float:
     """Compute the margin: how much nearer images are to their own dstate than to the other one.
 
     It is the mean over all images of the squared distance to the nearest image of the other dstate,
-    minus that to the nearest image of their own. Shuffling a useless feature adds the same to both
-    squares, so the difference stays.
+    minus that to the nearest image of their own. A feature is important if shuffling its values
+    changes the margin. A useless feature adds the same to both distances, so the margin stays.
     """
     distances = cdist(images, model._fit_X, "sqeuclidean")
     same = second[:, None] == model.classes_[model._y]

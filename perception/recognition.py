@@ -250,9 +250,8 @@ def _deal(
     cards = cards[counts[of[cards]] > 1]
     if len(cards) < folds:
         raise PerceptionError(
-            f"folds: expected at most {len(cards)}, the images of places seen more than once, "
-            f"got {folds}"
-            "; take fewer"
+            f"folds: expected at most {len(cards)}, the number of images of places that were seen "
+            f"more than once, got {folds}; take fewer"
         )
     fold = np.full(len(labels), -1, np.intp)
     fold[cards] = np.arange(len(cards)) % folds

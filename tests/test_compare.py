@@ -555,7 +555,7 @@ def edited(path: Path, change: Callable[[dict[str, object]], object]) -> Path:
         ),
         (
             lambda d: (d.update(complete=False), d["backbone"]["places"].update(sometimes=[])),
-            "backbone: places: steps ",
+            "backbone: places: it contradicts the maps",
         ),
         (
             lambda d: (d["maps"][0]["dstates"][0].update(view="x"), d["maps"][0].pop("id")),

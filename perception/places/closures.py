@@ -224,8 +224,8 @@ def without_drift(middles: Array, way: Array, drift: float) -> Array:
     """Compute the middles of visits without a steady drift of the heading.
 
     Args:
-        middles: (n, 2) middles in metres, by the track.
-        way: (n,) metres driven at each visit.
+        middles: (n, 2) middles in metres, according to the track.
+        way: (n,) metres driven before each visit.
         drift: The drift to remove, in radians a metre.
 
     Returns:

@@ -190,7 +190,7 @@ class _Detector:
             self._first += 1
 
     def _passes(self, chain: _Chain) -> Iterator[Visit]:
-        """Yield a visit for each time that the robot drives through the disc of a chain."""
+        """Yield a visit for each time that the robot drives through the disc of a junction."""
         recent, sightings = self._recent, chain.sightings
         first = recent.at(sightings[0].way - GAP * EVERY)
         last = recent.at(sightings[-1].way + GAP * EVERY, "right")

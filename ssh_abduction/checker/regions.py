@@ -22,6 +22,8 @@ _Node: TypeAlias = tuple[str, int] | tuple[str, int, int | None]
 def known_sides(m: Reading) -> Mapping[Course, Mapping[int, RightBranch]]:
     """Find the places known to lie right of each course, each with the branch that leads to it.
 
+    A course is a path in one direction.
+
     Here the order of places comes from travels alone. If a map lists places in an order that
     travels do not imply, another order may be just as right.
     """

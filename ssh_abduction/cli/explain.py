@@ -68,7 +68,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.add(
         "trace",
         "trace file (JSON Lines), or - for standard input; or a file of maps that solve -o "
-        "wrote, or a folder that map wrote, for its trace and the theory of its maps",
+        "wrote, or a folder that `map` wrote, for its trace and the theory of its maps",
     )
     parser.add(
         "steps",

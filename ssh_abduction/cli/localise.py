@@ -45,7 +45,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.add(
         "other",
         "trace of a robot in the mapped world that uses the same names of views and actions; "
-        "- for standard input; or a folder that map wrote",
+        "- for standard input; or a folder that `map` wrote",
         type=trace_path,
     )
     parser.add("--map I", "the number of the map, from 1 (default: 1)", type=int)

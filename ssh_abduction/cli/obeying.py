@@ -98,10 +98,10 @@ class Obeying:
         return with_names(self.corrections, solution, self.trace)
 
     def blamed(self, explanation: Explanation | None) -> list[str]:
-        """List the corrections without which the trace may have a map.
+        """List the corrections that may be the reason why the trace has no map.
 
-        They are left out one by one. A correction without which the stretch of the explanation
-        still has no map is not listed.
+        Each correction is dropped in turn. If the steps of the explanation still have no map, it
+        is not to blame, and it is not listed.
         """
         said = self.corrections.known_in(drives_of(self.trace)) if self.corrections else None
         if explanation is None or said is None:

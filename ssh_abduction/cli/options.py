@@ -52,7 +52,7 @@ def add_theory(parser: Parser, default: str = "topological") -> None:
     parser.add(
         "--theory PRESET|FILE",
         f"a preset: {', '.join(PRESETS)}; or a .toml file with fields of a theory; or a file "
-        f"of maps, or a folder that map wrote, to use their theory (default: {default})",
+        f"of maps, or a folder that `map` wrote, to use their theory (default: {default})",
         to=group,
     )
     for name, text in (

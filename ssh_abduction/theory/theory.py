@@ -65,7 +65,7 @@ class Theory:
         boundary: Whether the axioms about left and right of a path hold. none: they do not. strict:
             without exception. defeasible: with exceptions for pairs of paths, each at a cost.
         symmetric_sides: Whether two paths cross where the robot turns from one onto the other. If
-            they do, a branch that is on the right of a robot is on its left on the way back.
+            so, each goes on to both sides of the other one.
         path_order: Order of the places of a path. partial: some pairs may stay unordered. total:
             every two places are ordered.
         next_place: Whether a travel leads to the next place of its path, with no place between.

@@ -1,9 +1,9 @@
-"""Searches for a map that contradicts something in which all known maps agree.
+"""Searches for a map that contradicts something on which all known maps agree.
 
-Every engine uses this. Two steps may share a dstate, place, path or course in all known maps, but
-not in some unknown map. Or they may share it in no known map, but in some unknown map. Either
-possibility is a *doubt*. Clingo gets the rule for each doubt once. Then it is asked for an answer
-in which at least one doubt of a set holds.
+Every engine uses this. Two steps may share a dstate, place, path or course (a path in one
+direction) in all known maps, but not in some unknown map. Or they may share it in no known map, but
+in some unknown map. Either possibility is a *doubt*. Clingo gets the rule for each doubt once. Then
+it is asked for an answer in which at least one doubt of a set holds.
 """
 
 from __future__ import annotations

@@ -254,7 +254,8 @@ def _are_paired(edges: Collection[frozenset[Side]]) -> bool:
 def _groups(shown: _Shown, turns: bool) -> tuple[dict[int, int], dict[int, int], bool]:
     """Group the dstates that turns link.
 
-    Returns the first dstate of each one's group, its slots from there, and whether all turns agree.
+    Returns three things: for each dstate, the first dstate of its group; for each dstate, the
+    number of quarter turns from that first dstate; and whether all turns agree.
     """
     links: dict[int, list[tuple[int, int]]] = {dstate: [] for dstate in shown.places}
     for x, turn, y in shown.turns if turns else ():
@@ -323,7 +324,7 @@ def _can_draw_sided(shown: _Shown, crossing: bool) -> bool:
 def _paired(shown: _Shown, same: _ArmClasses) -> list[frozenset[Gateway]] | None:
     """Find the edges, each between two gateways. None if a gateway leads to two places.
 
-    Gateways of one place that lead to the same gateway become one, also in `same`.
+    If two gateways of a place lead to the same gateway, they are merged. This changes `same`.
     """
     joined = [
         ((shown.places[x], (x, AHEAD)), (shown.places[y], (y, BACK))) for x, y in shown.travels
