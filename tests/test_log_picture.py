@@ -14,6 +14,7 @@ from simulator.tours import record
 from simulator.world import World
 from ssh_abduction import solve
 from ssh_abduction.cli.simulate import scans_of
+from ssh_abduction.data.map_parts import Name
 from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.odometry import displacement_between, moved
 from ssh_abduction.output.drawing import ALARM
@@ -64,6 +65,18 @@ def test_places_without_a_decision_are_dots_and_the_others_have_numbers(house: L
     for place in ssh_map.places:
         assert (f">{place}</text>" in picture) == (place not in hidden)
         assert (f"<title>place {place}</title>" in picture) == (place in hidden)
+
+
+def test_places_have_the_names_that_a_person_gave(house: LogMap) -> None:
+    best = house.solution.maps[0]
+    hidden = min(undecided_places(best))
+    shown = min(set(best.places) - undecided_places(best))
+    names = (Name("place", shown, "Küche <1>"), Name("place", hidden, "corner"))
+    named = replace(house.solution, maps=(replace(best, names=names),))
+    picture = figure(house.log, house.imported, named)
+    assert ">Küche &lt;1&gt;</text>" in picture
+    assert ">corner</text>" in picture
+    assert f"<title>place {hidden} (corner)</title>" in picture
 
 
 def test_edges_follow_the_robot_and_each_is_drawn_once(house: LogMap) -> None:

@@ -208,12 +208,18 @@ def _map_marks(sheet: _Sheet, imported: Imported, solution: Solution) -> Iterato
             'stroke-opacity=".8" stroke-linejoin="round" fill="none"/>'
         )
     at = {place: sheet.on_page(middle) for place, middle in middles.items()}
-    yield from (_dot(at[place], 4, EDGE, f"place {place}") for place in visits if place in hidden)
+    for place in visits:
+        if place in hidden:
+            yield _dot(at[place], 4, EDGE, ssh_map.called("place", place))
     for place in shown:
         yield from _place(sheet, imported, at[place], visits[place])
-    # Numbers come last, so that nothing covers them.
+    # Numbers and names come last, so that nothing covers them.
     for place in shown:
         yield from _number(at[place], str(place), doubts.get(place))
+    for place in visits:
+        if name := ssh_map.name_of("place", place):
+            x, y = at[place]
+            yield svg_text(x, y + 18, name, "#222", 11, "bold", halo=True)
 
 
 def _bands(
