@@ -34,11 +34,8 @@ class Answer:
     def take_down(self, ssh_map: SSHMap, cost: tuple[int, ...]) -> None:
         """Record a map that was given to the caller.
 
-        Count it in its level: the maps of one cost. Maps come level by level.
-
-        Args:
-            ssh_map: The map.
-            cost: The preferred counts of the map, the most important one first (`Priced`).
+        Count it in its level: the maps of one cost. Maps come level by level. `cost` has the
+        preferred counts, the most important one first.
         """
         if self._last is None or self._last[1] != cost:
             self._levels.append(Level(cost_as_counted(ssh_map, cost, self._parts.task.theory), 0))
@@ -57,11 +54,9 @@ class Answer:
             known.bound = replace(known.bound, dstates=max(apart, known.bound.dstates or 0))
 
     def solution(self, maps: tuple[SSHMap, ...], grounding: Grounding | None = None) -> Solution:
-        """Make the solution that holds these maps.
+        """Make the solution that lists these maps, which the caller kept, in this order.
 
-        Args:
-            maps: The maps that the caller kept, in the order in which the solution lists them.
-            grounding: The size of the ground program; None to ask clingo for it.
+        `grounding` is the size of the ground program; None to ask clingo for it.
         """
         parts, known, task = self._parts, self._parts.known, self._parts.task
         levels = tuple(replace(level, complete=parts.rivals.listed) for level in self._levels)

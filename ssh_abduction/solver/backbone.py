@@ -60,12 +60,7 @@ class Rivals:
     """
 
     def __init__(self, task: Task, judging: Judging) -> None:
-        """Start without any known map.
-
-        Args:
-            task: The task of the search that lists the maps.
-            judging: Says which maps the evidence rejects.
-        """
+        """Start without any known map."""
         self.sharing = Sharing()
         self.listed = False
         self.engine: Engine | None = None
@@ -114,19 +109,11 @@ def prove_backbone(
 ) -> bool:
     """Find more minimal maps until `sharing` holds exactly what all minimal maps share.
 
-    Args:
-        task: The task of the search.
-        judging: Says which maps the evidence rejects.
-        cost: The preferred counts of minimal maps, the most important one first.
-        sharing: What the known minimal maps share; at least one is known. Each new map is added.
-        engine: The engine that proved the minimum; None if it is no longer available.
-
-    Returns:
-        True if the proof is complete. False if no proof is possible, as the theory allows a dstate
-        at several places or along several courses.
-
-    Raises:
-        LimitError: A limit is reached.
+    At least one minimal map is known, and each new one is added to `sharing`. `cost` has the
+    preferred counts of minimal maps, the most important one first. The engine is the one that
+    proved the minimum; None if it is no longer available. Returns whether the proof is complete. No
+    proof is possible if the theory allows a dstate at several places or along several courses.
+    Raises LimitError if a limit is reached.
     """
     if SHOWN_ONCE & task.theory.given_up:
         return False
@@ -147,9 +134,8 @@ class _Reasoning:
     def settle_labels(self, engine: Engine) -> bool:
         """Resolve all doubts, one labelling of minimal maps after the other.
 
-        Returns:
-            Whether no doubt is left; False if this engine cannot list labellings, or cannot forbid
-            maps that the evidence rejects.
+        Returns whether no doubt is left; False if this engine cannot list labellings, or cannot
+        forbid maps that the evidence rejects.
         """
         forbidden = set[frozenset[Equality]]()
         while isinstance(engine, LabellingEngine):
@@ -223,10 +209,9 @@ class _Reasoning:
         return size
 
     def _settle_prefix(self, engine: StepEngine, size: int) -> int:
-        """Resolve the doubts about the first `size` steps.
+        """Resolve the doubts about the first `size` steps, and return the next size to try.
 
-        Returns:
-            The size of the prefix to try next; 0 if no doubt about the trace is left.
+        It is 0 if no doubt about the trace is left.
         """
         engine.grow(size)
         while (found := engine.map_with(list(self._doubts(size)), self._cost)) is not None:

@@ -53,10 +53,8 @@ class Beams:
     ) -> None:
         """Prepare the search by beams.
 
-        Args:
-            parts: The parts of the search.
-            add: Computes the cost of a map in nats, and keeps the map if the cost is small.
-            keep_best: Makes the cheapest known map the best map of the search.
+        `add` computes the cost of a map in nats, and keeps the map if the cost is small.
+        `keep_best` makes the cheapest known map the best map of the search.
         """
         self._parts, self._add, self._keep_best = parts, add, keep_best
         # The cost of the best map of the last broad beam, and the estimate of it by the beam.
@@ -70,9 +68,6 @@ class Beams:
 
         If displacements may be wrong, this is False: after a wrong one the pose is unknown, so the
         beam often drops the map of least cost.
-
-        Args:
-            nats: The cost of the best map.
         """
         is_sound = math.isfinite(self.broken) and not self._parts.task.theory.jumped
         return is_sound and self._best[0] <= nats + EQUAL
@@ -80,12 +75,8 @@ class Beams:
     def search(self, clashes: Callable[[], bool]) -> bool:
         """Search by beams of growing width, as far as there is time.
 
-        Args:
-            clashes: Called if the first beam finds no map: returns whether a short proof shows that
-                the trace has none.
-
-        Returns:
-            Whether the trace may have a map.
+        If the first beam finds no map, `clashes` returns whether a short proof shows that the trace
+        has none. Returns whether the trace may have a map.
         """
         watch = self._parts.watch
         time = _Time(watch.elapsed(), watch.left())

@@ -78,17 +78,12 @@ class Candidates:
             self.offer(answer_maps.causal_map(self._task.log.merged(), self._task.trace))
 
     def beam(self, width: int) -> Beam | None:
-        """Return the beam of hypotheses about dstates and places that has this width.
+        """Return the beam of this many hypotheses about dstates and places.
 
-        Later calls return the same beam, which goes on where it stopped.
-
-        Args:
-            width: The number of hypotheses.
-
-        Returns:
-            The beam. None without the speed-up `greedy`, if the trace is long, or if the checker
-            cannot check all axioms. Also None if the trace has neither displacements nor stars at
-            any angles, as `guesses/tree.py` makes better maps of it.
+        Later calls return the same beam, which goes on where it stopped. None without the speed-up
+        `greedy`, if the trace is long, or if the checker cannot check all axioms. Also None if the
+        trace has neither displacements nor stars at any angles, as `guesses/tree.py` makes better
+        maps of it.
         """
         theory = self._task.theory
         if (
@@ -140,11 +135,8 @@ class Candidates:
         A sketch extends the best map of a prefix, or begins at the first step. The sketch with the
         most new dstates is large, but the checker accepts it most often and fastest. So it is tried
         first. Then come the others, the smallest first. With a time limit, stop at the first of
-        these that is better than the first sketch.
-
-        Args:
-            seconds: The time for all sketches. Each sketch may use a share of the time left.
-            beams: Whether to try beams of hypotheses, too.
+        these that is better than the first sketch. `seconds` are for all sketches, and each may use
+        a share of the time left. `beams` says whether to try beams of hypotheses, too.
         """
         with self._sketching:
             if (
@@ -177,10 +169,8 @@ class Candidates:
         """Offer a sketch that has only as many dstates as there are pairwise distinct steps.
 
         No map has fewer dstates. Such a sketch exists if the robot drives there and back and most
-        views are different. Clingo then only has to find the fewest places and paths.
-
-        Returns:
-            Whether such a sketch was found and accepted.
+        views are different. Clingo then only has to find the fewest places and paths. Returns
+        whether such a sketch was found and accepted.
         """
         from ssh_abduction.solver.steps.apart import Continuations  # loads numpy
 
@@ -237,8 +227,7 @@ class Candidates:
     def frame(self, speedups: Speedups) -> None:
         """Offer maps in which places have frames, although the theory does not demand frames.
 
-        Args:
-            speedups: The speed-ups that the caller has on. With frames, more of them may apply.
+        `speedups` are those that the caller has on. With frames, more of them may apply.
         """
         from ssh_abduction.solver.engines.framed import maps_with_frames  # loads numpy
 

@@ -16,11 +16,9 @@ from ssh_abduction.data.trace import Trace
 
 @dataclass(frozen=True)
 class Digest:
-    """A short trace that the solver gets instead of the old drives.
+    """A short trace that the solver gets instead of the old drives, with the labels of its steps.
 
-    Attributes:
-        trace: The trace.
-        labels: For each of its steps, the dstate in the existing map.
+    A label is the dstate in the existing map.
     """
 
     trace: Trace
@@ -30,10 +28,7 @@ class Digest:
     def of(cls, trace: Trace, ssh_map: SSHMap, *, short: bool) -> Digest:
         """Make a digest of the drives of a map.
 
-        Args:
-            trace: The drives.
-            ssh_map: Their map.
-            short: Whether each link occurs only once. If False, the digest has all steps.
+        If `short`, each link occurs only once. If not, the digest has all steps.
         """
         if not short:
             return cls(trace, ssh_map.dstate_at)
@@ -56,11 +51,9 @@ class Digest:
         return cls(Trace(tuple(steps), drive="standing"), tuple(labels))
 
     def labels_of_all(self, found: SSHMap, ssh_map: SSHMap) -> tuple[int, ...]:
-        """Return the dstate of each step of all drives, by a map of the digest and new drives.
+        """Return the dstate of each step of all drives.
 
-        Args:
-            found: The map of the digest and the new drives.
-            ssh_map: The map of the old drives.
+        `found` is the map of the digest and the new drives, and `ssh_map` that of the old drives.
         """
         number = dict(zip(self.labels, found.dstate_at, strict=False))
         new = found.dstate_at[len(self.labels) :]
@@ -82,11 +75,10 @@ def _observations(trace: Trace, ssh_map: SSHMap) -> dict[int, list[Step]]:
 
 
 def _trails(ssh_map: SSHMap) -> list[list[tuple[int, str | None]]]:
-    """Cover the links of a map by few trails.
+    """Cover the links of a map by few trails, so that each link is in one trail.
 
-    Returns:
-        The trails: lists of pairs of a dstate and the action that leads to the next dstate, None
-        at the end. Each link is in one trail. A dstate without links is a trail of its own.
+    A trail has pairs of a dstate and the action that leads to the next dstate, None at the end. A
+    dstate without links is a trail of its own.
     """
     leaving: dict[int, list[tuple[str, int]]] = {s.id: [] for s in ssh_map.dstates}
     excess = dict.fromkeys(leaving, 0)

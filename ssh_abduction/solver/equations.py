@@ -81,10 +81,6 @@ class Equations:
 
         If the robot may be off its dstates, it gets a pose of its own at each step t, which has the
         number size + t. Then there are also equations between these poses and the dstates.
-
-        Args:
-            labels: The dstate of each step.
-            size: The number of dstates.
         """
         if not self.spreads.any():
             return replace(self, first=labels[self.first], last=labels[self.last])

@@ -32,13 +32,8 @@ def estimated(
     """Yield rivals that cost little more than the best map, each once.
 
     In each rival, some visits to a place of the best map are visits to a new place instead: a
-    single visit, or a visit and all later ones.
-
-    Args:
-        best: The best map.
-        visit: For each step, the first step of its visit.
-        cost_of: Computes the cost of a map.
-        seconds: The time that this may take.
+    single visit, or a visit and all later ones. `visit` has, for each step, the first step of its
+    visit. `seconds` is the time that this may take.
     """
     at = best.places or best.dstates
     visits: dict[int, list[int]] = {}  # the first steps of the visits to each place
@@ -68,9 +63,7 @@ def estimated(
 def _moved(best: Rival, visit: Sequence[int], place: int, moved: Collection[int]) -> Course:
     """Return the dstates and places of a map after some visits to a place get a new place.
 
-    Args:
-        visit: For each step, the first step of its visit.
-        moved: The first steps of the visits that get a new place.
+    `visit` has, for each step, the first step of its visit, and `moved` those of the moved visits.
     """
     at = best.places or best.dstates
     begins = _begins(at, visit)
@@ -82,13 +75,9 @@ def _moved(best: Rival, visit: Sequence[int], place: int, moved: Collection[int]
 
 
 def _begins(at: Sequence[int], visit: Sequence[int]) -> list[int]:
-    """For each step, find the first step of its visit.
+    """For each step, find the first step of its visit. A visit also begins where the place changes.
 
-    A visit also begins where the place changes.
-
-    Args:
-        at: The place of each step; without places, the dstate.
-        visit: For each step, the first step of its visit by the trace alone.
+    `at` has the place of each step; without places, the dstate. `visit` is by the trace alone.
     """
     begins: list[int] = []
     for step, name in enumerate(at):

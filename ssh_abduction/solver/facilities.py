@@ -69,11 +69,10 @@ class Facilities:
         return shares * self.price / saved
 
     def first_shares(self) -> tuple[Array, Array]:
-        """Compute approximate shares, without a search of all space.
+        """Compute approximate shares, (n,), without a search of all space.
 
-        Returns:
-            The shares, (n,), and what each point pays for each of its coordinates in the cheapest
-            clustering, (n, d). This clustering may use fractions of clusters.
+        Also return what each point pays for each of its coordinates in the cheapest clustering, (n,
+        d). This clustering may use fractions of clusters.
         """
         program, pays = _Program(self.price, np.full(len(self.points), self.price)), 0 * self.points
         shares = self._approximate(program, *self._starts())
@@ -124,9 +123,8 @@ class Facilities:
     ) -> tuple[Array, NDArray[np.bool_], Array, Array]:
         """Move each of m facilities to the mean of the points that pay less there than their share.
 
-        Returns:
-            What the points save there, (m,), which points these are, (m, n), what they pay, (m,),
-            and where the facility is, (m, d).
+        Returns what the points save there, (m,), which points these are, (m, n), what they pay,
+        (m,), and where the facility is, (m, d).
         """
         centres, moving = centres.copy(), np.arange(len(centres))
         for _ in range(STEPS):
@@ -161,9 +159,8 @@ class Facilities:
     def _most_saved(self, shares: Array) -> tuple[float, Array, NDArray[np.int_]]:
         """Bound what the points save at any facility, by dividing space into boxes.
 
-        Returns:
-            The bound, at least the price; and facilities where more than the price is saved, with
-            their kinds.
+        The bound is at least the price. Also return facilities where more than the price is saved,
+        with their kinds.
         """
         most, found, kinds = self.price, [np.zeros((0, self.points.shape[1]))], []
         for kind in np.unique(self.kinds):

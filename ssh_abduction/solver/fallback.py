@@ -32,12 +32,9 @@ _log = log_of(__name__)
 def fall_back(parts: Parts, answer: Answer, *, may_search: bool) -> None:
     """Make some map of the whole trace if none is known, and prove a bound from distinct steps.
 
-    If the search was not stopped, or has proven its minimum, do nothing.
-
-    Args:
-        parts: The parts of the search. Its `known` gets the map, the bound and the status.
-        answer: The answer of the search.
-        may_search: Whether clingo may look for a map in the reserved last part of the time limit.
+    If the search was not stopped, or has proven its minimum, do nothing. The map, the bound and the
+    status go to `parts.known`. `may_search` says whether clingo may look for a map in the reserved
+    last part of the time limit.
     """
     known = parts.known
     if not known.stopped or known.status is Status.OPTIMAL:
@@ -67,15 +64,9 @@ def clash_in(
 ) -> range | None:
     """Find a stretch of consecutive steps that has no map by itself. Then the trace has no map.
 
-    Args:
-        trace: The trace.
-        theory: Its theory, with all defaults filled in.
-        stretches: The stretches to try.
-        maps_of: Solves a trace. Returns some maps, and whether the answer is proven.
-
-    Returns:
-        The first such stretch; None if there is none, or if the theory allows faults. Also None if
-        it has rules of the user, which may hold only for the whole trace.
+    `maps_of` solves a trace, and returns some maps and whether the answer is proven. Returns None
+    if there is no such stretch, or if the theory allows faults. Also None if it has rules of the
+    user, which may hold only for the whole trace.
     """
     if theory.has_faults or theory.rules:
         return None
@@ -96,11 +87,8 @@ def late_clash(
     """Look for a short clash if a stopped search has no map.
 
     The clash may end at a step that contradicted a sketch, or at a step that the theory asserts to
-    be at the dstate or place of an earlier one.
-
-    Args:
-        parts: The parts of the search. Its `known` gets the status if there is a clash.
-        maps_of: As in `clash_in`.
+    be at the dstate or place of an earlier one. `maps_of` is as in `clash_in`. `parts.known` gets
+    the status if there is a clash.
     """
     known, task, clash = parts.known, parts.task, None
     if known.best is not None or not known.stopped or known.status is not Status.UNKNOWN:

@@ -61,15 +61,7 @@ HELD_STILL = 1e-9
 
 
 def fit(trace: Trace, ssh_map: SSHMap) -> Fit:
-    """Find the poses of the dstates that agree best with the displacements.
-
-    Args:
-        trace: A trace with displacements at some of its steps.
-        ssh_map: A map of all steps of the trace.
-
-    Returns:
-        The poses of the dstates, and chi-square with its degrees of freedom.
-    """
+    """Find the poses of the dstates that agree best with the displacements, and the chi-square."""
     # The matrices are small: threads of BLAS would mostly wait for each other.
     with threadpool_limits(1, user_api="blas"):
         return Poses.of_map(trace, ssh_map).fit()
@@ -88,12 +80,9 @@ class Poses:
     ) -> None:
         """Collect the equations. Nothing is solved yet.
 
-        Args:
-            trace: A trace with displacements at some of its steps.
-            headings: For each step, which of the unknown headings it has (mostly its dstate). The
-                numbers are consecutive, from 0.
-            positions: For each of these headings, the name of the position that it belongs to
-                (mostly the place of the dstate).
+        `headings` has, for each step, the number of its unknown heading (mostly its dstate), from 0
+        without gaps. `positions` has, for each of these headings, the name of the position that it
+        belongs to (mostly the place of the dstate).
         """
         self._dstates = len(positions)
         labels = np.asarray(headings, dtype=int)
@@ -127,15 +116,11 @@ class Poses:
     def settled(
         self, start: Array | None, fixed: Sequence[int], wanted: Sequence[int]
     ) -> tuple[float, Array, Array]:
-        """Find the unknowns with the least chi-square, and their covariance.
+        """Find the unknowns with the least chi-square, and the covariance of the wanted ones.
 
-        Args:
-            start: Unknowns to begin with; None to compute some.
-            fixed: The indices of unknowns whose values are known.
-            wanted: The indices of the unknowns whose covariance is wanted.
-
-        Returns:
-            The chi-square, all unknowns, and the covariance of the wanted ones.
+        `start` has unknowns to begin with; None to compute some. `fixed` and `wanted` are indices
+        of unknowns: those whose values are known, and those whose covariance is wanted. The
+        chi-square is returned first.
         """
         unknown = self._best(start, NEARLY)
         squares = float((self._residuals(unknown) ** 2).sum())
@@ -144,9 +129,8 @@ class Poses:
     def gaussian(self) -> tuple[list[int], Array, Array]:
         """Find the poses of the dstates and their covariance, relative to a dstate of each part.
 
-        Returns:
-            The part of the map of each dstate; the means of x and y of each place, in the order of
-            the first dstates there, and of the heading of each dstate; and their covariance.
+        Returns the part of the map of each dstate; the means of x and y of each place, in the order
+        of the first dstates there, and of the heading of each dstate; and their covariance.
         """
         place, facing = self._place[: self._dstates], 2 * self._positions
         part = self._parts()[place].tolist()
@@ -159,9 +143,8 @@ class Poses:
     def _best(self, start: Array | None = None, still: float = STILL) -> Array:
         """Find the unknowns with the least sum of squares.
 
-        Args:
-            start: Unknowns to begin with; None to compute some.
-            still: End if a round lowers the sum of squares by less than this share.
+        `start` has unknowns to begin with; None to compute some. End if a round lowers the sum of
+        squares by less than the share `still`.
         """
         unknown = self._begun() if start is None else start
         if not len(self._moved):
@@ -245,11 +228,9 @@ class Poses:
         """Find how to rotate each group of headings so that positions agree best, in radians.
 
         The rotations are complex numbers on the unit circle that minimise a quadratic form. The
-        power method for its inverse finds them (Boumal 2016, "Nonconvex phase synchronization").
-        If positions do not determine a rotation, it is arbitrary.
-
-        Args:
-            onward: The displacements n x 2 in metres, turned by the present headings.
+        power method for its inverse finds them (Boumal 2016, "Nonconvex phase synchronization"). If
+        positions do not determine a rotation, it is arbitrary. `onward` has the displacements in
+        metres, (n, 2), turned by the present headings.
         """
         size = int(self._group.max()) + 1
         inverse = np.linalg.inv(self._misfit(onward) + HELD * np.identity(size))
@@ -267,10 +248,8 @@ class Poses:
         """Compute the matrix of the quadratic form that says how badly rotations of groups fit.
 
         For given rotations, the form is the least sum of squares that any positions have. Vectors
-        in the plane are complex numbers.
-
-        Args:
-            onward: The displacements n x 2 in metres, turned by the headings before the rotations.
+        in the plane are complex numbers. `onward` has the displacements in metres, (n, 2), turned
+        by the headings before the rotations.
         """
         weights = 1 / self._sigmas(0)
         vectors = weights * (onward[:, 0] + 1j * onward[:, 1])
@@ -311,11 +290,9 @@ class Poses:
         return matrix(entries, (len(first), size))
 
     def _predicted(self, unknown: Array) -> tuple[Array, Array, Array]:
-        """Predict the displacements from the unknowns.
+        """Predict the displacements from the unknowns, in metres and radians, (n, 3).
 
-        Returns:
-            The displacements n x 3 in metres and radians, and the cosine and the sine of the
-            heading in the middle of each displacement.
+        Also return the cosine and the sine of the heading in the middle of each displacement.
         """
         at, heading = (
             unknown[: 2 * self._positions].reshape(-1, 2),
@@ -428,8 +405,7 @@ class Poses:
     def _open_rotations(self, unknown: Array, said: NDArray[np.int_]) -> int:
         """Count the independent rotations of groups of headings that displacements leave open.
 
-        Args:
-            said: The numbers of the dstates that have displacements.
+        `said` has the numbers of the dstates that have displacements.
         """
         groups = np.unique(self._group[said])
         if len(groups) == len(np.unique(self._parts()[self._place[said]])):
@@ -471,10 +447,9 @@ class Poses:
         return tuple(poses)
 
     def _spreads(self, unknown: Array, origins: Sequence[int]) -> Array:
-        """Compute the covariance of the position of each dstate, (dstates, 2, 2), in square metres.
+        """Return the covariance of the position of each dstate, (dstates, 2, 2), in square metres.
 
-        Args:
-            origins: Dstates whose poses count as known.
+        The poses of `origins`, which are dstates, count as known.
         """
         at = 2 * self._place[list(origins)]
         fixed = [*at.tolist(), *(at + 1).tolist(), *(2 * self._positions + s for s in origins)]

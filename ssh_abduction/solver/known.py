@@ -15,7 +15,6 @@ class Known:
     """What is known about the maps of a trace.
 
     Attributes:
-        status: What is proven.
         best: The best map of the whole trace; None if there is none.
         cost: The preferred counts of the best map, the most important one first; () without one.
         bound: Proven lower bounds on the counts of any map.
@@ -47,29 +46,19 @@ class Known:
         return self.best is None or found.cost < self.cost
 
     def keep(self, found: Found, labels: tuple[int, ...]) -> None:
-        """Make a map the best one.
-
-        Args:
-            found: The map, perhaps of a prefix.
-            labels: The dstate of each step of the whole trace.
-        """
+        """Make a map, perhaps of a prefix, the best one. `labels` are those of the whole trace."""
         self.best, self.cost = replace(found.map, dstate_at=labels), found.cost
 
     def raise_bound(self, proven: int | None) -> None:
-        """Raise the lower bound on the count that the theory minimises first.
-
-        Args:
-            proven: The bound; None for no bound. A smaller bound than the known one is ignored.
-        """
+        """Raise the lower bound on the count that is minimised first, if `proven` is larger."""
         first = self._theory.priorities[0] if self._theory.priorities else None
         if first and proven is not None and proven > (getattr(self.bound, first) or 0):
             self.bound = replace(self.bound, **{first: proven})
 
     def raise_lower(self, cost: tuple[int, ...]) -> None:
-        """Raise the lower bound on the cost of every map.
+        """Raise the lower bound on the cost of every map to that of a minimal map of a prefix.
 
-        Args:
-            cost: The preferred counts of a minimal map of a prefix, the most important one first.
+        `cost` has preferred counts, the most important one first.
         """
         self.raise_bound(cost[0] if cost else None)
         if self.lower is None or cost > self.lower:

@@ -42,16 +42,9 @@ def laid(
 ) -> Solution | None:
     """Find a joint map of little cost that keeps the map of the old drives.
 
-    Args:
-        old: The old drives.
-        ssh_map: Their map.
-        trace: The new drives.
-        problem: All drives, and a theory that `can_lay`.
-        watch: The clock of the search.
-
-    Returns:
-        The solution with the cheaper of two maps: the new drives are joined to the old ones, or are
-        pieces of their own. None if neither satisfies the axioms.
+    `trace` has the new drives, and the problem all drives, under a theory that `can_lay`. The
+    solution has the cheaper of two maps: the new drives are joined to the old ones, or are pieces
+    of their own. None if neither satisfies the axioms.
     """
     joint, theory = problem.trace, problem.theory
     ranking, judging = Ranking(joint), Judging(problem)
@@ -86,14 +79,8 @@ def unproven(
 ) -> Solution:
     """Make a solution of a joint map that was found without a search.
 
-    Args:
-        found: The joint map.
-        ssh_map: The map of the old drives, which it keeps.
-        old: The old drives.
-        problem: All drives, and their theory.
-        watch: The clock of the search.
-        stopped: Why there is no proof.
-        weighed: The cost of the map and of its rivals; None if they were not computed.
+    It keeps the map of the old drives. `stopped` says why there is no proof. `weighed` has the cost
+    of the map and of its rivals; None if they were not computed.
     """
     joint = problem.trace
     return Solution(
@@ -139,13 +126,7 @@ def _joint_maps(old: Trace, ssh_map: SSHMap, trace: Trace, problem: Problem) -> 
 
 
 def _of_all(found: SSHMap, labels: tuple[int, ...], problem: Problem) -> SSHMap | None:
-    """Make a map of all drives from a map of a digest; None if it breaks an axiom.
-
-    Args:
-        found: The map of the digest.
-        labels: For each step of all drives, its dstate in that map.
-        problem: All drives, and the theory.
-    """
+    """Make a map of all drives from a map of a digest and labels; None if it breaks an axiom."""
     order = [found.dstates[s] for s in dict.fromkeys(labels)]
     facing = [-math.pi / 2 * (s.heading or 0) for s in order]  # only star=frame uses them
     places = numbered(s.place for s in order)

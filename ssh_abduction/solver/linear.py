@@ -23,14 +23,9 @@ DAMPING = 1e-10
 
 
 def matrix(entries: tuple[Any, tuple[Any, Any]], shape: tuple[int, int]) -> Any:
-    """Make a matrix of its entries. Entries at one position are added up.
+    """Make a matrix from its values, and their rows and columns. Values at one position add up.
 
-    Args:
-        entries: The values, and their rows and columns.
-        shape: The numbers of rows and columns.
-
-    Returns:
-        A `csr_array`; an array of numpy if there are few columns.
+    It is a `csr_array`, or an array of numpy if there are few columns.
     """
     made = coo_array(entries, shape=shape)
     return made.toarray() if shape[1] <= DENSE else made.tocsr()
@@ -49,12 +44,9 @@ def weighted(some: Any, weights: Array) -> Any:
 
 
 def system_solved(square: Any, added: Array, right: Any) -> Any:
-    """Solve a system of linear equations.
+    """Solve a system of linear equations with a dense or sparse n x n matrix.
 
-    Args:
-        square: The n x n matrix, dense or sparse.
-        added: The n numbers to add to its diagonal.
-        right: The right-hand side, with n rows.
+    The n numbers in `added` are added to its diagonal.
     """
     if isinstance(square, np.ndarray):
         return np.linalg.solve(square + np.diag(added), right)
@@ -65,10 +57,7 @@ def system_solved(square: Any, added: Array, right: Any) -> Any:
 def least_squares(some: Any, values: Array, weights: Array) -> Array:
     """Solve a system by weighted least squares. Of several solutions, return nearly the smallest.
 
-    Args:
-        some: The matrix of the system.
-        values: The right-hand side, already multiplied by the weights.
-        weights: The weight of each equation.
+    The values are already multiplied by the weights of their equations.
     """
     system = weighted(some, weights)
     if isinstance(system, np.ndarray):
@@ -82,12 +71,9 @@ def least_squares(some: Any, values: Array, weights: Array) -> Array:
 
 
 def inverse(square: Any, added: Array, rows: NDArray[np.intp]) -> Array:
-    """Compute some rows, and the same columns, of the inverse of a symmetric matrix.
+    """Compute some rows, and the same columns, of the inverse of a symmetric n x n matrix.
 
-    Args:
-        square: The n x n matrix, dense or sparse.
-        added: The n numbers to add to its diagonal.
-        rows: The numbers of the wanted rows.
+    The matrix is dense or sparse. The n numbers in `added` are added to its diagonal.
     """
     if square.shape[0] <= DENSE_INVERSE:
         # If these rows come last, the wanted part of the inverse depends only on the last block of

@@ -26,12 +26,9 @@ Priced: TypeAlias = tuple[SSHMap, tuple[int, ...]]
 def listed(parts: Parts, found: Iterator[Priced], *, keeps_time: bool) -> Iterator[Priced]:
     """Yield the maps asked for, each with its preferred counts, after a check.
 
-    The clock of the search stops while the caller works with a map.
-
-    Args:
-        parts: The parts of the search.
-        found: The minimal maps, and then maps that cost more, each with its preferred counts.
-        keeps_time: Whether to keep a share of the time limit for finding the backbone later.
+    The clock of the search stops while the caller works with a map. `found` has the minimal maps,
+    and then maps that cost more. If `keeps_time`, a share of the time limit is kept for finding the
+    backbone later.
     """
     known, watch, most = parts.known, parts.watch, parts.limits.most
     if known.status is Status.OPTIMAL:
@@ -67,9 +64,7 @@ def note(parts: Parts, ssh_map: SSHMap, cost: tuple[int, ...]) -> None:
 def by_count(parts: Parts, mended_maps: tuple[SSHMap, ...] | None) -> Generator[Priced, None, None]:
     """Yield the minimal maps, then those with up to `within` dstates more, with their counts.
 
-    Args:
-        parts: The parts of the search.
-        mended_maps: The minimal maps, if mending the trace found them; else None.
+    `mended_maps` are the minimal maps, if mending the trace found them.
     """
     known, limits = parts.known, parts.limits
     minimal = mended_maps or parts.prefixes.minimal_maps()

@@ -101,14 +101,9 @@ class Mending:
     def minimal_maps(self, most: int) -> tuple[SSHMap, ...] | None:
         """List the minimal maps, if it is proven which mended traces have them.
 
-        Call this after the iteration over `maps` has ended.
-
-        Args:
-            most: The number of maps to list for each mended trace; 0 for all.
-
-        Returns:
-            The maps. None if there is no such proof: the best map costs more than the bound, or not
-            all mended traces were solved.
+        Call this after the iteration over `maps` has ended. `most` is the number of maps to list
+        for each mended trace; 0 for all. Returns None if there is no such proof: the best map costs
+        more than the bound, or not all mended traces were solved.
         """
         if self._best is None or self._best.cost[0] != self.bound or not self._cheapest:
             return None
@@ -126,11 +121,7 @@ class Mending:
         return tuple(dict.fromkeys(listed))
 
     def _improving(self, better: Found | None, mended: Trace) -> Iterator[Found]:
-        """Yield a map, and remember it, if it is the best one so far.
-
-        Args:
-            mended: The mended trace that it was found for.
-        """
+        """Yield a map, and remember it with its mended trace, if it is the best one so far."""
         if better is not None and (self._best is None or better.cost < self._best.cost):
             self._best, self._best_mended = better, mended
             yield better
@@ -140,10 +131,8 @@ class Mending:
 
         Merging groups the visits, and the votes of the groups mend the trace. The groups are almost
         a map. First yield a map near the groups, then solve the mended trace. If this gives a
-        better map, merge again, beginning with the places of this map.
-
-        Args:
-            trace: The trace of the task, perhaps without some displacements.
+        better map, merge again, beginning with the places of this map. The trace is that of the
+        task, perhaps without some displacements.
         """
         theory = self._task.theory
         if theory.star != "frame" or not (theory.misread or theory.jumped):
@@ -173,11 +162,8 @@ class Mending:
     ) -> Iterator[Found]:
         """Yield better maps that treat displacements as wrong if they do not fit the labels.
 
-        If there is a better map, go on with its labels.
-
-        Args:
-            labels: The dstate of each step, found without displacements.
-            places: The place of each step; None if it is unknown.
+        If there is a better map, go on with its labels. Labels and places of steps were found
+        without displacements; an unknown place is None.
         """
         trace, tried = self._task.trace, set()
         for _ in range(ROUNDS):
@@ -271,11 +257,9 @@ class Mending:
         return self._task.problem.changed(mended, self._without_faults)
 
     def _minimal(self, mended: Trace, seconds: float = math.inf) -> tuple[Found | None, bool]:
-        """Find the best map of a mended trace.
+        """Find the best map of a mended trace, as a map of the trace itself with faults.
 
-        Returns:
-            The map, as a map of the trace itself with faults, or None; and whether it is proven
-            that this map is minimal, or that there is no map.
+        Also return whether it is proven that this map is minimal, or that there is no map.
         """
         if mended not in self._solved or not (self._solved[mended][1] or seconds < math.inf):
             maps, proven = self._maps_of(mended, 1, seconds)
@@ -285,13 +269,9 @@ class Mending:
     def _maps_of(
         self, mended: Trace, most: int, seconds: float = math.inf
     ) -> tuple[list[SSHMap], bool]:
-        """Solve a mended trace.
+        """Solve a mended trace, and list at most this many maps; 0 for all.
 
-        Args:
-            most: The number of maps to list; 0 for all.
-
-        Returns:
-            Minimal maps of the mended trace and True; or the best map known and False.
+        Returns minimal maps of the mended trace and True; or the best map known and False.
         """
         maps, proven = self._solver(
             mended, self._without_faults, most, min(seconds, SHARE * self._task.watch.left())

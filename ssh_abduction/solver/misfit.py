@@ -36,16 +36,11 @@ class Misfit:
     """The misfits of sets of returns of one trace, each computed once.
 
     Attributes:
-        trace: The trace.
         visit: For each step, the first step of its visit. Without places, each step is a visit.
     """
 
     def __init__(self, problem: Problem) -> None:
-        """Find the visits of the trace. No misfit is computed yet.
-
-        Args:
-            problem: The trace, and its theory with all defaults filled in.
-        """
+        """Find the visits of the trace. No misfit is computed yet."""
         self.trace, self._overlap = problem.trace, problem.overlap
         theory = problem.theory
         stays = theory.level == "topological" and "turn_stays" in theory.hard and not theory.jumped
@@ -57,9 +52,7 @@ class Misfit:
     def of_returns(self, returns: Iterable[Equality], wrong: Collection[int] = ()) -> float:
         """Compute the misfit (a chi-square) of a set of returns.
 
-        Args:
-            returns: The returns.
-            wrong: The steps whose displacements are ignored.
+        The displacements to `wrong` steps are ignored.
         """
         headings, positions = list(range(len(self.visit))), list(self.visit)
         for found in returns:
@@ -73,10 +66,7 @@ class Misfit:
     ) -> float:
         """Compute the misfit (a chi-square) if each step is at a given dstate and place.
 
-        Args:
-            dstates: The dstate of each step, as a number.
-            places: The place of each step, as a number. Steps at one dstate are at one place.
-            wrong: The steps whose displacements are ignored.
+        Steps at one dstate are at one place. The displacements to `wrong` steps are ignored.
         """
         first_at: dict[int, int] = {}
         first_in: dict[int, int] = {}
@@ -110,16 +100,10 @@ class Misfit:
     def core(
         self, returns: Sequence[Equality], least: float, wrong: Collection[int] = ()
     ) -> list[Equality]:
-        """Find a minimal subset of returns whose misfit is at least `least`.
+        """Find a minimal subset of returns whose misfit is a chi-square of at least `least`.
 
-        Args:
-            returns: The returns.
-            least: The chi-square that the misfit of the subset has to reach.
-            wrong: The steps whose displacements are ignored.
-
-        Returns:
-            The subset; all returns if even their misfit is less; an empty list if the misfit
-            without any return is that large.
+        The displacements to `wrong` steps are ignored. Returns all returns if even their misfit is
+        less, and an empty list if the misfit without any return is that large.
         """
         if self.of_returns(returns, wrong) < least:
             return list(returns)

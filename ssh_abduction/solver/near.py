@@ -29,24 +29,16 @@ from ssh_abduction.theory.theory import Theory
 
 
 class NearMinimal:
-    """Lists the maps of a trace that cost more than the minimum.
-
-    Attributes:
-        engine: The engine that has the axioms for the whole trace.
-    """
+    """Lists the maps that cost more than the minimum, with an engine for the whole trace."""
 
     def __init__(
         self, task: Task, judging: Judging, most: int, report: Callable[[], None], before: Asker
     ) -> None:
         """Prepare an engine. The search begins with `maps`.
 
-        Args:
-            task: The task of the search for the minimal maps.
-            judging: Says which maps the evidence rejects.
-            most: The number of maps wanted; 0 for all.
-            report: Called now and then to report progress.
-            before: The asker of the search for the minimal maps. Its times are added to the times
-                of this engine.
+        `most` is the number of maps wanted; 0 for all. `report` is called now and then. `before` is
+        the asker of the search for the minimal maps. Its times are added to the times of this
+        engine.
         """
         self._task = replace(task, speedups=replace(task.speedups, prefixes=False))
         self._judging, self._most, self._report = judging, most, report
@@ -64,9 +56,8 @@ class NearMinimal:
     ) -> Iterator[tuple[SSHMap, tuple[int, ...]]]:
         """Yield the maps with their preferred counts, the most important one first.
 
-        Args:
-            minimal: The preferred counts of minimal maps.
-            within: By how much a map may exceed the first of these counts (excuses aside).
+        `minimal` are those of minimal maps. A map may exceed the first of them (excuses aside) by
+        `within`.
         """
         count = counted_first(self._task.theory)
         assert count is not None

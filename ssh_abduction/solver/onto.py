@@ -58,13 +58,7 @@ _LIMITS = ("time limit", "memory limit", "interrupted")  # what ends a search ea
 
 @dataclass(frozen=True)
 class Solving:
-    """How to solve a trace.
-
-    Attributes:
-        solve: Solves a trace under a theory.
-        speedups: The speed-ups that are on.
-        watch: The clock and the limits of all solving.
-    """
+    """How to solve a trace: a function, the speed-ups, and the clock and limits of all solving."""
 
     solve: Callable[[Trace, Theory], Solution]
     speedups: Speedups
@@ -80,16 +74,10 @@ def solve_onto(
 ) -> Solution:
     """Find the minimal joint maps of new and old drives that keep the map of the old drives.
 
-    Args:
-        trace: The new drive, or several.
-        existing: The solution of the old drives, with their trace. Its first map is the existing
-            map.
-        theory: The theory; None for that of the solution. Steps in it are steps of the joint trace.
-        corrections: Names and corrections of a person, to be obeyed; None for none.
-        solving: How to solve a trace.
-
-    Raises:
-        SolverError: The solution has no map or no trace, or the new drive contradicts the map.
+    The existing solution has the trace of the old drives, and its first map is the one to keep. The
+    theory is by default that of this solution; its steps are those of the joint trace. Corrections
+    of a person are obeyed. Raises SolverError if the solution has no map or no trace, or the new
+    drive contradicts the map.
     """
     old, ssh_map = _existing(existing)
     theory = checked_theory(theory or existing.theory.replace(returns=0))
@@ -154,8 +142,7 @@ def solve_onto(
 def _grown(ssh_map: SSHMap, old: Trace, problem: Problem) -> SSHMap | None:
     """Make a map without a search: the existing map, and new places for the new drive.
 
-    Returns:
-        The map; None if a step contradicts it, or if the checker does not accept it.
+    None if a step contradicts it, or if the checker does not accept it.
     """
     sketch = sketch_beyond(ssh_map, old, problem.theory, homing=False)
     if first_contradiction(sketch, problem.trace) is not None:
@@ -184,12 +171,10 @@ def _existing(existing: object) -> tuple[Trace, SSHMap]:
 def _pinned(theory: Theory, digest: Digest, ssh_map: SSHMap, old: Trace, *, joins: bool) -> Theory:
     """Return the theory for a digest and a new drive, with assertions that keep the existing map.
 
-    They say that steps at different dstates or places of that map are different.
-
-    Args:
-        theory: The theory. Its assertions about old steps are moved to steps of the digest.
-        joins: Whether to assert equal dstates, too. The fast engine for frames can obey this. With
-            other theories, it would switch fast engines off.
+    They say that steps at different dstates or places of that map are different. Assertions of the
+    theory about old steps are moved to steps of the digest. If `joins`, equal dstates are asserted,
+    too. The fast engine for frames can obey this. With other theories, it would switch fast engines
+    off.
     """
     place = [ssh_map.dstates[s].place for s in digest.labels]
     first = {s: t for t, s in reversed([*enumerate(digest.labels)])}
@@ -231,9 +216,8 @@ def _broken(
 ) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
     """Find what a map of a digest and a new drive changes in the existing map.
 
-    Returns:
-        Pairs of dstates of the existing map that are merged (a dstate that is split is paired with
-        itself); and pairs of dstates whose places are merged, or split.
+    Returns pairs of its dstates that are merged (a dstate that is split is paired with itself); and
+    pairs of dstates whose places are merged, or split.
     """
     number: dict[int, int] = {}
     split = {
@@ -258,11 +242,8 @@ def _with_assertions(
 ) -> tuple[Solution, tuple[SSHMap, ...]]:
     """Solve again, and assert which steps of the digest are at one dstate or place.
 
-    Do nothing if the trace is too long for that.
-
-    Returns:
-        The new solution, and its maps that keep the existing map; or the old solution `found` and
-        no maps.
+    Returns the new solution, and its maps that keep the existing map; or, if the trace is too long
+    for that, the old solution `found` and no maps.
     """
     if len(part) > READABLE:
         return found, ()
@@ -285,10 +266,7 @@ def _with_assertions(
 def _weighed(found: Solution, old: int, ssh_map: SSHMap) -> Weighed | None:
     """Return the costs of the maps found, with the rivals that keep the existing map.
 
-    Args:
-        found: The solution of all drives. Each step of the old drives is a step of its trace.
-        old: The number of these steps.
-        ssh_map: The existing map.
+    The trace of the solution begins with all `old` steps of the old drives.
     """
     if found.weighed is None:
         return None

@@ -28,13 +28,11 @@ class Parts:
     """The objects that all stages of one search share.
 
     Attributes:
-        limits: The limits of the search.
         speedups: The speed-ups that the caller has on. `task.speedups` has only the ones that hold
             for the theory.
         watch: The clock of the search, with its limits.
         task: The trace and theory, as engines see them.
         known: What is known about the maps of the trace so far.
-        judging: Checks maps before they are given to the caller.
         rivals: The minimal maps found so far.
         candidates: Makes maps without a proof that they are minimal.
         prefixes: Finds and lists minimal maps.

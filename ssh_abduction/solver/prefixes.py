@@ -90,15 +90,10 @@ class Prefixes:
         most: int,
         report: Callable[[], None],
     ) -> None:
-        """Prepare the search. `find_minimum` begins it.
+        """Prepare the search. `find_minimum` begins it, with this engine.
 
-        Args:
-            task: The task of the search.
-            known: What is known about the maps of the trace. The results are added to it.
-            judging: Says which maps the evidence rejects.
-            engine: The engine to begin with.
-            most: The number of maps wanted; 0 for all.
-            report: Called now and then to report progress.
+        The results are added to what is known. `most` is the number of maps wanted; 0 for all.
+        `report` is called now and then to report progress.
         """
         self.engine = engine
         self._task, self._known, self._judging, self._most, self._report = (
@@ -176,11 +171,7 @@ class Prefixes:
         self.engine.forbid(equalities)
 
     def _forbid_in_engine(self, equalities: frozenset[Equality]) -> bool:
-        """Let the present engine forbid all maps that have all of these equalities.
-
-        Returns:
-            Whether it can do so.
-        """
+        """Let the present engine forbid all maps with all of these equalities, if it can do so."""
         can_forbid = isinstance(self.engine, StepEngine) or all(
             equality.holds for equality in equalities
         )
@@ -223,11 +214,8 @@ class Prefixes:
     def _name_more_paths(self, cost: tuple[int, ...] | None) -> bool:
         """Start a new control with more names for paths, if the proof of the minimum needs them.
 
-        Args:
-            cost: The preferred counts of a minimal map of the prefix; None if it has no map.
-
-        Returns:
-            Whether there is a new control.
+        `cost` has the preferred counts of a minimal map of the prefix; None if it has no map.
+        Returns whether there is a new control.
         """
         if not isinstance(self.engine, StepEngine):
             return False  # names for paths are never short
@@ -262,16 +250,10 @@ class Prefixes:
     ) -> Generator[SSHMap, None, int]:
         """Find the minimal maps of this prefix that replay to the end.
 
-        Append the maps to `held`. Yield them instead if there are many, or if the prefix is the
-        whole trace.
-
-        Args:
-            held: The list that gets the maps.
-            streamed: The sizes of earlier prefixes whose maps were yielded. Leave out maps that
-                already replay from such a prefix, as they were yielded, too.
-
-        Returns:
-            The last step at which a replay fails; 0 if all minimal maps replay to the end.
+        They are appended to `held`, or yielded if there are many, or if the prefix is the whole
+        trace. `streamed` has the sizes of earlier prefixes whose maps were yielded. Maps that
+        already replay from such a prefix are left out, as they were yielded, too. Returns the last
+        step at which a replay fails; 0 if all minimal maps replay to the end.
         """
         enough = min(HELD_BACK, self._most + 1) if self._most else HELD_BACK
         asked = self._most and self._most + 1
@@ -327,13 +309,8 @@ class Prefixes:
         """Replay the trace over a map of a prefix.
 
         If stars (the openings seen at a step) need to agree only within their spread, also find out
-        at the end whether the stars of all steps fit the map.
-
-        Args:
-            known: Use only the links between this many first steps; None for all of the prefix.
-
-        Returns:
-            The labels of the steps that the map explains, and how the replay ended.
+        at the end whether the stars of all steps fit the map. If `known` is given, only the links
+        between this many first steps are used.
         """
         log = self._task.log
         replayed = log.replay(

@@ -95,12 +95,8 @@ def in_order(maps: Sequence[SSHMap], counts: Iterable[int]) -> tuple[SSHMap, ...
     """Sort maps into an order that is the same in each run.
 
     Maps with the least chi-square come first. Maps with the same chi-square are sorted by labels,
-    then by places, paths, directions and faults.
-
-    Args:
-        maps: The maps, level by level. A level is the maps of one cost.
-        counts: The number of maps in each level. Each level is sorted by itself. Maps after the
-            last level keep their order.
+    then by places, paths, directions and faults. Each level (the maps of one cost) is sorted by
+    itself. `counts` has the numbers of maps of levels. Maps after the last level keep their order.
     """
     left = iter(maps)
     levels = [sorted(islice(left, count), key=_order) for count in counts]
@@ -138,12 +134,7 @@ def weights(maps: Sequence[SSHMap]) -> tuple[float, ...]:
 
 
 def noise_warning(ssh_map: SSHMap, trace: Trace) -> str | None:
-    """Return a warning if the best map contradicts the noise model of the odometry; else None.
-
-    Args:
-        ssh_map: The best map.
-        trace: The trace, with the noise model of its odometry.
-    """
+    """Return a warning if the best map contradicts the noise model of the odometry; else None."""
     fit = ssh_map.fit
     if fit is None or fit.dof < 1 or min(fit.p, 1 - fit.p) > DOUBTED / 2:
         return None

@@ -49,16 +49,7 @@ class Recorded:
 
     @classmethod
     def of(cls, read: FieldReader, record: Mapping[str, Any], steps: int) -> Recorded:
-        """Read these parts from the record of a solution.
-
-        Args:
-            read: Checks the fields.
-            record: The fields of the solution.
-            steps: The number of steps of the trace.
-
-        Raises:
-            MapError: A field is wrong.
-        """
+        """Read these parts from the record of a solution. Raises MapError if a field is wrong."""
         written = (
             None
             if record.get("certificate") is None
@@ -237,15 +228,8 @@ def effort_in(read: FieldReader, record: Mapping[str, Any]) -> Effort:
 def levels_in(read: FieldReader, record: Mapping[str, Any], maps: int) -> tuple[Level, ...]:
     """Read the levels: how many of the maps have which cost.
 
-    If the file has no levels, all maps are one level.
-
-    Args:
-        read: Checks the fields.
-        record: The fields of the solution.
-        maps: The number of maps in the file.
-
-    Raises:
-        MapError: A field is wrong, or the levels do not add up to this number of maps.
+    If the file has no levels, all maps are one level. Raises MapError if a field is wrong, or the
+    levels do not add up to this number of maps.
     """
     complete = record.get("minimal_listed", record.get("complete")) is True
     if "levels" not in record:

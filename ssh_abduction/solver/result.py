@@ -442,11 +442,7 @@ class Solution(MapSequence):
 
 
 def _checked_record(read: FieldReader, data: Any) -> Mapping[str, Any]:
-    """Check that data are a solution in a version that can be read, and return its fields.
-
-    Raises:
-        MapError: They are not.
-    """
+    """Check that data are a solution of a known version, or raise MapError; return its fields."""
     record, where = read.mapping(data, ""), read.where
     if "maps" not in record and "labels" in record:
         raise MapError(f"{where}: maps: expected a solution, got one map; take SSHMap.load")

@@ -74,16 +74,11 @@ def is_for(problem: Problem) -> bool:
 
 
 def least_cost(problem: Problem, visit: Sequence[int], most: float) -> float:
-    """Compute a lower bound on the cost of every map.
+    """Compute a lower bound on the cost of every map, in nats.
 
-    Args:
-        problem: The trace and its theory, for which `is_for` is true.
-        visit: For each step, the first step of its visit.
-        most: The cost of some map, in nats.
-
-    Returns:
-        The bound in nats. It is at most `most` minus UNPROVEN. If no points get shares, it is what
-        the misfit of the track costs.
+    `visit` has, for each step, the first step of its visit. `most` is the cost of some map, in
+    nats. The bound is at most `most` minus UNPROVEN. If no points get shares, it is what the misfit
+    of the track costs.
     """
     track, within = _LinearTrack.of(problem), math.sqrt(2 * most)
     parts = [part.of_best_pieces() for part in _parts(problem, track, np.array(visit))]
@@ -274,14 +269,10 @@ class _Losses:
 
     @classmethod
     def of(cls, part: _MovedPoints, first: Array, gap: float, within: float) -> _Losses:
-        """Bound the losses.
+        """Bound the losses of points with these approximate shares, (n,).
 
-        Args:
-            part: The points.
-            first: Their approximate shares, (n,).
-            gap: Two points are far if they are this many standard deviations too far apart to share
-                a facility.
-            within: The greatest |z|. Bending more costs more than the known map.
+        Two points are far if they are `gap` standard deviations too far apart to share a facility.
+        `within` is the greatest |z|. Bending more costs more than the known map.
         """
         most = np.minimum(part.price, GROWTH * first + SLACK)
         unit = np.sqrt(part.variances.max(0))
@@ -313,20 +304,13 @@ class _Losses:
 
 
 def _best_numbers(shares: Array, pays: Array, near: Array, far: Array) -> tuple[float, Array]:
-    """Find numbers c with which the losses are at most what bending costs.
+    """Find numbers c, (n, 2), with which the losses are at most what bending costs.
 
     With numbers c, the share of a point falls by about `pays / (1 + c)`. The sum of the shares is
     maximised by Lagrangian duality: a matrix Z is the price of bending, and is found by subgradient
-    steps. A point whose losses exceed its share is left out: its c is 0.
-
-    Args:
-        shares: Approximate shares of all points, (n,).
-        pays: What each point pays for its position and heading in the cheapest clustering, (n, 2).
-        near: The losses against near points, as in `_Losses`.
-        far: The losses against far points.
-
-    Returns:
-        The estimated sum of the shares, and the numbers, (n, 2).
+    steps. A point whose losses exceed its share is left out: its c is 0. `pays` has what each point
+    pays for its position and heading in the cheapest clustering, (n, 2). `near` and `far` are as in
+    `_Losses`. The estimated sum of the shares is returned first.
     """
     size = near.shape[2]
     pays = FIRST * pays + ALONE * shares[:, None]

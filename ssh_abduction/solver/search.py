@@ -349,13 +349,9 @@ class Search:
     ) -> tuple[tuple[SSHMap, ...], bool]:
         """Solve a mended trace (its faults are corrected) within the limits of this search.
 
-        Args:
-            theory: A theory without faults.
-            most: The number of maps to list at most; 0 for all.
-
-        Returns:
-            The minimal maps (none if the trace has no map) and True; or the best map known after
-            that time and False.
+        The theory has no faults. At most `most` maps are listed; 0 for all. Returns the minimal
+        maps (none if the trace has no map) and True; or the best map known after that time and
+        False.
         """
         search = Search(
             mended,

@@ -305,11 +305,7 @@ class Kept:
         self._seen: set[tuple[Hashable, ...]] = set()
 
     def split(self, before: Sequence[int]) -> None:
-        """Replace the classes by parts of them.
-
-        Args:
-            before: For each new class, the old class that it is a part of.
-        """
+        """Replace the classes by parts of them. `before` has the old class of each new class."""
         parts: dict[int, list[int]] = {}
         for new, old in enumerate(before):
             parts.setdefault(old, []).append(new)
@@ -319,11 +315,7 @@ class Kept:
         self._seen.clear()
 
     def absorb(self, names: tuple[Hashable, ...]) -> None:
-        """Update the attributes by one more map.
-
-        Args:
-            names: The name of each class in this map; None if the class has no name there.
-        """
+        """Update the attributes by the name of each class in one more map, None if it has none."""
         if names in self._seen:
             return
         if len(self._seen) == REMEMBERED:
@@ -349,10 +341,8 @@ class Kept:
 def _read_shared(data: Any, of_step: Sequence[int] | None, steps: int, where: str) -> Shared:
     """Read what a file says about one sort. Raises MapError.
 
-    Args:
-        data: The field of the file.
-        of_step: The number of the dstate of each step, if the file has one number for each dstate;
-            None if it has one number for each step.
+    `of_step` has the number of the dstate of each step, if the file has one number for each dstate;
+    None if it has one number for each step.
     """
     expected = steps if of_step is None else len(set(of_step))
     always = data.get("always") if isinstance(data, Mapping) else None

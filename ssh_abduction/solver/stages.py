@@ -29,12 +29,9 @@ class Stages:
     """
 
     def __init__(self, parts: Parts, solve_mended: Solver, *, goes_on: bool) -> None:
-        """Prepare the stages, but begin none.
+        """Prepare the stages, but begin none. The results are added to `parts.known`.
 
-        Args:
-            parts: The parts of the search. The results are added to `parts.known`.
-            solve_mended: A function that solves a mended trace, see `mending.Solver`.
-            goes_on: Whether the search goes on from an earlier search for the first steps.
+        If `goes_on`, the search goes on from an earlier search for the first steps.
         """
         self.mends = False
         self.mended_maps: tuple[SSHMap, ...] | None = None
@@ -51,11 +48,9 @@ class Stages:
     def find_minimum(self) -> None:
         """Find the minimal cost, and set the status in `parts.known`.
 
-        If this takes long, change to an engine that finds dstates before places and paths.
-
-        Raises:
-            LimitError: A limit is reached. Its reason is "no proof" if mending the trace found no
-                proof and the trace is too long for the readable encodings.
+        If this takes long, change to an engine that finds dstates before places and paths. Raises
+        LimitError at a limit. Its reason is "no proof" if mending the trace found no proof and the
+        trace is too long for the readable encodings.
         """
         parts, task = self._parts, self._parts.task
         engine, steps = parts.prefixes.engine, len(task.trace)
@@ -98,8 +93,7 @@ class Stages:
     def _mend(self) -> bool:
         """Look for maps with faults by mending the trace.
 
-        Returns:
-            Whether minimal maps were found and proven.
+        Returns whether minimal maps were found and proven.
         """
         from ssh_abduction.solver.mending import Mending  # loads numpy
 
@@ -125,14 +119,9 @@ class Stages:
         return bool(self.mended_maps)
 
     def _find_minimum_soon(self, seconds: float) -> bool:
-        """Try to find the minimal cost by growing prefixes, for a short time.
+        """Find the minimal cost by growing prefixes, if that ends in these seconds.
 
-        Args:
-            seconds: The time that this may take. If STEPWISE_SHARE of the time left is less, that
-                is the limit.
-
-        Returns:
-            Whether it ended in that time.
+        It may take at most STEPWISE_SHARE of the time left. Returns whether it ended.
         """
         parts, watch = self._parts, self._parts.watch
         whole = watch.stage_ends

@@ -28,8 +28,6 @@ class Rival:
     """A map of the whole trace, without its paths.
 
     Attributes:
-        nats: Its cost, in nats.
-        dstates: The dstate of each step, numbered by first visit.
         places: The place of each step, numbered by first visit; empty for a causal map.
         estimated: Whether the map was made from the best one by giving visits a new place. It fits
             the displacements, but may break an axiom.

@@ -130,23 +130,15 @@ class Weighing:
     def guess(self, clashes: Callable[[], bool]) -> bool:
         """Find some maps of little cost without clingo, in a share of the time (`beams.py`).
 
-        Args:
-            clashes: Called if the first beam finds no map: returns whether a short proof shows that
-                the trace has none.
-
-        Returns:
-            Whether the trace may have a map.
+        `clashes` is as in `Beams.search`. Returns whether the trace may have a map.
         """
         return self._beams.search(clashes)
 
     def search(self, of_labels: OfLabels) -> None:
         """Find the maps of least cost and their rivals, and prove that there are no others.
 
-        Args:
-            of_labels: Lists the minimal maps of a theory, within some seconds.
-
-        Raises:
-            LimitError: A limit is over. What was found so far is kept.
+        `of_labels` lists the minimal maps of a theory, within some seconds. Raises LimitError if a
+        limit is over. What was found so far is kept.
         """
         parts, self._of_labels = self._parts, of_labels
         parts.known.status = Status.UNKNOWN  # what was proven is about counts
@@ -235,11 +227,7 @@ class Weighing:
         return tuple(alike) or (ssh_map,), proven and bool(alike)
 
     def add(self, ssh_map: SSHMap) -> float:
-        """Compute the cost of a map, and keep it if it costs little more than the best one.
-
-        Returns:
-            The cost in nats.
-        """
+        """Return the cost of a map in nats. Keep it if it costs little more than the best one."""
         nats = nats_of(Cost.of(ssh_map), self._parts.task.theory)
         nats += self._misfit.of_map(ssh_map) / 2
         if self.candidates and nats < self.candidates[0].nats - EQUAL:
@@ -257,11 +245,8 @@ class Weighing:
     def too_expensive(self, ssh_map: SSHMap) -> frozenset[Equality] | None:
         """Add a map. Find equalities to forbid, which exclude it but no map worth finding.
 
-        Args:
-            ssh_map: The map with the fewest dstates, places and paths of all maps left.
-
-        Returns:
-            Equalities: returns and believed displacements; None if no map left is worth finding.
+        The map has the fewest dstates, places and paths of all maps left. The equalities are
+        returns and believed displacements; None if no map left is worth finding.
         """
         look_at_clock()
         watch = self._parts.watch
