@@ -120,6 +120,14 @@ def test_a_robot_that_was_carried_unseen_is_mapped_as_two_ways(scans: tuple[Scan
     assert not check(done.trace, solution.maps[0], solution.theory)
 
 
+def test_a_second_drive_may_begin_where_the_odometer_jumps_once(scans: tuple[Scan, ...]) -> None:
+    parts = (*scans[:60], *scans[85:])
+    track, notes = told(stepwise(parts, lambda i, step: (80.0, 30.0, 0.0) if i == 60 else step))
+    assert track.cuts == (60,)
+    assert "starts anew" not in notes
+    assert "If a second drive begins there, cut the log there." in notes
+
+
 def test_a_pause_in_which_the_robot_drove_on_is_no_jump(scans: tuple[Scan, ...]) -> None:
     assert unknown_steps(RobotLog((*scans[:60], *scans[75:]))) == Unknown()
 

@@ -159,7 +159,7 @@ def describe_cuts(log: RobotLog, track: Track, turned: list[tuple[int, float]]) 
             + ". Nothing is known of how the robot moved there, so the trace has no displacement "
             "across. An odometer that is started anew, or a second program that publishes the same "
             "odometry, jumps like this. So does a log that is not in the order of the drive."
-            + (TWO_DRIVES if anew else "")
+            + (TWO_DRIVES if anew or len(jumps) == 1 else "")
         )
     if still:
         notes.append(
