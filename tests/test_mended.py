@@ -17,6 +17,7 @@ from ssh_abduction.explain.no_map import explain
 from ssh_abduction.solver import Search, Status
 from ssh_abduction.solver.fallback import clash_in, late_clash
 from ssh_abduction.solver.guesses.mended import mended_sketch
+from ssh_abduction.solver.mending import Mending
 from ssh_abduction.theory.settle import settle
 
 NOISE = Odometry(along=0.05, across=0.02, heading=0.01)
@@ -86,3 +87,22 @@ def test_steps_that_are_said_to_be_at_one_place_are_searched_for_a_clash() -> No
     around = Trace.from_steps("abcd" * 24, ["right", "travel"] * 47 + ["right"])
     solution = solve(around, Theory(same_place=((0, 4),)), time_limit=0.5)
     assert (solution.status, len(solution.maps)) == (Status.UNSATISFIABLE, 0)
+
+
+def test_maps_that_are_not_proven_when_they_are_listed_are_not_called_minimal() -> None:
+    """When minimal maps of a mended trace are listed, the time may be over before they are found
+    again."""
+    trace = maze(2, 2, steps=30, seed=2).trace
+    steps = list(trace.steps)
+    steps[12] = replace(steps[12], action=Action.of("around"))
+    search = Search(replace(trace, steps=tuple(steps)), Theory(slipped=1.5))
+
+    def too_late(
+        mended: Trace, theory: Theory, most: int, seconds: float
+    ) -> tuple[tuple[SSHMap, ...], bool]:
+        return search._solve_mended(mended, theory, 1, seconds)[0], most == 1
+
+    for solver, is_listed in ((search._solve_mended, True), (too_late, False)):
+        mending = Mending(search._parts.task, solver)
+        assert list(mending.maps())
+        assert bool(mending.minimal_maps(0)) == is_listed

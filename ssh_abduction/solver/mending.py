@@ -103,7 +103,7 @@ class Mending:
 
         Call this after the iteration over `maps` has ended. `most` is the number of maps to list
         for each mended trace; 0 for all. Returns None if there is no such proof: the best map costs
-        more than the bound, or not all mended traces were solved.
+        more than the bound, or not all mended traces were solved, or listed, in time.
         """
         if self._best is None or self._best.cost[0] != self.bound or not self._cheapest:
             return None
@@ -113,12 +113,13 @@ class Mending:
         costs = {mended: found.cost for mended, (found, _) in solved.items() if found is not None}
         least = min(costs.values())
         minimal = [mended for mended, cost in costs.items() if cost == least]
-        listed = (
-            self._as_found(ssh_map, mended).map
-            for mended in minimal
-            for ssh_map in self._maps_of(mended, most)[0]
-        )
-        return tuple(dict.fromkeys(listed))
+        listed: dict[SSHMap, None] = {}
+        for mended in minimal:
+            maps, proven = self._maps_of(mended, most)
+            if not proven:  # the time was over before they were found again
+                return None
+            listed |= dict.fromkeys(self._as_found(ssh_map, mended).map for ssh_map in maps)
+        return tuple(listed)
 
     def _improving(self, better: Found | None, mended: Trace) -> Iterator[Found]:
         """Yield a map, and remember it with its mended trace, if it is the best one so far."""

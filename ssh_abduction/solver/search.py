@@ -365,7 +365,8 @@ class Search:
         maps = tuple(search.unranked())
         if search.stopped == "interrupted":
             self.interrupt()
-        return maps, search.status in (Status.OPTIMAL, Status.UNSATISFIABLE)
+        is_listed = most == 1 or search.complete or search.stopped == "maps limit"
+        return maps, is_listed and search.status in (Status.OPTIMAL, Status.UNSATISFIABLE)
 
     def _reason(self) -> None:
         """Prove what all minimal maps share, if not all of them are listed."""
