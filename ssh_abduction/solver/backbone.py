@@ -209,10 +209,7 @@ class _Reasoning:
         return size
 
     def _settle_prefix(self, engine: StepEngine, size: int) -> int:
-        """Resolve the doubts about the first `size` steps, and return the next size to try.
-
-        It is 0 if no doubt about the trace is left.
-        """
+        """Resolve the doubts about the first `size` steps. Return the next size; 0 at the end."""
         engine.grow(size)
         while (found := engine.map_with(list(self._doubts(size)), self._cost)) is not None:
             replayed = self._replay(found)
@@ -254,8 +251,7 @@ class _Reasoning:
     def _doubts_of_classes(self, size: int) -> Iterator[Doubt]:
         """Yield the doubts about classes of steps. Each class is given by its first step.
 
-        Two classes that are one in all known maps may differ in another map, or the other way
-        round.
+        Two classes that are one in all known maps may differ in another map, or vice versa.
         """
         sharing = self._sharing
         firsts = [t for t in sharing.firsts() if t < size]

@@ -81,9 +81,8 @@ class Candidates:
         """Return the beam of this many hypotheses about dstates and places.
 
         Later calls return the same beam, which goes on where it stopped. None without the speed-up
-        `greedy`, if the trace is long, or if the checker cannot check all axioms. Also None if the
-        trace has neither displacements nor stars at any angles, as `guesses/tree.py` makes better
-        maps of it.
+        `greedy`, if the trace is long, or if the checker cannot check all axioms. Also None without
+        displacements and stars at any angles, as `guesses/tree.py` makes better maps then.
         """
         theory = self._task.theory
         if (
@@ -225,10 +224,7 @@ class Candidates:
             self.offer(ssh_map)
 
     def frame(self, speedups: Speedups) -> None:
-        """Offer maps in which places have frames, although the theory does not demand frames.
-
-        `speedups` are those that the caller has on. With frames, more of them may apply.
-        """
+        """Offer maps in which places have frames, although the theory does not demand frames."""
         from ssh_abduction.solver.engines.framed import maps_with_frames  # loads numpy
 
         watch = self._task.watch

@@ -73,10 +73,7 @@ def labelling_engine(task: Task, labels: Sequence[int]) -> Engine:
 
 
 def step_engine(task: Task) -> StepEngine:
-    """Make a `StepEngine`, which suits any theory. Its prefix is empty.
-
-    With the speed-up `path_names` it begins with few names for paths.
-    """
+    """Make a `StepEngine`, for any theory. With `path_names` it begins with few names for paths."""
     most = readable.most_paths(task.trace, task.theory, len(task.trace))
     names = min(prefixes.FIRST_PATHS, most) if task.speedups.path_names else most
     return StepEngine(task, names)

@@ -26,10 +26,7 @@ class Digest:
 
     @classmethod
     def of(cls, trace: Trace, ssh_map: SSHMap, *, short: bool) -> Digest:
-        """Make a digest of the drives of a map.
-
-        If `short`, each link occurs only once. If not, the digest has all steps.
-        """
+        """Make a digest of the drives of a map. If it is `short`, each link occurs only once."""
         if not short:
             return cls(trace, ssh_map.dstate_at)
         shown = _observations(trace, ssh_map)

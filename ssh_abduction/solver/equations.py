@@ -106,11 +106,9 @@ def spreads_of(trace: Trace) -> Array:
 
     A dstate has one pose in a map, but the robot is not at exactly this pose on each visit. Turns
     do not move it, so the k steps of a visit share one error of position. To count this error once,
-    each of the steps gets k times its variance.
-
-    Returns:
-        The variances of x, y and heading, (steps, 3), in square metres and square radians. They are
-        0 if the odometry declares no such errors.
+    each of the steps gets k times its variance. The result has variances of x, y and heading,
+    (steps, 3), in square metres and square radians. They are 0 if the odometry declares no such
+    errors.
     """
     odometry = trace.odometry or Odometry()
     visit = np.cumsum([1, *(action.kind != "turn" for action in trace.actions)]) - 1

@@ -279,8 +279,7 @@ class _Boxes:
         """Bound what is saved in each box.
 
         The points that save something everywhere in a box save a concave quadratic function, whose
-        maximum is known. Each other point saves at most what it saves at the nearest point of the
-        box.
+        maximum is known. Another point saves at most what it saves at the nearest point of the box.
         """
         look_at_clock()
         variances, off = self._all.variances, self._all.offsets(centres)

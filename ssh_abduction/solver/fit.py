@@ -374,10 +374,8 @@ class Poses:
         """Count the degrees of freedom: equations minus the unknowns that they determine.
 
         The equations determine neither where each part of the map is nor how it is turned, nor how
-        some groups of headings are turned.
-
-        A displacement with hardly any noise (EXACT) determines as many unknowns as it has
-        equations. So it adds no freedom.
+        some groups of headings are turned. A displacement with hardly any noise (EXACT) determines
+        as many unknowns as it has equations. So it adds no freedom.
         """
         said = np.unique(np.concatenate([self._from, self._to]))
         used = np.unique(self._place[said])

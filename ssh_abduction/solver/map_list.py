@@ -27,8 +27,7 @@ def listed(parts: Parts, found: Iterator[Priced], *, keeps_time: bool) -> Iterat
     """Yield the maps asked for, each with its preferred counts, after a check.
 
     The clock of the search stops while the caller works with a map. `found` has the minimal maps,
-    and then maps that cost more. If `keeps_time`, a share of the time limit is kept for finding the
-    backbone later.
+    and then maps that cost more. If `keeps_time`, some time is kept for finding the backbone later.
     """
     known, watch, most = parts.known, parts.watch, parts.limits.most
     if known.status is Status.OPTIMAL:

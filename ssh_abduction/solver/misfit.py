@@ -50,10 +50,7 @@ class Misfit:
         self._known: dict[_Groups, float] = {}
 
     def of_returns(self, returns: Iterable[Equality], wrong: Collection[int] = ()) -> float:
-        """Compute the misfit (a chi-square) of a set of returns.
-
-        The displacements to `wrong` steps are ignored.
-        """
+        """Return the misfit (a chi-square) of returns, ignoring displacements to `wrong` steps."""
         headings, positions = list(range(len(self.visit))), list(self.visit)
         for found in returns:
             if found.of == "dstate":

@@ -36,9 +36,8 @@ class NearMinimal:
     ) -> None:
         """Prepare an engine. The search begins with `maps`.
 
-        `most` is the number of maps wanted; 0 for all. `report` is called now and then. `before` is
-        the asker of the search for the minimal maps. Its times are added to the times of this
-        engine.
+        `most` is the number of maps wanted; 0 for all. `report` is called now and then. The times
+        of `before`, the asker of the search for minimal maps, are added to those of this engine.
         """
         self._task = replace(task, speedups=replace(task.speedups, prefixes=False))
         self._judging, self._most, self._report = judging, most, report

@@ -74,10 +74,9 @@ def solve_onto(
 ) -> Solution:
     """Find the minimal joint maps of new and old drives that keep the map of the old drives.
 
-    The existing solution has the trace of the old drives, and its first map is the one to keep. The
-    theory is by default that of this solution; its steps are those of the joint trace. Corrections
-    of a person are obeyed. Raises SolverError if the solution has no map or no trace, or the new
-    drive contradicts the map.
+    The existing solution has the trace of the old drives, and its first map is the one to keep. Its
+    theory is the default; steps in a theory are steps of the joint trace. Corrections of a person
+    are obeyed. Raises SolverError without a map or trace, or if the new drive contradicts the map.
     """
     old, ssh_map = _existing(existing)
     theory = checked_theory(theory or existing.theory.replace(returns=0))
@@ -173,8 +172,7 @@ def _pinned(theory: Theory, digest: Digest, ssh_map: SSHMap, old: Trace, *, join
 
     They say that steps at different dstates or places of that map are different. Assertions of the
     theory about old steps are moved to steps of the digest. If `joins`, equal dstates are asserted,
-    too. The fast engine for frames can obey this. With other theories, it would switch fast engines
-    off.
+    too. The fast engine for frames can obey this. For other theories it switches fast engines off.
     """
     place = [ssh_map.dstates[s].place for s in digest.labels]
     first = {s: t for t, s in reversed([*enumerate(digest.labels)])}

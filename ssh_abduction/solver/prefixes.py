@@ -154,10 +154,7 @@ class Prefixes:
         return first_accepted(self._minimise_known, why_refused, self._forbid)
 
     def _forbid(self, equalities: frozenset[Equality]) -> None:
-        """Forbid all maps that have all of these equalities.
-
-        If the engine cannot do it, go on with a `StepEngine`.
-        """
+        """Forbid all maps with all these equalities. If need be, go on with a `StepEngine`."""
         if self._forbid_in_engine(equalities):
             return
         _log.debug(

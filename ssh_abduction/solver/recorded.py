@@ -99,10 +99,7 @@ class Support:
 
     @property
     def certificate(self) -> Certificate | None:
-        """The proof that no map has fewer dstates; None if there is none.
-
-        It is computed at the first use.
-        """
+        """The proof that no map has fewer dstates, computed at first use; None if there is none."""
         if self.recorded is not None:
             return self.recorded.certificate
         return self.basis.certificate if self.basis else None

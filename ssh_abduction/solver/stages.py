@@ -91,10 +91,7 @@ class Stages:
             parts.prefixes.find_minimum()
 
     def _mend(self) -> bool:
-        """Look for maps with faults by mending the trace.
-
-        Returns whether minimal maps were found and proven.
-        """
+        """Look for maps by mending the trace. Return whether minimal ones were found and proven."""
         from ssh_abduction.solver.mending import Mending  # loads numpy
 
         parts, known, most = self._parts, self._parts.known, self._parts.limits.most

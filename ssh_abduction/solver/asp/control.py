@@ -88,8 +88,7 @@ class Control(clingo.Control):
         """Make a control without a program, with command-line options of clingo.
 
         `check` is called now and then while clingo grounds an encoding with `@go_on`. If it raises
-        an exception, the grounding ends and the control is unusable. `preparing` is as in the
-        attribute.
+        an exception, the grounding ends and the control is unusable.
         """
         super().__init__(["--warn=none", *options])
         self.preparing = preparing
@@ -326,10 +325,7 @@ class Asker:
                 handle.cancel()
 
     def _has_come(self, handle: clingo.SolveHandle, until: Callable[[], bool]) -> bool:
-        """Wait until clingo has an answer or ends, or until `until` returns True.
-
-        Returns False if `until` ended the wait. Raises LimitError if a limit is reached.
-        """
+        """Wait for an answer or the end; False if `until` ended the wait. May raise LimitError."""
         began = time.perf_counter()
         try:
             while not handle.wait(POLL):

@@ -84,7 +84,7 @@ class Blocks:
         return bound
 
     def least_faults(self, most: int) -> int:
-        """Return the least cost, in tenths, that faults of maps with at most `most` dstates have.
+        """Return a lower bound, in tenths, on the faults of maps with at most `most` dstates.
 
         The trace is divided into blocks from its first step on. Each block ends as soon as it needs
         a fault. The least costs of the faults of all blocks are added up.

@@ -49,7 +49,7 @@ class FaultyEngine:
     """The engine for the causal theory with faults. It minimises dstates and faults together."""
 
     def __init__(self, task: Task, most_faults: int | None = None) -> None:
-        """Begin with an empty prefix. If given, `most_faults` is how many may occur, at no cost."""
+        """Begin with an empty prefix. If given, up to `most_faults` faults cost nothing."""
         self.asker = Asker(task.watch)
         self._most_faults = most_faults
         self.size = 0
@@ -204,10 +204,7 @@ class FaultyEngine:
             self.bound = max(self.bound or 0, bound[0])
 
     def _machine(self, answer: FaultyAnswer) -> tuple[dict[int, int], PartialMachine]:
-        """Make a machine, which is dstates and links, from an answer.
-
-        Returns, first, the number of each dstate by its name, in the order of first visits.
-        """
+        """Make a machine (dstates and links) from an answer, and number its dstates in order."""
         number: dict[int, int] = {}
         for t in sorted(answer.where):
             number.setdefault(answer.where[t], len(number))

@@ -227,9 +227,8 @@ class FramedEngine:
     def _charted(self, size: int, before: FramedChart | None) -> FramedChart | None:
         """Chart the first steps, with the pairs of nodes that must be at different places.
 
-        The pairs are those that follow from the trace alone, by the axioms of order and sides. If
-        `before`, the chart of fewer steps, is given, only its pairs are taken. Returns None if the
-        steps fit no frames.
+        The pairs follow from the trace alone, by the axioms of order and sides. If `before`, the
+        chart of fewer steps, is given, only its pairs are taken. None if the steps fit no frames.
         """
         chart = Chart.framed(self._task.trace, self._task.log, size)
         return None if chart is None else self._fitting.charted(chart, before)

@@ -123,7 +123,7 @@ class NameSearch:
                 return answer, bool(end.value)
 
     def _labels_by(self, names: dict[int, int]) -> list[int] | None:
-        """Return the labels by an answer, or give clingo what it lacked if that is no map."""
+        """Return labels by an answer. If it is no map, give clingo what it lacked; return None."""
         program = self._program
         if views := program.rests(names):
             program.name_more(views)

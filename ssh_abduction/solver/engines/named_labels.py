@@ -157,7 +157,7 @@ class NamedLabels:
         self._program.give_links(links)
 
     def _first_spares(self, pinned: Pinned) -> dict[int, int]:
-        """Give each view one spare name more than the given map needs, but at least `SPARES`."""
+        """Return the spare names per view: one more than the given map needs, at least `SPARES`."""
         seen = pinned.chart.seen
         found = Counter(dict(zip(self._given_map, seen, strict=False)).values())
         taken = Counter(seen[node] for node in pinned.clique)

@@ -62,7 +62,9 @@ def all_accepted(
 
 
 def minimal_part(suffices: Callable[[list[Member]], bool], members: list[Member]) -> list[Member]:
-    """Find a minimal part of the members that still suffices. With more members it always does.
+    """Find a minimal part of some members that still suffices.
+
+    If some members suffice, so do more members.
 
     Reference:
         Junker 2004, "QuickXplain: preferred explanations and relaxations for over-constrained

@@ -80,10 +80,7 @@ class SmallMaps:
         return merged_near(pinned.chart.apart(), pinned.chart.links, guess, check)
 
     def _guessed(self, pinned: Pinned, check: Callable[[], None]) -> list[int] | None:
-        """Guess the dstates of these steps, -1 if the guess is not sure.
-
-        Returns None if a guess would take too much memory.
-        """
+        """Guess the dstates of these steps, -1 if not sure; None if that takes too much memory."""
         steps = pinned.chart
         chart = Chart.turned(self._task.trace, self._task.log, len(steps.seen))
         if chart is None:  # turns cannot be rotations by right angles

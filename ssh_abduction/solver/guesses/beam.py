@@ -184,8 +184,7 @@ class Beam:
         and at most LOST * ALIKE in all. Drop those that cost at least UNSURE more than the best.
         The last two limits apply separately to hypotheses whose present piece is not joined yet
         (`Pieces.is_loose`), as they cost more until it is joined. `options` are ways to extend the
-        beam by step t, sorted by cost. If `checked`, hypotheses that the checker refuses are
-        dropped.
+        beam by step t, sorted by cost. If `checked`, drop what the checker refuses.
         """
         most, several = width, bool(self._frames)
         if several:

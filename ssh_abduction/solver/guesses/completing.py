@@ -44,10 +44,9 @@ def completed(
     """Complete dstates and places to a map. The caller has to check it.
 
     `labels` has the dstate of each step, and `places` the place of each dstate, which a causal
-    theory ignores. `facing` has the heading of each dstate in radians, counterclockwise; only
-    star=frame uses it. Returns None if an action leads from one dstate to two dstates, if a path
-    would be a circle, if a dstate would face both directions of its path, or if the stars fit no
-    frames.
+    theory ignores. `facing` has the heading of each dstate in radians, counterclockwise, for
+    star=frame. Returns None if an action leads from one dstate to two, if a path would be a circle,
+    if a dstate would face both directions of its path, or if the stars fit no frames.
     """
     links: dict[tuple[int, str], int] = {}
     for here, action, there in zip(labels, trace.actions, labels[1:], strict=False):
@@ -95,8 +94,7 @@ def _facing(
     """Find which way each dstate faces at its place, by the stars or by its heading in radians.
 
     Returns the slot of each dstate (the number of its direction in the frame of its place), and the
-    pairs of dstates that face opposite ways. Both are empty for a theory without frames. None if no
-    frame fits the stars.
+    pairs of dstates that face opposite ways; both are empty without frames. None if no frame fits.
     """
     if theory.star == "gateways":
         return gateways.facing(trace, ssh_map, theory.axioms, bool(theory.changed))

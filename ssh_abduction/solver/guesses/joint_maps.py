@@ -207,11 +207,7 @@ class Joining:
         return sorted((way for way in found if way.good >= least), reverse=True)[:CROSSED]
 
     def _joined(self, first: Part, second: Part, ways: Sequence[_Anchor]) -> Part | None:
-        """Join two maps by the anchor that costs least, without breaking axioms.
-
-        Returns:
-            The joint map; None if each costs at least as much as the two maps apart.
-        """
+        """Join two maps by the cheapest anchor that breaks no axiom; None if apart is cheaper."""
         found: list[Part] = []
         for way in ways:
             look_at_clock()

@@ -244,8 +244,7 @@ class HypothesisPoses:
 
         A new place or dstate gets the position or heading of the robot. `position` is the index in
         the means of the x of a known place, and `heading` that of a known dstate; None for new
-        ones. New entries, x and y before the heading, come just before the pose of the robot in the
-        new means and covariance.
+        ones. New entries, x and y before the heading, come just before the pose of the robot.
         """
         n = len(moved.mean) - 3
         old = [] if position is None else [position, position + 1]

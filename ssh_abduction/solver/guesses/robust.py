@@ -329,10 +329,7 @@ class _Model:
         return labels[::-1]
 
     def _normal(self, counts: Floats) -> Floats:
-        """Turn counts into transition probabilities, both of shape (actions, from, to states).
-
-        A slip leads to each state equally often.
-        """
+        """Turn counts into transition probabilities. Slips lead to each state equally often."""
         chances: Floats = counts / counts.sum(axis=2, keepdims=True)
         slipping: Floats = (1 - self._slip) * chances + self._slip / counts.shape[2]
         return slipping

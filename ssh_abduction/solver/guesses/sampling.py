@@ -48,11 +48,10 @@ class _Transitions:
     def __init__(
         self, leaves: Sequence[tuple[int, int]], ways: int, states: int, labels: States
     ) -> None:
-        """Count the transitions of a draw.
+        """Count the transitions of a draw, in which each visit has a state.
 
         `leaves` has the slot and action at which each visit but the last ends. `ways` is the number
-        of states per place, 4 or 1. With 4, states 2 and 3 face opposite to 0 and 1. `labels` has
-        the state of each visit.
+        of states per place, 4 or 1. With 4, states 2 and 3 face opposite to 0 and 1.
         """
         number: dict[int, int] = {}
         self._slot = np.array([slot for slot, _ in leaves], dtype=int)

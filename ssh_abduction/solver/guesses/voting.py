@@ -235,8 +235,7 @@ class Merging:
         """Find how to turn the group of another visit before it is merged with that of this visit.
 
         Slot K of this visit shall be slot K + turn of the other. Returns a list with the group of
-        the other visit and the quarters to turn it by; empty if both visits are in one group
-        already.
+        the other visit and the quarters to turn it by; empty if both visits are in one group.
         """
         mine, its = self._group_of[visit], self._group_of[other]
         if mine == its:

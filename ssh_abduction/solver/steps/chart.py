@@ -80,7 +80,7 @@ class Chart:
         return Continuations(self.seen, [action for _, action, _ in self.links], self.excluded)
 
     def is_map(self, labels: Sequence[int]) -> bool:
-        """Whether labels make a causal map. They do not if one is unknown, which is negative.
+        """Whether labels make a causal map; False if one is unknown, that is, negative.
 
         Each dstate must have one observation, each action at a dstate must lead to one dstate, and
         the nodes of an excluded pair must have different labels.
@@ -113,7 +113,7 @@ class Chart:
 
     @staticmethod
     def around(trace: Trace, log: Log, size: int) -> dict[int, list[int]] | None:
-        """For each observation, find those that a robot makes ahead, right, back and left there.
+        """For each observation, find those ahead, right, back and left of a robot that makes it.
 
         Returns None if some action is neither turn nor travel, if a turn leads from one observation
         to two different ones, or if some of the four observations are unknown.

@@ -117,10 +117,9 @@ def not_all_one(equalities: Collection[Equality]) -> str:
 
 
 def read_faulty(model: Model) -> tuple[dict[int, int], frozenset[int], frozenset[int]]:
-    """Read an answer of faulty.lp.
+    """Read the dstate (a name) of each step, the slipped steps, and the misread steps left open.
 
-    Returns the names of the dstates of steps; the steps whose action slipped; and the misread steps
-    whose dstate is left open.
+    A misread step is left open if the answer does not say at which dstate it is.
     """
     where: dict[int, int] = {}
     steps: dict[str, set[int]] = {"slips": set(), "lost": set()}

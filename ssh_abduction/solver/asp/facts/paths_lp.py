@@ -64,8 +64,7 @@ def paths_frameless_facts(
 
     `links` are triples of a dstate, the number of an action, and the dstate that it leads to. In
     each set of `far`, at least one pair of dstates is at different places. If `single`, only those
-    places, and those segments of paths, are merged that the axioms force to be one. This is solved
-    faster.
+    places and segments are merged that the axioms force to be one. This is solved faster.
     """
     facts = [
         sides_framed_facts(theory),

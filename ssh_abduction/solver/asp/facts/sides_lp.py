@@ -33,10 +33,7 @@ def sides_frameless_facts(theory: Theory, actions: Mapping[int, Action]) -> str:
 def turn_facts(
     batch: int, chart: FramedChart, visits: Iterable[int], turns: Iterable[tuple[int, str, int]]
 ) -> str:
-    """Return the facts for sides_framed.lp about the new visits and the turns of one batch.
-
-    Turns are triples of a node, the direction of the turn, and the node after it.
-    """
+    """Return the facts about the new visits and the turns (node, direction, node) of a batch."""
     facts = [f"visit({batch},{visit})." for visit in visits]
     for s, turn, x in turns:
         (visit, slot), (_, faced) = chart.facing[s], chart.facing[x]

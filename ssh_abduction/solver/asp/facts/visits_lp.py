@@ -25,9 +25,9 @@ def visit_facts(
     """Return the facts for one batch.
 
     Each node (the steps of a visit that face one slot) has its number, visit and slot. `leaves` has
-    each visit that ends, with the slot that it leaves through, and the action. Pairs of visits read
-    (I, J, R): `fits` may be at one place, `unfit` of earlier batches are now known not to be, and
-    `joined` are, as the user says.
+    each visit that ends, with the slot that it leaves through, and the action. Triples (I, J, R)
+    stand for pairs of visits: `fits` may be at one place, `unfit` of earlier batches are now known
+    not to be, and `joined` are at one place, as the user says.
     """
     new = {"node": nodes, "leaves": leaves, "fits": fits, "unfit": unfit, "joined": joined}
     return "\n".join(
@@ -69,8 +69,8 @@ def forbidden_pairs(
 ) -> str:
     """Return the rule against answers with all of `pairs` and none of `different` at one place.
 
-    Pairs of visits read (I, J, R). The rule applies only while answers up to the batch `listed` are
-    listed; None for always.
+    Triples (I, J, R) stand for pairs of visits. The rule applies only while answers up to the batch
+    `listed` are listed; None for always.
     """
     body = [
         *(f"same({i},{j},{r})" for i, j, r in pairs),
