@@ -57,9 +57,10 @@ def main() -> None:
     now, timer = time.perf_counter, signal.ITIMER_REAL
     if options.clock == "cpu":
         now, timer = cpu_seconds, signal.ITIMER_PROF
+        # A search reads these clocks.
         vars(limits)["time"] = SimpleNamespace(
-            perf_counter=cpu_seconds
-        )  # a search reads this clock
+            perf_counter=cpu_seconds, thread_time=time.thread_time
+        )
     instance = INSTANCES[options.instance]
     end_after(AROUND)
     for module in PEERS[tool].modules if tool in PEERS else ():

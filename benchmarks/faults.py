@@ -26,6 +26,7 @@ import resource
 import signal
 import statistics
 import sys
+import time
 from collections import Counter
 from collections.abc import Hashable, Iterable, Sequence
 from multiprocessing.connection import Connection
@@ -187,9 +188,10 @@ def work(sender: Connection, name: str, solver: str, seed: int, limit: float, me
                 {"status": "ok", "cpu": spent, **judged(case, [explanation], PEERS[solver].proves)}
             )
         else:
+            # A search reads these clocks.
             vars(limits)["time"] = SimpleNamespace(
-                perf_counter=cpu_seconds
-            )  # a search reads this clock
+                perf_counter=cpu_seconds, thread_time=time.thread_time
+            )
             end_after(limit + MARGIN, signal.ITIMER_PROF)
             search(
                 sender, case, theory_for(case, FAMILIES[name].theory, told=solver == TOLD), limit
