@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import TypeAlias
@@ -34,12 +35,12 @@ from scipy.special import gammaincc
 from ssh_abduction.data.drives import drives_of
 from ssh_abduction.data.maps import Fault, SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.runtime.clock import look_at_clock
+from ssh_abduction.runtime.clock import heeding, look_at_clock
 from ssh_abduction.runtime.loggers import log_of
-from ssh_abduction.solver.asp.limits import LimitError
+from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.beams import Beams
 from ssh_abduction.solver.choosing import READABLE, labelling_engine
-from ssh_abduction.solver.engines.base import Found
+from ssh_abduction.solver.engines.base import Found, Task
 from ssh_abduction.solver.equations import spreads_of
 from ssh_abduction.solver.estimating import (
     CostOf,
@@ -49,6 +50,7 @@ from ssh_abduction.solver.estimating import (
     least_places,
     rival_of,
 )
+from ssh_abduction.solver.forced import Forcing
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
 from ssh_abduction.solver.map_list import Priced
@@ -61,6 +63,7 @@ from ssh_abduction.solver.weighed import EQUAL, Rival, Weighed
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.evidence.displacement import jumped
 from ssh_abduction.theory.settle import Problem, displacement_of
+from ssh_abduction.theory.speedups import row
 from ssh_abduction.theory.theory import Theory
 
 _log = log_of(__name__)
@@ -77,6 +80,8 @@ IMPROBABLE = 0.01
 EXCESS = 2.25
 # Without a time limit, give up after PATIENCE seconds plus MORE times the time of the best map.
 PATIENCE, MORE = 10.0, 5.0
+# Finding joins that all cheap maps have takes at most this share of the time, and PATIENCE seconds.
+FORCING = 0.4
 # Estimating rivals may end OVERTIME seconds late. It gets LEAST_ESTIMATING to ESTIMATING seconds.
 OVERTIME, LEAST_ESTIMATING, ESTIMATING = 0.7, 0.1, 0.5
 
@@ -149,18 +154,23 @@ class Weighing:
         self._least = {"places": least_places(parts.task.problem)}
         may_be_wrong = range(1, len(parts.task.trace)) if parts.task.theory.jumped else ()
         self._base = self._misfit.of_returns([], may_be_wrong) / 2  # of every map
+        task = replace(parts.task, speedups=replace(parts.task.speedups, prefixes=False))
         if self.candidates and is_for(parts.task.problem):
             most = self.candidates[0].nats
             self.bound = least_cost(parts.task.problem, self._misfit.visit, most)
+        elif self.candidates and Forcing.holds_for(task.problem):
+            task = self._with_forced_joins(task)
         if parts.task.theory.has_faults and len(parts.task.trace) > READABLE:
             raise LimitError("no proof")
-        task = replace(parts.task, speedups=replace(parts.task.speedups, prefixes=False))
         best = parts.known.best
         engine = labelling_engine(task, best.dstate_at if best else ())
         judging = _CostJudging(task.problem, self)
         engine.grow(len(task.trace))
         prefixes = Prefixes(task, Known(task.theory), judging, engine, 1, parts.report)
-        last = prefixes.minimise()
+        try:
+            last = prefixes.minimise()
+        finally:
+            self._take_bound(prefixes.engine.bound)
         if last is None and not self.candidates:
             parts.known.status = Status.UNSATISFIABLE
             return
@@ -168,6 +178,33 @@ class Weighing:
         self.proven = True
         parts.known.status = Status.OPTIMAL
         self.keep_best()
+
+    def _take_bound(self, least: int | None) -> None:
+        """Raise the bound if clingo proved that each cheap map has at least so many dstates."""
+        if self.candidates and "dstates" in self._prices:
+            nats = self._price({**self._least, "dstates": least or 0}) + self._base
+            self.bound = max(self.bound, min(nats, self.candidates[0].nats))
+
+    def _with_forced_joins(self, task: Task) -> Task:
+        """Find joins that all cheap maps have. Raise the bound, and assert the joins for clingo."""
+        least = self._parts.known.bound.dstates or 0
+        best = self.candidates[0]
+        forcing = Forcing(task.problem, task.log, self._misfit, best.map, least)
+        seconds = min(FORCING * self._parts.watch.left(), PATIENCE)
+        with suppress(LimitError), heeding(Watch().part(seconds).check):
+            forcing.force(self._most)
+            for bound in forcing.bounds(best.nats) if forcing.low < best.nats - EQUAL else ():
+                self.bound = max(self.bound, bound)
+        self.bound = max(self.bound, min(forcing.low, best.nats))
+        returns = forcing.returns
+        self._base = max(self._base, self._misfit.of_returns(returns) / 2)
+        same = [(one.first, one.second) for one in returns if one.of == "dstate"]
+        if not same or not row("visits").holds_for(task.theory):
+            return task
+        theory = task.theory.replace(same=(*task.theory.same, *same))
+        return replace(
+            Task.of(task.problem.changed(theory=theory), task.watch), speedups=task.speedups
+        )
 
     def keep_best(self) -> None:
         """Weigh the best map of the search. Then make the cheapest known map the best one."""

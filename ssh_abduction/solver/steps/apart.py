@@ -205,7 +205,7 @@ def clique(apart: Matrix, seen: Sequence[int]) -> list[int]:
 def large_clique(apart: Matrix) -> list[int]:
     """Grow a clique greedily from each of a few nodes, and return the largest, sorted."""
     random = np.random.default_rng(0)
-    found = [_grown(apart, [node], random) for node in range(len(apart))]
+    found = [grown_clique(apart, [node], random) for node in range(len(apart))]
     largest: list[int] = max(found, key=len, default=[])
     return sorted(largest)
 
@@ -216,15 +216,15 @@ def _greedy_clique(apart: Matrix) -> list[int]:
     A swap removes some nodes and grows the clique again. Keep the result unless it is smaller.
     """
     random = np.random.default_rng(0)
-    best = _grown(apart, [], random)
+    best = grown_clique(apart, [], random)
     for _ in range(min(SWAPS, len(apart) // 8) if 1 < len(best) < len(apart) else 0):
         kept = random.permutation(best)[random.integers(1, len(best)) :]
-        other = _grown(apart, kept.tolist(), random)
+        other = grown_clique(apart, kept.tolist(), random)
         best = other if len(other) >= len(best) else best
     return best
 
 
-def _grown(apart: Matrix, kept: list[int], random: np.random.Generator) -> list[int]:
+def grown_clique(apart: Matrix, kept: list[int], random: np.random.Generator) -> list[int]:
     """Grow a clique from the nodes `kept`, which are pairwise apart, until no node can be added.
 
     Each time add the candidate that is apart from the most other candidates. Chance breaks ties.

@@ -1,0 +1,449 @@
+"""Joins that every cheap map has, and a lower bound on the cost of all maps.
+
+Let F be joins of visits that every map of a cost below T has. Then each such map costs at least the
+misfit of F, and the prices of its dstates and places. At first F is empty. A map without one more
+join costs at least the misfit of F, and the prices of the dstates and places that it needs without
+this join. If this is T or more, then each map of a cost below T has this join, too, and F gets it.
+The more joins F has, the greater is its misfit, and the more dstates and places are needed without
+one more join. If the misfit of F and the prices are T or more, then no map costs less than T.
+
+The joins are those of the best known map. If F gets no further join, assume that a map lacks a
+certain one, and find what all cheap maps without it have. If no map costs less than T without it, F
+gets it. This is a branch and bound with few branches: one of the two sides always ends.
+
+*Counts.* Two visits that cannot be at one place are apart. So are two visits that the same action
+leads on from, to visits that are apart (`steps/chart.py`). Visits that F joins are apart from the
+same visits. A clique of dstates, or of places, is a lower bound on their number.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.runtime.clock import look_at_clock
+from ssh_abduction.solver.misfit import Misfit
+from ssh_abduction.solver.steps.apart import clique, grown_clique
+from ssh_abduction.solver.steps.chart import Chart, FramedChart
+from ssh_abduction.solver.steps.log import Log
+from ssh_abduction.theory.evidence import Equality
+from ssh_abduction.theory.settle import Problem
+from ssh_abduction.theory.speedups import row
+
+Ints = NDArray[np.int_]
+Flags = NDArray[np.bool_]
+
+# Search for a higher bound until it is known to this share.
+NEARLY = 0.004
+# The bound compares all pairs of visits, so it is only for traces of at most LONGEST steps.
+LONGEST = 2500
+# Try a clique with each of at most TRIED pairs that were not apart before.
+TRIED = 20
+# Consider joins of each visit with the last visits to its place, with at least one. Of all visits
+# together, consider about this many joins at most.
+PAIRS = 5000
+# Assume the lack of at most BRANCHES joins, one after the other, until F gets one of them.
+BRANCHES = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Visits:
+    """Visits to places, whose directions are numbered as in a map.
+
+    With frames, a visit is the steps between two travels, and its place has four directions. Else
+    each step is a visit, and its place has one direction.
+
+    Attributes:
+        visit: The visit of each step.
+        direction: The direction of each step at the place of its visit.
+        seen: The observation at each step, as a number.
+        place: The place of each visit in the map; without frames, its dstate.
+        links: For each visit but the last: the direction in which the robot leaves, the action, and
+            the direction in which it arrives at the next visit; (visits - 1, 3).
+        apart: The flag [R, I, J] says that visits I and J cannot be at one place such that
+            direction 0 of I is direction R of J.
+        away: The flag [I, J] says that visits I and J are at different places by evidence; None
+            with frames, where `apart` says it.
+    """
+
+    visit: Ints
+    direction: Ints
+    seen: Ints
+    place: Ints
+    links: Ints
+    apart: Flags
+    away: Flags | None
+
+    @classmethod
+    def of(cls, problem: Problem, log: Log, ssh_map: SSHMap) -> Visits:
+        """Chart a trace, and number the directions as in a map of it."""
+        chart = (
+            Chart.framed(problem.trace, log) if row("visits").holds_for(problem.theory) else None
+        )
+        return cls._of_steps(log, ssh_map) if chart is None else cls._framed(chart, ssh_map)
+
+    @classmethod
+    def _framed(cls, chart: FramedChart, ssh_map: SSHMap) -> Visits:
+        visit, slot = np.array(chart.facing)[list(chart.node_of)].T
+        at = [ssh_map.dstates[label] for label in ssh_map.dstate_at]
+        place, turned = np.zeros((2, len(chart.stars)), dtype=int)
+        place[visit] = [dstate.place for dstate in at]
+        turned[visit] = ([dstate.heading or 0 for dstate in at] - slot) % 4
+        leaves = [(visit, *how) for visit, how in sorted(chart.leaves.items())]
+        left, out, action = np.array(leaves, dtype=int).reshape(-1, 3).T
+        links = np.stack([(out + turned[left]) % 4, action, turned[left + 1]], 1)
+        rows, columns = np.indices(2 * (len(place),))
+        apart, more = np.zeros_like(chart.misfits), (turned - turned[:, None]) % 4
+        for r in range(4):
+            apart[(r + more) % 4, rows, columns] = chart.misfits[r]
+        apart |= apart[[0, 3, 2, 1]].transpose(0, 2, 1)
+        seen = np.array(chart.seen)[list(chart.node_of)]
+        return cls(visit, (slot + turned[visit]) % 4, seen, place, links, apart, None)
+
+    @classmethod
+    def _of_steps(cls, log: Log, ssh_map: SSHMap) -> Visits:
+        steps, none = len(log.seen), np.zeros(len(log.seen), dtype=int)
+        away = np.zeros((steps, steps), dtype=bool)
+        for j, others in log.pairs.elsewhere.items():
+            away[j, list(others)] = away[list(others), j] = True
+        links = np.stack([none[1:], np.array(log.actions, dtype=int), none[1:]], 1)
+        apart = Chart.of_steps(log, steps).apart()[None]
+        place = np.array(ssh_map.dstate_at)
+        return cls(np.arange(steps), none, np.array(log.seen), place, links, apart, away)
+
+    def lacking(self, first: int, second: int) -> Visits:
+        """Return the same visits, but two of them are not joined as in the map."""
+        apart = self.apart.copy()
+        apart[0, first, second] = apart[0, second, first] = True
+        return replace(self, apart=apart)
+
+    def joined(self, of: Ints, pairs: Iterable[tuple[int, int]]) -> Ints:
+        """Merge classes of visits, and those that the same actions lead to from merged ones."""
+        of = of.copy()
+        waiting = list(pairs)
+        while waiting:
+            for i, j in waiting:
+                of[of == of[i]] = of[j]
+            led: dict[tuple[int, int, int], int] = {}
+            after = [
+                (led.setdefault((a, out, action), v), v)
+                for v, (a, (out, action, _)) in enumerate(
+                    zip(of[:-1].tolist(), self.links.tolist(), strict=True), 1
+                )
+            ]
+            waiting = [(i, j) for i, j in after if of[i] != of[j]]
+        merged: Ints = np.unique(of, return_inverse=True)[1]
+        return merged
+
+    def returns(self, of: Ints) -> list[Equality]:
+        """List the returns of all maps that have the visits of each class at one place."""
+        found: list[Equality] = []
+        first: dict[object, int] = {}
+        for t, (a, x) in enumerate(
+            zip(of[self.visit].tolist(), self.direction.tolist(), strict=True)
+        ):
+            if (begin := first.setdefault((a, x), t)) < t:
+                found.append(Equality(begin, t))
+            if (begin := first.setdefault(a, t)) < t and self.away is None:
+                found.append(Equality(begin, t, "place"))
+        return found
+
+
+class _Cliques:
+    """Cliques of a graph of what is apart, one in each part. Two parts are apart altogether."""
+
+    def __init__(self, apart: Flags) -> None:
+        self._apart, self._random = apart, np.random.default_rng(0)
+        self.part: Ints = connected_components(csr_array(~apart), directed=False)[1]
+        self._members = [np.flatnonzero(self.part == p) for p in range(self.part.max() + 1)]
+        self._cliques = [
+            some[clique(apart[np.ix_(some, some)], [0] * len(some))] for some in self._members
+        ]
+        self.size = sum(map(len, self._cliques))
+
+    def size_with(self, pairs: Sequence[tuple[int, int]]) -> int:
+        """Return the size of a clique if some more pairs are apart, too."""
+        apart, larger = self._apart, dict[int, Ints]()
+        if not pairs:
+            return self.size
+        first, second = np.array(pairs).T
+        apart[first, second] = apart[second, first] = True
+        for u, v in pairs[:TRIED]:
+            part = int(self.part[u])
+            best, some = larger.get(part, self._cliques[part]), self._members[part]
+            kept = [u, v, *best[apart[u, best] & apart[v, best]].tolist()]
+            left = some[apart[np.ix_(kept, some)].all(0)]
+            if len(kept) + len(left) > len(best):
+                more = grown_clique(apart[np.ix_(left, left)], [], self._random)
+                if len(kept) + len(more) > len(best):
+                    larger[part] = np.array([*kept, *left[more]])
+        apart[first, second] = apart[second, first] = False
+        return self.size + sum(len(c) - len(self._cliques[part]) for part, c in larger.items())
+
+
+class _Joined:
+    """Classes of visits that are at one place in every cheap map.
+
+    Attributes:
+        fails: Whether no map has these classes.
+    """
+
+    def __init__(self, visits: Visits, of: Ints) -> None:
+        self._apart = _of_classes(visits.apart, of)
+        self._turns = len(self._apart)
+        self._links = np.unique(np.column_stack([of[:-1], visits.links, of[1:]]), axis=0)
+        self._close()
+        self.fails = bool(self._apart[0].diagonal().any())
+        if self.fails:
+            return
+        # The links into each class: from which class and direction, by (class, action, direction).
+        self._into: dict[tuple[int, int, int], list[tuple[int, int]]] = defaultdict(list)
+        self._ways: dict[int, list[tuple[int, int]]] = defaultdict(list)
+        for a, out, action, arrives, b in self._links.tolist():
+            self._into[b, action, arrives].append((a, out))
+            if (action, arrives) not in self._ways[b]:
+                self._ways[b].append((action, arrives))
+        nodes = np.unique(np.column_stack([of[visits.visit], visits.direction]), axis=0)
+        a, x = nodes.T
+        self._node = {(a, x): node for node, (a, x) in enumerate(nodes.tolist())}
+        apart = self._apart[(x - x[:, None]) % self._turns, a[:, None], a]
+        self._dstates = _Cliques(apart | (a[:, None] == a) & (x[:, None] != x))
+        self._has_frames = visits.away is None
+        apart = self._apart if visits.away is None else _of_classes(visits.away[None], of)
+        self._places = _Cliques(np.logical_and.reduce(apart))
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """The least numbers of dstates and places."""
+        return self._dstates.size, self._places.size
+
+    def _close(self) -> None:
+        """If the same action leads from two classes to classes that are apart, so are the two."""
+        every = self._links.T
+        actions = [every[:, every[2] == action] for action in np.unique(every[2])]
+        before = -1
+        while before < (before := int(np.count_nonzero(self._apart))):
+            for a, out, _, arrives, b in actions:
+                then = self._apart[(arrives - arrives[:, None]) % self._turns, b[:, None], b]
+                e, f = np.nonzero(then)
+                self._apart[(out[f] - out[e]) % self._turns, a[e], a[f]] = True
+
+    def may_join(self, a: int, b: int) -> bool:
+        """Whether two classes may be at one place as in the map."""
+        return not self._apart[0, a, b]
+
+    def counts_lacking(self, a: int, b: int) -> tuple[int, int] | None:
+        """Return the least numbers of dstates and places if two classes are not joined.
+
+        Return None if no map lacks this join.
+        """
+        added = self._lack(a, b)
+        fails = any(not r and c == d for r, c, d in added)
+        node = self._node
+        nodes = [
+            (u, v)
+            for r, c, d in added
+            for x in range(self._turns)
+            if (u := node.get((c, x))) is not None
+            if (v := node.get((d, (x + r) % self._turns))) is not None
+        ]
+        places = [(c, d) for c, d in {(c, d) for _, c, d in added} if self._apart[:, c, d].all()]
+        for r, c, d in added:
+            self._apart[r, c, d] = self._apart[-r % self._turns, d, c] = False
+        if fails:
+            return None
+        return self._dstates.size_with(nodes), self._places.size_with(
+            places if self._has_frames else []
+        )
+
+    def _lack(self, a: int, b: int) -> list[tuple[int, int, int]]:
+        """Flag that two classes are not joined, and all that follows. Return the new flags."""
+        added, waiting = [], [(0, a, b)]
+        while waiting:
+            r, a, b = waiting.pop()
+            if self._apart[r, a, b]:
+                continue
+            self._apart[r, a, b] = self._apart[-r % self._turns, b, a] = True
+            added.append((r, a, b))
+            for action, arrives in self._ways[a]:
+                for c, out in self._into[a, action, arrives]:
+                    for d, other in self._into.get((b, action, (arrives + r) % self._turns), ()):
+                        waiting.append(((other - out) % self._turns, c, d))
+        return added
+
+
+class Forcing:
+    """Finds joins that every cheap map has.
+
+    Attributes:
+        visits: The visits of the trace.
+        joins: The joins that every cheap map is proven to have: the class of each visit.
+        low: A lower bound on the cost of every map with these joins.
+    """
+
+    def __init__(
+        self, problem: Problem, log: Log, misfit: Misfit, ssh_map: SSHMap, dstates: int = 0
+    ) -> None:
+        """Chart the trace.
+
+        Args:
+            problem: The trace and its theory, for which `holds_for` is true.
+            log: The same trace as integers.
+            misfit: Computes misfits.
+            ssh_map: The best known map.
+            dstates: The least number of dstates that is proven.
+        """
+        self._misfit, self._dstates = misfit, dstates
+        dstate, place, _ = problem.theory.prices
+        self._prices = dstate, place if problem.theory.level == "topological" else 0.0
+        self.visits = Visits.of(problem, log, ssh_map)
+        at: dict[int, list[int]] = defaultdict(list)
+        for v, place in enumerate(self.visits.place.tolist()):
+            at[place].append(v)
+        most = max(PAIRS // len(self.visits.place), 1)
+        self._pairs = [
+            (i, j)
+            for some in at.values()
+            for k, j in enumerate(some)
+            for i in some[max(k - most, 0) : k]
+        ]
+        self.joins = self.visits.joined(np.arange(len(self.visits.place)), [])
+        self.low = 0.0
+
+    @staticmethod
+    def holds_for(problem: Problem) -> bool:
+        """Whether the bound holds for a theory, and the trace is not too long for it."""
+        theory = problem.theory
+        is_known = row("visits").holds_for(theory) or row("clique").holds_for(theory)
+        return is_known and not theory.has_faults and len(problem.trace) <= LONGEST
+
+    @property
+    def returns(self) -> list[Equality]:
+        """The returns that every cheap map is proven to have."""
+        return self.visits.returns(self.joins)
+
+    def bounds(self, most: float) -> Iterator[float]:
+        """Yield rising lower bounds on the cost of every map, `most` at most. `joins` stays."""
+        low = self._bound(most)
+        yield low
+        while most - low > NEARLY * most:
+            middle = (low + most) / 2
+            # The copy of the visits keeps these joins from becoming `joins`.
+            if self._forced(replace(self.visits), self.joins, middle, {}, 1):
+                low = middle
+                yield low
+            else:
+                most = middle
+
+    def _bound(self, most: float) -> float:
+        """Compute a lower bound on the cost of every map without branches, `most` at most."""
+        low, joins, known = 0.0, self.joins, dict[tuple[int, int], float]()
+        while low < most:
+            joins, low, worth = self._grown(self.visits, joins, most, known)
+            if low < most:
+                most = max([low, *(value for _, value in worth)])
+        return most
+
+    def force(self, most: float) -> None:
+        """Find joins that every map of a cost below `most` has, until no more are found."""
+        self._forced(self.visits, self.joins, most, {}, 1)
+
+    def _price(self, counts: tuple[int, int]) -> float:
+        """Return the price of at least this many dstates and places."""
+        return max(counts[0], self._dstates) * self._prices[0] + counts[1] * self._prices[1]
+
+    def _forced(
+        self,
+        visits: Visits,
+        joins: Ints,
+        most: float,
+        known: dict[tuple[int, int], float],
+        branches: int,
+    ) -> bool:
+        """Add joins that every map of a cost below `most` has.
+
+        Args:
+            visits: The visits.
+            joins: The joins to begin with.
+            most: A cost.
+            known: Prices of maps that lack joins. More are added.
+            branches: How many joins may be assumed to lack at a time.
+
+        Returns:
+            Whether no map costs less than `most`.
+        """
+        while True:
+            joins, low, worth = self._grown(visits, joins, most, known)
+            if visits is self.visits:
+                self.joins, self.low = joins, low
+            if low >= most:
+                return True
+            for (i, j), _ in worth[: BRANCHES if branches else 0]:
+                lacking = visits.lacking(i, j)
+                if self._forced(lacking, joins, most, dict(known), branches - 1):
+                    joins = visits.joined(joins, [(i, j)])
+                    break
+            else:
+                return False
+
+    def _grown(
+        self, visits: Visits, joins: Ints, most: float, known: dict[tuple[int, int], float]
+    ) -> tuple[Ints, float, list[tuple[tuple[int, int], float]]]:
+        """Add all joins that every map of a cost below `most` has, without branches.
+
+        Args:
+            visits: The visits.
+            joins: The joins so far: the class of each visit.
+            most: A cost.
+            known: Prices of maps that lack joins. More are added.
+
+        Returns:
+            The joins, a lower bound on the cost of maps that have them, and the other joins of the
+            best map, each with a lower bound on the cost of maps without it. The highest is first.
+        """
+        while True:
+            look_at_clock()
+            classes = _Joined(visits, joins)
+            if classes.fails:
+                return joins, math.inf, []
+            misfit = self._misfit.of_returns(visits.returns(joins)) / 2
+            low = self._price(classes.counts) + misfit
+            if low >= most:
+                return joins, low, []
+            left = dict[tuple[int, int], tuple[int, int]]()
+            for i, j in self._pairs:
+                a, b = int(joins[i]), int(joins[j])
+                if a != b and classes.may_join(a, b):
+                    best = left.setdefault((min(a, b), max(a, b)), (i, j))
+                    if known.get((i, j), 0.0) > known.get(best, 0.0):
+                        left[min(a, b), max(a, b)] = (i, j)
+            worth = {pair: known.get(pair, 0.0) for pair in left.values()}
+            if not any(price + misfit >= most for price in worth.values()):
+                for (a, b), pair in left.items():
+                    look_at_clock()
+                    counts = classes.counts_lacking(a, b)
+                    price = math.inf if counts is None else self._price(counts)
+                    worth[pair] = max(worth[pair], price)
+                known.update(worth)
+            forced = [pair for pair, price in worth.items() if price + misfit >= most]
+            if not forced:
+                ranked = sorted(worth.items(), key=lambda found: -found[1])
+                return joins, low, [(pair, price + misfit) for pair, price in ranked]
+            joins = visits.joined(joins, forced)
+
+
+def _of_classes(apart: Flags, of: Ints) -> Flags:
+    """Flag the classes that have members that are apart."""
+    order = np.argsort(of, kind="stable")
+    starts = np.flatnonzero(np.diff(of[order], prepend=-1))
+    rows = np.logical_or.reduceat(apart[:, order][:, :, order], starts, axis=1)
+    found: Flags = np.logical_or.reduceat(rows, starts, axis=2)
+    return found

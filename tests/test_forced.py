@@ -1,0 +1,133 @@
+"""Joins that every cheap map has, and the bound that follows (solver/forced.py)."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import NamedTuple
+from unittest.mock import patch
+
+import pytest
+import together
+import truth
+
+from ssh_abduction import Solution, Theory, Trace, solve
+from ssh_abduction.data import Odometry
+from ssh_abduction.data.map_parts import DState
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.solver.forced import Forcing
+from ssh_abduction.solver.misfit import Misfit
+from ssh_abduction.solver.steps.log import Log
+from ssh_abduction.solver.weighed import Weighed
+from ssh_abduction.theory.settle import settle
+
+EQUAL = 1e-6
+ROUGH = {**truth.NOISE, "along": 0.3, "across": 0.1, "heading": 0.02, "scale": 0.05, "bend": 0.0035}
+FINE = {**truth.NOISE, "scale": 0.05, "bend": 0.0035}
+THEORIES = {
+    "frames": Theory.topological(),
+    "joint": Theory.topological(),
+    "causal": Theory.causal(),
+    "bare": Theory.topological().replace(star="none"),
+}
+PRICES = [(8, 8, 0), (3, 5, 0), (1, 2, 0), (2, 1, 1)]
+
+
+class Case(NamedTuple):
+    """A trace, its theory, its cheapest maps, and their cost."""
+
+    trace: Trace
+    theory: Theory
+    solution: Solution
+    weighed: Weighed
+
+
+def forcing_of(trace: Trace, theory: Theory, ssh_map: SSHMap) -> Forcing:
+    problem = settle(trace, theory)
+    assert Forcing.holds_for(problem)
+    log = Log(problem.trace, problem.theory, evidence=problem.evidence)
+    return Forcing(problem, log, Misfit(problem), ssh_map)
+
+
+@contextmanager
+def without_forcing() -> Iterator[None]:
+    with patch.object(Forcing, "holds_for", lambda _: False):
+        yield
+
+
+def case_of(kind: str, seed: int) -> Case:
+    draw = random.Random(seed)
+    noise = truth.Noise(Odometry(**draw.choice([ROUGH, FINE])))
+    if kind == "joint":
+        (known,) = together.of_mazes(3, draw.randint(3, 6), [seed], noise, 2)
+    else:
+        known = truth.random_walk(3, draw.randint(5, 11), seed, noise)
+    theory = THEORIES[kind].replace(weigh="cost", prices=draw.choice(PRICES))
+    with without_forcing():
+        return solved(known.trace, theory)
+
+
+def solved(trace: Trace, theory: Theory) -> Case:
+    solution = solve(trace, theory)
+    assert solution.status.value == "optimal"
+    assert solution.weighed is not None
+    return Case(trace, theory, solution, solution.weighed)
+
+
+@pytest.mark.filterwarnings("ignore:views")
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("kind", THEORIES)
+def test_every_cheap_map_has_the_forced_joins_and_none_costs_less_than_the_bound(
+    kind: str, seed: int
+) -> None:
+    trace, theory, solution, weighed = case_of(kind, seed)
+    most = weighed.nats + (1e-3, 4.0)[seed % 2]
+    for ssh_map in {solution.maps[0], solution.maps[-1]}:
+        forcing = forcing_of(trace, theory, ssh_map)
+        assert max(forcing.bounds(2 * weighed.nats)) <= weighed.nats + EQUAL
+        forcing.force(most)
+        assert forcing.low <= weighed.nats + EQUAL
+        for rival in weighed.rivals:
+            for join in forcing.returns if rival.nats < most and not rival.estimated else ():
+                names = rival.dstates if join.of == "dstate" or not rival.places else rival.places
+                assert names[join.first] == names[join.second]
+
+
+def test_the_proof_of_a_maze_of_sixty_steps() -> None:
+    known = truth.random_walk(4, 60, 3001, truth.Noise(Odometry(**FINE)))
+    trace, theory, solution, weighed = solved(known.trace, Theory.topological())
+    forcing = forcing_of(trace, theory, solution.maps[0])
+    assert max(forcing.bounds(weighed.nats)) == pytest.approx(weighed.nats)
+    forcing.force(weighed.nats + 4)
+    assert max(forcing.joins) + 1 == len(set(known.places))
+    assert forcing.low == pytest.approx(weighed.nats)
+
+
+def true_map(known: truth.Known) -> SSHMap:
+    """The map of a maze by its truth, without paths. Dstates are (x, y, heading)."""
+    labels, places = truth.partition(known.dstates), truth.partition(known.places)
+    dstates = dict[int, DState]()
+    for step, label, place, true in zip(
+        known.trace.steps, labels, places, known.dstates, strict=True
+    ):
+        assert isinstance(true, tuple)
+        dstates[label] = DState(label, step.view, place, heading=true[2])
+    return SSHMap(labels, tuple(dstates.values()), (), ())
+
+
+def test_the_lack_of_one_join_is_assumed_if_no_other_way_leads_on() -> None:
+    known = truth.random_walk(6, 150, 3002, truth.Noise(Odometry(**FINE)))
+    ssh_map, problem = true_map(known), settle(known.trace)
+    cost = 8 * (len(ssh_map.dstates) + len(set(known.places)))
+    cost += Misfit(problem).of_map(ssh_map) / 2
+    forcing = forcing_of(known.trace, Theory.topological(), ssh_map)
+    assert next(forcing.bounds(cost)) < cost - 1
+    forcing.force(cost - EQUAL)
+    assert forcing.low > cost - EQUAL
+
+
+def test_there_is_no_bound_if_the_trace_may_have_faults() -> None:
+    known = truth.random_walk(3, 8, 0, truth.Noise(Odometry(**FINE)))
+    assert Forcing.holds_for(settle(known.trace))
+    assert not Forcing.holds_for(settle(known.trace, Theory(misread=2.0)))
