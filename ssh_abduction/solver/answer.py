@@ -43,10 +43,7 @@ class Answer:
         self._levels[-1] = replace(self._levels[-1], count=self._levels[-1].count + 1)
 
     def count_apart(self) -> None:
-        """Raise the lower bound on dstates to the size of a set of pairwise distinct steps.
-
-        The bound that a stopped search has proven may be smaller.
-        """
+        """Raise the lower bound on dstates to the size of a set of pairwise distinct steps."""
         known = self._parts.known
         self._basis = self._basis_of(len(self._parts.task.trace))
         if self._basis:
@@ -120,10 +117,7 @@ class Answer:
         return ordered
 
     def _basis_of(self, size: int) -> Basis | None:
-        """Collect the data for a certificate of the bound, from the first `size` steps.
-
-        Return None if the theory lacks an axiom that the certificate needs.
-        """
+        """Collect the data for a certificate; None if the theory lacks an axiom that it needs."""
         task = self._parts.task
         if not row("clique").holds_for(task.theory):
             return None

@@ -25,12 +25,7 @@ BROAD = 4
 
 @dataclass(frozen=True, slots=True)
 class _Time:
-    """The time of all beams of a search.
-
-    Attributes:
-        begun: The seconds on the clock when it began.
-        seconds: How long it lasts; inf without a limit.
-    """
+    """The time of all beams: the clock at its start, and how many seconds it lasts, or inf."""
 
     begun: float
     seconds: float

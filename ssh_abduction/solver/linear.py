@@ -23,10 +23,7 @@ DAMPING = 1e-10
 
 
 def matrix(entries: tuple[Any, tuple[Any, Any]], shape: tuple[int, int]) -> Any:
-    """Make a matrix from its values, and their rows and columns. Values at one position add up.
-
-    It is a `csr_array`, or an array of numpy if there are few columns.
-    """
+    """Make a `csr_array` (dense if it has few columns). Values at one position are added up."""
     made = coo_array(entries, shape=shape)
     return made.toarray() if shape[1] <= DENSE else made.tocsr()
 
@@ -44,10 +41,7 @@ def weighted(some: Any, weights: Array) -> Any:
 
 
 def system_solved(square: Any, added: Array, right: Any) -> Any:
-    """Solve a system of linear equations with a dense or sparse n x n matrix.
-
-    The n numbers in `added` are added to its diagonal.
-    """
+    """Solve a linear system after adding n numbers to the diagonal of its n x n matrix."""
     if isinstance(square, np.ndarray):
         return np.linalg.solve(square + np.diag(added), right)
     whole = (square + diags_array(added)).tocsc()

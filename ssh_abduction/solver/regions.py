@@ -92,10 +92,7 @@ class Deriving:
         self._left = UNITS
 
     def mapped(self, ssh_map: SSHMap) -> SSHMap:
-        """Return the same map with its regions.
-
-        If the map has no places, or too many dstates for the time left, it gets no regions.
-        """
+        """Add the regions to a map, if it has places and few enough dstates for the time left."""
         key = (
             tuple((s.place, s.path, s.direction) for s in ssh_map.dstates),
             ssh_map.links,

@@ -78,7 +78,6 @@ class FaultyControl:
 
     Attributes:
         names: The number of names of each view, not counting its rest.
-        given: The steps that clingo gets.
         full: The steps that may be at any dstate, even if their view is misread.
         forbidden: Sets of equalities of steps. In no answer do all equalities of one set hold.
     """

@@ -66,9 +66,7 @@ class _GivenNodes:
         choices: For each node, the names that it may have.
         is_open: For each node, whether clingo has it and has to choose its name.
         links: The given links, as keys in the order in which they were given.
-        nodes: The given nodes.
         last: For each view, the last given node that may have several names.
-        batches: The number of batches.
     """
 
     spare: dict[int, list[int]]

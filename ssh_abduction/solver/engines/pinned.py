@@ -18,7 +18,6 @@ class Pinned:
     """A chart and a clique of its nodes, which are pinned to the names 0, 1, and so on.
 
     Attributes:
-        chart: The chart: nodes and the links between them.
         clique: Nodes that are pairwise distinct.
         may_be: For each node, the names of those clique nodes with which it may share a dstate.
     """

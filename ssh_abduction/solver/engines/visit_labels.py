@@ -49,10 +49,9 @@ GROWN = 1.1
 
 
 class VisitLabels:
-    """Finds labels with the fewest dstates for the first steps of a trace.
+    """Finds labels with the fewest dstates for the first `size` steps of a trace.
 
     Attributes:
-        size: The number of these steps.
         bound: A proven lower bound on the number of dstates; None if none is known.
         clique: Nodes that are pairwise distinct.
     """

@@ -44,7 +44,6 @@ class _GivenVisits:
     """A record of everything about the chart that the control was given.
 
     Attributes:
-        visits: The visits.
         place_of: For each node, its number in the order in which clingo decides nodes.
         ends: The visits that end in the steps given to the control so far.
         turns: The turns, as (node, direction, node).
@@ -64,7 +63,6 @@ class VisitProgram:
     """The control of visits.lp, and a record of what it was given.
 
     Attributes:
-        chart: The chart of the first steps, with their visits and nodes.
         batch: The number of the last batch of visits; -1 before the first.
         least: A lower bound on the dstates: the number of nodes that are first in any case.
     """

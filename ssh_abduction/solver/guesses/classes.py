@@ -188,10 +188,7 @@ class Classes:
     def _ranked(
         self, root: int, fits: Sequence[int], *, forced: bool = False
     ) -> list[tuple[int, int]]:
-        """Return possible merges of a class with dstates: pairs (evidence, dstate), the best first.
-
-        If `forced`, two known dstates may be merged.
-        """
+        """Rank possible merges of a class with dstates: pairs (evidence, dstate), best first."""
         found = []
         for dstate in fits:
             evidence = self.merge(dstate, root, forced=forced)

@@ -57,8 +57,6 @@ class Hypothesis:
         heading: For each dstate, the index of its heading in the means.
         mean: The means, in metres, radians and standard deviations. First the errors of scale and
             drift, then positions and headings, and last the pose of the robot (x, y, heading).
-        covariance: The covariance of these.
-        nats: The cost.
         changes: The part of `nats` that is the price of gateways that changed between drives.
         faults: Pairs (step, kind): the steps at which an action "slipped" or a displacement
             "jumped".

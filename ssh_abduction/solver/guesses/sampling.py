@@ -42,7 +42,6 @@ class _Transitions:
 
     Attributes:
         counts: The table: how often the action of the row led to the state of the column.
-        totals: The sum of each row.
     """
 
     def __init__(

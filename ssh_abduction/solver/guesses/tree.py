@@ -58,7 +58,6 @@ class KnownDState:
 
     Attributes:
         seen: The observation: the view, and the star if the theory uses stars.
-        place: The number of the place.
         heading: The heading in the frame of the place, in quarters clockwise.
         path: The number of the path; None if it is unknown.
         direction: The direction along the path, 1 or -1.

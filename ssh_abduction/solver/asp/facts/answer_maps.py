@@ -148,10 +148,7 @@ def causal_map(labels: Sequence[int], trace: Trace) -> SSHMap:
 def faulty_map(
     labels: Sequence[int], trace: Trace, faults: Sequence[tuple[int, str]], theory: Theory
 ) -> SSHMap:
-    """Make a causal map from labels, with faults: steps and kinds, which cost what the theory says.
-
-    Dstates are numbered by first visit.
-    """
+    """Make a causal map with faults (steps and kinds). Dstates are numbered by first visit."""
     number: dict[int, int] = {}
     found = tuple(number.setdefault(label, len(number)) for label in labels)
     is_at = dict(enumerate(found))

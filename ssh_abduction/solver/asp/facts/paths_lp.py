@@ -157,7 +157,6 @@ class Segments:
         elsewhere: Pairs of these places that are different places of every map.
         travels: Triples of a segment and two places: in the direction of the segment, a travel
             leads from the first place to the second.
-        segments: All segments.
         distinct: Pairs of segments that cannot be one path.
     """
 
