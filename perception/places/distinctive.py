@@ -261,7 +261,7 @@ def _middle(sightings: Sequence[_Sighting]) -> Array:
 
 
 def _distance(middle: Array, radius: float, junction: Junction) -> float | None:
-    """The distance of a junction from a chain in metres; None if it is too far for one place."""
+    """The distance of a junction from a chain's middle in metres; None if it is not one place."""
     far = math.dist(middle, junction.middle)
     return far if far < max(SAME, SHARE * min(radius, junction.radius)) else None
 

@@ -62,7 +62,7 @@ def add_parser(verbs: Verbs) -> None:
     said = {
         "misread": "the robot sees a view or star of another dstate (default: 0.01)",
         "slipped": "the action fails, or the robot is kidnapped (default: 0.01)",
-        "unmapped": "a robot of unknown position is outside the map (default: 0.1)",
+        "unmapped": "a robot that may be anywhere is outside the map (default: 0.1)",
         "reentered": "a robot outside the map is back on it after its next action (default: 0.1)",
     }
     for name in CHANCES:
@@ -71,8 +71,8 @@ def add_parser(verbs: Verbs) -> None:
         )
     parser.add_setting(
         "zero_one",
-        "whether the map holds without exception: the defaults of misread, slipped and unmapped "
-        "are then 0, and that of reentered is 1 (default: false)",
+        "whether views and actions never fail: the defaults of misread, slipped and unmapped are "
+        "then 0, and that of reentered is 1 (default: false)",
         default=False,
     )
     parser.add(

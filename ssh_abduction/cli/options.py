@@ -252,7 +252,7 @@ def seed(text: str) -> int:
     """Convert text to a seed of random numbers. Raise ArgumentTypeError for anything else."""
     if not text.isdecimal() or int(text) >= 2**32:
         raise argparse.ArgumentTypeError(
-            f"expected a number from 0 to {2**32 - 1}, got {text!r}; take a smaller one"
+            f"expected a whole number from 0 to {2**32 - 1}, got {text!r}; give one"
         )
     return int(text)
 

@@ -40,8 +40,8 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.add(
         "--by",
-        "what to minimise: actions or metres, by moves that the robot did before; or places, by "
-        "all moves along the paths of the map, even if the robot never did them (default: actions)",
+        "what to minimise (default: actions). Routes for actions and metres have only moves that "
+        "the robot did before. Routes for places have all moves along the paths of the map",
         choices=("actions", "places", "metres"),
         default="actions",
     )

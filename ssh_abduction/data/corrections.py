@@ -114,12 +114,12 @@ class Passage:
 class Corrections:
     """Names and corrections of a person, with the drives that they are about.
 
-    A value is immutable. `solve` obeys it.
+    It is immutable. `solve` finds only maps that agree with it.
 
     Attributes:
         drives: The fingerprint of each drive, by its name.
         names: The names.
-        pairs: Pairs of steps.
+        pairs: Pairs of steps that are said to be at one place or dstate, or not to be.
         gateways: Gateways that are open or closed.
         source: The file that it was read from.
     """

@@ -77,8 +77,8 @@ def figure(log: RobotLog, imported: Imported, solution: Solution) -> str:
         caption = (
             f"The first map over the scans, at {poses}. Numbers are places, ticks their gateways, "
             f"and lines the edges along the robot's course. {colours}Dots are places at which the "
-            "robot only passed through. Bands are regions that all known ways enter through one "
-            "place. Red shows the probability of a doubtful join."
+            "robot only passed through. Bands are regions that, as far as known, have only one "
+            "entrance. Red shows the probability of a doubtful join."
         )
     return f"<figure>{picture}<figcaption>{caption}</figcaption></figure>"
 

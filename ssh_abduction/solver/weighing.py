@@ -450,9 +450,9 @@ class _CostJudging(Judging):
         self._weighing = weighing
 
     def refusal(self, ssh_map: SSHMap) -> tuple[str, frozenset[Equality]] | None:
-        """Return what rejects a map: the name of evidence, or "cost", and equalities to forbid.
+        """Return what rejects a map, and the equalities to forbid; None if nothing rejects it.
 
-        Return None if no map that is left is worth finding.
+        A map is rejected by evidence, which is named, or by its "cost".
         """
         if (found := super().refusal(ssh_map)) is not None:
             return found

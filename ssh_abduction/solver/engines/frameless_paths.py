@@ -136,7 +136,7 @@ class PlacesAndPaths:
     def forbid_together(self, equalities: Collection[Equality]) -> None:
         """Exclude maps in which all of these equalities hold, if one of them is about places.
 
-        Sets of equalities of dstates alone are forbidden by `named`.
+        The engine `named` forbids sets with only equalities of dstates.
         """
         if any(equality.of == "place" for equality in equalities):
             self._refused.append(equalities)

@@ -291,7 +291,10 @@ class NameProgram:
         return [-atom.literal] if atom else []
 
     def resting(self, value: bool) -> tuple[clingo.Symbol, bool]:
-        """Return the assumption that some node has a rest as its name (True), or none (False)."""
+        """Return the assumption that some node has a rest as its name (True), or none (False).
+
+        A rest is the last spare name of a view. It stands for all further dstates with that view.
+        """
         return names_lp.resting(self._known.batches - 1), value
 
     def reader(self) -> names_lp.NameReader:

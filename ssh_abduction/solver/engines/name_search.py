@@ -64,9 +64,9 @@ class NameSearch:
         self._had_all_help = False  # whether maps near a guess were sought already
 
     def improving(self) -> Iterator[list[int]]:
-        """Yield labels of all nodes. The last labels have the fewest dstates.
+        """Yield labels of all nodes. The labels that are yielded last have the fewest dstates.
 
-        If the search takes long, other labels with few dstates come first.
+        If the search takes long, other labels are yielded before.
         """
         known = self._incumbent
         if not self._program.chart.links:

@@ -167,9 +167,10 @@ class NamedLabels:
         }
 
     def improving(self) -> Iterator[list[int]]:
-        """Yield labels of all steps of the prefix. The last labels have the fewest dstates.
+        """Yield labels of all steps of the prefix of the trace.
 
-        If the search takes long, other labels with few dstates come first.
+        The labels that are yielded last have the fewest dstates. If the search takes long, other
+        labels are yielded before.
         """
         assert self._search is not None  # `grow` comes first
         known = self._incumbent

@@ -43,7 +43,7 @@ _Seen = tuple[int, Star]
 
 
 def sketches_of(first: Step, theory: Theory) -> list[Sketch]:
-    """Make a sketch of each kind. Sketches that mostly have smaller maps come first.
+    """Make a sketch of each kind. Kinds that usually give smaller maps come first.
 
     Args:
         first: The first step.

@@ -116,7 +116,7 @@ class Sketch:
     def all_of(cls, first: Step, theory: Theory) -> list[Sketch]:
         """Make a sketch of each kind, with and without frames and `homing`.
 
-        Sketches that mostly have smaller maps come first.
+        The kinds that usually give smaller maps come first.
 
         Args:
             first: The first step.

@@ -99,9 +99,10 @@ def _named(symbol: Symbol) -> tuple[int, int]:
 class NameReader:
     """Reads answers of names.lp, if clingo was given all links of a trace.
 
-    It reads only where actions lead, and follows the trace along these links. This takes fewer
-    calls of clingo than reading the name of each step. `actions` has the action after each step but
-    the last, as a number, and `choices` the names that each step can have.
+    It reads only the links (where each action leads from each dstate), and follows the trace along
+    them. This takes fewer calls of clingo than reading the name of each step. `actions` has the
+    action after each step but the last, as a number, and `choices` the names that each step can
+    have.
     """
 
     def __init__(self, actions: Sequence[int], choices: Sequence[Sequence[int]]) -> None:
