@@ -9,6 +9,7 @@ from typing import TypeAlias
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.words import counted
 from ssh_abduction.runtime.loggers import log_of
+from ssh_abduction.solver.asp.limits import StageTimeError
 from ssh_abduction.solver.near import NearMinimal, counted_first
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.values import Status
@@ -60,14 +61,18 @@ def note(parts: Parts, ssh_map: SSHMap, cost: tuple[int, ...]) -> None:
         parts.rivals.add(ssh_map, cost)
 
 
-def by_count(parts: Parts, mended_maps: tuple[SSHMap, ...] | None) -> Generator[Priced, None, None]:
+def by_count(
+    parts: Parts, mended_maps: tuple[tuple[SSHMap, ...], bool] | None
+) -> Generator[Priced, None, None]:
     """Yield the minimal maps, then those with up to `within` dstates more, with their counts.
 
-    `mended_maps` are the minimal maps, if mending the trace found them.
+    `mended_maps` are minimal maps, and whether they are all, if mending the trace found them.
     """
     known, limits = parts.known, parts.limits
-    minimal = mended_maps or parts.prefixes.minimal_maps()
+    minimal, is_all = mended_maps or (parts.prefixes.minimal_maps(), True)
     yield from ((ssh_map, known.cost) for ssh_map in minimal)
+    if not is_all:
+        raise StageTimeError
     parts.rivals.listed = True  # so the backbone needs no further search
     if not limits.most or known.count < limits.most:
         parts.watch.end_stage_after(math.inf)

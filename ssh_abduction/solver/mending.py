@@ -98,28 +98,34 @@ class Mending:
             yield from self._improving(self._minimal(mended)[0], mended)
         yield from self._by_rare_dstates()
 
-    def minimal_maps(self, most: int) -> tuple[SSHMap, ...] | None:
+    def minimal_maps(self, most: int) -> tuple[tuple[SSHMap, ...], bool] | None:
         """List the minimal maps, if it is proven which mended traces have them.
 
-        Call this after the iteration over `maps` has ended. `most` is the number of maps to list
-        for each mended trace; 0 for all. Returns None if there is no such proof: the best map costs
-        more than the bound, or not all mended traces were solved, or listed, in time.
+        Call this after the iteration over `maps` has ended.
+
+        Args:
+            most: The number of maps to list for each mended trace; 0 for all.
+
+        Returns:
+            Minimal maps, and whether these are all. None if there is no such proof: the best map
+            costs more than the bound, or not all mended traces were solved.
         """
         if self._best is None or self._best.cost[0] != self.bound or not self._cheapest:
             return None
         solved = {mended: self._minimal(mended) for mended in self._cheapest}
         if not all(proven for _, proven in solved.values()):
             return None
-        costs = {mended: found.cost for mended, (found, _) in solved.items() if found is not None}
-        least = min(costs.values())
-        minimal = [mended for mended, cost in costs.items() if cost == least]
-        listed: dict[SSHMap, None] = {}
-        for mended in minimal:
-            maps, proven = self._maps_of(mended, most)
-            if not proven:  # the time was over before they were found again
-                return None
-            listed |= dict.fromkeys(self._as_found(ssh_map, mended).map for ssh_map in maps)
-        return tuple(listed)
+        found = {mended: one for mended, (one, _) in solved.items() if one is not None}
+        least = min(one.cost for one in found.values())
+        listed, is_all = dict[SSHMap, None](), True
+        for mended, one in found.items():
+            if one.cost == least:
+                maps, proven = self._maps_of(mended, most)
+                is_all &= proven
+                # If the time was over, these maps need not be minimal. The one found before is.
+                minimal = [self._as_found(m, mended).map for m in maps] if proven else [one.map]
+                listed |= dict.fromkeys(minimal)
+        return tuple(listed), is_all
 
     def _improving(self, better: Found | None, mended: Trace) -> Iterator[Found]:
         """Yield a map, and remember it with its mended trace, if it is the best one so far."""

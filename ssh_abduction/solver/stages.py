@@ -25,7 +25,7 @@ class Stages:
 
     Attributes:
         mends: Whether the search tried to mend the trace (guess its faults and correct them).
-        mended_maps: The minimal maps, if mending the trace found them all; else None.
+        mended_maps: Minimal maps that mending the trace found, and whether they are all; else None.
     """
 
     def __init__(self, parts: Parts, solve_mended: Solver, *, goes_on: bool) -> None:
@@ -34,7 +34,7 @@ class Stages:
         If `goes_on`, the search goes on from an earlier search for the first steps.
         """
         self.mends = False
-        self.mended_maps: tuple[SSHMap, ...] | None = None
+        self.mended_maps: tuple[tuple[SSHMap, ...], bool] | None = None
         self._parts, self._solve_mended, self._goes_on = parts, solve_mended, goes_on
 
     def make_first_map(self) -> None:
@@ -109,7 +109,7 @@ class Stages:
         finally:
             known.raise_bound(mending.bound)
         if self.mended_maps:
-            first = self.mended_maps[0]
+            first = self.mended_maps[0][0]
             known.status = Status.OPTIMAL
             known.keep(Found.of(first, parts.task.theory), first.dstate_at)
             parts.rivals.reasons = False  # engines do not know mended traces
