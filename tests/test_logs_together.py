@@ -240,7 +240,7 @@ def test_logs_that_do_not_go_together_are_refused(
     assert "expected another name than that of" in capsys.readouterr().err
     assert main(["map", *logs, *out, "--jobs", "2"]) == 1
     assert "--together: expected one search for all logs" in capsys.readouterr().err
-    assert distinct([logs[0], logs[1], logs[0]]) == ([*logs], [])
+    assert distinct([logs[0], logs[1], logs[0]]) == ([*logs], [(logs[0], logs[0])])
     (tmp_path / "b" / "run.log").write_text("one")
     assert distinct(logs) == ([logs[0]], [(logs[1], logs[0])])
 

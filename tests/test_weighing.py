@@ -350,6 +350,22 @@ def test_an_excess_misfit_makes_the_best_map_less_sure() -> None:
         Weighed.from_dict(read, {**less.to_dict(), "excess": 0.5}, 3)
 
 
+def test_steps_that_may_be_one_are_named_if_no_join_is_as_doubtful() -> None:
+    """The best map keeps steps 1 and 3 apart, and a rival joins them."""
+    best = Rival(10.0, (0, 1, 0, 2), (0, 1, 0, 2))
+    rivals = best, Rival(11.0, (0, 1, 0, 1), (0, 1, 0, 1))
+    weighed = Weighed(10.0, 0.0, rivals)
+    assert weighed.missed == (1, 3, pytest.approx(1 / (1 + math.e)))
+    assert weighed.sentence.endswith("; steps 1 and 3 may be at one place, too (0.27)")
+    apart = Rival(10.5, (0, 1, 2, 3), (0, 1, 2, 3))
+    doubtful = replace(weighed, rivals=(*rivals, apart))
+    assert doubtful.sentence.endswith("; the most doubtful join is of steps 0 and 2 (0.69)")
+    assert replace(weighed, rivals=(best,)).missed is None
+    turned = replace(weighed, rivals=(best, Rival(11.0, (0, 1, 2, 3), (0, 1, 0, 2))))
+    assert turned.sentence.endswith("; steps 0 and 2 may be one dstate or two (0.73)")
+    assert replace(weighed, doubt="the track is unreliable").missed is None
+
+
 def test_costs_in_doubt_make_no_map_sure() -> None:
     rivals = (Rival(10.0, (0, 1, 0), (0, 1, 0)),)
     sure = Weighed(10.0, 0.0, rivals, True, 0.0)

@@ -129,7 +129,8 @@ def distinct(logs: Sequence[str]) -> tuple[list[str], list[tuple[str, str]]]:
     """Return the logs without copies; and pairs of each copy and the log with the same content."""
     first: dict[str, str] = {}  # by content; a log that cannot be read is like no other one
     owners = [(log, first.setdefault(_content([log]) or log, log)) for log in logs]
-    return [*first.values()], [(log, other) for log, other in owners if log != other]
+    copies = [pair for i, pair in enumerate(owners) if pair[0] != pair[1] or pair in owners[:i]]
+    return [*first.values()], copies
 
 
 def is_done(folder: Path, logs: Sequence[str], settings: dict[str, Any]) -> bool:

@@ -8,6 +8,7 @@ one that costs 3 nats more is exp(3) = 20 times less probable.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -20,6 +21,8 @@ EQUAL = 1e-6  # costs in nats that differ by less count as equal
 # The price of breaking axioms, in nats. Mention a map that breaks axioms only if it costs SAID nats
 # less than the best map.
 BROKEN, SAID = 12.0, 1.0
+# Mention that two steps may be at one place, too, if that is more probable than this.
+DOUBTED = 0.05
 MOST = 700.0  # exp of more nats overflows
 
 
@@ -163,6 +166,41 @@ class Weighed:
             last[name] = step
         return tuple(sorted(joins, key=lambda join: join[2]))
 
+    @cached_property
+    def missed(self) -> tuple[int, int, float] | None:
+        """Two steps at different places of the best map that are most probably at one place.
+
+        Each step has its name, and the third value is the probability. It is None if no rival has
+        such steps, or if there is a `doubt`.
+        """
+        best = self.rivals[0].places or self.rivals[0].dstates
+        apart = [told for told in self._pairs("place") if best[told[0]] != best[told[1]]]
+        return self._named(max(apart, key=lambda told: told[2], default=None))
+
+    @cached_property
+    def unsure(self) -> tuple[int, int, float] | None:
+        """The two steps of which it is least sure whether they are one dstate; as in `missed`."""
+        least = min(self._pairs("dstate"), key=lambda told: abs(told[2] - 0.5), default=None)
+        return self._named(least)
+
+    def _pairs(self, of: str) -> Iterator[tuple[int, int, float]]:
+        """Yield steps that some map has at one place or dstate, with the probability of that."""
+        pairs: set[tuple[int, int]] = set()
+        for rival in () if self.doubt is not None else self.rivals:
+            last: dict[int, int] = {}
+            for step, name in enumerate(rival.dstates if of == "dstate" else rival.places):
+                if name in last:
+                    pairs.add((last[name], step))
+                last[name] = step
+        yield from ((*pair, self.probability(*pair, of)) for pair in sorted(pairs))
+
+    def _named(self, told: tuple[int, int, float] | None) -> tuple[int, int, float] | None:
+        """Put the names of steps, such as "monday:12", in place of their numbers."""
+        if told is None:
+            return None
+        names = named_steps(self.drives, len(self.rivals[0].dstates))
+        return names[told[0]], names[told[1]], told[2]
+
     @property
     def sentence(self) -> str:
         """How probable the best map is, and which of its joins is least sure, in words."""
@@ -178,6 +216,15 @@ class Weighed:
         elif self.searched and not self.proven:
             least = math.floor(100 * self.bound / self.nats)
             text += f", without a proof, but each map costs at least {least} % as much"
+        doubted = 1 - self.joins[0][2] if self.joins else 0.0
+        if self.missed and self.missed[2] > max(doubted, DOUBTED):
+            first, second, probability = self.missed
+            sure = probability_in_words(probability)
+            return f"{text}; steps {first} and {second} may be at one place, too ({sure})"
+        if self.unsure and doubted <= DOUBTED <= self.unsure[2] <= 1 - DOUBTED:
+            first, second, probability = self.unsure
+            sure = probability_in_words(probability)
+            return f"{text}; steps {first} and {second} may be one dstate or two ({sure})"
         if not self.joins:
             return f"{text}; the best map joins no two visits"
         first, second, probability = self.joins[0]
