@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from ssh_abduction import Theory, Trace, check, export_map, route, solve
+from ssh_abduction import Solution, Theory, Trace, check, export_map, route, solve
 from ssh_abduction.cli import main
 from ssh_abduction.data import (
     Corrections,
@@ -422,3 +422,23 @@ def test_the_opposite_of_what_was_said_replaces_it(first: str, then: str, left: 
     changed = said.with_pair(then, "tuesday:1", "monday:0")
     assert [pair.kind for pair in changed.pairs if "monday:0" in pair.steps] == left
     assert said.pairs[1] in changed.pairs
+
+
+def test_names_of_drives_may_have_commas(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As those of simulated drives have: "two floors, 1 tours, seed 0"."""
+    files = []
+    for name in ("two floors, 1", "a,b"):
+        trace = Trace.from_steps("abc", ["travel", "around"], name=name)
+        files.append(str(tmp_path / f"{len(files)}.jsonl"))
+        trace.save(files[-1])
+    maps, pair = str(tmp_path / "maps.json"), "two floors, 1:0, a,b:0"
+    assert main(["solve", *files, "--together", "-o", maps, "--same", pair]) == 0
+    assert Solution.load(maps).theory.same == ((0, 3),)
+    assert main(["correct", str(tmp_path), "--different", "a,b:2,two floors, 1:1"]) == 0
+    capsys.readouterr()
+    assert main(["correct", str(tmp_path)]) == 0
+    assert "different: a,b:2, two floors, 1:1" in capsys.readouterr().out
+    for wrong in ("a,b:0", "a,b:0,a,b:0", "a,b:0,a,b:1,a,b:2", "c,d:0,a,b:1"):
+        assert main(["correct", str(tmp_path), "--same", wrong]) == 1

@@ -6,7 +6,7 @@ import argparse
 import shlex
 from pathlib import Path
 
-from ssh_abduction.cli.options import add_map, add_maps, trace_beside
+from ssh_abduction.cli.options import add_map, add_maps, at_comma, trace_beside
 from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.saved_map import SavedMap, sentences_of
 from ssh_abduction.data.corrections import PAIRS
@@ -80,7 +80,7 @@ def _how_to_obey(maps: Path) -> str:
 
 def _pair(saved: SavedMap, kind: str, pair: str) -> tuple[str, str]:
     """Read a pair of steps, such as "monday:12,tuesday:3", or raise MapError."""
-    steps = [saved.step(step.strip()) for step in pair.split(",")]
+    steps = at_comma(pair, saved.step)
     if len(steps) != 2 or steps[0] == steps[1]:
         raise MapError(
             f"--{kind.replace('_', '-')}: expected two steps such as monday:12,tuesday:3, got "

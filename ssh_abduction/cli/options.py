@@ -7,11 +7,12 @@ import difflib
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from ssh_abduction.cli.parsing import Parser, true_or_false
 from ssh_abduction.data.drives import step_named
@@ -22,6 +23,8 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory.fields import ASSERTIONS, CHOICES
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import PRESETS, SETTLED, Theory
+
+Step = TypeVar("Step")  # a step by its number or its name
 
 RULES = (
     "a file of your own rules for clingo, written with the predicates of the encodings; may be "
@@ -385,7 +388,16 @@ def number_steps(options: argparse.Namespace, trace: Trace) -> None:
         pairs = getattr(options, name) or []
         for i, pair in enumerate(pairs):
             if ":" in pair:
-                pairs[i] = ",".join(str(step_named(trace, step)) for step in pair.split(","))
+                steps = at_comma(pair, partial(step_named, trace))
+                pairs[i] = ",".join(map(str, steps))
+
+
+def at_comma(pair: str, read: Callable[[str], Step]) -> list[Step]:
+    """Read the steps that a comma separates. The names of drives may have commas, too."""
+    for comma in re.finditer(",", pair):
+        with suppress(AbductionError):
+            return [read(pair[: comma.start()].strip()), read(pair[comma.end() :].strip())]
+    return [read(step.strip()) for step in pair.split(",")]
 
 
 def choices_of(options: argparse.Namespace) -> dict[str, Any]:
