@@ -570,7 +570,10 @@ def test_what_programs_read_is_utf_8_on_every_terminal(tmp_path: Path) -> None:
             ["simulate", "notched-rectangle", "--seed", "-1", "-o", "x"],
             "--seed: expected a whole number from 0 to",
         ),
-        (["learning-curve", "y", "x", "--seed", "1e3"], "--seed: expected a whole number from 0 to"),
+        (
+            ["learning-curve", "y", "x", "--seed", "1e3"],
+            "--seed: expected a whole number from 0 to",
+        ),
         (
             ["cluster", "x", "-o", "y", "--plot", "z.foo"],
             "--plot: expected a name that ends in .png, .pdf or .svg",

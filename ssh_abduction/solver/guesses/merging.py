@@ -69,7 +69,8 @@ def merged_near(
     `apart`, `links` and `check` are as for `merged`. In the guess, the label of a node is -1 if it
     is unknown. It is ignored if the node cannot be one dstate with earlier nodes of that label.
     """
-    classes = _from_guess(apart, links, guess, check)
+    classes = Classes(apart, links, check)
+    classes.take(guess)
     classes.settle_all()
     return classes.labels()
 
@@ -80,7 +81,9 @@ def kept(apart: Matrix, links: Iterable[Link], guess: Sequence[int]) -> list[int
     Nodes whose label is unknown (-1) or cannot be kept are dstates of their own, unless the links
     make them one with others. `apart` and `links` are as for `merged`.
     """
-    return _from_guess(apart, links, guess).labels()
+    classes = Classes(apart, links)
+    classes.take(guess)
+    return classes.labels()
 
 
 def dstates_merged(
@@ -154,15 +157,3 @@ def _apart_in_map(
             apart[np.ix_(known, known)] |= apart[np.ix_(there[known], there[known])]
         if (apart == before).all():
             return apart
-
-
-def _from_guess(
-    apart: Matrix,
-    links: Iterable[Link],
-    guess: Sequence[int],
-    check: Callable[[], None] = lambda: None,
-) -> Classes:
-    """Make classes, and merge the nodes that share a label in a guess if they can be one."""
-    classes = Classes(apart, links, check)
-    classes.take(guess)
-    return classes
