@@ -20,8 +20,10 @@ from ssh_abduction import OnlineMapper, Solution, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.misfit import false_costs, misfit
 from ssh_abduction.data import MapError, Odometry, SolverError, TheoryError
+from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.solver import Search, Status, beams, weighing
+from ssh_abduction.solver.estimating import estimated
 from ssh_abduction.solver.fit import Poses, fit
 from ssh_abduction.solver.misfit import Misfit
 from ssh_abduction.solver.weighed import Rival, Weighed
@@ -378,6 +380,30 @@ def test_costs_in_doubt_make_no_map_sure() -> None:
     assert Weighed.from_dict(read, doubted.to_dict(), 3) == doubted
     with pytest.raises(MapError, match=r"weighed.doubt: expected a text, got 3"):
         Weighed.from_dict(read, {**doubted.to_dict(), "doubt": 3}, 3)
+
+
+def test_drives_are_not_surely_one_place_by_chance() -> None:
+    """A rival that lays fewer drives on each other is less improbable than its cost says."""
+    drives = (Drive("monday", 0, 2), Drive("tuesday", 2, 4))
+    joined, other, apart = (0, 1, 0, 1), (0, 1, 1, 2), (0, 1, 2, 3)
+    for rival, most in ((other, 0.95), (apart, 0.75)):
+        rivals = (Rival(50.0, joined, joined), Rival(58.0, rival, rival, estimated=True))
+        sure = Weighed(50.0, 0.0, rivals, True, drives=drives)
+        assert (sure.confidence > most) == (rival == other)
+    assert sure.confidence == pytest.approx(1 / (1 + math.exp(-0.8)))
+    assert sure.probability(0, 2) == sure.confidence
+
+
+def test_each_drive_apart_is_a_rival() -> None:
+    joined = Rival(0.0, (0, 1, 2, 0, 1, 2, 3, 1), (0, 1, 2, 0, 1, 2, 3, 1))
+    drives = (Drive("one", 0, 3), Drive("two", 3, 6), Drive("three", 6, 8))
+    known = estimated(joined, range(8), drives, lambda dstates, _: 20.0 * len({*dstates}), 10.0)
+    found = [rival.dstates for rival in known]
+    assert found[:3] == [
+        (0, 1, 2, 3, 4, 5, 6, 4),
+        (0, 1, 2, 3, 4, 5, 6, 1),
+        (0, 1, 2, 0, 1, 2, 3, 4),
+    ]
 
 
 def test_a_robot_that_drives_counts() -> None:

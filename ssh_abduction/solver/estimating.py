@@ -8,13 +8,15 @@ to a new place. They fit the displacements, and may break axioms.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
+from itertools import chain
 from typing import TypeAlias
 
+from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import heeding, look_at_clock
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.steps.chart import numbered
-from ssh_abduction.solver.weighed import Rival
+from ssh_abduction.solver.weighed import CHANCE, Rival
 from ssh_abduction.theory.settle import Problem
 
 # The dstate and the place of each step, numbered by first visit.
@@ -27,37 +29,54 @@ CERTAIN = 19.0
 
 
 def estimated(
-    best: Rival, visit: Sequence[int], cost_of: CostOf, seconds: float
+    best: Rival, visit: Sequence[int], drives: Sequence[Drive], cost_of: CostOf, seconds: float
 ) -> Iterator[Rival]:
     """Yield rivals that cost little more than the best map, each once.
 
     In each rival, some visits to a place of the best map are visits to a new place instead: a
-    single visit, or a visit and all later ones. `visit` has, for each step, the first step of its
-    visit. `seconds` is the time that this may take.
+    single visit, or a visit and all later ones. Or a drive shares no dstate and no place with the
+    other drives. `visit` has, for each step, the first step of its visit. `seconds` is the time
+    that this may take.
     """
+    watch = Watch().part(seconds)
+    tried: set[Course] = {(best.dstates, best.places)}
+    apart = ((_apart(best, drive), CHANCE * CERTAIN) for drive in drives)
+    for course, most in chain(apart, ((moved, CERTAIN) for moved in _all_moved(best, visit))):
+        if course in tried:
+            continue
+        tried.add(course)
+        try:
+            with heeding(watch.check):
+                look_at_clock()
+                nats = cost_of(*course)
+        except LimitError:
+            return
+        if nats < best.nats + most:
+            yield Rival(nats, *course, True, best.faults)
+
+
+def _apart(best: Rival, drive: Drive) -> Course:
+    """Return the dstates and places of a map after a drive gets dstates and places of its own."""
+    more = len(best.dstates)
+    dstates, places = (
+        tuple(numbered(name + more * (drive.first <= t < drive.stop) for t, name in enumerate(of)))
+        for of in (best.dstates, best.places)
+    )
+    return dstates, places
+
+
+def _all_moved(best: Rival, visit: Sequence[int]) -> Iterator[Course]:
+    """Yield the dstates and places of each map in which some visits to a place get a new place."""
     at = best.places or best.dstates
     visits: dict[int, list[int]] = {}  # the first steps of the visits to each place
     for step, begin in enumerate(_begins(at, visit)):
         if begin == step:
             visits.setdefault(at[step], []).append(step)
-    watch = Watch().part(seconds)
-    tried: set[Course] = {(best.dstates, best.places)}
     for name, begins in visits.items():
         singly = [{begin} for begin in begins[1:]]
         from_then_on = [set(begins[i:]) for i in range(1, len(begins) - 1)]
         for moved in (*singly, *from_then_on) if len(begins) > 1 else ():
-            dstates, places = course = _moved(best, visit, name, moved)
-            if course in tried:
-                continue
-            tried.add(course)
-            try:
-                with heeding(watch.check):
-                    look_at_clock()
-                    nats = cost_of(dstates, places)
-            except LimitError:
-                return
-            if nats < best.nats + CERTAIN:
-                yield Rival(nats, dstates, places, True, best.faults)
+            yield _moved(best, visit, name, moved)
 
 
 def _moved(best: Rival, visit: Sequence[int], place: int, moved: Collection[int]) -> Course:

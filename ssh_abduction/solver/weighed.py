@@ -16,6 +16,7 @@ from typing import Any
 from ssh_abduction.data.drives import Drive, named_steps
 from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.data.map_parts import FAULTS
+from ssh_abduction.theory.overlap import groups_of
 
 EQUAL = 1e-6  # costs in nats that differ by less count as equal
 # The price of breaking axioms, in nats. Mention a map that breaks axioms only if it costs SAID nats
@@ -23,6 +24,9 @@ EQUAL = 1e-6  # costs in nats that differ by less count as equal
 BROKEN, SAID = 12.0, 1.0
 # Mention that two steps may be at one place, too, if that is more probable than this.
 DOUBTED = 0.05
+# Drives coincide by chance more often than costs say: of false joins of two drives, one in e saves
+# this many nats more (docs/measurements/truth.md).
+CHANCE = 10.0
 MOST = 700.0  # exp of more nats overflows
 
 
@@ -87,8 +91,19 @@ class Weighed:
 
     @cached_property
     def weights(self) -> tuple[float, ...]:
-        """The probability of each rival, if there are no other maps."""
-        likely = [math.exp((self.nats - rival.nats) / self.excess) for rival in self.rivals]
+        """The probability of each rival, if there are no other maps.
+
+        If a rival lays fewer or more drives on each other than the best map, the difference of
+        their costs is divided by CHANCE.
+        """
+        drive = [i for i, d in enumerate(self.drives) for _ in range(d.first, d.stop)]
+        ways = [
+            groups_of(r.places or r.dstates, drive, range(len(self.drives))) for r in self.rivals
+        ]
+        likely = [
+            math.exp((self.nats - rival.nats) / self.excess / (1.0 if way == ways[0] else CHANCE))
+            for rival, way in zip(self.rivals, ways, strict=True)
+        ]
         return tuple(weight / sum(likely) for weight in likely)
 
     @property

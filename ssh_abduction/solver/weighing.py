@@ -371,7 +371,8 @@ class Weighing:
         """
         least = best.nats + self._within if self.proven else -math.inf
         seconds = min(max(self._parts.watch.left() + OVERTIME, LEAST_ESTIMATING), ESTIMATING)
-        for rival in estimated(best, self._misfit.visit, self._cost_like(best), seconds):
+        drives, visit = drives_of(self._parts.task.trace), self._misfit.visit
+        for rival in estimated(best, visit, drives, self._cost_like(best), seconds):
             if rival.nats >= least and (rival.dstates, rival.places) not in known:
                 yield rival
 

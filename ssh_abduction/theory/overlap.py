@@ -41,10 +41,7 @@ class Overlap:
         """
         if len(self._tied) == 1:
             return 0.0
-        first: dict[Hashable, int] = {}
-        pairs = {*zip(at, self._drive, strict=False)}
-        shared = ((first.setdefault(place, drive), drive) for place, drive in pairs)
-        return self._price * (len({*self._tied}) - len({*_joined(self._tied, shared)}))
+        return self._price * (len({*self._tied}) - groups_of(at, self._drive, self._tied))
 
     def of_steps(self, labels: Sequence[int], places: Sequence[Hashable]) -> float:
         """Return the price by the dstates of the first steps and the places of dstates."""
@@ -59,6 +56,20 @@ class Overlap:
         """Return the price of joining two pieces of a map, given by their steps."""
         groups = [{self._tied[self._drive[t]] for t in steps} for steps in (some, others)]
         return 0.0 if groups[0] & groups[1] else self._price
+
+
+def groups_of(at: Iterable[Hashable], drive: Iterable[int], tied: Sequence[int]) -> int:
+    """Count the groups of drives that share no place with each other.
+
+    Args:
+        at: The place of each step.
+        drive: The drive of each step, as a number.
+        tied: For each drive, a number. Drives with equal numbers are in one group.
+    """
+    first: dict[Hashable, int] = {}
+    pairs = {*zip(at, drive, strict=False)}
+    shared = ((first.setdefault(place, number), number) for place, number in pairs)
+    return len({*_joined(tied, shared)})
 
 
 def _joined(groups: Sequence[int], pairs: Iterable[tuple[int, int]]) -> list[int]:
