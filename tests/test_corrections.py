@@ -442,3 +442,13 @@ def test_names_of_drives_may_have_commas(
     assert "different: a,b:2, two floors, 1:1" in capsys.readouterr().out
     for wrong in ("a,b:0", "a,b:0,a,b:0", "a,b:0,a,b:1,a,b:2", "c,d:0,a,b:1"):
         assert main(["correct", str(tmp_path), "--same", wrong]) == 1
+
+
+def test_a_route_avoids_a_place_whose_name_has_a_comma(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    maps = str(folder / "building" / "maps.json")
+    assert main(["name", maps, "p1", "room 1, left"]) == 0
+    capsys.readouterr()
+    assert main(["route", maps, "--from", "0", "--to", "p1", "--avoid", "room 1, left"]) == 1
+    assert "avoid: expected other dstates and places than those of to" in capsys.readouterr().err

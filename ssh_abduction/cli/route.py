@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Collection
 
 from ssh_abduction.cli.options import add_map, add_maps
 from ssh_abduction.cli.parsing import Verbs
@@ -54,13 +55,14 @@ def run(options: argparse.Namespace) -> int:
     from ssh_abduction.rivals.listing import Listing
 
     listing = Listing.load(options.maps)
+    given = {name.text for ssh_map in listing.maps for name in ssh_map.names}
     try:
         found = route(
             listing,
             options.start,
             options.goal,
             by=options.by,
-            avoid=_names(options.avoid),
+            avoid=_names(options.avoid, given),
             map=options.map,
         )
     except MapError as error:
@@ -94,6 +96,11 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _names(words: list[str] | None) -> list[str]:
-    """Split words at commas, to list the names of dstates and places to avoid."""
-    return [name for word in words or () for name in word.split(",") if name]
+def _names(words: list[str] | None, given: Collection[str]) -> list[str]:
+    """Split words at commas, to list what to avoid. Names that a person gave may have commas."""
+    return [
+        name
+        for word in words or ()
+        for name in ([word] if word in given else word.split(","))
+        if name
+    ]
