@@ -18,7 +18,8 @@ cheaper maps are found, each with a probability proportional to exp(-cost).
 *Places* are minimised only after dstates, so clingo proves no lower bound on them. Evidence gives
 one: the size of a set of steps that are pairwise at different places.
 
-If the robot may be off the poses of its dstates, as in logs, `scatter.py` gives a better bound.
+*Better bounds* come from joins that all cheap maps have (`forced.py`). If the robot may be off the
+poses of its dstates, as in logs, `scatter.py` gives one, too.
 """
 
 from __future__ import annotations
@@ -158,7 +159,7 @@ class Weighing:
         if self.candidates and is_for(parts.task.problem):
             most = self.candidates[0].nats
             self.bound = least_cost(parts.task.problem, self._misfit.visit, most)
-        elif self.candidates and Forcing.holds_for(task.problem):
+        if self.candidates and Forcing.holds_for(task.problem):
             task = self._with_forced_joins(task)
         if parts.task.theory.has_faults and len(parts.task.trace) > READABLE:
             raise LimitError("no proof")
