@@ -17,6 +17,7 @@ from test_together import joint_traces
 
 from ssh_abduction import Solution, SSHMap, Theory, Trace, check, solve
 from ssh_abduction.cli import main
+from ssh_abduction.data import Corrections
 from ssh_abduction.data.drives import starts_of, together
 from ssh_abduction.data.errors import SolverError, TraceError
 from ssh_abduction.solver import Status, choosing
@@ -178,3 +179,20 @@ def test_a_digest_has_each_link_once() -> None:
     assert digest.labels == (0, 1, 0)
     short = replace(long[:7], name="short")
     assert solve(short, onto=standing)[0].dstate_at == (0, 1) * 50 + (0, 1, 0, 1, 0, 1, 0)
+
+
+def test_names_stay_when_drives_are_added() -> None:
+    monday = Trace.from_steps("abcd", ["travel", "around", "travel"], name="monday")
+    said = Corrections.for_drives(monday).with_name("kitchen", "place", "monday:1")
+    said = said.with_name("corridor", "path", "monday:0")
+    solution = solve(monday, corrections=said)
+    for name in ("tuesday", "friday"):
+        solution = solve(Trace.from_steps("xb", ["travel"], name=name), onto=solution)
+        ssh_map = solution.maps[0]
+        kitchen = ssh_map.dstates[ssh_map.dstate_at[1]]
+        assert ssh_map.name_of("place", kitchen.place) == "kitchen"
+        assert ssh_map.name_of("path", kitchen.path) == "corridor"
+        assert len(ssh_map.names) == 2
+    unnamed = Corrections.for_drives(monday)
+    last = Trace.from_steps("xb", ["travel"], name="last")
+    assert solve(last, onto=solution, corrections=unnamed).maps[0].names == ()

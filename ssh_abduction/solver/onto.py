@@ -20,7 +20,7 @@ drives are short, the solver gets all old steps.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -29,6 +29,7 @@ from ssh_abduction.data.checks import an_instance
 from ssh_abduction.data.corrections import Corrections
 from ssh_abduction.data.drives import drives_of, starts_of, step_name, together
 from ssh_abduction.data.errors import SolverError
+from ssh_abduction.data.map_parts import Name
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted
@@ -97,7 +98,7 @@ def solve_onto(
                 raise
             on_map = unproven(grown, ssh_map, old, problem, solving.watch, "interrupted")
         if on_map is not None:
-            return on_map if corrections is None else with_names(corrections, on_map, joint)
+            return _named(on_map, ssh_map, corrections)
     short = solving.speedups.that_hold_for(in_use).digest and in_use.displacement == "none"
     digest = Digest.of(old, ssh_map, short=short)
     with warnings.catch_warnings():  # ignore that a digest may equal the new drive
@@ -135,7 +136,29 @@ def solve_onto(
             onto=tuple(drive.name for drive in drives_of(old)),
         ),
     )
-    return solution if corrections is None else with_names(corrections, solution, joint)
+    return _named(solution, ssh_map, corrections)
+
+
+def _named(solution: Solution, ssh_map: SSHMap, corrections: Corrections | None) -> Solution:
+    """Name places and paths as a person said or, if nothing is said, as in the existing map."""
+    if corrections is not None:
+        assert solution.trace is not None
+        return with_names(corrections, solution, solution.trace)
+    maps = (replace(grown, names=tuple(_kept_names(grown, ssh_map))) for grown in solution.maps)
+    return replace(solution, maps=tuple(maps))
+
+
+def _kept_names(grown: SSHMap, ssh_map: SSHMap) -> Iterator[Name]:
+    """Yield the names of an existing map for a map that begins with its steps."""
+    for name in ssh_map.names:
+        steps = zip(ssh_map.dstate_at, grown.dstate_at, strict=False)
+        ids = [
+            getattr(grown.dstates[after], name.kind)
+            for before, after in steps
+            if name.kind != "region" and getattr(ssh_map.dstates[before], name.kind) == name.id
+        ]
+        if ids and ids[0] is not None:
+            yield replace(name, id=ids[0])
 
 
 def _grown(ssh_map: SSHMap, old: Trace, problem: Problem) -> SSHMap | None:
