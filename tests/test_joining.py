@@ -11,7 +11,7 @@ import pytest
 import truth
 from together import of_mazes
 
-from ssh_abduction import SSHMap, Theory, Trace, solve
+from ssh_abduction import SSHMap, Theory, Trace, explain_pair, solve
 from ssh_abduction.checker.checker import violations
 from ssh_abduction.data import Closure, Odometry, Step, together
 from ssh_abduction.data.star import Gateway, Star
@@ -178,3 +178,10 @@ def test_the_search_joins_many_drives() -> None:
     (known,) = of_mazes(4, 60, [315], NOISE, drives=6)
     *_, ssh_map = Search(known.trace)._parts.candidates.joined()
     assert truth.is_true(ssh_map, known)
+
+
+def test_explain_says_what_laying_costs() -> None:
+    """The second drive may begin at the last place of the first one."""
+    said = str(explain_pair(along("abcda", "a"), 4, 5, time_limit=100))
+    assert "saves 1 dstate, 1 place (16.0 nats)" in said
+    assert "costs 32.0 nats of misfit and of laying drives on each other" in said

@@ -184,7 +184,8 @@ class PairExplanation:
             priced = (f"{text} {'more' if number > 0 else 'less'}" for number, text in changed)
             counts = f"{_effect(price)} of price ({', '.join(priced) or 'the same counts'})"
         loop = f": {self.loop}" if self.loop else ""
-        return f"{what} {counts} and {_effect(misfit)} of misfit{loop}"
+        laying = " and of laying drives on each other" if self.theory.several_drives else ""
+        return f"{what} {counts} and {_effect(misfit)} of misfit{laying}{loop}"
 
     @property
     def assuming(self) -> dict[str, str]:
