@@ -21,6 +21,7 @@ from ssh_abduction.data import Corrections
 from ssh_abduction.data.drives import starts_of, together
 from ssh_abduction.data.errors import SolverError, TraceError
 from ssh_abduction.solver import Status, choosing
+from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.digest import Digest
 from ssh_abduction.theory import Speedups
 
@@ -196,3 +197,12 @@ def test_names_stay_when_drives_are_added() -> None:
     unnamed = Corrections.for_drives(monday)
     last = Trace.from_steps("xb", ["travel"], name="last")
     assert solve(last, onto=solution, corrections=unnamed).maps[0].names == ()
+
+
+def test_the_seconds_count_all_of_the_work() -> None:
+    """Not only those of the last search."""
+    monday = Trace.from_steps("abcd", ["travel", "around", "travel"], name="monday")
+    solution = solve(monday)
+    with patch.object(Watch, "elapsed", lambda watch: 7.0):
+        added = solve(Trace.from_steps("ab", ["travel"], name="tuesday"), onto=solution)
+    assert added.seconds.total == 7.0

@@ -126,6 +126,7 @@ def solve_onto(
         maps=maps,
         theory=_settled(found.theory, theory),
         steps=len(joint),
+        effort=replace(found.effort, seconds=replace(found.seconds, total=solving.watch.elapsed())),
         levels=(Level(found.cost, len(maps), found.complete),) if found.within else (),
         shared=None,
         trace=joint,
