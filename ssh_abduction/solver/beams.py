@@ -39,8 +39,8 @@ class Beams:
     """The beams of one search, and what they say about the best map.
 
     Attributes:
-        broken: How many nats the best map that breaks axioms saves, compared to the best map, as in
-            `Weighed`; 0 if it does not cost less, -inf if none was sought.
+        broken: By how many nats the best map that breaks axioms is cheaper than the best map, as in
+            `Weighed`; 0 if it is not, -inf if none was sought.
     """
 
     def __init__(

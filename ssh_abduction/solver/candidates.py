@@ -50,7 +50,7 @@ class Candidates:
     """Makes maps of the whole trace, and keeps the best one that the checker accepts.
 
     Attributes:
-        contradicting: For each sketch, the step that contradicted it. The surest sketch is
+        contradicting: The steps that contradicted sketches, that of the most reliable sketch
             first.
     """
 
@@ -81,8 +81,9 @@ class Candidates:
         """Return the beam of this many hypotheses about dstates and places.
 
         Later calls return the same beam, which goes on where it stopped. None without the speed-up
-        `greedy`, if the trace is long, or if the checker cannot check all axioms. Also None without
-        displacements and stars at any angles, as `guesses/tree.py` makes better maps then.
+        `greedy`, if the trace is long, or if the checker cannot check all axioms. Also None
+        if the trace has neither displacements nor stars at any angles, as `guesses/tree.py` makes
+        better maps then.
         """
         theory = self._task.theory
         if (

@@ -82,7 +82,8 @@ def _all_moved(best: Rival, visit: Sequence[int]) -> Iterator[Course]:
 def _moved(best: Rival, visit: Sequence[int], place: int, moved: Collection[int]) -> Course:
     """Return the dstates and places of a map after some visits to a place get a new place.
 
-    `visit` has, for each step, the first step of its visit, and `moved` those of the moved visits.
+    `visit` has, for each step, the first step of its visit, and `moved` has the first steps of the
+    moved visits.
     """
     at = best.places or best.dstates
     begins = _begins(at, visit)
@@ -96,7 +97,8 @@ def _moved(best: Rival, visit: Sequence[int], place: int, moved: Collection[int]
 def _begins(at: Sequence[int], visit: Sequence[int]) -> list[int]:
     """For each step, find the first step of its visit. A visit also begins where the place changes.
 
-    `at` has the place of each step; without places, the dstate. `visit` is by the trace alone.
+    `at` has the place of each step; without places, the dstate. `visit` has the first step of each
+    step's visit, as the trace alone divides the steps into visits.
     """
     begins: list[int] = []
     for step, name in enumerate(at):

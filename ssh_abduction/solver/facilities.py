@@ -45,7 +45,7 @@ class Facilities:
     Attributes:
         points: x and y in metres, or x, y and a heading in radians, (n, 2) or (n, 3).
         variances: The variance of each coordinate of each point, (n, 2) or (n, 3).
-        kinds: Each point, and each facility, is of one kind, (n,).
+        kinds: The kind of each point, (n,). Each facility is of one kind, too.
         fees: What each point pays more at a facility of another kind; inf if it cannot, (n,).
         price: The price of a facility.
     """
@@ -278,8 +278,9 @@ class _Boxes:
     def _bounds(self, centres: Array, half: Array) -> Array:
         """Bound what is saved in each box.
 
-        The points that save something everywhere in a box save a concave quadratic function, whose
-        maximum is known. Another point saves at most what it saves at the nearest point of the box.
+        What is saved by the points that save something everywhere in a box is a concave quadratic
+        function. Its maximum is known. Any other point saves at most what it saves at the nearest
+        position in the box.
         """
         look_at_clock()
         variances, off = self._all.variances, self._all.offsets(centres)

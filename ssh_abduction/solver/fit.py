@@ -129,8 +129,9 @@ class Poses:
     def gaussian(self) -> tuple[list[int], Array, Array]:
         """Find the poses of the dstates and their covariance, relative to a dstate of each part.
 
-        Returns the part of the map of each dstate; the means of x and y of each place, in the order
-        of the first dstates there, and of the heading of each dstate; and their covariance.
+        Returns, for each dstate, its part of the map; the means, as one vector; and the covariance.
+        The vector has x and y of each place, in the order of the first dstates there, and then the
+        heading of each dstate.
         """
         place, facing = self._place[: self._dstates], 2 * self._positions
         part = self._parts()[place].tolist()

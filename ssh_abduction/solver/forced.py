@@ -1,19 +1,19 @@
 """Joins that every cheap map has, and a lower bound on the cost of all maps.
 
-Let F be joins of visits that every map of a cost below T has. Then each such map costs at least the
-misfit of F, and the prices of its dstates and places. At first F is empty. A map without one more
-join costs at least the misfit of F, and the prices of the dstates and places that it needs without
-this join. If this is T or more, then each map of a cost below T has this join, too, and F gets it.
-The more joins F has, the greater is its misfit, and the more dstates and places are needed without
-one more join. If the misfit of F and the prices are T or more, then no map costs less than T.
+Let F be joins of visits that every map of a cost below T has. At first F is empty. Each such map
+costs at least the misfit of F plus the prices of its dstates and places. Now take a further join. A
+map without it costs at least the misfit of F plus the prices of the dstates and places that are
+needed without it. If this sum is T or more, then every map of a cost below T has the join, and F
+gets it. Then the misfit of F is greater, and more dstates and places are needed without a further
+join. If the misfit of F plus the prices is T or more, then no map costs less than T.
 
 The joins are those of the best known map. If F gets no further join, assume that a map lacks a
-certain one, and find what all cheap maps without it have. If no map costs less than T without it, F
+certain one, and find what all cheap maps without it have. If no map without it costs less than T, F
 gets it. This is a branch and bound with few branches: one of the two sides always ends.
 
-*Counts.* Two visits that cannot be at one place are apart. So are two visits that the same action
-leads on from, to visits that are apart (`steps/chart.py`). Visits that F joins are apart from the
-same visits. A clique of dstates, or of places, is a lower bound on their number.
+*Counts.* Two visits that cannot be at one place are apart. If the same action leads from two visits
+to visits that are apart, these two are apart, too (`steps/chart.py`). Visits that F joins are apart
+from the same visits. A clique of dstates, or of places, is a lower bound on their number.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ class Visits:
         return replace(self, apart=apart)
 
     def joined(self, of: Ints, pairs: Iterable[tuple[int, int]]) -> Ints:
-        """Merge classes of visits, and those that the same actions lead to from merged ones."""
+        """Merge the classes of pairs of visits, then those that one action leads to from each."""
         of = of.copy()
         waiting = list(pairs)
         while waiting:
@@ -158,7 +158,7 @@ class Visits:
 
 
 class _Cliques:
-    """Cliques of a graph of what is apart, one in each part. Two parts are apart altogether."""
+    """A clique in each part of the graph `apart`. All nodes of different parts are apart."""
 
     def __init__(self, apart: Flags) -> None:
         self._apart, self._random = apart, np.random.default_rng(0)
@@ -170,7 +170,7 @@ class _Cliques:
         self.size = sum(map(len, self._cliques))
 
     def size_with(self, pairs: Sequence[tuple[int, int]]) -> int:
-        """Return the size of a clique if some more pairs are apart, too."""
+        """Return the size of a clique of the whole graph if some more pairs are apart, too."""
         apart, larger = self._apart, dict[int, Ints]()
         if not pairs:
             return self.size
@@ -226,7 +226,7 @@ class _Joined:
         return self._dstates.size, self._places.size
 
     def _close(self) -> None:
-        """If the same action leads from two classes to classes that are apart, so are the two."""
+        """Flag two classes as apart if one action leads from them to classes that are apart."""
         every = self._links.T
         actions = [every[:, every[2] == action] for action in np.unique(every[2])]
         before = -1
@@ -331,7 +331,7 @@ class Forcing:
         return self.visits.returns(self.joins)
 
     def bounds(self, most: float) -> Iterator[float]:
-        """Yield rising lower bounds on the cost of every map, `most` at most. `joins` stays."""
+        """Yield rising lower bounds on the cost of every map, `most` at most. Keep `joins`."""
         low = self._bound(most)
         yield low
         while most - low > NEARLY * most:
@@ -375,7 +375,7 @@ class Forcing:
             joins: The joins to begin with.
             most: A cost.
             known: Prices of maps that lack joins. More are added.
-            branches: How many joins may be assumed to lack at a time.
+            branches: How many joins may be assumed to be lacking at a time.
 
         Returns:
             Whether no map costs less than `most`.
@@ -441,7 +441,7 @@ class Forcing:
 
 
 def _of_classes(apart: Flags, of: Ints) -> Flags:
-    """Flag the classes that have members that are apart."""
+    """Flag two classes as apart if a member of one is apart from a member of the other."""
     order = np.argsort(of, kind="stable")
     starts = np.flatnonzero(np.diff(of[order], prepend=-1))
     rows = np.logical_or.reduceat(apart[:, order][:, :, order], starts, axis=1)

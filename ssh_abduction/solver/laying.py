@@ -32,7 +32,7 @@ from ssh_abduction.theory.theory import Theory
 
 
 def can_lay(theory: Theory) -> bool:
-    """Whether a theory, in which no field is "auto", lets new drives be laid on a map."""
+    """Whether new drives can be laid on a map by a theory in which no field is "auto"."""
     may_differ = theory.has_faults or theory.lifts or theory.unknown_views
     return theory.weigh == "cost" and not may_differ
 
@@ -43,8 +43,8 @@ def laid(
     """Find a joint map of little cost that keeps the map of the old drives.
 
     `trace` has the new drives, and the problem all drives, under a theory that `can_lay`. The
-    solution has the cheaper of two maps: the new drives are joined to the old ones, or are pieces
-    of their own. None if neither satisfies the axioms.
+    solution has the cheaper of two maps: one joins the new drives to the old ones, and in the other
+    they are pieces of their own. None if neither satisfies the axioms.
     """
     joint, theory = problem.trace, problem.theory
     ranking, judging = Ranking(joint), Judging(problem)

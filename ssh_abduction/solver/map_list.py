@@ -66,7 +66,7 @@ def by_count(
 ) -> Generator[Priced, None, None]:
     """Yield the minimal maps, then those with up to `within` dstates more, with their counts.
 
-    `mended_maps` are minimal maps, and whether they are all, if mending the trace found them.
+    If mending the trace found minimal maps, `mended_maps` has them, and whether they are all.
     """
     known, limits = parts.known, parts.limits
     minimal, is_all = mended_maps or (parts.prefixes.minimal_maps(), True)

@@ -215,7 +215,7 @@ class Mending:
         """Yield better maps in which an action slipped shortly before a rarely visited dstate.
 
         The causal theory does not notice every slip, as a slip may only add a link to its map. With
-        paths, that link is wrong, and the places after it become new ones.
+        paths, this wrong link makes the places after it new ones.
         """
         before: Found | None = None
         while self._task.theory.slipped and self._best is not before:
@@ -316,7 +316,7 @@ def _has_frames(task: Task) -> bool:
 
 
 def _places(ssh_map: SSHMap) -> list[tuple[int, int] | None]:
-    """For each step, return its place and the slot there that the robot faces; None if unknown."""
+    """For each step, return its place and the slot (direction) there that it faces, or None."""
     at = [
         None if s.place is None or s.heading is None else (s.place, s.heading)
         for s in ssh_map.dstates

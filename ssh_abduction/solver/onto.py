@@ -3,8 +3,8 @@
 The map of the old drives is the *existing map*: the joint map must keep its dstates and places. The
 solver does not get the old drives. It gets a digest of them (`digest.py`). Steps of the digest that
 are at different dstates or places of the existing map are asserted to be different. If the best
-maps also have the steps of each dstate at one dstate, they are the best of all maps that keep the
-existing map. If not, these steps are asserted to be equal, too, if the traces are short enough.
+maps split no dstate of the existing map, they are the best of all maps that keep it. If they do,
+the steps of each dstate are asserted to be one dstate, too, if the traces are short enough.
 
 With displacements, a long drive is laid on the existing map (`laying.py`). If that fails, or if the
 drives are short, the solver gets all old steps.
@@ -195,8 +195,9 @@ def _pinned(theory: Theory, digest: Digest, ssh_map: SSHMap, old: Trace, *, join
     """Return the theory for a digest and a new drive, with assertions that keep the existing map.
 
     They say that steps at different dstates or places of that map are different. Assertions of the
-    theory about old steps are moved to steps of the digest. If `joins`, equal dstates are asserted,
-    too. The fast engine for frames can obey this. For other theories it switches fast engines off.
+    theory about old steps are moved to steps of the digest. If `joins`, steps at one dstate of that
+    map are also asserted to be one dstate. The fast engine for frames can obey such assertions. For
+    other theories, they switch fast engines off.
     """
     place = [ssh_map.dstates[s].place for s in digest.labels]
     first = {s: t for t, s in reversed([*enumerate(digest.labels)])}
@@ -303,7 +304,7 @@ def _weighed(found: Solution, old: int, ssh_map: SSHMap) -> Weighed | None:
 
 
 def _settled(found: Theory, theory: Theory) -> Theory:
-    """Return the settled theory with the assertions of the user instead of those for a digest."""
+    """Return the theory `found`, with the assertions of `theory` instead of those for a digest."""
     return found.replace(
         same=theory.same,
         different=theory.different,

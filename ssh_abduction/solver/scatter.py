@@ -1,4 +1,4 @@
-"""A lower bound on the cost of all maps of a log, whose robot is off the poses of its dstates.
+"""A lower bound on the cost of all maps if the robot may be off the poses of dstates, as in logs.
 
 A visit lies some decimetres beside its place. Each map pays for this scatter, and for bending the
 track so that visits come nearer to each other.
@@ -12,9 +12,9 @@ and the rest of the error counts. The sum of both bounds is a bound on the cost.
 *A track that bends.* Let z be the most important errors of the track, as independent standard
 normal variables. Bending costs |z|^2 / 2. It moves each point by some b against the other points of
 its cluster. For each c > 0, |a + b|^2 >= c / (1 + c) |a|^2 - c |b|^2. So multiply the variances of
-each point by 1 + 1 / c. Then the bound holds except for a loss of at most c |b|^2 / 2. Far points
-are too far apart to share a facility. If z brings two far points together, one of them loses
-at most its share, and the other one nothing. All these losses are at most quadratic forms of z. The
+each point by 1 + 1 / c. Then the bound holds except for a loss of at most c |b|^2 / 2. If two
+points are too far apart to share a facility, but z brings them together, one of them loses at most
+its share, and the other one nothing. All these losses are at most quadratic forms of z. The
 numbers c are chosen so small that the sum of the forms is at most |z|^2 / 2. So bending costs more
 than it saves. A point whose losses are greater than its share is left out.
 

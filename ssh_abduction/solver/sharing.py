@@ -422,8 +422,8 @@ def _differing_in_words(sort: Sort, shared: Shared, steps: Sequence[int]) -> str
 def stretches(steps: Sequence[int]) -> str:
     """Name steps in words, such as "12–15 and 40".
 
-    If they form more than NAMED stretches, only count the steps of the further ones. A stretch of
-    named steps is of one drive, such as "tuesday:12–15".
+    A stretch is consecutive steps of one drive. If the drive has a name, it is "tuesday:12–15".
+    Name at most NAMED stretches, and only count the steps of the others.
     """
     runs: list[list[int]] = []
     for step in steps:

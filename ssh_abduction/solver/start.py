@@ -53,7 +53,7 @@ class Limits:
 class Start:
     """The starting point of a search, and whether it proves the backbone at its end.
 
-    Users of the package do not need this class; its other modules do.
+    Other modules need this class. Users of the package do not.
 
     Attributes:
         reasons: Whether to prove at the end what all minimal maps share, if not all are listed. A

@@ -82,8 +82,8 @@ def cost_as_counted(ssh_map: SSHMap, cost: tuple[int, ...], theory: Theory) -> C
     """Return the cost of a map, with the counts that the theory minimises taken from clingo.
 
     Without some axioms, a dstate may have several places or paths, but a map shows only one. Then
-    clingo counts more than the map shows. If maps are compared by their cost in nats, those of one
-    cost may have different counts: then the map is counted.
+    clingo counts more than the map shows. If maps are compared by their cost in nats, maps
+    of one cost may have different counts. Then the counts are those of the map.
 
     Args:
         ssh_map: The map.
@@ -174,7 +174,9 @@ class Effort:
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """How many listed maps have one cost: the minimal cost, or the least with more dstates.
+    """How many listed maps have one cost.
+
+    It is the minimal cost or, with `within`, the least cost for some greater number of dstates.
 
     Attributes:
         cost: The cost of the first of these maps. All of them share the counts that the theory

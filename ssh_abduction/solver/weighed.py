@@ -61,14 +61,14 @@ class Weighed:
 
     Attributes:
         bound: A proven lower bound on the cost of every map, in nats.
-        within: `rivals` has all maps that cost less than this many nats more than the best one. 0
-            if it is not proven which map is the best.
+        within: `rivals` has every map that costs more than the best one by less than this many
+            nats. 0 if it is not proven which map is the best.
         rivals: The maps that cost little more than the best one, the best one first. Estimated
             maps come last.
         searched: Whether a broad beam of hypotheses ended with the best map, and its misfit is not
             improbable. Such a map is seldom false, even if it is not proven to be the best.
-        broken: How many nats the best map that breaks axioms saves, compared to the best map; 0 if
-            it does not cost less, -inf if none was sought.
+        broken: By how many nats the best map that breaks axioms is cheaper than the best map; 0 if
+            it is not, -inf if none was sought.
         excess: The misfit of the best map, divided by the misfit that the standard deviations
             predict. Costs are divided by it before they become probabilities.
         doubt: Why the costs cannot be trusted, such as "the track is unreliable"; None if they can.
@@ -91,7 +91,7 @@ class Weighed:
 
     @cached_property
     def weights(self) -> tuple[float, ...]:
-        """The probability of each rival, if there are no other maps.
+        """The probability of each rival, assuming that there are no other maps.
 
         If a rival lays fewer or more drives on each other than the best map, the difference of
         their costs is divided by CHANCE.
@@ -194,7 +194,7 @@ class Weighed:
 
     @cached_property
     def unsure(self) -> tuple[int, int, float] | None:
-        """The two steps of which it is least sure whether they are one dstate; as in `missed`."""
+        """The two steps whose probability of being one dstate is nearest to 0.5, as in `missed`."""
         least = min(self._pairs("dstate"), key=lambda told: abs(told[2] - 0.5), default=None)
         return self._named(least)
 

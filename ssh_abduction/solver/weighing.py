@@ -144,7 +144,7 @@ class Weighing:
         """Find the maps of least cost and their rivals, and prove that there are no others.
 
         `of_labels` lists the minimal maps of a theory, within some seconds. Raises LimitError if a
-        limit is over. What was found so far is kept.
+        limit is reached. What was found so far is kept.
         """
         parts, self._of_labels = self._parts, of_labels
         parts.known.status = Status.UNKNOWN  # what was proven is about counts
@@ -402,7 +402,7 @@ def _prices_of(theory: Theory) -> dict[str, float]:
 
 
 def _exactly(ssh_map: SSHMap) -> list[Equality]:
-    """List for each two steps whether they are at one dstate, and whether they are at one place.
+    """List for each pair of steps whether they are at one dstate, and whether at one place.
 
     These equalities exclude only maps with exactly these dstates and places. A map with more
     returns is not excluded, as it may have fewer faults.
@@ -426,7 +426,7 @@ def _with(faults: Sequence[Fault], ssh_map: SSHMap) -> SSHMap:
 def _pinned(theory: Theory, ssh_map: SSHMap) -> Theory:
     """Return a theory that weighs by counts, and asserts the dstates and places of a map.
 
-    Of the places it only asserts which dstates are at different ones.
+    It asserts which dstates are at different places, but not which are at one place.
     """
     labels = ssh_map.dstate_at
     first = {label: labels.index(label) for label in dict.fromkeys(labels)}
