@@ -196,7 +196,7 @@ class Watch:
             raise StageTimeError
 
     def later(self, seconds: float) -> Callable[[], None]:
-        """Make a `check` that overlooks the time limit for some seconds of the processor.
+        """Make a `check` that ignores the time limit for some seconds of processor time.
 
         So the work that it limits has the same result on a busy machine.
         """

@@ -247,8 +247,8 @@ class FaultyEngine:
     def _explained(self, answer: FaultyAnswer) -> tuple[Found | None, list[int]]:
         """Explain the whole trace by the dstates and links of an answer, with the cheapest faults.
 
-        Returns the map, or None if it is not allowed, and up to PLACES steps that have a fault or
-        an action without a link, and that clingo was not given.
+        Returns the map (None if it is not allowed), and up to PLACES steps to give to clingo next:
+        those with a fault, or with an action without a link.
         """
         _, machine = self._machine(answer)
         if not machine.shows:  # all given steps are lost

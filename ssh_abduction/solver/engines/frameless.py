@@ -121,7 +121,7 @@ class FramelessEngine:
                 yield settled
 
     def _labels_of(self, cost: tuple[int, ...]) -> Iterable[list[int]]:
-        """Return the labels that maps of this cost have, known ones if there are any."""
+        """Return the known labels of maps of this cost, else all with its number of dstates."""
         if self._best and self._best[0] == cost:
             return self._best[1]
         return self._all_that_fit(cost[0])

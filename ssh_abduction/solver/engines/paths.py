@@ -108,8 +108,8 @@ class Paths:
 def pairwise_distinct(members: Sequence[int], pairs: Iterable[tuple[int, int]]) -> list[int]:
     """Find a large clique: a list of segments, or places, that are pairwise distinct.
 
-    `pairs` are not one. A pair of a member with itself, which means that the labels contradict the
-    axioms, is ignored.
+    `pairs` are distinct. A pair of a member with itself means that the labels contradict the
+    axioms, and is ignored.
     """
     number = {member: i for i, member in enumerate(members)}
     rivals = np.zeros((len(members), len(members)), dtype=bool)

@@ -109,8 +109,8 @@ def apart_yet_joined(
 
     Each triple includes both visits of `pair`, which are at one place, and reads (first, (middle,
     slot), (last, slot)). The middle visit is at one place with each of the others. The pair of the
-    first and the last visit is missing, or differs in its slot. A slot is the one of its visit that
-    is slot 0 of the first visit.
+    first and the last visit is missing, or differs in its slot. Each slot is that of its visit
+    which is slot 0 of the first visit.
     """
     i, j, r = pair
     of_i, of_j = turned[i], turned[j]
@@ -127,6 +127,6 @@ def apart_yet_joined(
 
 
 def _in_order(*visits: tuple[int, int]) -> Three:
-    """Sort visits at one place, each with its slot that is slot 0 of the first argument."""
+    """Sort visits at one place. Their given slots are the same direction of the place."""
     (i, a), (j, b), (k, c) = sorted(visits)
     return i, j, k, (b - a) % 4, (c - b) % 4

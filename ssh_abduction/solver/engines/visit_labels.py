@@ -96,8 +96,8 @@ class VisitLabels:
     def grow(self, size: int) -> bool:
         """Chart the first `size` steps, and give clingo their new visits.
 
-        If many nodes (visits of the chart that look different) are new, make a new clingo control.
-        Returns False, and changes nothing, if no headings of the visits fit the steps.
+        If many nodes are new, make a new clingo control. Returns False, and changes nothing, if the
+        steps fit no frames.
         """
         if size == self.size:
             return True

@@ -64,7 +64,7 @@ class VisitProgram:
 
     Attributes:
         batch: The number of the last batch of visits; -1 before the first.
-        least: A lower bound on the dstates: the number of nodes that are first in any case.
+        least: A lower bound on the dstates: the number of nodes that are first in every answer.
     """
 
     def __init__(self, task: Task, asker: Asker, chart: FramedChart, sides: Sides) -> None:

@@ -19,8 +19,8 @@ of the true matrix of transitions has a single entry of 1. At first the rows are
 Dirichlet prior of small weight) and have little influence. Their influence grows as the temperature
 falls. A sweep draws new states for stretches of visits, given the visits before and after the
 stretch and the transitions of the last draw. This is forward filtering, backward sampling (Scott
-2002, "Bayesian methods for hidden Markov models"). Stars rule out some states of a visit from the
-start, and so do pinned visits from which the visit is apart. No axiom says that travels are
+2002, "Bayesian methods for hidden Markov models"). A visit cannot have a state that contradicts its
+star, or a pinned visit (see below) from which it is apart. No axiom says that travels are
 reversible. Still, each travel is counted in both directions.
 
 Places have names, as dstates have in `engines/named_labels.py`. Pairwise distinct visits are pinned

@@ -212,7 +212,7 @@ class Beam:
     def _extended(self, beam: list[Hypothesis], end: int) -> list[Hypothesis]:
         """Extend a beam as `_onward` does. Keep the hypotheses that the checker accepts.
 
-        If all that remain cost much more than one that it refuses, that one may have crowded out
+        If all accepted ones cost much more than a refused one, the refused one may have crowded out
         others. Then check each step.
         """
         begun = len(beam[0].labels)

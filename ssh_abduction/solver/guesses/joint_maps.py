@@ -47,7 +47,7 @@ class _Anchor(NamedTuple):
     """A way to lay a map on another one.
 
     Attributes:
-        good: How many more dstates (or places) coincide that may be one than that may not.
+        good: How many dstates (or places) coincide that may be one, minus those that may not.
         old: A dstate of the first map.
         new: A dstate of the second map, which is laid on `old`.
         turn: By how many radians the second map is turned counterclockwise.
@@ -162,8 +162,9 @@ class Joining:
     ) -> Iterator[_Anchor]:
         """Yield anchors that make two dstates of two maps one.
 
-        `changes` has what changed gateways cost if each place of the first map is each place of the
-        second one; inf if it cannot be. Dstates coincide if they are nearer than `near` metres.
+        `changes` has, for each place of the first map and each of the second, what changed gateways
+        cost if they are one place; inf if they cannot be. Dstates coincide if they are nearer than
+        `near` metres.
         """
         alike = np.array([[bool(seen & other) for other in second.seen] for seen in first.seen])
         (at, facing), (there, turned) = first.poses, second.poses
@@ -244,10 +245,10 @@ class Joining:
 def _voted(
     first: Part, second: Part, ways: Iterable[tuple[int, int, float]], near: float
 ) -> Iterator[tuple[int, int, float]]:
-    """Yield one of all ways that lay a map on another in about the same way, the most votes first.
+    """Yield one way of each group of similar ways to lay a map on another, largest groups first.
 
     A way has the dstates that are laid on each other, and the turn of the second map, which is laid
-    on the first. Ways are about the same if they differ by less than about `near` metres.
+    on the first. Ways are similar if they differ by less than about `near` metres.
     """
     listed = [*ways]
     if not listed:

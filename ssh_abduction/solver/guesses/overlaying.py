@@ -3,9 +3,9 @@
 A *part* is a map of some drives, with the joint Gaussian distribution of its poses. An `Overlay`
 has two parts whose frames are unrelated at first. Merging two dstates fixes the frames to each
 other. From then on the two places that most surely coincide are merged first, and the poses are
-conditioned on each merge. What two merged dstates lead to by one action is merged, too. If gateways
-may change between drives, places with different gateways may be merged, at a price for each change.
-Dstates and places of a map that must be kept are never merged with each other.
+conditioned on each merge. Dstates that one action leads to from merged dstates are merged, too. If
+gateways may change between drives, places with different gateways may be merged, at a price for
+each change. Dstates and places of a map that must be kept are never merged with each other.
 """
 
 from __future__ import annotations
@@ -387,7 +387,7 @@ class Overlay:
             self._condition([*same, heading], sum(self._prices) - changes)
 
     def _condition(self, same: list[tuple[int, int]], saved: float) -> None:
-        """Condition the poses on equal entries of the means, which saves some nats."""
+        """Condition the poses on the equality of entries of the means. Subtract the nats saved."""
         state, (first, second) = self._state, map(list, zip(*same, strict=True))
         spreads = self._spreads[-len(same) :] if len(same) % 2 else self._spreads[:2]
         state.mean, state.covariance, square = conditioned(

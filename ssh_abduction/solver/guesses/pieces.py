@@ -75,10 +75,10 @@ class Pieces:
 def fitted(found: Hypothesis, place: int, dstate: int | None = None) -> Hypothesis:
     """Turn the piece of the robot, so that its last pose fits a place or dstate of another piece.
 
-    The last three entries of the means are the pose. If only the position is known, the first place
-    becomes the hinge, and the second one decides by how much to turn. Nothing is turned if the
-    place is in the piece of the robot already. Then the piece is joined to the other one. Without a
-    dstate of the place, only the position is fitted.
+    The last three entries of the means are the pose. Nothing changes if the place is in the piece
+    of the robot already. Without a dstate, only the position is fitted: the first place becomes the
+    hinge, and the second one decides by how much to turn. Once the piece is turned, it becomes a
+    part of the other one.
     """
     pieces = found.pieces
     other = pieces.of_place[place] if dstate is None else pieces.of_heading[dstate]

@@ -220,7 +220,7 @@ class Sampler:
         return _DrawnStates(states, self._transitions.entries(states), drawn)
 
     def _sweep(self, choice: _DrawnStates, power: float) -> None:
-        """Draw all states, all stretches at once, from a choice, and update its field `drawn`."""
+        """Draw all states from a choice, and update its field `drawn`. Do all stretches at once."""
         likely = self._transitions.likely(choice.entries, power)
         starts, lengths = self._stretches(int(self._random.integers(STRETCH)))
         ahead = self._filtered(choice.states, likely, choice.drawn, starts, lengths)

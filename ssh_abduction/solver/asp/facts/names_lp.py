@@ -1,8 +1,8 @@
 """Write facts for `fast/names.lp`, and read its answers.
 
-In that encoding, dstates have *names* (numbers) before the search. A *spare* name belongs to no
-known step, and using it costs a dstate. The last spare name of a view is its *rest*: one name for
-all dstates of the view that have no name of their own.
+In that encoding, dstates have *names* (numbers) before the search. A *node* is a step. A *spare*
+name belongs to no known step, and using it costs a dstate. The last spare name of a view is its
+*rest*: one name for all dstates of the view that have no name of their own.
 """
 
 from __future__ import annotations

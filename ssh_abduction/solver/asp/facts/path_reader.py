@@ -1,8 +1,9 @@
 """Read maps from answers of `fast/paths_framed.lp` and `fast/paths_frameless.lp`.
 
-These encodings get dstates and links as input, and find places and paths for them. A *segment* is a
-part of a path that travels and turns around join. Several segments may be one path. In the same way
-turns join dstates to small places, and several of these may be one place of the map.
+These encodings get dstates and links as input, and find places and paths for them. Travels and
+turns around join dstates to *segments*, which are parts of paths. Several segments may be one path.
+In the same way turns join dstates to small places, and several of these may be one place of the
+map.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Write facts for `fast/paths_framed.lp` and `fast/paths_frameless.lp`, and read their answers.
 
 These encodings find places and paths for fixed labels (the dstate of each step or node). A *node*
-is the steps of one visit that face the same way. A *segment* is a part of a path that travels and
-turns around join. Several segments may be one path.
+is the steps of one visit that face the same way. Travels and turns around join dstates to
+*segments*, which are parts of paths. Several segments may be one path.
 """
 
 from __future__ import annotations
@@ -63,8 +63,8 @@ def paths_frameless_facts(
     """Return the facts for paths_frameless.lp about dstates and their links.
 
     `links` are triples of a dstate, the number of an action, and the dstate that it leads to. In
-    each set of `far`, at least one pair of dstates is at different places. If `single`, only those
-    places and segments are merged that the axioms force to be one. This is solved faster.
+    each set of `far`, at least one pair of dstates is at different places. If `single`, places and
+    segments are merged only if the axioms force them to be one. This is solved faster.
     """
     facts = [
         sides_framed_facts(theory),
@@ -88,8 +88,8 @@ def paths_frameless_facts(
 def read_contrary(model: Model) -> tuple[list[int], list[int]]:
     """Read the dstates that show that the labels have no places and paths.
 
-    These are one of each segment that shows it, the shortest segment first; and those at which two
-    paths cross, if the paths seem to meet again.
+    Returns a dstate of each segment that shows it, the shortest segment first; and the dstates at
+    which two paths cross that seem to meet again.
     """
     atoms = list(map(read_atom, model.symbols(shown=True)))
     contrary = sorted((args[1], args[0]) for name, args in atoms if name == "contrary")

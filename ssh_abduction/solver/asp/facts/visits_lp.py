@@ -1,7 +1,8 @@
 """Write facts for `fast/visits.lp`, and read its answers.
 
-That encoding finds which visits are at one place. A *pair* of visits is a triple (I, J, R) with
-I < J. It means that I and J are at one place, and slot 0 of I is slot R of J.
+That encoding finds which visits are at one place. A *slot* of a visit is one of its four
+directions. Slots are numbered clockwise from the heading on arrival. A *pair* of visits is a triple
+(I, J, R) with I < J. It means that I and J are at one place, and slot 0 of I is slot R of J.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ def listing_atom(batch: int) -> Symbol:
 
 
 def first(place: int) -> Symbol:
-    """Return the atom that the node at an index in the order of nodes is first at its dstate."""
+    """Return the atom that the node at this index in the order of nodes is first at its dstate."""
     return Function("first", number_symbols(place))
 
 
