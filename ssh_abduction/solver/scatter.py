@@ -236,9 +236,9 @@ class _MovedPoints(Facilities):
         """Return twice what the position and the heading of a point lose if c is 1, (2, k, k).
 
         The facility moves by a mean of the moves of its points, weighted by c over the variance. So
-        the loss of a cluster is half of the sum, over its points, of their mean loss against the
-        others. This mean is at most the greatest of these losses. Position and heading have numbers
-        c and means of their own.
+        the loss of a cluster is half of the sum, over its points, of the mean loss of a point
+        against the others. The mean is at most the greatest loss against any other point. Position
+        and heading have numbers c and means of their own.
         """
         moved = (self.moves[i] - self.moves[others]) / np.sqrt(2 * self.variances[i])[:, None]
         return np.stack([_dominating(moved[:, :2]), _dominating(moved[:, 2:])])

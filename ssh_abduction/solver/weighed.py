@@ -185,8 +185,8 @@ class Weighed:
     def missed(self) -> tuple[int, int, float] | None:
         """Two steps at different places of the best map that are most probably at one place.
 
-        Each step has its name, and the third value is the probability. It is None if no rival has
-        such steps, or if there is a `doubt`.
+        Each step is given by its name, and the third value is the probability. None if no rival has
+        such steps at one place, or if there is a `doubt`.
         """
         best = self.rivals[0].places or self.rivals[0].dstates
         apart = [told for told in self._pairs("place") if best[told[0]] != best[told[1]]]

@@ -220,7 +220,7 @@ class FaultyEngine:
         """Follow the links of an answer through the steps that clingo was not given.
 
         Returns the dstate of each step, and -1. If the links do not explain a step, or evidence
-        contradicts its dstate, it returns None, and this step to give to clingo next.
+        contradicts its dstate, returns None and the step to give to clingo next.
         """
         number, machine = self._machine(answer)
         labels: list[int] = []

@@ -46,7 +46,7 @@ class FramelessEngine:
     """The engine for a trace with a map, without frames. It minimises the dstates first."""
 
     def __init__(self, task: Task, known: Sequence[int] = ()) -> None:
-        """Begin with an empty prefix. `known` has the dstates of a small map; empty if unknown."""
+        """Begin with an empty prefix. `known` has each step's dstate in a small map, or nothing."""
         self.asker = Asker(task.watch)
         self._task = task
         self._fitting = PlacesAndPaths(task, self.asker, known)

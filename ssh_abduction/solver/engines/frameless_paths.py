@@ -103,7 +103,7 @@ class PlacesAndPaths:
     """
 
     def __init__(self, task: Task, asker: Asker, known: Sequence[int] = ()) -> None:
-        """Begin with an empty prefix. `known` has the dstates of a small map; empty if unknown."""
+        """Begin with an empty prefix. `known` has each step's dstate in a small map, or nothing."""
         self.named = NamedLabels(task, asker, known, self)
         self._task, self._asker = task, asker
         self._actions = dict(zip(task.log.actions, task.trace.actions, strict=True))

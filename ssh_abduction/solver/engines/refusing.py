@@ -64,7 +64,7 @@ def all_accepted(
 def minimal_part(suffices: Callable[[list[Member]], bool], members: list[Member]) -> list[Member]:
     """Find a minimal part of some members that still suffices.
 
-    If some members suffice, so do more members.
+    `suffices` has to stay true if members are added.
 
     Reference:
         Junker 2004, "QuickXplain: preferred explanations and relaxations for over-constrained

@@ -102,8 +102,8 @@ def mended(guess: Sequence[int], chart: Chart) -> list[int]:
     """Correct a guess by a vote: what does an action at a dstate mostly lead to?
 
     Each node gets the label to which the label and action before it mostly lead in the guess,
-    unless the view at the node contradicts it. So all labels after a right one become right, if
-    only a few were wrong. In the guess, -1 is an unknown label.
+    unless the view at the node contradicts it. If only a few labels were wrong, all labels after a
+    right one become right. In the guess, -1 is an unknown label.
     """
     keys = [
         None if label < 0 else (view, label) for view, label in zip(chart.seen, guess, strict=True)

@@ -263,10 +263,11 @@ class VisitLabels:
     def forbid_together(
         self, pairs: Collection[tuple[int, int]], places: Collection[tuple[int, int]] = ()
     ) -> None:
-        """Exclude labels with all these pairs of nodes at one dstate, or at one place.
+        """Exclude labels with each of `pairs` at one dstate, and each of `places` at one place.
 
-        If places are given, labels found before are not removed, as labels do not show which nodes
-        are at one place. The search for their paths rejects them later.
+        Both have pairs of nodes. If `places` is not empty, labels found before are not removed, as
+        labels do not show which nodes are at one place. The search for their paths rejects them
+        later.
         """
         program, facing = self.program, self.chart.facing
         apart = [(a, b) for a, b in pairs if a != b]

@@ -421,8 +421,8 @@ class Beam:
     ) -> Iterator[tuple[int, float, Hypothesis]]:
         """Yield the chi-square of the pose of the robot at each of some places at step t.
 
-        The place comes first, the hypothesis last. If the place is in another piece, the piece of
-        the robot is turned to fit it.
+        Items are triples (place, chi-square, hypothesis). If a place is in another piece, the piece
+        of the robot is turned to fit it.
         """
         own = [place for place in places if moved.pieces.of_place[place] == moved.pieces.here]
         squares = self._reckoning.squares(moved, t, own).tolist() if own else []

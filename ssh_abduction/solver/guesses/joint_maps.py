@@ -187,7 +187,7 @@ class Joining:
     ) -> list[_Anchor]:
         """List the best anchors that make two places of two maps one, by the gateways there.
 
-        A single place that coincides tells too little, unless no other pair of places agrees.
+        One pair of coinciding places is too little evidence, unless no other pair may be one.
         `same` tells whether each place of the first map may be each place of the second. Places
         coincide if they are nearer than `near` metres.
         """

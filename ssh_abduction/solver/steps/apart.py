@@ -203,7 +203,7 @@ def clique(apart: Matrix, seen: Sequence[int]) -> list[int]:
 
 
 def large_clique(apart: Matrix) -> list[int]:
-    """Grow a clique greedily from each of a few nodes, and return the largest, sorted."""
+    """Grow a clique greedily from each node of a small graph, and return the largest, sorted."""
     random = np.random.default_rng(0)
     found = [grown_clique(apart, [node], random) for node in range(len(apart))]
     largest: list[int] = max(found, key=len, default=[])

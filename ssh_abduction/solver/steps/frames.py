@@ -107,7 +107,7 @@ def may_face(first: Frame, then: Frame, shift: int) -> list[str]:
 
 
 def must_face(first: Frame, then: Frame, shift: int) -> list[str]:
-    """Return the only way that the robot can face, as `may_face`: a list of at most one."""
+    """Return the way that the robot has to face, as in `may_face`: a list of at most one."""
     found = rotation_bits(first, then, shift)
     return [
         way
