@@ -22,7 +22,7 @@ from ssh_abduction.solver.engines import base as engine
 from ssh_abduction.solver.engines import (
     name_program,
     name_search,
-    naming,
+    named_labels,
     pinned,
     small_maps,
 )
@@ -276,7 +276,7 @@ def test_of_a_long_trace_clingo_is_given_some_links_at_a_time() -> None:
 
     expected = solve(walk.trace, CAUSAL)
     with (
-        patch.object(naming, "AT_ONCE", 500),
+        patch.object(named_labels, "AT_ONCE", 500),
         patch.object(pinned, "AT_ONCE", 500),
         patch.object(small_maps, "AT_ONCE", 500),
         patch.object(name_search, "PATIENCE", 10),
@@ -296,7 +296,7 @@ def test_of_a_long_trace_as_much_is_taken_as_adds_to_the_clique() -> None:
     log = Log(trace, CAUSAL)
     long = CausalEngine(engine.Task.of(Problem.of(trace, CAUSAL), Watch(100.0)))
     long._named.size = 32
-    with patch.object(engine, "AT_ONCE", 50), patch.object(naming, "AT_ONCE", 50):
+    with patch.object(engine, "AT_ONCE", 50), patch.object(named_labels, "AT_ONCE", 50):
         size = long.next_size(32)
         assert long.next_size(10) == size
         long._named.size = size
