@@ -210,9 +210,9 @@ class Joining:
     def _joined(self, first: Part, second: Part, ways: Sequence[_Anchor]) -> Part | None:
         """Join two maps by the cheapest anchor that breaks no axiom; None if apart is cheaper."""
         found: list[Part] = []
+        overlay = Overlay(first, second, self._problem, self.sights)
         for way in ways:
             look_at_clock()
-            overlay = Overlay(first, second, self._problem, self.sights)
             begun = overlay.merge(way.old, way.new, way.turn if way.by_places else None)
             if begun and (part := overlay.part()).nats < first.nats + second.nats:
                 found.append(part)

@@ -130,7 +130,8 @@ class Part:
         """Return the median length in metres of the moves of these drives that are no turns."""
         moves = [trace.steps[t].displacement or (0.0, 0.0, 0.0) for t in self.labels]
         ways = [math.hypot(dx, dy) for dx, dy, _ in moves]
-        return median([way for way in ways if way > max(ways) / 10] or [1.0])
+        least = max(ways) / 10
+        return median([way for way in ways if way > least] or [1.0])
 
     def beside(self, other: Part) -> Part:
         """Put another part beside this one. The frames of the two stay unrelated."""
@@ -200,7 +201,7 @@ class Overlay:
         links: list[dict[int, int]] = [{} for _ in both.places]
         for (s, action), x in both.links.items():
             links[s][action] = x
-        self._state = _State(
+        self._apart = _State(
             [*range(len(both.places))],
             [*range(len(both.sights))],
             [*both.sights],
@@ -212,16 +213,20 @@ class Overlay:
             frozenset(both.places[s] for s in both.kept),
         )
         # The cost of changed gateways if two places are one; inf if they cannot be.
-        self._changes = np.full(2 * (len(both.sights),), math.inf)
+        self._costs = np.full(2 * (len(both.sights),), math.inf)
         for (p, seen), (q, others) in combinations(enumerate(both.sights), 2):
-            self._changes[p, q] = sights.merged(seen, others)
+            self._costs[p, q] = sights.merged(seen, others)
+        # These change while the two maps are merged.
+        self._state, self._changes = self._apart, self._costs
 
     def merge(self, old: int, new: int, turn: float | None = None) -> bool:
         """Merge a dstate of the standing map with one of the drive, and then all that coincide.
 
-        With a `turn`, only their places are merged, and the map of the drive is turned by it, in
-        radians. Returns whether the two can be one dstate, or one place.
+        An earlier merge is undone first. With a `turn`, only their places are merged, and the map
+        of the drive is turned by it, in radians. Returns whether the two can be one dstate, or one
+        place.
         """
+        self._state, self._changes = self._apart, self._costs.copy()
         new += self._old[0]
         self._lay(old, new, turn)
         places = self._both.places[old], self._both.places[new]
