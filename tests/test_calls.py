@@ -160,6 +160,7 @@ RIGHT: dict[str, set[str]] = {
     "Step.image": {"list", "array", "huge", "[1, 2]"},
     "Theory.from_dict.data": {"dict"},
     "difference.drives": EMPTY,
+    "explain_pair.known": EMPTY,
     "Theory.prefer": {"list"},
     "Theory.without": {"list"},
     "Theory.rules": {"empty text", *EMPTY},

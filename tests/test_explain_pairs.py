@@ -14,14 +14,14 @@ from strategies import TOYS, theories, traces
 
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.cli import main
-from ssh_abduction.data import TraceError
+from ssh_abduction.data import MapError, TraceError
 from ssh_abduction.explain.axioms import Axioms
 from ssh_abduction.explain.derivation import Derivation
 from ssh_abduction.explain.mend import explain_trace
 from ssh_abduction.explain.pairs import explain_pair
 from ssh_abduction.explain.piece import Piece
 from ssh_abduction.explain.verdict import PairExplanation, Verdict
-from ssh_abduction.solver import Status
+from ssh_abduction.solver import Search, Start, Status
 from ssh_abduction.solver.asp.facts import derivation_lp, further_rules
 from ssh_abduction.theory.encodings import axioms
 from ssh_abduction.theory.settle import settle
@@ -246,6 +246,62 @@ def test_what_a_join_costs_in_nats() -> None:
             "misfit: the loop of 34 m closes 6.0 m off",
         ),
     ]
+
+
+ACES3 = Trace.load(Path(__file__).parent.parent / "examples" / "aces3-route.jsonl")
+# A square whose loop closes 3 m off, and a second round.
+SQUARE = Trace.from_steps(
+    "abcdefghabcdefgha",
+    ["travel", "left"] * 8,
+    displacements=[*[(10, 0, 0), (0, 0, 1.5708)] * 3, (7, 0, 0), (0, 0, 1.5708)] * 2,
+)
+
+
+@pytest.mark.parametrize(("trace", "within"), [(ACES3, 1), (SQUARE, 16)])
+def test_an_answer_is_never_worse_than_the_known_maps(trace: Trace, within: int) -> None:
+    """No time is left for any search, but the known maps are still there."""
+    solution = solve(trace)
+    known = solve(trace, within=within).maps
+    first, second = next(
+        (i, j)
+        for j in range(len(trace))
+        for i in range(j)
+        if {m.dstate_at[i] == m.dstate_at[j] for m in known} == {False, True}
+    )
+    none = explain_pair(trace, first, second, time_limit=1e-9)
+    assert (none.same.cost, none.different.cost) == (None, None)
+    some = explain_pair(trace, first, second, time_limit=1e-9, known=known)
+    costs = [side.cost for side in (some.same, some.different)]
+    assert some.verdict is Verdict.UNKNOWN
+    assert solution.cost in costs
+    assert None not in costs
+    if solution.weighed:
+        nats = [side.nats for side in (some.same, some.different) if side.nats is not None]
+        assert min(nats) == pytest.approx(solution.weighed.nats)
+        assert len(nats) == 2
+    search = Search(trace, time_limit=1e-9, _start=Start(known=known))
+    assert [*search] == [solution.maps[0]]
+    assert (search.status, search.cost) == (Status.FEASIBLE, solution.cost)
+
+
+@pytest.mark.parametrize(("trace", "within"), [(ACES3, 1), (SQUARE, 16)])
+def test_known_maps_change_no_answer_that_is_proven(trace: Trace, within: int) -> None:
+    anew, known = Search(trace, within=within), solve(trace, within=within + 1).maps
+    search = Search(trace, within=within, _start=Start(known=known))
+    assert {*search} == {*anew}
+    assert (search.count, search.cost, search.status) == (anew.count, anew.cost, anew.status)
+    pair = 0, len(trace) - 1
+    assert explain_pair(trace, *pair, known=known) == explain_pair(trace, *pair)
+
+
+def test_known_maps_that_the_theory_forbids_are_ignored() -> None:
+    known = solve(SQUARE).maps
+    theory = Theory(different=[(0, 8)])
+    assert known[0].dstate_at[0] == known[0].dstate_at[8]
+    search = Search(SQUARE, theory, time_limit=1e-9, _start=Start(known=known))
+    assert all(ssh_map.dstate_at[0] != ssh_map.dstate_at[8] for ssh_map in search)
+    with pytest.raises(MapError, match="maps are of another trace"):
+        explain_pair(SQUARE.prefix(9), 0, 8, known=known)
 
 
 def test_rivals_that_disagree_are_counted() -> None:

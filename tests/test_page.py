@@ -34,6 +34,7 @@ from ssh_abduction.page.html import Page
 from ssh_abduction.page.replays import ALPHABET, LOST, beams_of, drawn_images
 from ssh_abduction.page.server import PageServer
 from ssh_abduction.rivals import Listing
+from ssh_abduction.solver import Watch
 from ssh_abduction.solver.asp.workers import _under_way
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -407,6 +408,20 @@ def test_question_whose_asker_is_gone_is_given_up(
         until(lambda: bool(_under_way))
     until(lambda: not _under_way)
     assert b"expected a pair" in asked(server, "POST", own + "explain", {})[1]
+
+
+def test_answers_begin_with_the_maps_of_the_page() -> None:
+    """The time is too short for a search that would find these maps again."""
+    trace = Trace.load(Path(__file__).parent.parent / "examples" / "aces3-route.jsonl")
+    listing = Listing.of(solve(trace))
+    with PageServer(listing, trace, time_limit=1e-3) as served:
+        solved = served.answer("solve", {}, Watch(60))
+        pair = served.answer("explain", {"pair": [0, 20]}, Watch(60))
+        assumed = served.answer("explain", {"pair": [0, 20], "same": [[3, 9]]}, Watch(60))
+    assert solved["text"].startswith("feasible (time limit): 19 dstates, 10 places, 4 paths")
+    assert pair["text"].startswith("map 1 has both steps at two places\nit is unknown")
+    assert "no map is known that costs less: 19 dstates" in pair["assuming"]["different"]
+    assert not assumed["text"].startswith("map 1")
 
 
 def sleep(*arguments: object) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import re
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -37,11 +36,12 @@ from ssh_abduction.explain.pairs import PairQuestion
 from ssh_abduction.explain.sides import PlaceExplanation, PlaceQuestion
 from ssh_abduction.explain.verdict import PairExplanation, Verdict
 from ssh_abduction.runtime.program import interrupted_code
-from ssh_abduction.solver import Stop, probability_in_words
+from ssh_abduction.solver import Stop
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
-    from ssh_abduction.rivals.listing import Listing
+    from ssh_abduction.data.maps import SSHMap
+    from ssh_abduction.rivals.pair_in_map import PairInMap
 
 EXIT_NO_MAP, EXIT_UNKNOWN = 20, 30
 SECONDS = 60.0  # the default time limit: joint maps with changes may need hours for a proof
@@ -115,30 +115,33 @@ def run(options: argparse.Namespace) -> int:
         "memory_limit": options.memory_limit,
     }
     question: PairQuestion | TraceQuestion | PlaceQuestion
+    known: tuple[SSHMap, ...] = ()
+    pair: PairInMap | None = None
     if of_place:
         place, path = (None if n is None else int(n) for n in of_place.groups())
         assert place is not None
         question = PlaceQuestion(trace, place, path, theory, **limits)
     elif options.steps:
         first, second = (step_named(trace, step) for step in options.steps)
+        if maps and found and data.get("maps"):
+            from ssh_abduction.rivals.listing import Listing  # loads numpy
+            from ssh_abduction.rivals.pair_in_map import PairInMap
+
+            listing = Listing.from_dict(data, named(maps))
+            if listing.steps == len(trace):  # else --theory names the maps of another trace
+                known, pair = listing.maps, PairInMap.of(listing, first, second)
         question = PairQuestion(
-            trace, first, second, theory, max_maps=options.maps or None, **limits
+            trace, first, second, theory, max_maps=options.maps or None, known=known, **limits
         )
     else:
         question = TraceQuestion(trace, theory, **limits)
-    from ssh_abduction.rivals.listing import Listing  # loads numpy
-
-    pair = None
-    if found and maps and options.steps and not of_place:
-        listing = Listing.from_dict(data, named(maps)).named_beside(maps)
-        pair = _InMap.of(listing, first, second)
     written = (
         partial(_as_json, pair) if options.json else partial(_as_text, pair, options.time_limit)
     )
 
     def last_words(why: Stop) -> tuple[str, int]:
-        known = question.known(why)
-        return written(known), _exit_code(known)
+        answer = question.known(why)
+        return written(answer), _exit_code(answer)
 
     with (
         on_ctrl_c(question.interrupt),
@@ -164,59 +167,15 @@ def _maps_of(options: argparse.Namespace) -> tuple[str | None, Theory | None, An
     return file, theory_of_maps(data, file), data
 
 
-@dataclass(frozen=True, slots=True)
-class _InMap:
-    """What the first map of a file says about the places of two steps.
-
-    Attributes:
-        is_one_place: Whether the two steps are at one place.
-        probability: The probability that they are; None if maps were not compared by cost.
-        nats: The extra cost, in nats, of the best known map that contradicts `is_one_place`; None
-            if no such map is known.
-    """
-
-    is_one_place: bool
-    probability: float | None
-    nats: float | None
-
-    @classmethod
-    def of(cls, listing: Listing, first: int, second: int) -> _InMap | None:
-        """Compare the places of two steps; None without places."""
-        at = [listing.maps[0].place_of(step) for step in (first, second)]
-        if None in at:
-            return None
-        weighed = listing.weighed
-        return cls(
-            at[0] == at[1],
-            None
-            if weighed is None or weighed.doubt is not None
-            else weighed.probability(first, second, "place"),
-            None if weighed is None else weighed.nats_if_other(first, second),
-        )
-
-    def __str__(self) -> str:
-        text = f"map 1 has both steps at {'one place' if self.is_one_place else 'two places'}"
-        if self.probability is not None:
-            text += f"; the probability of one place is {probability_in_words(self.probability)}"
-        if self.nats is not None:
-            other = "two places" if self.is_one_place else "one place"
-            text += f"; the best known map with {other} costs {self.nats:.1f} nats more"
-        return text
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return it as plain data."""
-        return {"same_place": self.is_one_place, "probability": self.probability, "nats": self.nats}
-
-
-def _as_text(in_map: _InMap | None, seconds: float, explanation: Answer) -> str:
-    lines = [str(explanation), *([str(in_map)] if in_map else [])]
+def _as_text(in_map: PairInMap | None, seconds: float, explanation: Answer) -> str:
+    lines = [*([str(in_map)] if in_map else []), str(explanation)]
     is_limited = explanation.stopped in (None, "time limit")
     if is_limited and _exit_code(explanation) == EXIT_UNKNOWN:
         lines.append(f"undecided within {seconds:g} s; --time-limit gives it more time")
     return "\n".join(lines) + "\n"
 
 
-def _as_json(in_map: _InMap | None, explanation: Answer) -> str:
+def _as_json(in_map: PairInMap | None, explanation: Answer) -> str:
     record = explanation.to_dict()
     return json_line(record | ({"map": in_map.to_dict()} if in_map else {})) + "\n"
 

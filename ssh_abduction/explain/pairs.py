@@ -16,7 +16,7 @@ minimal maps, and for the best map of each side.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 from ssh_abduction.data.checks import a_count_of_maps
@@ -33,7 +33,7 @@ from ssh_abduction.explain.piece import Piece
 from ssh_abduction.explain.question import LimitedQuestion
 from ssh_abduction.explain.verdict import PairExplanation, Side, Verdict
 from ssh_abduction.runtime.deprecated import renamed_parameters
-from ssh_abduction.solver import EQUAL, Cost, Status, Stop, facts
+from ssh_abduction.solver import EQUAL, Cost, Judging, Misfit, Status, Stop, facts
 from ssh_abduction.theory.settle import displacement_of
 from ssh_abduction.theory.theory import Theory, checked_theory
 
@@ -62,6 +62,7 @@ def explain_pair(
     time_limit: float | None = None,
     memory_limit: int | None = None,
     max_maps: int | None = 100,
+    known: Iterable[SSHMap] = (),
 ) -> PairExplanation:
     """Explain whether two steps of a trace are one dstate, and why.
 
@@ -75,6 +76,8 @@ def explain_pair(
         memory_limit: MiB, as for `solve`.
         max_maps: List at most this many minimal maps, and count those in which the steps are one
             dstate; None for all.
+        known: Maps of the trace that are known, such as those of a solution. The searches begin
+            with those that satisfy the theory, so that the best map that they find costs no more.
 
     Returns:
         The verdict. If it holds in every map, also an argument for it.
@@ -82,6 +85,7 @@ def explain_pair(
     Raises:
         TraceError: The trace has no such step, or both steps are the same; and as `solve` does.
         TheoryError: As `solve` does.
+        MapError: A known map is of another trace.
 
     Reference:
         Kuipers & Beeson 2002, section 4.2: why x0 and x4 of the rectangle differ.
@@ -95,6 +99,7 @@ def explain_pair(
         time_limit=time_limit,
         memory_limit=memory_limit,
         max_maps=max_maps,
+        known=known,
     ).answer()
 
 
@@ -115,8 +120,9 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
         time_limit: float | None = None,
         memory_limit: int | None = None,
         max_maps: int | None = 100,
+        known: Iterable[SSHMap] = (),
     ) -> None:
-        super().__init__(trace, theory, time_limit, memory_limit)
+        super().__init__(trace, theory, time_limit, memory_limit, known)
         check_two_steps(trace, first, second)
         names = named_steps(drives_of(trace), len(trace))
         self.first, self.second = names[min(first, second)], names[max(first, second)]
@@ -128,8 +134,7 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
         self._listed = False
         self._derivation: Derivation | None = None
         self._clash: Explanation | None = None
-        # The first map that was found, with its cost, and its cost in nats.
-        self._best: tuple[SSHMap, Cost | None, float | None] | None = None
+        self._best: tuple[SSHMap, Side] | None = None  # the best map that was found
         self._changes: tuple[str, ...] = ()
         self._ruling_out: dict[bool, Piece] = {}  # a piece of the trace without a map of the side
 
@@ -206,6 +211,7 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
         return here is not None and there is not None and here > there
 
     def _find_out(self) -> None:
+        self._begin_with_known_maps()
         # if a few steps around the pair have no map of a side, the whole trace has none
         for one in (True, False):
             self._ask_pieces(one, SMALL)
@@ -229,9 +235,38 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
                     piece, self.trace, self.first, self.second, one=not one, stop=self._over
                 )
         if self._best:
-            ssh_map, cost, nats = self._best
+            ssh_map, side = self._best
             places = [ssh_map.place_of(step) for step in (self.first, self.second)]
-            self._changes = self._changes_in_words(ssh_map, places, cost, nats)
+            self._changes = self._changes_in_words(ssh_map, places, side.cost, side.nats)
+
+    def _begin_with_known_maps(self) -> None:
+        """Take over the known maps that satisfy the theory, with their costs."""
+        judging = Judging(self.problem)
+        misfit = Misfit(self.problem) if self.theory.weigh == "cost" and self._known_maps else None
+        for ssh_map in filter(judging.accepts, self._known_maps):
+            self._keep(ssh_map, Cost.of(ssh_map), misfit.nats_of(ssh_map) if misfit else None)
+
+    def _keep(
+        self, ssh_map: SSHMap, cost: Cost | None, nats: float | None, *, proven: bool = False
+    ) -> None:
+        """Keep the cost of a map if no better map of its side is known.
+
+        `proven` says that no map of the side costs less.
+        """
+        one = ssh_map.dstate_at[self.first] == ssh_map.dstate_at[self.second]
+        before = self._sides[one]
+        side = replace(before, possible=True, cost=cost, nats=nats, proven=proven)
+        if proven or before.cost is None or self._is_cheaper(side, before):
+            self._sides[one] = side
+        if self._best is None or self._is_cheaper(side, self._best[1]):
+            self._best = ssh_map, side
+
+    def _is_cheaper(self, side: Side, other: Side) -> bool:
+        """Tell whether the map of a side costs less than that of another. Both have a map."""
+        if (side.nats is None) is not (other.nats is None):  # a limit came before the price
+            return side.nats is not None
+        here, there = side.dearness(self.theory), other.dearness(self.theory)
+        return here is not None and there is not None and here < there
 
     # Few steps around the pair
 
@@ -309,23 +344,14 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
         )
         search = self._solved(self.trace, self.theory, 1 if settled else self._maps, seconds)
         for found in search:
-            self._best = self._best or (found, search.cost, search.nats)
-            one = found.dstate_at[self.first] == found.dstate_at[self.second]
-            side = self._sides[one]
-            if search.status is Status.OPTIMAL:
+            is_minimal = search.status is Status.OPTIMAL
+            self._keep(found, search.cost, search.nats, proven=is_minimal)
+            if is_minimal:
+                one = found.dstate_at[self.first] == found.dstate_at[self.second]
                 self._minimum = search.cost
                 self._minimal[one] = True
                 self._least_nats = search.nats
-                self._sides[one] = replace(
-                    side,
-                    possible=True,
-                    cost=search.cost,
-                    proven=True,
-                    maps=side.maps + 1,
-                    nats=search.nats,
-                )
-            elif side.cost is None:
-                self._sides[one] = replace(side, possible=True, cost=search.cost, nats=search.nats)
+                self._sides[one] = replace(self._sides[one], maps=self._sides[one].maps + 1)
         if search.status is Status.UNSATISFIABLE:
             self._sides = {True: Side(possible=False), False: Side(possible=False)}
         self._listed = search.complete and not settled
@@ -343,14 +369,9 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
             1,
             self._watch.left() * (SHARE if self._minimum is None else 2 * SHARE),
         )
-        for _ in search:
-            self._sides[one] = replace(
-                self._sides[one],
-                possible=True,
-                cost=search.cost,
-                proven=search.status is Status.OPTIMAL,
-                nats=search.nats,
-            )
+        for found in search:
+            proven = search.status is Status.OPTIMAL
+            self._keep(found, search.cost, search.nats, proven=proven)
         if search.status is Status.UNSATISFIABLE:
             self._sides[one] = Side(possible=False)
         elif (

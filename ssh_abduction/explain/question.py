@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from contextlib import suppress
 from typing import Generic, TypeVar
 
-from ssh_abduction.data.maps import Fault, SSHMap
+from ssh_abduction.data.maps import Fault, SSHMap, check_of_trace, checked_maps
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.axioms import Interrupted
 from ssh_abduction.solver import (
@@ -15,6 +15,7 @@ from ssh_abduction.solver import (
     LimitError,
     Progress,
     Search,
+    Start,
     Status,
     Stop,
     Watch,
@@ -38,6 +39,7 @@ class LimitedQuestion(ABC, Generic[_Answer]):
         theory: The theory; Theory.topological() if None.
         time_limit: Seconds; None for no limit.
         memory_limit: MiB; None for no limit.
+        known: Maps of the trace that are known. Each search begins with them.
     """
 
     def __init__(
@@ -46,6 +48,7 @@ class LimitedQuestion(ABC, Generic[_Answer]):
         theory: Theory | None,
         time_limit: float | None,
         memory_limit: int | None,
+        known: Iterable[SSHMap] = (),
     ) -> None:
         check_limit("time_limit (--time-limit)", "seconds", time_limit)
         check_limit("memory_limit (--memory-limit)", "MiB", memory_limit)
@@ -54,6 +57,8 @@ class LimitedQuestion(ABC, Generic[_Answer]):
         self.theory.check_steps(trace)
         check_rules(self.theory)
         self.limit, self.memory = time_limit, memory_limit
+        self._known_maps = checked_maps(known)
+        check_of_trace(self._known_maps, trace, "known", views=False)
         self.stopped: Stop | None = None
         self._watch = Watch(time_limit, memory_limit)
         self._watch.use_reserve()
@@ -107,6 +112,7 @@ class LimitedQuestion(ABC, Generic[_Answer]):
             memory_limit=self.memory,
             max_maps=maps,
             on_progress=end_with_this,
+            _start=Start(known=self._known_maps),
         )
         return search
 

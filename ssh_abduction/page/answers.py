@@ -1,34 +1,49 @@
 """Find the answers to questions of a served page. Each answer is found in its own process.
 
-This module imports nothing that draws, so that the process starts sooner.
+The searches begin with the maps that the page shows, so an answer is never worse than these. This
+module imports nothing that draws, so that the process starts sooner.
 """
 
 from __future__ import annotations
 
+from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.pairs import explain_pair
 from ssh_abduction.explain.verdict import PairExplanation
-from ssh_abduction.solver import Solution, Watch, solve
+from ssh_abduction.solver import Search, Solution, Start, Watch
 from ssh_abduction.theory.theory import Theory
 
 
 def pair_explained(
-    trace: Trace, first: int, second: int, theory: Theory, limit: float | None, watch: Watch
+    trace: Trace,
+    first: int,
+    second: int,
+    theory: Theory,
+    known: tuple[SSHMap, ...],
+    limit: float | None,
+    watch: Watch,
 ) -> PairExplanation:
     """Explain in `limit` seconds why two steps are one dstate (place and heading), or not.
 
-    `watch` is not used, as the server ends the process itself. `in_process` passes one to each
-    function that it runs.
+    `known` are the maps that the page shows. `watch` is not used, as the server ends the process
+    itself. `in_process` passes one to each function that it runs.
     """
-    return explain_pair(trace, first, second, theory, time_limit=limit)
+    return explain_pair(trace, first, second, theory, time_limit=limit, known=known)
 
 
 def solved_with(
-    trace: Trace, theory: Theory, maps: int, limit: float | None, watch: Watch
+    trace: Trace,
+    theory: Theory,
+    known: tuple[SSHMap, ...],
+    maps: int | None,
+    limit: float | None,
+    watch: Watch,
 ) -> Solution:
     """Find the minimal maps by a theory with assumptions about pairs of steps.
 
-    At most `maps` are listed; None lists all. `limit` is in seconds. `watch` is as in
+    At most `maps` are listed; None lists all. `known`, `limit` and `watch` are as in
     `pair_explained`.
     """
-    return solve(trace, theory, max_maps=maps, time_limit=limit)
+    start = Start(known=known)
+    search = Search(trace, theory, max_maps=maps, time_limit=limit, _start=start)
+    return search.solution(tuple(search))

@@ -31,6 +31,7 @@ from ssh_abduction.page.content import Called, content_of
 from ssh_abduction.page.html import html_of
 from ssh_abduction.page.replays import Run
 from ssh_abduction.rivals.listing import Listing
+from ssh_abduction.rivals.pair_in_map import PairInMap
 from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import LimitError, Watch, in_process
 from ssh_abduction.theory.theory import Theory
@@ -77,6 +78,7 @@ class PageServer(ThreadingHTTPServer):
         time_limit: float | None = 30.0,
     ) -> None:
         self._trace, self._theory, self._maps, self._limit = trace, theory, max_maps, time_limit
+        self._listing = listing
         self._run, self._called = run, called or Called(listing.source)
         self._page = html_of(content_of(listing, trace, run, self._called), served=True).encode()
         self._token = secrets.token_urlsafe(24)
@@ -115,14 +117,28 @@ class PageServer(ThreadingHTTPServer):
             raise MapError(f"expected explain or solve, got {brief(question)}; ask one of the two")
         theory = self._assuming(data)
         pair = self._pair(data.get("pair")) if question == "explain" else None
+        known = self._listing.maps
         with self._turn(watch):
             if pair is not None:
                 why = in_process(
-                    answers.pair_explained, self._trace, *pair, theory, self._limit, watch=watch
+                    answers.pair_explained,
+                    self._trace,
+                    *pair,
+                    theory,
+                    known,
+                    self._limit,
+                    watch=watch,
                 )
-                return {"text": str(why), "assuming": why.assuming}
+                text = "\n".join([*self._in_map(pair, theory), str(why)])
+                return {"text": text, "assuming": why.assuming}
             found = in_process(
-                answers.solved_with, self._trace, theory, self._maps, self._limit, watch=watch
+                answers.solved_with,
+                self._trace,
+                theory,
+                known,
+                self._maps,
+                self._limit,
+                watch=watch,
             )
         if not found.maps:
             return {"text": found.headline}
@@ -130,6 +146,13 @@ class PageServer(ThreadingHTTPServer):
             "text": found.headline,
             "content": content_of(found, self._trace, self._run, self._called),
         }
+
+    def _in_map(self, pair: tuple[int, int], theory: Theory) -> Iterator[str]:
+        """Yield what the maps of the page say about a pair of steps, unless more is assumed."""
+        if theory == (self._theory or Theory.topological()) and (
+            said := PairInMap.of(self._listing, *pair)
+        ):
+            yield str(said)
 
     @contextmanager
     def _turn(self, watch: Watch) -> Iterator[None]:

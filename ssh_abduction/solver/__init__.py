@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.guesses.gated import sketch_beyond, sketches_of
     from ssh_abduction.solver.guesses.tree import Sketch
     from ssh_abduction.solver.judging import InternalError, Judging
+    from ssh_abduction.solver.misfit import Misfit
     from ssh_abduction.solver.obeying import obeyed, with_names
     from ssh_abduction.solver.ranking import Ranking
     from ssh_abduction.solver.recorded import drives_in, joins_in, theory_in, trace_in
@@ -61,6 +62,7 @@ _HOMES = {  # module: the names that this package exports from it
     "guesses.gated": ("sketch_beyond", "sketches_of"),
     "guesses.tree": ("Sketch",),
     "judging": ("InternalError", "Judging"),
+    "misfit": ("Misfit",),
     "obeying": ("obeyed", "with_names"),
     "ranking": ("Ranking",),
     "recorded": ("drives_in", "joins_in", "theory_in", "trace_in"),
@@ -100,6 +102,7 @@ __all__ = [
     "Level",
     "LimitError",
     "Limits",
+    "Misfit",
     "Outcome",
     "Point",
     "Progress",

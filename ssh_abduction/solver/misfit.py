@@ -23,6 +23,7 @@ from typing import TypeAlias
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.engines.refusing import minimal_part
 from ssh_abduction.solver.fit import Poses
+from ssh_abduction.solver.values import Cost, nats_of
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.evidence.displacement import jumped
 from ssh_abduction.theory.settle import Problem
@@ -42,7 +43,7 @@ class Misfit:
     def __init__(self, problem: Problem) -> None:
         """Find the visits of the trace. No misfit is computed yet."""
         self.trace, self._overlap = problem.trace, problem.overlap
-        theory = problem.theory
+        theory = self._theory = problem.theory
         stays = theory.level == "topological" and "turn_stays" in theory.hard and not theory.jumped
         self.visit = [0]
         for t, action in enumerate(self.trace.actions, 1):
@@ -74,6 +75,10 @@ class Misfit:
     def of_map(self, ssh_map: SSHMap) -> float:
         """Compute the misfit (a chi-square) of a map of the whole trace."""
         return self.of_returns(self.returns_of(ssh_map), jumped(ssh_map))
+
+    def nats_of(self, ssh_map: SSHMap) -> float:
+        """Compute the cost of a map of the whole trace in nats: its prices and half its misfit."""
+        return nats_of(Cost.of(ssh_map), self._theory) + self.of_map(ssh_map) / 2
 
     def returns_of(self, ssh_map: SSHMap) -> list[Equality]:
         """List the returns of a map: each step with the last step at the same dstate or place.

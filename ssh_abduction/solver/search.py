@@ -122,7 +122,7 @@ class Search:
         self.trace = trace
         self.clash: range | None = None
         self._begun = False
-        self._reasons = _start.reasons
+        self._reasons, self._known_maps = _start.reasons, _start.known
         self._parts = Parts(
             problem, self.limits, checked_speedups(speedups), on_progress, _start, began
         )
@@ -272,6 +272,7 @@ class Search:
         _log.info("search of %r under %r, with %s", self.trace, self.theory, engine)
         watch.start()
         try:
+            _begin_with(self._known_maps, parts, self._weighing)
             with heeding(watch.check):
                 self._stages.make_first_map()
                 if self._weighing is None:
@@ -445,6 +446,17 @@ class Search:
         maps = () if best is None else (_with_names(best, self.trace, drives_of(self.trace)),)
         solution = self._answer.solution(maps, Grounding(0, 0))
         return replace(solution, complete=known.status is Status.UNSATISFIABLE)
+
+
+def _begin_with(maps: Sequence[SSHMap], parts: Parts, weighing: Weighing | None) -> None:
+    """Keep the known maps that the checker accepts, even if the time limit is over."""
+    for ssh_map in maps:
+        if weighing is None:
+            parts.candidates.offer(ssh_map)
+        elif parts.judging.accepts(ssh_map):
+            weighing.add(ssh_map)
+    if weighing is not None and maps:
+        weighing.keep_best()
 
 
 def _with_names(ssh_map: SSHMap, trace: Trace, drives: Sequence[Drive]) -> SSHMap:

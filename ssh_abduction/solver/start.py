@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from ssh_abduction.data.checks import a_count_of_maps, a_flag
 from ssh_abduction.data.errors import SolverError, brief, is_whole
-from ssh_abduction.data.maps import SSHMap, checked_map
+from ssh_abduction.data.maps import SSHMap, checked_map, checked_maps
 from ssh_abduction.solver.asp.limits import check_limit
 
 if TYPE_CHECKING:
@@ -62,16 +62,20 @@ class Start:
             grounding and its proofs; None to begin anew.
         minimal: A map of the trace that costs what `after` proved to be minimal; None if there is
             none. With such a map, the search only lists maps.
+        known: Maps of the trace that an earlier search found. The search begins with those that
+            the checker accepts, so that its best map costs no more than they do.
     """
 
     reasons: bool = False
     after: Parts | None = None
     minimal: SSHMap | None = None
+    known: tuple[SSHMap, ...] = ()
 
     def __post_init__(self) -> None:
         a_flag("reasons", self.reasons, SolverError)
         if self.minimal is not None:
             checked_map(self.minimal, "minimal")
+        checked_maps(self.known)
 
 
 ANEW = Start()

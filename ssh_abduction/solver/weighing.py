@@ -266,8 +266,7 @@ class Weighing:
 
     def add(self, ssh_map: SSHMap) -> float:
         """Return the cost of a map in nats. Keep it if it costs little more than the best one."""
-        nats = nats_of(Cost.of(ssh_map), self._parts.task.theory)
-        nats += self._misfit.of_map(ssh_map) / 2
+        nats = self._misfit.nats_of(ssh_map)
         if self.candidates and nats < self.candidates[0].nats - EQUAL:
             self._improved = self._parts.watch.elapsed()
         if all(known.map != ssh_map for known in self.candidates):
