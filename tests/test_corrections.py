@@ -265,6 +265,40 @@ def test_gateways_are_opened_and_closed(folder: Path, capsys: pytest.CaptureFixt
     assert "it contradicts the trace: the robot" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("onto", [False, True])
+def test_a_later_drive_that_saw_the_gateway_as_before_is_warned_of(
+    onto: bool, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A person opens a gateway that was closed on Monday. On Tuesday it was closed, too."""
+    stars = (1, 0, 0, 0), (0, 0, 1, 0)
+    for name in ("monday", "tuesday"):
+        seeing(name, *stars).save(folder / f"{name}.jsonl")
+    seeing("other", (1, 1, 0, 0), (0, 0, 1, 1)).save(folder / "other.jsonl")
+    maps = str(folder / "building" / "maps.json")
+    assert main(solving(folder, "monday")) == 0
+    assert main(["correct", maps, "--open", "monday:0 right"]) == 0
+    capsys.readouterr()
+    file = str(folder / "building" / "corrections.yaml")
+
+    def warned(*names: str) -> str:
+        last = ["solve", str(folder / f"{names[-1]}.jsonl"), "--onto", maps, "--corrections", file]
+        assert main(solving(folder, "monday")) == 0
+        capsys.readouterr()
+        assert main(last if onto else solving(folder, *names)) == 0
+        return capsys.readouterr().err
+
+    told = warned("monday", "tuesday")
+    said = "open: right at monday:0, left at monday:3: it contradicts what tuesday saw at step"
+    assert f"{said} tuesday:0: without it, tuesday would share places with" in told
+    assert told.count("it contradicts") == 1
+    # This drive saw the gateway open.
+    assert "it contradicts" not in warned("monday", "other")
+    # This one was elsewhere than Monday, with or without the correction.
+    strange = Trace.from_steps("ax", ["travel"], stars=[(1, 1, 1, 0), (0, 0, 1, 0)], name="strange")
+    strange.save(folder / "strange.jsonl")
+    assert "it contradicts" not in warned("monday", "strange")
+
+
 def test_verbs_with_the_recorded_trace_obey_what_was_said_of_its_stars(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -16,8 +16,11 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.explain.no_map import Explanation, explain
-from ssh_abduction.solver import Solution, obeyed, with_names
+from ssh_abduction.solver import Solution, drives_kept_apart, obeyed, solve, with_names
 from ssh_abduction.theory.theory import Theory
+
+# A search for a map without corrections of gateways may take this many seconds.
+SHORTEST, DOUBTING = 0.05, 10.0
 
 
 def corrections_of(options: argparse.Namespace) -> Corrections | None:
@@ -49,6 +52,20 @@ def as_corrected(
     corrected = obeyed(said, trace, theory)
     say_obeyed(said, trace)
     return corrected
+
+
+def say_drives_kept_apart(said: Corrections, solution: Solution, limit: float | None) -> None:
+    """Warn on stderr of drives that are apart only because a gateway was corrected.
+
+    A search for a map without the correction gets what is left of the time limit.
+    """
+    left = DOUBTING if limit is None else min(limit - solution.seconds.total, DOUBTING)
+
+    def find(trace: Trace, theory: Theory) -> Solution:
+        return solve(trace, theory, max_maps=1, time_limit=max(left, SHORTEST))
+
+    if said.gateways and solution.stopped != "interrupted":
+        warn(drives_kept_apart(said, solution, find))
 
 
 def say_obeyed(said: Corrections, trace: Trace) -> None:

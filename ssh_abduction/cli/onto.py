@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from ssh_abduction.cli.obeying import corrections_of
+from ssh_abduction.cli.obeying import corrections_of, say_drives_kept_apart
 from ssh_abduction.cli.options import number_steps, theory_of
 from ssh_abduction.cli.outcome import exit_code, save_solution, warn
 from ssh_abduction.cli.text import describe, headline
@@ -27,6 +27,7 @@ def run(options: argparse.Namespace) -> int:
     trace = together([Trace.load(path) for path in options.traces])
     if existing.trace is not None:
         number_steps(options, together([existing.trace, trace]))
+    corrections = corrections_of(options)
     solution = solve(
         trace,
         theory_of(options, existing.theory.replace(returns=0)),
@@ -36,9 +37,11 @@ def run(options: argparse.Namespace) -> int:
         within=options.within,
         memory_limit=options.memory_limit,
         speedups=Speedups.without(options.without_speedups),
-        corrections=corrections_of(options),
+        corrections=corrections,
     )
     warn(solution.warnings)
+    if corrections is not None:
+        say_drives_kept_apart(corrections, solution, options.time_limit)
     save_solution(solution, options.output)
     if options.json:
         print(json_line(solution.to_dict()))

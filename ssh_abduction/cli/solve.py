@@ -14,7 +14,7 @@ from itertools import chain
 from typing import Any
 
 from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.obeying import Obeying
+from ssh_abduction.cli.obeying import Obeying, say_drives_kept_apart
 from ssh_abduction.cli.options import (
     add_limits,
     add_theory,
@@ -225,6 +225,7 @@ def run(options: argparse.Namespace) -> int:
         warn(warnings_of(search, solution))
         options.json = False  # the JSON is complete: a later error must not follow it
         save_solution(solution, options.output)
+    say_drives_kept_apart(obeying.corrections, solution, options.time_limit)
     return exit_code(solution)
 
 

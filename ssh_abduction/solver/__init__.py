@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.guesses.tree import Sketch
     from ssh_abduction.solver.judging import InternalError, Judging
     from ssh_abduction.solver.misfit import Misfit
-    from ssh_abduction.solver.obeying import obeyed, with_names
+    from ssh_abduction.solver.obeying import drives_kept_apart, obeyed, with_names
     from ssh_abduction.solver.ranking import Ranking
     from ssh_abduction.solver.recorded import drives_in, joins_in, theory_in, trace_in
     from ssh_abduction.solver.regions import find_regions, with_regions
@@ -63,7 +63,7 @@ _HOMES = {  # module: the names that this package exports from it
     "guesses.tree": ("Sketch",),
     "judging": ("InternalError", "Judging"),
     "misfit": ("Misfit",),
-    "obeying": ("obeyed", "with_names"),
+    "obeying": ("drives_kept_apart", "obeyed", "with_names"),
     "ranking": ("Ranking",),
     "recorded": ("drives_in", "joins_in", "theory_in", "trace_in"),
     "regions": ("find_regions", "with_regions"),
@@ -123,6 +123,7 @@ __all__ = [
     "check_rules",
     "cost_as_counted",
     "drives_in",
+    "drives_kept_apart",
     "end_all",
     "ending",
     "facts",
