@@ -371,8 +371,11 @@ class Weighing:
         """
         least = best.nats + self._within if self.proven else -math.inf
         seconds = min(max(self._parts.watch.left() + OVERTIME, LEAST_ESTIMATING), ESTIMATING)
-        drives, visit = drives_of(self._parts.task.trace), self._misfit.visit
-        for rival in estimated(best, visit, drives, self._cost_like(best), seconds):
+        task, visit = self._parts.task, self._misfit.visit
+        # Drives that closures tie to others do not overlap by chance.
+        overlap = task.problem.overlap
+        free = [drive for i, drive in enumerate(drives_of(task.trace)) if not overlap.is_tied(i)]
+        for rival in estimated(best, visit, free, self._cost_like(best), seconds):
             if rival.nats >= least and (rival.dstates, rival.places) not in known:
                 yield rival
 

@@ -33,6 +33,10 @@ class Overlap:
         closures = ((self._drive[c.first], self._drive[c.last]) for c in trace.closures)
         self._tied = _joined(range(len(starts) + 1), closures)  # a group for each drive
 
+    def is_tied(self, drive: int) -> bool:
+        """Whether closures tie a drive, given by its number, to others."""
+        return self._tied.count(self._tied[drive]) > 1
+
     def nats(self, at: Sequence[Hashable]) -> float:
         """Return the price of joining drives that have places in common.
 
