@@ -34,8 +34,8 @@ def estimated(
     """Yield rivals that cost little more than the best map, each once.
 
     In each rival, some visits to a place of the best map are visits to a new place instead: a
-    single visit, or a visit and all later ones. Or one of `drives` shares no dstate and no
-    place with the others. `visit` has, for each step, the first step of its visit. `seconds` is the time
+    single visit, or a visit and all later ones. Or one of `drives` shares no dstate and no place
+    with the others. `visit` has, for each step, the first step of its visit. `seconds` is the time
     that this may take.
     """
     watch = Watch().part(seconds)
