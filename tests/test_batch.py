@@ -457,7 +457,7 @@ def test_memory_is_counted_for_each_trace(traces: Path) -> None:
         ]
     )
     # run by a shell: a process inherits the peak of the one that starts it, which is large here
-    command += " --memory-limit 70; exit"
+    command += " --memory-limit 80; exit"
     done = subprocess.run(command, shell=True, capture_output=True, text=True, check=False)
     lines = [json.loads(line) for line in done.stdout.splitlines()]
     assert [line.get("stopped") for line in lines] == [None, "memory limit", None]

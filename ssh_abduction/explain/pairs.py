@@ -33,7 +33,7 @@ from ssh_abduction.explain.piece import Piece
 from ssh_abduction.explain.question import LimitedQuestion
 from ssh_abduction.explain.verdict import PairExplanation, Side, Verdict
 from ssh_abduction.runtime.deprecated import renamed_parameters
-from ssh_abduction.solver import EQUAL, Cost, Judging, Misfit, Status, Stop, facts
+from ssh_abduction.solver import EQUAL, Cost, Judging, Status, Stop, facts
 from ssh_abduction.theory.settle import displacement_of
 from ssh_abduction.theory.theory import Theory, checked_theory
 
@@ -242,6 +242,8 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
     def _begin_with_known_maps(self) -> None:
         """Take over the known maps that satisfy the theory, with their costs."""
         judging = Judging(self.problem)
+        from ssh_abduction.solver import Misfit  # loads numpy
+
         misfit = Misfit(self.problem) if self.theory.weigh == "cost" and self._known_maps else None
         for ssh_map in filter(judging.accepts, self._known_maps):
             self._keep(ssh_map, Cost.of(ssh_map), misfit.nats_of(ssh_map) if misfit else None)
