@@ -241,10 +241,12 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
 
     def _begin_with_known_maps(self) -> None:
         """Take over the known maps that satisfy the theory, with their costs."""
-        judging = Judging(self.problem)
+        if not self._known_maps:
+            return
         from ssh_abduction.solver import Misfit  # loads numpy
 
-        misfit = Misfit(self.problem) if self.theory.weigh == "cost" and self._known_maps else None
+        judging = Judging(self.problem)
+        misfit = Misfit(self.problem) if self.theory.weigh == "cost" else None
         for ssh_map in filter(judging.accepts, self._known_maps):
             self._keep(ssh_map, Cost.of(ssh_map), misfit.nats_of(ssh_map) if misfit else None)
 
