@@ -15,7 +15,10 @@ from typing import TypeGuard
 
 
 class AbductionError(Exception):
-    """The root of all errors. Its text is one line: what was expected, what came, what to do."""
+    """The base class of all errors of this package.
+
+    The text is one line. It says what was expected, what was found, and how to correct the input.
+    """
 
     def __str__(self) -> str:
         return printable(super().__str__())  # names of files and views may hold anything

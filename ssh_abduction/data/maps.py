@@ -75,8 +75,8 @@ class SSHMap:
             the id of the dstate that the action leads to.
         places: The ids of the places.
         paths: The paths, each with an order of its places.
-        excused: With boundary=defeasible, the pairs of path ids that are exempt from the default
-            side_of_branch.
+        excused: The pairs of paths, by id, to which the axiom side_of_branch is not applied. Only
+            a theory with boundary=defeasible allows any.
         fit: How well the map agrees with the displacements; None if none were used.
         faults: The parts of the trace that the map treats as wrong, sorted by step.
         regions: Sets of places that directed paths bound, or that one place cuts off; the largest
@@ -203,18 +203,18 @@ class SSHMap:
         return next((n.text for n in self.names if (n.kind, n.id) == (kind, number)), None)
 
     def called(self, kind: str, number: int) -> str:
-        """Return words for a place, path or region, such as "place 4 (kitchen)".
+        """Return the kind, number and name of a place, path or region: "place 4 (kitchen)".
 
         Raises:
-            MapError: An argument is wrong.
+            MapError: `kind` is not "place", "path" or "region", or `number` is no whole number.
         """
         return f"{kind} {self.numbered(kind, number)}"
 
     def numbered(self, kind: str, number: int) -> str:
-        """Return the number of a place, path or region with its name, such as "4 (kitchen)".
+        """Return the number and name of a place, path or region, such as "4 (kitchen)".
 
         Raises:
-            MapError: An argument is wrong.
+            MapError: `kind` is not "place", "path" or "region", or `number` is no whole number.
         """
         name = self.name_of(kind, a_whole_number("number", number, MapError))
         return str(number) if name is None else f"{number} ({name})"
@@ -264,7 +264,7 @@ class SSHMap:
     def renumbered(self) -> SSHMap:
         """Return the same map with dstates, places and paths numbered by first visit.
 
-        Direction +1 of each path becomes the one in which the robot first faced along it.
+        Direction +1 of a path becomes the direction that the robot faced when it was first there.
         """
         visited = [
             self.dstates[s] for s in dict.fromkeys([*self.dstate_at, *range(len(self.dstates))])

@@ -76,8 +76,8 @@ def explain_pair(
         memory_limit: MiB, as for `solve`.
         max_maps: List at most this many minimal maps, and count those in which the steps are one
             dstate; None for all.
-        known: Maps of the trace that are known, such as those of a solution. The searches begin
-            with those that satisfy the theory, so that the best map that they find costs no more.
+        known: Maps of the trace that are known already, such as those of a solution. Searches begin
+            with the known maps that satisfy the theory, and never end with a worse map.
 
     Returns:
         The verdict. If it holds in every map, also an argument for it.

@@ -54,10 +54,13 @@ _log = log_of(__name__)
 class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
     """A scikit-learn estimator that learns to recognise dstates from images and actions.
 
-    It needs no place names. Given several traces of one building, it clusters the images of all
-    traces into views, and labels them all by the joint map of the traces. For each image, it finds
-    the most similar image of another trace. If several joint maps are minimal and `choose` is None,
-    it keeps the maps that put most of these pairs at one dstate.
+    A dstate (distinctive state) is a place and a heading. The learner needs no names of places.
+    Given several traces of one building, it clusters the images of all traces into views, and finds
+    a joint map of the traces. This map gives each image its label.
+
+    If several joint maps are minimal and `choose` is None, the images decide. The learner pairs
+    each image with the most similar image of another trace, and keeps the maps that put most of
+    these pairs at one dstate.
 
     Args:
         theory: The axioms; Theory.topological() by default.
@@ -65,8 +68,8 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
             It is cloned. The default is ViewClusterer(random_state=0). If the theory allows
             misread views, the default also has `isolated=10`: an image that is like no other one
             gets no view, and to treat it as misread costs little.
-        choose: Index of the map to take if several are minimal, from 0; None takes the first map,
-            and only the labels on which all maps agree.
+        choose: Index, from 0, of the minimal map to take. None takes the first map, but learns only
+            from the labels on which all minimal maps agree.
         time_limit: Seconds for finding the map; None for no limit.
         features: A transformer of scikit-learn that makes vectors of images. It is cloned. The
             default makes reciprocals of ranges, or is a PanoramaTransformer for panoramas.
@@ -168,9 +171,9 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
 
         Args:
             X: Images, (m, d), or traces with m steps in all.
-            y: The true dstates, (m,), as ids in `map_`; a negative one does not count. None
-                follows each trace on the map instead, and takes the dstates that its views allow
-                and that fit most images.
+            y: The true dstates, (m,), as ids in `map_`. Images with a negative one do not count.
+                None estimates the true dstates: it follows each trace on the map from each dstate,
+                and takes the walk that no view contradicts and that fits most images.
 
         Raises:
             LearnerError: `fit` was not called yet, images are given without `y`, no dstate is

@@ -154,9 +154,9 @@ class Explorer:
     Args:
         robot: The robot, with the methods `look`, `can` and `do`.
         theory: The axioms, and what to minimise; Theory.topological() by default.
-        margin: Doubt a return (two visits that the map has at one place) while some map without
-            this return has at most this many dstates more. 0 doubts nothing.
-        time_limit: Seconds for each step, and again for weighing each doubt. A step may take a
+        margin: A return is two visits that the map has at one place. A return is in doubt while a
+            map without it has at most this many dstates more. 0 doubts nothing.
+        time_limit: Seconds for each step, and as many again for each doubt. A step may take a
             little longer. None waits for exact answers.
         max_maps: Keep at most this many maps; None keeps all.
 

@@ -82,9 +82,9 @@ class Localiser:
         recogniser: A recogniser trained on the labels of this map, such as
             `BootstrapLearner.recogniser_`. The localiser then reads images instead of views. None
             reads views.
-        trace: The trace that was mapped, to estimate probabilities by counting (equation 3 of this
-            module). Its steps may contradict the map. None takes all probabilities as 0 or 1 from
-            the map's links and views (equation 4).
+        trace: The trace that was mapped. What a dstate shows and where actions lead are estimated
+            by counting steps of this trace. Its steps may contradict the map. If None, the views
+            and links of the map are taken as certain.
         chances: The probabilities of errors; Chances() by default.
 
     Raises:
@@ -92,7 +92,8 @@ class Localiser:
         TraceError: `trace` is not a Trace.
         LocaliserError: The recogniser has labels that are no dstates of the map, or `chances` is
             no Chances.
-        PerceptionError: The distances of the recogniser cannot be read.
+        PerceptionError: The recogniser is not fitted, or is no PlaceRecogniser or pipeline that
+            ends with one.
     """
 
     def __init__(
@@ -156,14 +157,14 @@ class Localiser:
         view: View | None = None,
         image: ArrayLike | None = None,
     ) -> Belief:
-        """Compute the belief after an action and the next observation (equation 2).
+        """Compute the belief after an action and the next observation.
 
         Without view and image, only the action counts.
 
         Args:
             belief: The belief before the action.
-            action: The action, or its name. If the map has turns that are compared by their
-                angles (`estimates.py`), a turn needs a bearing.
+            action: The action, or its name. If the turns of the map are named by their angles, such
+                as "turn 91.3", give a turn as an Action with its bearing.
             view: The view after it, for a localiser without a recogniser.
             image: The image after it, (d,), for a localiser with a recogniser: laser ranges in
                 metres, or whatever it was trained on.

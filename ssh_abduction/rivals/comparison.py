@@ -254,8 +254,8 @@ class Comparison:
 def compare(maps: Maps, other: Maps | None = None) -> Comparison:
     """Compare maps of one trace: what they share, where they differ, and which steps decide.
 
-    If a solution does not list all minimal maps, its backbone (what all minimal maps share) is
-    used. It may take as long to find as the time limit of the search.
+    If a solution does not list all minimal maps, what these share is read from its backbone, which
+    may know more than the listed maps show.
 
     Args:
         maps: A Solution, a Listing (`Listing.load` reads a file), or maps of one trace.

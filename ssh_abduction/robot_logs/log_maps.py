@@ -302,7 +302,7 @@ def map_log(
     Args:
         log: The robot's log; or the logs of several drives through one building. Nothing needs to
             be known of where a drive starts.
-        theory: The axioms; None for BARE, which uses neither stars nor sides.
+        theory: The axioms; None for BARE, which uses no stars, sides or paths.
         choices: Values of fields of Theory, by name. They replace those of the theory.
         width: The width of the robot in metres. It cannot pass narrower parts of the free space.
         name: The name of the trace, or the names of the drives. None for no name, or for "drive 1",

@@ -54,7 +54,8 @@ class Solution(MapSequence):
     whatever time they took.
 
     Attributes:
-        status: What is proven.
+        status: What is proven: maps are minimal (OPTIMAL), a map exists (FEASIBLE), none exists
+            (UNSATISFIABLE), or nothing (UNKNOWN).
         maps: The minimal maps (status optimal), or the best map found (feasible). With `within`,
             maps with more dstates follow.
         cost: The counts of the first map; None if there is no map. All minimal maps share the

@@ -64,8 +64,8 @@ class Theory:
             and paths).
         boundary: Whether the axioms about left and right of a path hold. none: they do not. strict:
             without exception. defeasible: with exceptions for pairs of paths, each at a cost.
-        symmetric_sides: Whether two paths cross where the robot turns from one onto the other. If
-            so, each goes on to both sides of the other one.
+        symmetric_sides: Whether two paths always cross where the robot turns from one onto the
+            other: each path then continues on both sides of the other path.
         path_order: Order of the places of a path. partial: some pairs may stay unordered. total:
             every two places are ordered.
         next_place: Whether a travel leads to the next place of its path, with no place between.
@@ -81,8 +81,8 @@ class Theory:
             its displacements.
         joint: How many returns (visits that come back to a place) are tested together. 1: each
             alone. 2: also pairs of them.
-        returns: Number of returns to a place or a dstate that may be true. `reject` is divided
-            among them. 0 counts them in the trace.
+        returns: Number of possible returns to a place or a dstate. Each is tested at the level
+            `reject` divided by this number. 0 counts the possible returns of the trace.
         misread: Cost in dstates, with one decimal, of treating a view or a star (the gateways seen
             at a place) as wrong; 0 forbids it.
         slipped: Cost in dstates of an action that did not do what its name says; 0 forbids it.
@@ -213,7 +213,7 @@ class Theory:
 
     @property
     def price_of_laying(self) -> float:
-        """The price in nats of laying a drive on others: that of LAID dstates, and their places."""
+        """The price in nats of the claim that a drive shares places with other drives."""
         dstate, place, _ = self.prices
         number = 1 if self.star == "alike" else LAID
         return number * (dstate + place if self.level == "topological" else dstate)

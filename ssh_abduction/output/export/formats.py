@@ -62,7 +62,8 @@ def export_map(
             map has any, and dstates otherwise. Must be None for "svg", and not "places" for "dot".
         name: The name of the map in nav2 and tmap2 files. In tmap2 it also names the pointset.
         frame: The name of the coordinate frame of the positions, in nav2 and tmap2 files.
-        turns: How actions turn, as in `to_svg`. The layout of a map without poses uses it.
+        turns: How actions turn, for the layout of a map without poses: the trace that was mapped,
+            or a dict from the name of an action to its turn, as in `to_svg`.
         hide_undecided: Whether nav2 and tmap2 files leave out each place that the robot only
             passed, always between the same two neighbours. One road then joins these neighbours.
 
