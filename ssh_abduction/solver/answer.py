@@ -32,11 +32,7 @@ class Answer:
         return None if self._last is None else cost_as_counted(*self._last, self._parts.task.theory)
 
     def take_down(self, ssh_map: SSHMap, cost: tuple[int, ...]) -> None:
-        """Record a map that was given to the caller.
-
-        Count it in its level: the maps of one cost. Maps come level by level. `cost` has the
-        preferred counts, the most important one first.
-        """
+        """Count a map that was given to the caller, with its preferred counts, in its level."""
         if self._last is None or self._last[1] != cost:
             self._levels.append(Level(cost_as_counted(ssh_map, cost, self._parts.task.theory), 0))
         self._first, self._last = self._first or ssh_map, (ssh_map, cost)

@@ -75,10 +75,7 @@ class Rivals:
         self.sharing.absorb(ssh_map)
 
     def reason(self) -> None:
-        """Prove what all minimal maps share. Do nothing if all minimal maps are listed.
-
-        At a limit, or after Ctrl-C, this returns without a proof.
-        """
+        """Prove what all minimal maps share, unless all are listed. A limit ends the proof."""
         if self.listed or self._proven or not self.reasons or not self.sharing.maps:
             return
         _log.info("looking for what all minimal maps share, from %d of them", self.sharing.maps)
@@ -91,10 +88,7 @@ class Rivals:
 
     @property
     def backbone(self) -> Backbone | None:
-        """The backbone as far as it is known; None if no minimal map is known.
-
-        It is `proven` if all minimal maps are listed, or if `reason` found a proof.
-        """
+        """The backbone as far as it is known; None if no minimal map is known."""
         return (
             self.sharing.backbone(proven=self.listed or self._proven) if self.sharing.maps else None
         )
@@ -132,11 +126,7 @@ class _Reasoning:
         self._task, self._judging, self._cost, self._sharing = task, judging, cost, sharing
 
     def settle_labels(self, engine: Engine) -> bool:
-        """Resolve all doubts, one labelling of minimal maps after the other.
-
-        Returns whether no doubt is left; False if this engine cannot list labellings, or cannot
-        forbid maps that the evidence rejects.
-        """
+        """Resolve all doubts, one labelling after the other. Return whether none is left."""
         forbidden = set[frozenset[Equality]]()
         while isinstance(engine, LabellingEngine):
             failed, refused = 0, None
@@ -193,10 +183,7 @@ class _Reasoning:
             size = self._settle_prefix(engine, size)
 
     def _first_size(self) -> int:
-        """Return the length of the shortest prefix that determines the classes of all later steps.
-
-        A shorter prefix cannot be enough for a proof.
-        """
+        """Return the length of the shortest prefix that determines the classes of later steps."""
         classes, actions = self._sharing.classes, self._task.log.actions
         if not self._task.speedups.prefixes:
             return len(classes)
@@ -237,11 +224,7 @@ class _Reasoning:
         )
 
     def _doubts(self, size: int) -> Iterator[Doubt]:
-        """Yield the doubts about the first `size` steps, each as (sort, step, step, one).
-
-        `sort` is what the two steps may share, such as "dstates". `one` says what the doubt is:
-        that they are one (True), or that they are not.
-        """
+        """Yield the doubts about the first `size` steps."""
         firsts = self._sharing.firsts()
         yield from (
             ("dstates", firsts[self._sharing.classes[t]], t, False) for t in self._entering(size)
@@ -249,10 +232,7 @@ class _Reasoning:
         yield from self._doubts_of_classes(size)
 
     def _doubts_of_classes(self, size: int) -> Iterator[Doubt]:
-        """Yield the doubts about classes of steps. Each class is given by its first step.
-
-        Two classes that are one in all known maps may differ in another map, or vice versa.
-        """
+        """Yield the doubts about classes of steps. Each class is given by its first step."""
         sharing = self._sharing
         firsts = [t for t in sharing.firsts() if t < size]
         for sort in sharing.sorts():

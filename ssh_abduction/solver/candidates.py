@@ -70,10 +70,7 @@ class Candidates:
         self._sketching = threading.Lock()
 
     def merge(self) -> None:
-        """Make a causal map by merging steps greedily. This is fast. The map need not be minimal.
-
-        For other theories, or without the speed-up `greedy`, do nothing.
-        """
+        """Make a causal map by merging steps greedily, if the theory is causal. This is fast."""
         if self._task.speedups.greedy and self._task.theory.level == "causal":
             self.offer(answer_maps.causal_map(self._task.log.merged(), self._task.trace))
 
@@ -118,10 +115,7 @@ class Candidates:
         yield from filter(self._judging.accepts, map(self._with_unknown_views, joining.maps()))
 
     def go_on(self, beam: Beam) -> None:
-        """Offer a sketch that begins with the map of a beam which did not reach the last step.
-
-        If later steps contradict the sketch, begin with a map of fewer steps.
-        """
+        """Offer a sketch that begins with the longest map of a beam that later steps allow."""
         before = self._known.best
         for first in beam.partial():
             done = self._task.trace.prefix(len(first.dstate_at))

@@ -26,10 +26,7 @@ STEPWISE_SHARE = 0.4
 
 
 def may_name(task: Task) -> bool:
-    """Whether to use an engine that gives dstates names, and finds them before places and paths.
-
-    The speed-up `names` has to be on, and the trace has to be longer than FEW_STEPS.
-    """
+    """Whether to use an engine that gives dstates names, and finds them before places and paths."""
     return task.speedups.names and len(task.trace) > FEW_STEPS
 
 
@@ -58,12 +55,7 @@ def new_engine(task: Task) -> Engine:
 
 
 def labelling_engine(task: Task, labels: Sequence[int]) -> Engine:
-    """Make the engine that suits the theory. It finds dstates before places and paths if it can.
-
-    Args:
-        task: The problem, the limits and the speed-ups.
-        labels: The dstate of each step in a map of the trace; empty if none is known.
-    """
+    """Make the engine that finds dstates first, if it can begin with these labels of a map."""
     engine = new_engine(task)
     if labels and isinstance(engine, StepEngine) and takes_all(task) and task.speedups.ways:
         from ssh_abduction.solver.engines.frameless import FramelessEngine

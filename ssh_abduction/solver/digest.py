@@ -48,10 +48,7 @@ class Digest:
         return cls(Trace(tuple(steps), drive="standing"), tuple(labels))
 
     def labels_of_all(self, found: SSHMap, ssh_map: SSHMap) -> tuple[int, ...]:
-        """Return the dstate of each step of all drives.
-
-        `found` is the map of the digest and the new drives, and `ssh_map` that of the old drives.
-        """
+        """Return the dstate of each step of all drives in the map `found`."""
         number = dict(zip(self.labels, found.dstate_at, strict=False))
         new = found.dstate_at[len(self.labels) :]
         return (*(number[s] for s in ssh_map.dstate_at), *new)

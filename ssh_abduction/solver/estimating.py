@@ -80,11 +80,7 @@ def _all_moved(best: Rival, visit: Sequence[int]) -> Iterator[Course]:
 
 
 def _moved(best: Rival, visit: Sequence[int], place: int, moved: Collection[int]) -> Course:
-    """Return the dstates and places of a map after some visits to a place get a new place.
-
-    `visit` has, for each step, the first step of its visit, and `moved` has the first steps of the
-    moved visits.
-    """
+    """Return the dstates and places of a map after some visits to a place get a new place."""
     at = best.places or best.dstates
     begins = _begins(at, visit)
     new = [name == place and begin in moved for name, begin in zip(at, begins, strict=True)]
@@ -121,10 +117,7 @@ def rival_of(ssh_map: SSHMap, nats: float) -> Rival:
 
 
 def least_places(problem: Problem) -> int:
-    """Return a lower bound on the places: the size of a set of steps pairwise at different places.
-
-    Only evidence is used to tell places apart.
-    """
+    """Return a lower bound on the places: the size of a set of steps that evidence tells apart."""
     if problem.theory.level == "causal":
         return 0
     import numpy as np

@@ -129,10 +129,7 @@ def salvage(parts: Parts) -> None:
 
 
 def best_map(parts: Parts) -> Iterator[Priced]:
-    """Yield the best map known with its cost, if no map was given so far.
-
-    The checker checks the map first, as far as there is time.
-    """
+    """Yield the best map known with its cost, after a check, if no map was given so far."""
     known, watch = parts.known, parts.watch
     watch.start()
     if known.status in (Status.FEASIBLE, Status.OPTIMAL) and not known.count and known.best:
@@ -146,10 +143,7 @@ def best_map(parts: Parts) -> Iterator[Priced]:
 
 
 def overtime(parts: Parts) -> float:
-    """Return the seconds that are left to make a map without a search, or to check one.
-
-    Parts of the search that could not be stopped may have used up some of this time.
-    """
+    """Return the seconds that are left to make a map without a search, or to check one."""
     limit = parts.limits.time_limit
     if parts.known.stopped != "time limit" or limit is None:
         return INTERRUPTED

@@ -273,10 +273,7 @@ class Poses:
         return coo_array((np.ones(len(first)), (first, second)), shape=(size, size)).tocsr()
 
     def _sigmas(self, axis: int) -> Array:
-        """Return the approximate standard deviation of each displacement, for one axis.
-
-        Axis 0 is x, 1 is y, both in metres, and 2 is the turn in radians.
-        """
+        """Return approximate standard deviations of the displacements in x, y or turn (0, 1, 2)."""
         sigmas: Array = 1 / np.sqrt((self._whitening[:, :, axis] ** 2).sum(1))
         return sigmas
 
@@ -402,10 +399,7 @@ class Poses:
         )
 
     def _open_rotations(self, unknown: Array, said: NDArray[np.int_]) -> int:
-        """Count the independent rotations of groups of headings that displacements leave open.
-
-        `said` has the numbers of the dstates that have displacements.
-        """
+        """Count the independent rotations of groups of headings that displacements leave open."""
         groups = np.unique(self._group[said])
         if len(groups) == len(np.unique(self._parts()[self._place[said]])):
             return len(groups)
@@ -416,10 +410,7 @@ class Poses:
         return int((np.linalg.eigvalsh(form) < 1e-6 * max(float(form.diagonal().max()), 1.0)).sum())
 
     def _poses(self, unknown: Array) -> tuple[Pose, ...]:
-        """Compute the pose and covariance of each dstate.
-
-        They are relative to the first dstate of its connected part of the map.
-        """
+        """Compute the pose and covariance of each dstate, relative to the first of its part."""
         at, heading = (
             unknown[: 2 * self._positions].reshape(-1, 2),
             unknown[2 * self._positions : -2],

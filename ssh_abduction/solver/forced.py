@@ -292,15 +292,7 @@ class Forcing:
     def __init__(
         self, problem: Problem, log: Log, misfit: Misfit, ssh_map: SSHMap, dstates: int = 0
     ) -> None:
-        """Chart the trace.
-
-        Args:
-            problem: The trace and its theory, for which `holds_for` is true.
-            log: The same trace as integers.
-            misfit: Computes misfits.
-            ssh_map: The best known map.
-            dstates: The least number of dstates that is proven.
-        """
+        """Chart the trace, for its best known map and the proven least number of dstates."""
         self._misfit, self._dstates = misfit, dstates
         dstate, place, _ = problem.theory.prices
         self._prices = dstate, place if problem.theory.level == "topological" else 0.0

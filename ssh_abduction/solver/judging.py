@@ -54,11 +54,7 @@ class Judging:
         return bool(self._evidence)
 
     def why_refused(self, ssh_map: SSHMap) -> frozenset[Equality] | None:
-        """Find a set of equalities of a map that contradicts some evidence; None if there is none.
-
-        Args:
-            ssh_map: A map of the trace or of a prefix.
-        """
+        """Find equalities of a map that contradict some evidence; None if there are none."""
         refusal = self.refusal(ssh_map)
         return refusal[1] if refusal else None
 
@@ -78,24 +74,13 @@ class Judging:
         return None
 
     def allows_grown(self, trace: Trace, ssh_map: SSHMap, since: int) -> bool:
-        """Whether no evidence rejects a map of a trace that has grown.
-
-        Later checks use this trace.
-
-        Args:
-            trace: The trace.
-            ssh_map: A map of all of its steps.
-            since: The number of first steps that the evidence has already accepted.
-        """
+        """Whether no evidence rejects a map of a longer trace, which later checks use."""
         self._trace = trace
         return not any(evidence.refuse(trace, ssh_map, since) for evidence in self._evidence)
 
     @cached_property
     def can_accept(self) -> bool:
-        """Whether all axioms of the theory can be checked on a map.
-
-        The checker knows the built-in axioms. clingo checks a user's own rules.
-        """
+        """Whether the checker, or clingo for a user's own rules, can check all axioms."""
         own = {axiom.name for rules in self._theory.rules for axiom in rules.axioms} | {
             rules.name for rules in self._theory.rules
         }
@@ -103,21 +88,13 @@ class Judging:
         return not others and own.isdisjoint(AXIOMS) and can_be_asked(self._theory)
 
     def accepts(self, ssh_map: SSHMap) -> bool:
-        """Whether a map of the whole trace satisfies all axioms and agrees with all evidence.
-
-        The result is also False if some axioms cannot be checked.
-        """
+        """Whether a map of the whole trace satisfies all axioms and agrees with all evidence."""
         accepted = self.accepts_grown(ssh_map, 0)
         self._accepted = ssh_map if accepted else self._accepted
         return accepted
 
     def accepts_grown(self, ssh_map: SSHMap, since: int) -> bool:
-        """Whether a map of the whole trace satisfies all axioms and agrees with all evidence.
-
-        Args:
-            ssh_map: The map.
-            since: The number of first steps that the evidence has already accepted.
-        """
+        """Do the same for a map whose first `since` steps the evidence has accepted already."""
         return (
             self.can_accept
             and next(violations(self._trace, ssh_map, self._theory), None) is None
@@ -148,20 +125,11 @@ class Judging:
         self._judged += 1
 
     def has_time_for(self, steps: int, elapsed: float) -> bool:
-        """Whether checking this many steps fits into the share of the search time for checking.
-
-        Args:
-            steps: The number of steps to check.
-            elapsed: The seconds that the search took so far.
-        """
+        """Whether checking this many steps fits into the share of the time for checking."""
         return self._shown and self._a_step * steps <= BEYOND + SHARE * elapsed - self._seconds
 
     def pass_grown_map(self, trace: Trace, ssh_map: SSHMap) -> None:
-        """Check a map of a trace that has grown. Later checks use this trace.
-
-        Raises:
-            InternalError: The map breaks an axiom.
-        """
+        """Check a map of a longer trace, which later checks use. Raises InternalError."""
         self._trace = trace
         self._check(ssh_map, len(trace))
 

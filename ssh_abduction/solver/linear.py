@@ -49,10 +49,7 @@ def system_solved(square: Any, added: Array, right: Any) -> Any:
 
 
 def least_squares(some: Any, values: Array, weights: Array) -> Array:
-    """Solve a system by weighted least squares. Of several solutions, return nearly the smallest.
-
-    The values are already multiplied by the weights of their equations.
-    """
+    """Solve a system by weighted least squares. Of several solutions return nearly the smallest."""
     system = weighted(some, weights)
     if isinstance(system, np.ndarray):
         return np.linalg.lstsq(system, values, rcond=1e-12)[0].astype(float)

@@ -64,10 +64,7 @@ def note(parts: Parts, ssh_map: SSHMap, cost: tuple[int, ...]) -> None:
 def by_count(
     parts: Parts, mended_maps: tuple[tuple[SSHMap, ...], bool] | None
 ) -> Generator[Priced, None, None]:
-    """Yield the minimal maps, then those with up to `within` dstates more, with their counts.
-
-    If mending the trace found minimal maps, `mended_maps` has them, and whether they are all.
-    """
+    """Yield the minimal maps, then those with up to `within` dstates more, with their counts."""
     known, limits = parts.known, parts.limits
     minimal, is_all = mended_maps or (parts.prefixes.minimal_maps(), True)
     yield from ((ssh_map, known.cost) for ssh_map in minimal)

@@ -196,11 +196,7 @@ class Mending:
             yield self._mended(found.map)
 
     def _by_cheapest_causal_maps(self) -> Iterator[Trace]:
-        """Yield the distinct traces that the cheapest causal maps mend.
-
-        These maps cost the same, but with places one mended trace may need more dstates than
-        another.
-        """
+        """Yield the distinct traces that the cheapest causal maps mend."""
         causal: list[SSHMap] = []
         found: dict[Trace, None] = {}
         for cheapest in self._causal.maps_of_cost((self.bound or 0,), MOST_CAUSAL):
@@ -237,11 +233,7 @@ class Mending:
                 yield from self._improving(self._minimal(slipped)[0], slipped)
 
     def _mended(self, causal: SSHMap) -> Trace:
-        """Mend the trace by the faults of a causal map.
-
-        Replace a wrong view by the view of another step at the same dstate, and a wrong action by
-        an unknown one.
-        """
+        """Mend the trace by the faults of a causal map. A wrong action becomes unknown."""
         wrong = {
             kind: {fault.step for fault in causal.faults if fault.kind == kind}
             for kind in ("misread", "slipped")
@@ -264,10 +256,7 @@ class Mending:
         return self._task.problem.changed(mended, self._without_faults)
 
     def _minimal(self, mended: Trace, seconds: float = math.inf) -> tuple[Found | None, bool]:
-        """Find the best map of a mended trace, as a map of the trace itself with faults.
-
-        Also return whether it is proven that this map is minimal, or that there is no map.
-        """
+        """Find the best map of a mended trace, with its faults, and whether that is proven."""
         if mended not in self._solved or not (self._solved[mended][1] or seconds < math.inf):
             maps, proven = self._maps_of(mended, 1, seconds)
             self._solved[mended] = self._as_found(maps[0], mended) if maps else None, proven
@@ -276,10 +265,7 @@ class Mending:
     def _maps_of(
         self, mended: Trace, most: int, seconds: float = math.inf
     ) -> tuple[list[SSHMap], bool]:
-        """Solve a mended trace, and list at most this many maps; 0 for all.
-
-        Returns minimal maps of the mended trace and True; or the best map known and False.
-        """
+        """Solve a mended trace: return minimal maps (0: all) and True, or the best and False."""
         maps, proven = self._solver(
             mended, self._without_faults, most, min(seconds, SHARE * self._task.watch.left())
         )

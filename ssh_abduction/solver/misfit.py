@@ -62,10 +62,7 @@ class Misfit:
     def of_course(
         self, dstates: Sequence[int], places: Sequence[int], wrong: Collection[int] = ()
     ) -> float:
-        """Compute the misfit (a chi-square) if each step is at a given dstate and place.
-
-        Steps at one dstate are at one place. The displacements to `wrong` steps are ignored.
-        """
+        """Compute the chi-square if steps are at these dstates and places; ignore `wrong` moves."""
         first_at: dict[int, int] = {}
         first_in: dict[int, int] = {}
         headings = [first_at.setdefault(name, t) for t, name in enumerate(dstates)]
@@ -81,10 +78,7 @@ class Misfit:
         return nats_of(Cost.of(ssh_map), self._theory) + self.of_map(ssh_map) / 2
 
     def returns_of(self, ssh_map: SSHMap) -> list[Equality]:
-        """List the returns of a map: each step with the last step at the same dstate or place.
-
-        All other returns follow from these. They are in the order of the later steps.
-        """
+        """List the returns of a map: each step with the last step at its dstate or place."""
         found: list[Equality] = []
         at_dstate: dict[int, int] = {}
         at_place: dict[int, int] = {}

@@ -34,11 +34,7 @@ class NearMinimal:
     def __init__(
         self, task: Task, judging: Judging, most: int, report: Callable[[], None], before: Asker
     ) -> None:
-        """Prepare an engine. The search begins with `maps`.
-
-        `most` is the number of maps wanted; 0 for all. `report` is called now and then. The times
-        of `before`, the asker of the search for minimal maps, are added to those of this engine.
-        """
+        """Prepare an engine for `most` maps (0: all). Its times begin with those of `before`."""
         self._task = replace(task, speedups=replace(task.speedups, prefixes=False))
         self._judging, self._most, self._report = judging, most, report
         names = readable.most_paths(task.trace, task.theory, len(task.trace))
@@ -77,9 +73,5 @@ class NearMinimal:
 
 
 def counted_first(theory: Theory) -> Count | None:
-    """Return the count in which listed maps may exceed the minimum.
-
-    It is the first count that the theory minimises, except excuses: "dstates", "places" or "paths".
-    None if there is no such count.
-    """
+    """Return the first count, except excuses, that a theory minimises; None if there is none."""
     return next((name for name in theory.priorities if name != "excuses"), None)

@@ -122,10 +122,7 @@ def _as_seen(trace: Trace) -> Trace:
 
 
 def _seen_otherwise(passage: Passage, drive: Drive, trace: Trace, ssh_map: SSHMap) -> str | None:
-    """Find the first step of a drive that saw a gateway otherwise than a person says it is.
-
-    The map says which steps of the drive are at the dstates of the corrected steps.
-    """
+    """Find the first step of a drive, at a corrected dstate, that saw the gateway otherwise."""
     drives = drives_of(trace)
     way_at = {ssh_map.dstate_at[step_of(drives, step)]: way for step, way in passage.seen}
     for t in range(drive.first, drive.stop):

@@ -163,10 +163,7 @@ def _kept_names(grown: SSHMap, ssh_map: SSHMap) -> Iterator[Name]:
 
 
 def _grown(ssh_map: SSHMap, old: Trace, problem: Problem) -> SSHMap | None:
-    """Make a map without a search: the existing map, and new places for the new drive.
-
-    None if a step contradicts it, or if the checker does not accept it.
-    """
+    """Add new places for a new drive to a map, without a search; None if that breaks an axiom."""
     sketch = sketch_beyond(ssh_map, old, problem.theory, homing=False)
     if first_contradiction(sketch, problem.trace) is not None:
         return None
@@ -287,10 +284,7 @@ def _with_assertions(
 
 
 def _weighed(found: Solution, old: int, ssh_map: SSHMap) -> Weighed | None:
-    """Return the costs of the maps found, with the rivals that keep the existing map.
-
-    The trace of the solution begins with all `old` steps of the old drives.
-    """
+    """Return the costs of the maps found, with the rivals that keep the existing map."""
     if found.weighed is None:
         return None
     dstates = ssh_map.dstate_at

@@ -90,11 +90,7 @@ class Prefixes:
         most: int,
         report: Callable[[], None],
     ) -> None:
-        """Prepare the search. `find_minimum` begins it, with this engine.
-
-        The results are added to what is known. `most` is the number of maps wanted; 0 for all.
-        `report` is called now and then to report progress.
-        """
+        """Prepare the search for `most` maps (0: all). `find_minimum` begins it."""
         self.engine = engine
         self._task, self._known, self._judging, self._most, self._report = (
             task,
@@ -108,10 +104,7 @@ class Prefixes:
         self.start = len(task.trace) if self._at_once else FIRST_PREFIX
 
     def find_minimum(self) -> None:
-        """Extend the prefix until one of its minimal maps replays to the end, or it has no map.
-
-        Set `known.status` to OPTIMAL or UNSATISFIABLE, and `known.best` to the map.
-        """
+        """Extend the prefix until one of its minimal maps replays to the end, or it has none."""
         size, steps = min(len(self._task.trace), self.start), len(self._task.trace)
         while True:
             if size == steps:
@@ -175,11 +168,7 @@ class Prefixes:
         return can_forbid and self.engine.forbid(equalities)
 
     def _minimise_known(self) -> Found | None:
-        """Find a minimal map under the rules that the engine has; None if there is none.
-
-        The evidence has not judged this map yet. If a map on the way replays to the end and is
-        better than the best known one, keep it.
-        """
+        """Find a minimal map under the rules that the engine has; None if there is none."""
         while True:
             minimal = None
             for found in self.engine.improving_maps(
@@ -209,11 +198,7 @@ class Prefixes:
         return whole and not self._judging.why_refused(self._whole(found.map, replayed))
 
     def _name_more_paths(self, cost: tuple[int, ...] | None) -> bool:
-        """Start a new control with more names for paths, if the proof of the minimum needs them.
-
-        `cost` has the preferred counts of a minimal map of the prefix; None if it has no map.
-        Returns whether there is a new control.
-        """
+        """Begin again with more names for paths, if the proof of this cost needs them."""
         if not isinstance(self.engine, StepEngine):
             return False  # names for paths are never short
         needed = paths_needed(self._task, self.engine.size, cost)

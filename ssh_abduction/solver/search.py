@@ -258,10 +258,7 @@ class Search:
                 yield complete
 
     def _found(self) -> Iterator[Priced]:
-        """Run the search, and yield each map with its preferred counts as it is found.
-
-        If no minimal map is found, yield the best map known.
-        """
+        """Run the search, and yield each map with its preferred counts as it is found."""
         if self._begun:
             raise SolverError(
                 "search: expected to be iterated once, got a second time; make another Search"

@@ -260,11 +260,7 @@ class Sharing:
         return self._kept[sort]
 
     def backbone(self, *, proven: bool) -> Backbone:
-        """Make the backbone from the maps so far.
-
-        Args:
-            proven: Whether it is proven that all minimal maps share this.
-        """
+        """Make the backbone from the maps so far. Say whether it is proven that all share it."""
         found = {sort: self._shared(kept) for sort, kept in self._kept.items()}
         return Backbone(
             found["dstates"], found.get("places"), found.get("paths"), found.get("courses"), proven

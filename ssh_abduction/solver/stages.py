@@ -116,10 +116,7 @@ class Stages:
         return bool(self.mended_maps)
 
     def _find_minimum_soon(self, seconds: float) -> bool:
-        """Find the minimal cost by growing prefixes, if that ends in these seconds.
-
-        It may take at most STEPWISE_SHARE of the time left. Returns whether it ended.
-        """
+        """Find the minimal cost by growing prefixes. Return False if that takes too long."""
         parts, watch = self._parts, self._parts.watch
         whole = watch.stage_ends
         ends = watch.elapsed() + min(seconds, choosing.STEPWISE_SHARE * watch.left())
@@ -134,10 +131,7 @@ class Stages:
         return True
 
     def _settle_dstates_first(self) -> None:
-        """Go on with an engine that finds dstates before places and paths.
-
-        Such an engine begins with a map. If no map is known or can be made, change nothing.
-        """
+        """Go on with an engine that finds dstates first, if there is a map to begin with."""
         parts, best = self._parts, self._parts.known.best
         labels = best.dstate_at if best else ()
         parts.candidates.sketch()

@@ -134,10 +134,7 @@ class Weighing:
         return [candidate for candidate in self.candidates if candidate.nats <= least]
 
     def guess(self, clashes: Callable[[], bool]) -> bool:
-        """Find some maps of little cost without clingo, in a share of the time (`beams.py`).
-
-        `clashes` is as in `Beams.search`. Returns whether the trace may have a map.
-        """
+        """Guess maps of little cost (`beams.py`). Return whether the trace may have a map."""
         return self._beams.search(clashes)
 
     def search(self, of_labels: OfLabels) -> None:
@@ -454,10 +451,7 @@ class _CostJudging(Judging):
         self._weighing = weighing
 
     def refusal(self, ssh_map: SSHMap) -> tuple[str, frozenset[Equality]] | None:
-        """Return what rejects a map, and the equalities to forbid; None if nothing rejects it.
-
-        A map is rejected by evidence, which is named, or by its "cost".
-        """
+        """Return the evidence, or "cost", that rejects a map, and equalities to forbid; or None."""
         if (found := super().refusal(ssh_map)) is not None:
             return found
         returns = self._weighing.too_expensive(ssh_map)

@@ -31,10 +31,7 @@ _under_way: set[clingo.SolveHandle] = set()  # the running searches of clingo, e
 
 @atexit.register
 def _end_all() -> None:
-    """End all running searches of clingo when Python exits.
-
-    A search whose answers are not read to the end still has a thread. It would abort Python.
-    """
+    """End all running searches of clingo when Python exits, as their threads would abort it."""
     for handle in list(_under_way):
         handle.cancel()
 
@@ -298,10 +295,7 @@ class Asker:
         conflicts: int,
         on_bound: Callable[[Sequence[int]], None] | None = None,
     ) -> Iterator[clingo.SolveHandle]:
-        """Run a search of clingo in its own thread. Leaving the context stops the search.
-
-        Arguments are as for `Asker.answers`. `project` is clingo's option of that name.
-        """
+        """Run a search of clingo in its own thread. Leaving the context stops the search."""
         configuration: Any = control.configuration.solve
         configuration.opt_mode, configuration.models, configuration.project = mode, models, project
         configuration.solve_limit = f"{conflicts},-1"

@@ -35,10 +35,7 @@ def now() -> float:
 
 
 def processor_clock() -> Callable[[], float]:
-    """Make a clock that counts the processor time of this thread.
-
-    On a busy machine it counts at least 1 / WAITING of the wall-clock time.
-    """
+    """Make a clock of this thread's processor time, at least 1 / WAITING of the wall-clock time."""
     used, began = time.thread_time(), now()
 
     def clock() -> float:
@@ -48,13 +45,7 @@ def processor_clock() -> Callable[[], float]:
 
 
 def check_limit(name: str, unit: str, limit: object) -> None:
-    """Raise SolverError if a limit is neither None nor a number above 0.
-
-    Args:
-        name: The name of the limit in the error message.
-        unit: Its unit in the error message.
-        limit: The limit.
-    """
+    """Raise SolverError if a limit is neither None nor a number above 0. Name it and its unit."""
     if (
         limit is not None
         and not (is_finite(limit) and limit > 0)
@@ -110,11 +101,7 @@ class Watch:
         self.interrupted = False
 
     def start(self, since: float | None = None) -> None:
-        """Let the clock run. If it runs already, do nothing.
-
-        Args:
-            since: Count from this time of the clock; None for the present time.
-        """
+        """Let the clock run, from `since` if it is given. If it runs already, do nothing."""
         if self._started is None:
             self._started = self._clock() if since is None else since
 
@@ -129,12 +116,7 @@ class Watch:
         return self._started is not None
 
     def use_reserve(self, last: float = 0.0) -> None:
-        """Allow the search to use the reserved part of the time limit, too.
-
-        Args:
-            last: The share of the limit that stays reserved. Time that is already allowed stays
-                allowed.
-        """
+        """Allow the search to use the reserved time, too, but not the `last` share of the limit."""
         if self._limit is not None and self._allowed is not None:
             self._allowed = max(self._allowed, self._limit * (1 - last))
 
@@ -196,10 +178,7 @@ class Watch:
             raise StageTimeError
 
     def later(self, seconds: float) -> Callable[[], None]:
-        """Make a `check` that ignores the time limit for some seconds of processor time.
-
-        So the work that it limits has the same result on a busy machine.
-        """
+        """Make a `check` that ignores the time limit for some seconds of processor time."""
         used = processor_clock()
 
         def check() -> None:
@@ -234,10 +213,7 @@ def resident_memory() -> float:
 
 
 def peak_memory() -> float:
-    """Return the largest memory in MiB that this process has used.
-
-    On Linux this reads /proc, as getrusage there also counts what the parent process used.
-    """
+    """Return the largest memory in MiB that this process, without its parent, has used."""
     with suppress(OSError, StopIteration), open("/proc/self/status", "rb") as status:
         return next(int(line.split()[1]) for line in status if line.startswith(b"VmHWM:")) / 2**10
     import resource

@@ -105,10 +105,7 @@ def keeps_own_rules(problem: Problem, ssh_map: SSHMap) -> bool:
 
 
 def _shown(trace: Trace, ssh_map: SSHMap) -> Iterator[str]:
-    """Yield the atoms that describe a map, as the readable encodings have them.
-
-    The name of a dstate or place is the number of the first step there. Paths are numbered from 1.
-    """
+    """Yield the atoms that describe a map. The first step at a dstate or place is its name."""
     first: dict[int, int] = {}
     place: dict[int, int] = {}
     # For each path, its number, and the direction that the first step along it faces.

@@ -43,11 +43,7 @@ EXAMPLE = (
 
 
 def check_rules(theory: Theory) -> None:
-    """Check the user's own rules in a theory in which no field is "auto".
-
-    Raises:
-        TheoryError: Clingo cannot read some rules, or would never ground them.
-    """
+    """Check the user's own rules in a settled theory. Raises TheoryError if one is not allowed."""
     for rules in theory.rules:
         others = tuple(other for other in theory.rules if other is not rules)
         _check(rules, others, encodings.needed_by(vars(theory)))
@@ -57,10 +53,7 @@ def check_rules(theory: Theory) -> None:
 
 @lru_cache(maxsize=64)
 def _check(rules: Rules, others: tuple[Rules, ...], files: tuple[str, ...]) -> None:
-    """Check a file of rules. Raises TheoryError if a rule is not allowed.
-
-    It may read the predicates that other files of rules define, and those of the encodings.
-    """
+    """Check a file of rules. Raises TheoryError if a rule is not allowed."""
     of_steps, known, numbers = _predicates(files)
     statements = _statements(rules)
     own = {
@@ -209,10 +202,7 @@ def _said(rules: Rules, messages: list[str]) -> str:
 
 
 def _check_safety(*files: Rules) -> None:
-    """Let clingo look for unsafe variables. Raises TheoryError if it finds one.
-
-    Clingo looks for them before it grounds a program. Ground nothing here, as that may take long.
-    """
+    """Let clingo find unsafe variables, without grounding. Raises TheoryError if there are some."""
     messages: list[str] = []
     control = clingo.Control(logger=lambda _, message: messages.append(message))
     try:
@@ -281,10 +271,7 @@ def _derived(head: ast.AST) -> Iterator[ast.AST]:
 
 
 def _atoms(statement: ast.AST) -> Iterator[tuple[ast.AST, bool]]:
-    """Yield the atoms that a rule reads: those in its body and in the conditions of its head.
-
-    Each atom comes with a flag that is False if `not` stands before the atom.
-    """
+    """Yield the atoms that a rule reads, each with a flag: False if `not` stands before it."""
     derived = list(_derived(statement.head))
     for literal in statement.body:
         yield from _atoms_in(literal)

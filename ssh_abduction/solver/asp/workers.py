@@ -313,10 +313,7 @@ _outputs: list[BinaryIO] = []  # the stream for answers, in a worker process
 
 
 def reply(answer: object) -> None:
-    """Send the answer of the current task to the parent process. Then end this process.
-
-    A task calls it if it cannot return. The parent process waits for the end.
-    """
+    """Send the answer of a task that cannot return, and then end this process."""
     _send(answer, ends=True)
 
 

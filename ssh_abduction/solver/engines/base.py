@@ -175,11 +175,7 @@ def listing(cost: tuple[int, ...]) -> str:
 
 
 def next_charted_size(size: int, failed: int, steps: int) -> int:
-    """Return the size to grow to, for an engine that compares all pairs of steps beforehand.
-
-    After the first prefix this is the whole trace, if it has at most `AT_ONCE` steps. `failed` is
-    the step that no map of the prefix explains.
-    """
+    """Return the size to grow to, for an engine that compares all pairs of steps beforehand."""
     if size < FIRST_PREFIXES:
         return min(steps, max(failed + 1, FIRST_PREFIXES))
     return steps if steps <= AT_ONCE else min(steps, max(failed + 1, 2 * size, AT_ONCE))

@@ -178,11 +178,7 @@ class Blocks:
         return end, known
 
     def _refuted(self, begin: int, end: int, most: int, tenths: int) -> bool:
-        """Whether clingo proves that a block has no map within these limits.
-
-        Each view has enough names for all dstates, so the rest (the one name that all dstates
-        without a name of their own share) is not needed.
-        """
+        """Whether clingo proves that a block has no map within these limits."""
         proven = self._proven.get((begin, end))
         if proven is None or proven[0] < most or proven[1] < tenths:
             seen, actions = self.seen[begin:end], self.actions[begin : end - 1]

@@ -144,10 +144,7 @@ class FramedPaths:
         return clashes or [self._clash(chart, labels)]
 
     def _clash(self, chart: FramedChart, labels: Sequence[int]) -> list[int]:
-        """Find one small clash by trial: leave out nodes while no paths fit the others.
-
-        This is for labels whose contradiction shows only after choosing which segments merge.
-        """
+        """Find one small clash by trial: leave out nodes while no paths fit the others."""
 
         def clashes(nodes: list[int]) -> bool:
             control = self.control(chart, labels, nodes=nodes)

@@ -92,11 +92,7 @@ class FramelessEngine:
         yield from islice(self._listed(self._labels_of(cost), listing(cost)), enough or None)
 
     def _listed(self, every: Iterable[list[int]], mode: str) -> Iterator[Found]:
-        """Yield the maps with these labels.
-
-        If displacements are used, maps that differ in their places come first. How well a map fits
-        the displacements depends only on its dstates and places.
-        """
+        """Yield the maps with these labels; with displacements, first those whose places differ."""
         left, sooner, first = iter(every), list[list[int]](), set[SSHMap]()
         while (
             self._task.theory.displacement == "use"

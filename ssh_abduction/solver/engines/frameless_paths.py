@@ -134,10 +134,7 @@ class PlacesAndPaths:
             self._give_axioms([key for key in self.named.program.names() if key in grounded])
 
     def forbid_together(self, equalities: Collection[Equality]) -> None:
-        """Exclude maps in which all of these equalities hold, if one of them is about places.
-
-        The engine `named` forbids sets with only equalities of dstates.
-        """
+        """Exclude maps in which all of these equalities hold, if one is about places."""
         if any(equality.of == "place" for equality in equalities):
             self._refused.append(equalities)
             self._forget_tight()
@@ -254,10 +251,7 @@ class PlacesAndPaths:
         )
 
     def _far_away(self, labels: Sequence[int]) -> list[_Far]:
-        """List the constraints of evidence about dstates that are not at one place.
-
-        Constraints on a single pair come first, each pair once. Sets of pairs come last.
-        """
+        """List the constraints of evidence about dstates that are not at one place, pairs first."""
         away = self._task.log.pairs.elsewhere.items()
         found = {
             (labels[i], labels[t]): (i, t) for t, others in away if t < len(labels) for i in others

@@ -157,10 +157,7 @@ class NameProgram:
             return _GivenNodes(spare, choices, np.zeros(len(seen), dtype=bool))
 
     def add(self, links: Iterable[Link]) -> None:
-        """Give clingo more links and the nodes at their ends, in batches.
-
-        Limits are checked between batches, as clingo cannot be stopped while it grounds one.
-        """
+        """Give clingo more links and the nodes at their ends, in batches. Check limits between."""
         added, before = list(links), self._asker.ground_seconds
         for start in range(0, len(added), AT_A_TIME):
             self._asker.watch.check()
@@ -259,10 +256,7 @@ class NameProgram:
             self.name_more(short)
 
     def _labels_by_view(self, labels: Sequence[int]) -> dict[int, list[int]]:
-        """List the labels of a map that no pinned node has, by their views.
-
-        Labels come in the order in which clingo was given the first node of each.
-        """
+        """List the labels of a map that no pinned node has, by their views."""
         pinned = {labels[node] for node in self.pinned.clique}
         found: dict[int, dict[int, None]] = {}
         for node in (end for t, _, u in self._known.links for end in (t, u)):
@@ -271,10 +265,7 @@ class NameProgram:
         return {view: list(some) for view, some in found.items()}
 
     def literals_of(self, labels: Sequence[int]) -> list[int]:
-        """Return the literals that give nodes the names of their dstates in a map.
-
-        The name of a label is that of its pinned node, or a spare name of its view.
-        """
+        """Return the literals that give nodes the names of their dstates in a map."""
         name_of = {labels[node]: name for name, node in enumerate(self.pinned.clique)}
         for view, some in self._labels_by_view(labels).items():
             name_of |= dict(zip(some, self._known.spare[view], strict=False))

@@ -64,10 +64,7 @@ class NameSearch:
         self._had_all_help = False  # whether maps near a guess were sought already
 
     def improving(self) -> Iterator[list[int]]:
-        """Yield labels of all nodes. The labels that are yielded last have the fewest dstates.
-
-        If the search takes long, other labels are yielded before.
-        """
+        """Yield labels of all nodes. The labels that are yielded last have the fewest dstates."""
         known = self._incumbent
         if not self._program.chart.links:
             yield [0]
@@ -149,10 +146,7 @@ class NameSearch:
 
     @property
     def _may_help(self) -> bool:
-        """Whether to look for small maps in other ways.
-
-        They are maps of the causal theory, so they are of no use if there are further axioms.
-        """
+        """Whether to look for small maps in other ways, which know the causal axioms only."""
         return self._fitting is None and (
             self._task.speedups.greedy or self._task.speedups.annealed
         )
@@ -176,10 +170,7 @@ class NameSearch:
             yield from self._fewer(self._incumbent.labels)
 
     def _fewer(self, labels: list[int]) -> Iterator[list[int]]:
-        """Yield maps with fewer and fewer dstates than a known one, while clingo finds them soon.
-
-        If clingo proves that there is none, the last map is minimal, and the bound says so.
-        """
+        """Yield maps with ever fewer dstates than a known one, while clingo finds them soon."""
         self._program.make_room_for(labels)
         # Clasp begins each search with the choices of its last answer. So ask for this map first.
         self._asker.verdict(names_lp.read_names, self._program.literals_of(labels), FEWER[0])
@@ -199,10 +190,7 @@ class NameSearch:
     def _with_fewer(
         self, labels: Sequence[int], conflicts: int
     ) -> tuple[dict[int, int] | None, bool]:
-        """Ask for an answer with fewer dstates, first for one without rests.
-
-        Returns the answer, if clingo found one, and whether it proved that there is none.
-        """
+        """Ask for an answer with fewer dstates. Also say whether it is proven that none exists."""
         most = len(set(labels)) - 1 - len(self._program.pinned.clique)
         if most < 0:
             return None, True

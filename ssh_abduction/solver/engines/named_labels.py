@@ -167,11 +167,7 @@ class NamedLabels:
         }
 
     def improving(self) -> Iterator[list[int]]:
-        """Yield labels of all steps of the prefix of the trace.
-
-        The labels that are yielded last have the fewest dstates. If the search takes long, other
-        labels are yielded before.
-        """
+        """Yield labels of all steps of the prefix. The last ones have the fewest dstates."""
         assert self._search is not None  # `grow` comes first
         known = self._incumbent
         # Evidence about places may have refused the places of a known map since it was found.

@@ -135,10 +135,7 @@ class StepEngine:
         return True
 
     def ask_for(self, number: int, count: Count) -> None:
-        """From now on, ask only for maps with an exact number of dstates, places or paths.
-
-        The prefix must not grow any more.
-        """
+        """Ask only for maps with exactly this count from now on. The prefix must not grow."""
         if self._number is not None:
             self.asker.control.release_external(further_rules.of_number(*self._number))
         self._number = number, count
@@ -168,10 +165,7 @@ class StepEngine:
 
 
 def paths_needed(task: Task, size: int, cost: tuple[int, ...] | None) -> int:
-    """Return how many names for paths are enough to prove a cost, and to list all maps with it.
-
-    `cost` is that of the maps of the prefix; None if it is unknown.
-    """
+    """Return how many names for paths are enough to prove a cost, and to list all maps with it."""
     theory = task.theory
     segments = readable.most_paths(task.trace, theory, size)
     first = theory.priorities[0] if theory.priorities else None

@@ -120,10 +120,7 @@ class VisitLabels:
             return True
 
     def _order_of_choice(self, chart: FramedChart) -> list[int]:
-        """Set `clique`, and return the nodes in the order of choice.
-
-        The clique comes first, then the nodes that can share a dstate with the fewest others.
-        """
+        """Set `clique`, and return it and the other nodes, those that are apart from most first."""
         apart = chart.apart()
         self._asker.watch.check()
         self.clique = clique(apart, chart.seen) if self._task.speedups.clique else []

@@ -185,10 +185,7 @@ class VisitProgram:
         return intransitive(pairs, self._known.fits, self.chart)
 
     def located(self, pairs: Iterable[Pair]) -> Located:
-        """Locate all visits of the chart by the pairs that are at one place in a transitive answer.
-
-        If the places of all visits do not follow, the visits needed next are returned.
-        """
+        """Locate all visits by the pairs in a transitive answer, or say which visits are missed."""
         first: dict[int, tuple[int, int]] = {}
         for i, j, r in sorted(pairs):
             first.setdefault(j, (i, r))

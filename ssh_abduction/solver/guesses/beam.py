@@ -224,10 +224,7 @@ class Beam:
         return self._settled(valid)
 
     def _settled(self, beam: list[Hypothesis]) -> list[Hypothesis]:
-        """Fit the poses of hypotheses anew, compute their costs by these, and sort them by cost.
-
-        Do this only if the equations are not linear enough. Otherwise return the beam as it is.
-        """
+        """Fit the poses of hypotheses anew, if they are rough, and sort the hypotheses by cost."""
         if not self._reckoning.is_rough:
             return beam
         settled = []
@@ -276,10 +273,7 @@ class Beam:
         )
 
     def _map(self, found: Hypothesis, since: int) -> SSHMap | None:
-        """Make the map of a hypothesis; None if it contradicts the axioms or the evidence.
-
-        Its first `since` steps were checked against the evidence already.
-        """
+        """Make the map of a hypothesis; None if it contradicts the axioms or the evidence."""
         look_at_clock()
         steps = len(found.labels)
         trace, theory = self._mended(found), self._bare.of_steps(0, steps)

@@ -246,8 +246,5 @@ class Classes:
 
 
 def _is_ahead(ranked: Sequence[tuple[int, int]], evidence: int) -> bool:
-    """Whether the evidence for the best merge exceeds that for the next best by at least this much.
-
-    `ranked` has pairs (evidence, dstate), the best first. A single one is compared with 0.
-    """
+    """Whether the evidence for the best merge exceeds that for the next best by this much."""
     return ranked[0][0] >= evidence + (ranked[1][0] if len(ranked) > 1 else 0)

@@ -43,26 +43,14 @@ _Seen = tuple[int, Star]
 
 
 def sketches_of(first: Step, theory: Theory) -> list[Sketch]:
-    """Make a sketch of each kind. Kinds that usually give smaller maps come first.
-
-    Args:
-        first: The first step.
-        theory: The theory.
-    """
+    """Make a sketch of each kind. Kinds that usually give smaller maps come first."""
     if _is_gated(theory):
         return [GatewaySketch(first, theory, homing) for homing in (True, False)]
     return Sketch.all_of(first, theory)
 
 
 def sketch_beyond(ssh_map: SSHMap, trace: Trace, theory: Theory, homing: bool = True) -> Sketch:
-    """Make a sketch that begins with a map of a trace.
-
-    Args:
-        ssh_map: The map. It has to satisfy all axioms.
-        trace: The trace of the map.
-        theory: The theory.
-        homing: As for any sketch.
-    """
+    """Make a sketch that begins with a map of a trace, see `Sketch.beyond`."""
     kind = GatewaySketch if _is_gated(theory) else Sketch
     return kind.beyond(ssh_map, trace, theory, homing)
 

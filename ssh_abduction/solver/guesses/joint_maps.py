@@ -110,10 +110,7 @@ class Joining:
             yield from self._beside(best)
 
     def _all_joined(self, parts: list[Part], anchors: _Anchors, start: _Pair) -> list[Part]:
-        """Join maps, those with the best anchor first, until no more can be joined.
-
-        `anchors` are those of each pair of maps, and `start` is the pair that is joined first.
-        """
+        """Join maps, first the pair `start`, then those with the best anchor, while any can be."""
         pair = start
         while anchors:
             ways = anchors.pop(pair)

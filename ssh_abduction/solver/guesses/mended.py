@@ -56,10 +56,7 @@ def mended_sketch(trace: Trace, theory: Theory) -> SSHMap | None:
 
 
 def first_contradiction(sketch: Sketch, trace: Trace) -> int | None:
-    """Extend a sketch to the end of a trace.
-
-    If a step contradicts it, stop there and return this step.
-    """
+    """Extend a sketch to the end of a trace, or return the step that contradicts it."""
     done = len(sketch.labels)
     later = each_looking(zip(trace.actions[done - 1 :], trace.steps[done:], strict=True))
     reaches_end = all(sketch.extend(action, step) for action, step in later)
@@ -67,10 +64,7 @@ def first_contradiction(sketch: Sketch, trace: Trace) -> int | None:
 
 
 def _mended(trace: Trace, mended: Trace, sketch: Sketch, theory: Theory) -> Trace | None:
-    """Mend the step that contradicts a sketch: its view and star, or else the action before it.
-
-    `mended` is the trace with the faults that were mended before. The sketch has all steps before.
-    """
+    """Mend the step that contradicts a sketch: its view and star, or else the action before it."""
     t, steps = len(sketch.labels), list(mended.steps)
     action = mended.actions[t - 1]
     right = _right(mended, sketch, theory) if theory.misread else None

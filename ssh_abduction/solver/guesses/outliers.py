@@ -71,10 +71,7 @@ def wrong_displacements(
 
 
 def _returns(sites: Sequence[int | None]) -> Iterator[tuple[int, int]]:
-    """Yield the returns: pairs of steps at one site, with only other sites in between.
-
-    A site is a dstate or a place. Steps that follow each other are no return.
-    """
+    """Yield the returns: pairs of steps at one dstate or place, with only others in between."""
     last: dict[int, int] = {}
     for t, site in enumerate(sites):
         if site is None:

@@ -316,10 +316,7 @@ class Overlay:
         return None if math.isinf(unlikely[i, j]) else (int(places[i]), int(places[j]))
 
     def _tried(self, dstates: list[tuple[int, int]], places: tuple[int, int] | None = None) -> bool:
-        """Merge some dstates or two places, and all that follows, if this costs less than before.
-
-        Returns whether they are merged. If not, nothing changes.
-        """
+        """Merge dstates or places, and all that follows, if this costs less. Tell if it does."""
         before = self._state
         self._state = before.copy()
         try:
@@ -435,10 +432,7 @@ class Overlay:
 
 
 def _merged(kept: frozenset[int], first: int, second: int) -> frozenset[int]:
-    """Name a group by its first member, if it has a member that is kept.
-
-    Raises _ClashError if both members are kept.
-    """
+    """Name a group by its first member, if a member is kept. Raises _ClashError if both are."""
     if {first, second} <= kept:
         raise _ClashError
     return kept - {second} | {first} if second in kept else kept

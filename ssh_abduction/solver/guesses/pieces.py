@@ -131,10 +131,7 @@ def closed(found: Hypothesis, dstate: int, turn: float) -> Hypothesis:
 
 
 def _turned(found: Hypothesis, angle: float, centre: int) -> Hypothesis:
-    """Turn all poses of the piece of the robot about a centre, with their covariance.
-
-    The angle is in radians, counterclockwise. `centre` is the index of its x in the means.
-    """
+    """Turn all poses of the piece of the robot about a centre (its entry), by radians."""
     n, pieces = len(found.mean) - 3, found.pieces
     places = zip(found.position, pieces.of_place, strict=True)
     headings = zip(found.heading, pieces.of_heading, strict=True)

@@ -235,10 +235,7 @@ class Explainer:
 
 
 def robust_maps(explainer: Explainer) -> Iterator[Explained | None]:
-    """Yield explanations of a trace, each cheaper than the one before, one for each start of EM.
-
-    The item is None if that start led to no cheaper explanation.
-    """
+    """Yield an explanation for each start of EM; None if it costs no less than earlier ones."""
     rng = np.random.default_rng(0)
     dearer = [round(DEARER * max(found)) for found in zip(*explainer.price.values(), strict=True)]
     soft = replace(explainer, price={"misread": dearer, "slipped": dearer, **explainer.price})

@@ -191,10 +191,7 @@ class Sampler:
         return int((self._transitions.totals - self._transitions.counts.max(axis=1)).sum())
 
     def _choose(self, power: float) -> _DrawnStates:
-        """Choose LIKELY states for each visit at random, weighted by probability.
-
-        The last drawn state is always among them.
-        """
+        """Choose LIKELY states for each visit at random, weighted by probability."""
         likely = self._transitions.likely(self._transitions.entries(self._options), power)
         drawn = (self._options == self.labels[:, None]).argmax(axis=1)
         starts, lengths = self._stretches(0)
@@ -240,10 +237,7 @@ class Sampler:
         self._transitions.count(self.labels)
 
     def _stretches(self, first: int) -> tuple[States, States]:
-        """Divide the visits into stretches of STRETCH visits. Return first visits and lengths.
-
-        The second stretch begins at visit `first` or, if that is 0, the first one does.
-        """
+        """Divide the visits into stretches of STRETCH visits. Return their starts and lengths."""
         starts = np.unique(np.append(0, np.arange(first, len(self._visits), STRETCH)))
         return starts, np.diff(np.append(starts, len(self._visits)))
 

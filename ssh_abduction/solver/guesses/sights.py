@@ -179,10 +179,7 @@ def _smaller(star: Star, less: int) -> tuple[Frame, ...]:
 
 @lru_cache(maxsize=2**14)
 def _may_face_alike(first: Star, second: Star, changes: int) -> bool:
-    """Whether a robot may face the same way where it sees two stars of one place.
-
-    Up to `changes` gateways may have changed.
-    """
+    """Whether a robot may face one way where it sees two stars of a place that changed."""
     return any(
         "alike" in may_face(frame, other, shift)
         for frame, other in _equally_large(first, second)

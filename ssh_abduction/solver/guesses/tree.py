@@ -114,14 +114,7 @@ class Sketch:
 
     @classmethod
     def all_of(cls, first: Step, theory: Theory) -> list[Sketch]:
-        """Make a sketch of each kind, with and without frames and `homing`.
-
-        The kinds that usually give smaller maps come first.
-
-        Args:
-            first: The first step.
-            theory: The theory.
-        """
+        """Make a sketch of each kind. Kinds that usually give smaller maps come first."""
         framed = (
             [True, False] if theory.level == "topological" and theory.star != "frame" else [False]
         )
@@ -240,10 +233,7 @@ class Sketch:
         return next((x for x in s.reverse if self._states[x].seen == seen), None)
 
     def _turned_around(self, here: int, there: int) -> None:
-        """Add a turn around between two dstates.
-
-        If one of them has a course (a path and its direction), the other gets the reverse.
-        """
+        """Add a turn around between two dstates, which get reverse courses."""
         self._states[here].reverse.append(there)
         self._states[there].reverse.append(here)
         for s in (self._states[here], self._states[there]):
@@ -271,10 +261,7 @@ class Sketch:
         return there
 
     def _known_ahead(self, place: int, path: int, direction: int, step: Step) -> int | None:
-        """Return the dstate at which a travel to a known place ends.
-
-        None if the step contradicts what was seen at the place.
-        """
+        """Return the dstate at which a travel to a known place ends; None if the step differs."""
         there = self._along.get((place, path, direction))
         heading = 0
         if there is None and self._framed:

@@ -103,10 +103,7 @@ class Merging:
         self._misfits = self._misfitting(pairs)
 
     def start_from(self, places: Sequence[tuple[int, int] | None]) -> None:
-        """Merge the visits that a map has at one place.
-
-        Each step has its place and the slot there that it faces; None if unknown.
-        """
+        """Merge the visits that a map has at one place, given the place and slot of each step."""
         first: dict[int, _Turned] = {}
         for number, visit in enumerate(self.visits):
             step, _ = visit.steps[0]
@@ -217,10 +214,7 @@ class Merging:
         return misfits
 
     def _candidates(self) -> list[tuple[int, int, int]]:
-        """List at most `MOST_PAIRS` pairs of groups that may be one place.
-
-        For (I, J, R), slot K of group I would be slot K + R of group J.
-        """
+        """List at most MOST_PAIRS pairs (I, J, R): slot K of group I may be slot K + R of J."""
         some = np.array(sorted(self._groups))
         turns, first, second = np.nonzero(
             ~self._misfits[:, some[:, None], some]

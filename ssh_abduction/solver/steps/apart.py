@@ -169,10 +169,7 @@ class _Clique:
     group: int
 
     def joined(self, other: _Clique, *, apart: bool) -> _Clique:
-        """Return a largest clique of the union of this group and another one.
-
-        If `apart`, each step of one group is apart from each step of the other. If not, none is.
-        """
+        """Return a largest clique of two groups whose steps are all, or never, `apart`."""
         group = self.group + other.group
         if apart:
             more = len(self.steps) * other.group + len(other.steps) * self.group
@@ -189,11 +186,7 @@ def _ranked(keys: NDArray[np.int_]) -> NDArray[np.int_]:
 
 
 def clique(apart: Matrix, seen: Sequence[int]) -> list[int]:
-    """Find a large clique of nodes greedily: a sorted list of nodes that are pairwise apart.
-
-    Nodes with different views are always apart. So grow a clique for each view and join them.
-    `apart` is a matrix of nodes x nodes.
-    """
+    """Grow a clique greedily among the nodes of each view, and return all of them, sorted."""
     shown = np.asarray(seen)
     found: list[int] = []
     for view in range(int(shown.max()) + 1):
@@ -211,10 +204,7 @@ def large_clique(apart: Matrix) -> list[int]:
 
 
 def _greedy_clique(apart: Matrix) -> list[int]:
-    """Grow a clique greedily, and improve it by swaps.
-
-    A swap removes some nodes and grows the clique again. Keep the result unless it is smaller.
-    """
+    """Grow a clique greedily, and improve it: remove some of its nodes, and grow it again."""
     random = np.random.default_rng(0)
     best = grown_clique(apart, [], random)
     for _ in range(min(SWAPS, len(apart) // 8) if 1 < len(best) < len(apart) else 0):

@@ -96,10 +96,7 @@ class Certificate:
         return {"clique": list(self.clique), "words": words, "refuted": list(self.refuted)}
 
     def _pairs_alike(self, trace: Trace) -> Iterator[tuple[int, int]]:
-        """Yield the pairs of steps of the clique that show the same view, in order.
-
-        This does not visit the other pairs, as there may be millions of them.
-        """
+        """Yield only the pairs of steps of the clique that show the same view, in order."""
         alike: dict[View | None, list[int]] = {}
         for step in self.clique:
             alike.setdefault(trace.steps[step].view, []).append(step)

@@ -231,10 +231,7 @@ class FramedChart(Chart):
         return replace(self, elsewhere=self.elsewhere | frozenset(more))
 
     def apart(self) -> NDArray[np.bool_]:
-        """Return the pairs of nodes that are apart, as a matrix of flags, nodes x nodes.
-
-        Two nodes are apart if their visits cannot be at one place with both nodes facing one slot.
-        """
+        """Return the pairs of nodes that are apart, as a matrix of flags, nodes x nodes."""
         import numpy as np
 
         visits, slots = np.asarray(self.facing).T
@@ -264,10 +261,7 @@ class FramedChart(Chart):
 
     @cached_property
     def fitting(self) -> NDArray[np.int_]:
-        """For each n from 0: how many triples `fits` would list for the first n visits.
-
-        They are only counted, as there may be too many to list.
-        """
+        """For each n from 0: how many triples `fits` would list for the first n visits."""
         import numpy as np
 
         return np.cumsum([0, *np.count_nonzero(np.triu(~self.misfits, 1), axis=(0, 1))])

@@ -141,10 +141,7 @@ def ends(frame: Frame) -> list[str]:
 
 
 def heading(first: Frame, then: Frame, shift: int) -> int:
-    """Return the heading in the later frame, in whole degrees clockwise from that in the first.
-
-    It is the middle of the possible rotations; 0 if any rotation is possible, or none.
-    """
+    """Return the middle of the possible rotations in degrees clockwise; 0 if all or none are."""
     return middle_of_bits(rotation_bits(first, then, shift)) if first.slots == then.slots else 0
 
 

@@ -119,11 +119,7 @@ class _VisitLocaliser:
         return set(np.flatnonzero(self._fits[visit]).tolist())
 
     def _after(self, possible: set[State], visit: int) -> set[State]:
-        """Return the possible states of the next visit.
-
-        If the map lacks a link for the action from one of the states, any state that fits the next
-        visit is possible.
-        """
+        """Return the possible states of the next visit: all that fit, if a link is unknown."""
         slot, action = self._leaves[visit]
         there = {self._leads.get((faced(state, slot), action)) for state in possible}
         if not there or None in there:

@@ -81,10 +81,7 @@ class Log:
         pairs: Pairs | None = None,
         evidence: tuple[Evidence, ...] | None = None,
     ) -> None:
-        """Number the actions and observations. The theory has no field that is "auto".
-
-        If `pairs`, the evidence about pairs of steps, is None, it is found when it is first used.
-        """
+        """Number the actions and observations. Without `pairs`, find these when first used."""
         self._pairs, self._find = pairs, partial(pairs_of, trace, theory, evidence)
         actions: dict[str, int] = {}
         seen: dict[object, int] = {}

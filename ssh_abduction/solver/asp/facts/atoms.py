@@ -16,10 +16,7 @@ def constant(value: str | int) -> str:
 
 @lru_cache(maxsize=2**14)
 def read_atom(symbol: Symbol) -> tuple[str, tuple[int, ...]]:
-    """Return the name of an atom and its arguments as numbers; pos is 1 and neg is -1.
-
-    Results are cached: answers share most atoms, and each part of an atom takes a call to clingo.
-    """
+    """Return the name of an atom and its arguments as numbers; pos is 1 and neg is -1."""
     return symbol.name, tuple(
         arg.number if arg.type is SymbolType.Number else COURSE[arg.name]
         for arg in symbol.arguments

@@ -52,11 +52,7 @@ def dstates_and_faults_up_to(dstates: int, tenths: int) -> str:
 
 
 def faulty_base(actions: Iterable[int], names: Mapping[int, int], kinds: Iterable[str]) -> str:
-    """Return the facts for the names, the actions and the allowed kinds of faults.
-
-    Actions are numbers. `names` has, for each view, the number of its names without the rest.
-    `kinds` are of "misread" and "slipped".
-    """
+    """Return the facts for the names of each view, the actions and the allowed kinds of faults."""
     found = [f"action({action})." for action in sorted(set(actions))]
     found += [f"allowed({kind})." for kind in kinds]
     for view, some in groupby(faulty_names(names), key=itemgetter(1)):
@@ -117,10 +113,7 @@ def not_all_one(equalities: Collection[Equality]) -> str:
 
 
 def read_faulty(model: Model) -> tuple[dict[int, int], frozenset[int], frozenset[int]]:
-    """Read the dstate (a name) of each step, the slipped steps, and the misread steps left open.
-
-    A misread step is left open if the answer does not say at which dstate it is.
-    """
+    """Read the dstate of each step, the slipped steps, and the misread steps without a dstate."""
     where: dict[int, int] = {}
     steps: dict[str, set[int]] = {"slips": set(), "lost": set()}
     for name, args in map(read_atom, model.symbols(shown=True)):

@@ -156,10 +156,6 @@ def not_together(number: int, pairs: Sequence[tuple[int, int]]) -> str:
 def forbidden_links(
     links: Iterable[tuple[int, int, int]], placed: Iterable[tuple[int, int]] = ()
 ) -> str:
-    """Return the rule that some links do not all hold while some steps are at certain dstates.
-
-    Links are triples of a name, an action, and the name that it leads to. `placed` are pairs of a
-    step and the name of its dstate.
-    """
+    """Return the rule that some links do not all hold while some steps have certain names."""
     body = [f"goes({s},{a},{x})" for s, a, x in links] + [f"is({t},{s})" for t, s in placed]
     return f":- {', '.join(body)}."

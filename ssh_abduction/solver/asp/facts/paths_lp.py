@@ -106,10 +106,7 @@ def settled_facts(
     *,
     single: bool = False,
 ) -> str:
-    """Return the facts for paths_framed.lp about the labels of some nodes of a chart.
-
-    `single` is as in `paths_frameless_facts`.
-    """
+    """Return the facts for paths_framed.lp about the labels of some nodes of a chart."""
     facts = [
         settled_labels((node, labels[node]) for node in nodes),
         *(["single."] if single else []),
@@ -198,10 +195,7 @@ def pinned_facts(segments: Iterable[int]) -> str:
 
 
 def read_elsewhere(model: Model) -> list[tuple[int, int]]:
-    """Read the pairs of dstates that are at different places by paths_framed.lp.
-
-    If no places and paths fit the dstates, the list is empty.
-    """
+    """Read the pairs of dstates that are at different places; none if no paths fit the dstates."""
     found = [read_atom(symbol) for symbol in model.symbols(shown=True)]
     if any(name == "violated" for name, _ in found):
         return []
@@ -214,10 +208,7 @@ def settled_labels(labels: Iterable[tuple[int, int]]) -> str:
 
 
 def open_labels(labels: Sequence[int]) -> str:
-    """Return the rules that let clingo keep or drop the label of each node.
-
-    An answer is a set of kept labels that no places and paths fit.
-    """
+    """Return the rules by which an answer is a set of labels of nodes that no paths fit."""
     return "\n".join(
         [
             *(f"{{ is({node},{label}) }}." for node, label in enumerate(labels)),
