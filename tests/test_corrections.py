@@ -265,9 +265,13 @@ def test_gateways_are_opened_and_closed(folder: Path, capsys: pytest.CaptureFixt
     assert "it contradicts the trace: the robot" in capsys.readouterr().err
 
 
+@pytest.mark.filterwarnings("ignore:traces 1 and 2 have the same steps")
 @pytest.mark.parametrize("onto", [False, True])
 def test_a_later_drive_that_saw_the_gateway_as_before_is_warned_of(
-    onto: bool, folder: Path, capsys: pytest.CaptureFixture[str]
+    onto: bool,
+    folder: Path,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """A person opens a gateway that was closed on Monday. On Tuesday it was closed, too."""
     stars = (1, 0, 0, 0), (0, 0, 1, 0)
@@ -284,13 +288,32 @@ def test_a_later_drive_that_saw_the_gateway_as_before_is_warned_of(
         last = ["solve", str(folder / f"{names[-1]}.jsonl"), "--onto", maps, "--corrections", file]
         assert main(solving(folder, "monday")) == 0
         capsys.readouterr()
-        assert main(last if onto else solving(folder, *names)) == 0
-        return capsys.readouterr().err
+        assert main([*last, "-o", maps] if onto else solving(folder, *names)) == 0
+        told = capsys.readouterr().err
+        assert main(["compare", maps]) == 0
+        shown = capsys.readouterr()
+        assert ("it contradicts" in shown.err) == ("it contradicts" in told)
+        assert ("2 pieces that share no place" in shown.out) == (names[-1] != "other")
+        (*_, page) = content_of(Solution.load(maps)).get("warnings", ()) or ("",)
+        assert page in told
+        return told
 
     told = warned("monday", "tuesday")
     said = "open: right at monday:0, left at monday:3: it contradicts what tuesday saw at step"
     assert f"{said} tuesday:0: without it, tuesday would share places with" in told
     assert told.count("it contradicts") == 1
+    # So does Python.
+    drives = [seeing(name, *stars) for name in ("monday", "tuesday")]
+    said_of = load_corrections(file)
+    caplog.clear()
+    solution = (
+        solve(drives[1], onto=solve(drives[0], corrections=said_of), corrections=said_of)
+        if onto
+        else solve(drives, corrections=said_of)
+    )
+    assert [said in warning for warning in solution.warnings] == [True]
+    assert [solution.joined, *solution.warnings] == caplog.messages
+    assert solution.joined in solution._repr_html_()
     # This drive saw the gateway open.
     assert "it contradicts" not in warned("monday", "other")
     # This one was elsewhere than Monday, with or without the correction.

@@ -234,15 +234,15 @@ def test_drives_that_share_a_place_have_one_map() -> None:
     )
 
 
-def test_drives_that_share_nothing_are_pieces(tmp_path: Path) -> None:
+def test_drives_that_share_nothing_are_pieces(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     far = Trace.from_steps("xyz", ["travel", "around"], name="far")
     with pytest.warns(UserWarning, match=r"trace 2 \(far\) has no view in common with another"):
         solution = solve([MONDAY, far, TUESDAY], Theory.causal())
-    (ssh_map,) = solution.maps
-    assert ssh_map.pieces == ((0, 1, 2, 3), (4, 5, 6))
-    assert "2 pieces that share no place: far alone; monday, tuesday" in pieces_in_words(
-        solution.drives, ssh_map
-    )
+    assert solution[0].pieces == ((0, 1, 2, 3), (4, 5, 6))
+    assert "2 pieces that share no place: far alone; monday, tuesday" in solution.joined
+    assert caplog.messages == [solution.joined]
     solution.save(tmp_path / "maps.json")
     data = json.loads((tmp_path / "maps.json").read_text())
     assert data["maps"][0]["pieces"] == [[0, 1, 2, 3], [4, 5, 6]]

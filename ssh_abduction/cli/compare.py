@@ -50,6 +50,7 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    from ssh_abduction.cli.outcome import warn  # loads clingo
     from ssh_abduction.rivals.comparison import compare  # loads numpy
     from ssh_abduction.rivals.differences import difference
     from ssh_abduction.rivals.drive_joins import joins_of_drives
@@ -91,14 +92,18 @@ def run(options: argparse.Namespace) -> int:
         record["sides"] = sides.to_dict()
     if listing.faults:
         record["faults"] = [fault.to_dict() for fault in listing.faults]
+    if listing.warnings:
+        record["warnings"] = list(listing.warnings)
     if options.json:
         print(json_line({**record, **found.to_dict()}))
         return 0
     lines = [*_lines(found), *_faults(listing)]
+    lines += [f"  {listing.joined}"] if listing.joined else []
     lines += [f"  {sides}"] if sides is not None and sides.possible else []
     print("\n".join([*lines, *map(str, drives)]))
     if listing.sureness:
         print(listing.sureness)
+    warn(map(printable, listing.warnings))
     return 0
 
 

@@ -16,11 +16,8 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.explain.no_map import Explanation, explain
-from ssh_abduction.solver import Solution, drives_kept_apart, obeyed, solve, with_names
+from ssh_abduction.solver import Solution, obeyed, solve, with_kept_apart, with_names
 from ssh_abduction.theory.theory import Theory
-
-# A search for a map without corrections of gateways may take this many seconds.
-SHORTEST, DOUBTING = 0.05, 10.0
 
 
 def corrections_of(options: argparse.Namespace) -> Corrections | None:
@@ -52,20 +49,6 @@ def as_corrected(
     corrected = obeyed(said, trace, theory)
     say_obeyed(said, trace)
     return corrected
-
-
-def say_drives_kept_apart(said: Corrections, solution: Solution, limit: float | None) -> None:
-    """Warn on stderr of drives that are apart only because a gateway was corrected.
-
-    A search for a map without the correction gets what is left of the time limit.
-    """
-    left = DOUBTING if limit is None else min(limit - solution.seconds.total, DOUBTING)
-
-    def find(trace: Trace, theory: Theory) -> Solution:
-        return solve(trace, theory, max_maps=1, time_limit=max(left, SHORTEST))
-
-    if said.gateways and solution.stopped != "interrupted":
-        warn(drives_kept_apart(said, solution, find))
 
 
 def say_obeyed(said: Corrections, trace: Trace) -> None:
@@ -113,6 +96,14 @@ class Obeying:
     def with_names(self, solution: Solution) -> Solution:
         """Return a solution whose maps have the names that a person gave."""
         return with_names(self.corrections, solution, self.trace)
+
+    def finished(self, solution: Solution, limit: float | None) -> Solution:
+        """Add the names, and warnings of drives that a corrected gateway keeps apart."""
+
+        def find(trace: Trace, theory: Theory, seconds: float) -> Solution:
+            return solve(trace, theory, max_maps=1, time_limit=seconds)
+
+        return with_kept_apart(self.corrections, self.with_names(solution), limit, find)
 
     def blamed(self, explanation: Explanation | None) -> list[str]:
         """List the corrections that may be the reason why the trace has no map.

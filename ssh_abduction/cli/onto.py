@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import argparse
 
-from ssh_abduction.cli.obeying import corrections_of, say_drives_kept_apart
+from ssh_abduction.cli.obeying import corrections_of
 from ssh_abduction.cli.options import number_steps, theory_of
 from ssh_abduction.cli.outcome import exit_code, save_solution, warn
 from ssh_abduction.cli.text import describe, headline
-from ssh_abduction.data.drives import pieces_in_words, together
+from ssh_abduction.data.drives import together
 from ssh_abduction.data.errors import AbductionError, printable
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.trace import Trace
@@ -27,7 +27,6 @@ def run(options: argparse.Namespace) -> int:
     trace = together([Trace.load(path) for path in options.traces])
     if existing.trace is not None:
         number_steps(options, together([existing.trace, trace]))
-    corrections = corrections_of(options)
     solution = solve(
         trace,
         theory_of(options, existing.theory.replace(returns=0)),
@@ -37,17 +36,15 @@ def run(options: argparse.Namespace) -> int:
         within=options.within,
         memory_limit=options.memory_limit,
         speedups=Speedups.without(options.without_speedups),
-        corrections=corrections,
+        corrections=corrections_of(options),
     )
     warn(solution.warnings)
-    if corrections is not None:
-        say_drives_kept_apart(corrections, solution, options.time_limit)
     save_solution(solution, options.output)
     if options.json:
         print(json_line(solution.to_dict()))
         return exit_code(solution)
     kept = ", ".join(solution.support.onto)
     print(headline(solution, len(solution.maps), None))
-    print(printable(f"the map of {kept} is kept; {pieces_in_words(solution.drives, solution[0])}"))
+    print(printable(f"the map of {kept} is kept; {solution.joined}"))
     print(f"\n{'map 1' if len(solution) > 1 else 'map'}\n{describe(solution[0])}")
     return exit_code(solution)

@@ -14,7 +14,7 @@ from itertools import chain
 from typing import Any
 
 from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.obeying import Obeying, say_drives_kept_apart
+from ssh_abduction.cli.obeying import Obeying
 from ssh_abduction.cli.options import (
     add_limits,
     add_theory,
@@ -40,7 +40,7 @@ from ssh_abduction.cli.outcome import (
 )
 from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import by_displacements, compared, describe, describe_backbone, headline
-from ssh_abduction.data.drives import pieces_in_words, together
+from ssh_abduction.data.drives import together
 from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.floors import floors_in_words
@@ -220,12 +220,11 @@ def run(options: argparse.Namespace) -> int:
             )
             until_printed.enter_context(guard)
             explanation = printed.searched(guard.say)
-        solution = obeying.with_names(search.solution(tuple(printed.kept)))
+        solution = obeying.finished(search.solution(tuple(printed.kept)), options.time_limit)
         guard.say(partial(printed.end, solution, explanation))
         warn(warnings_of(search, solution))
         options.json = False  # the JSON is complete: a later error must not follow it
         save_solution(solution, options.output)
-    say_drives_kept_apart(obeying.corrections, solution, options.time_limit)
     return exit_code(solution)
 
 
@@ -353,12 +352,8 @@ def _lines(
     """Yield the lines that describe the result of a search to people."""
     yield headline(solution, search.count, explanation)
     yield from by_displacements(solution)
-    if (
-        joined := solution.drives
-        and solution.maps
-        and pieces_in_words(solution.drives, solution.maps[0])
-    ):
-        yield joined
+    if solution.joined:
+        yield solution.joined
     if solution.maps and (floors := floors_in_words(solution.maps[0])):
         yield floors
     if solution.weighed is None and solution.sureness:  # else the headline says it

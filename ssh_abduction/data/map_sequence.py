@@ -5,15 +5,26 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import overload
 
+from ssh_abduction.data.drives import Drive, pieces_in_words
 from ssh_abduction.data.errors import checked_index
 from ssh_abduction.data.maps import SSHMap
 
 
 class MapSequence:
-    """A sequence of maps, for a class with the attribute `maps`: `len`, indices and iteration."""
+    """A sequence of maps, for a class with the attributes `maps` and `drives`."""
 
     __slots__ = ()
     maps: tuple[SSHMap, ...]
+
+    @property
+    def drives(self) -> tuple[Drive, ...]:
+        """The drives of the trace; empty if they are unknown."""
+        raise NotImplementedError
+
+    @property
+    def joined(self) -> str:
+        """Which drives the first map joins, in words; empty for one drive or without a map."""
+        return pieces_in_words(self.drives, self.maps[0]) if self.maps else ""
 
     def __len__(self) -> int:
         """The number of maps."""

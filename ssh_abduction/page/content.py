@@ -17,7 +17,6 @@ from itertools import pairwise
 from statistics import median
 from typing import Any
 
-from ssh_abduction.data.drives import pieces_in_words
 from ssh_abduction.data.maps import SSHMap, check_of_trace
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted
@@ -104,6 +103,7 @@ def content_of(
     return {
         "sentence": found.sentence,
         "sureness": listing.sureness,
+        "warnings": listing.warnings,
         "joins": _joins(listing),
         **_drives(listing),
         "file": called.maps,
@@ -166,7 +166,7 @@ def _drives(listing: Listing) -> dict[str, Any]:
     first = {drive.name: drive.first for drive in listing.drives}
     return {
         "drives": [asdict(drive) for drive in listing.drives] if len(listing.drives) > 1 else [],
-        "joined": pieces_in_words(listing.drives, listing.maps[0]),
+        "joined": listing.joined,
         "between": [
             {
                 "sentence": f"{pair.first} and {pair.second}: {_shared_by(pair)}",

@@ -19,14 +19,23 @@ from typing import Any, TypeAlias
 from ssh_abduction.checker.joins import Join, joins_in_words
 from ssh_abduction.data.checks import a_flag, a_path, a_text, an_instance
 from ssh_abduction.data.corrections_file import named_beside
-from ssh_abduction.data.drives import Drive, with_named_faults
+from ssh_abduction.data.drives import Drive, pieces_in_words, with_named_faults
 from ssh_abduction.data.errors import MapError, brief, is_whole, named
 from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.map_parts import Fault
 from ssh_abduction.data.maps import ID_LENGTH, SSHMap, maps_of
 from ssh_abduction.data.trace import View
-from ssh_abduction.solver import Backbone, Solution, Status, Weighed, drives_in, joins_in, theory_in
+from ssh_abduction.solver import (
+    Backbone,
+    Solution,
+    Status,
+    Weighed,
+    drives_in,
+    joins_in,
+    theory_in,
+    warnings_in,
+)
 from ssh_abduction.theory.theory import Theory
 
 
@@ -46,6 +55,7 @@ class Listing:
         weighed: The costs of the maps in nats, if they were compared by cost; else None.
         by_minimality: The joins of the first map that rest on minimality alone, if known.
         drives: The drives of a joint trace; empty if there is one drive.
+        warnings: Sentences about what is suspicious in the trace, if known.
     """
 
     maps: tuple[SSHMap, ...]
@@ -57,6 +67,7 @@ class Listing:
     weighed: Weighed | None = None
     by_minimality: tuple[Join, ...] = ()
     drives: tuple[Drive, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     @property
     def steps(self) -> int:
@@ -68,6 +79,11 @@ class Listing:
         """The faults that all listed maps have, such as gateways that changed between drives."""
         first, *others = self.maps
         return tuple(f for f in first.faults if all(f in ssh_map.faults for ssh_map in others))
+
+    @property
+    def joined(self) -> str:
+        """Which drives the first map joins, in words; empty for a single drive."""
+        return pieces_in_words(self.drives, self.maps[0])
 
     @property
     def sureness(self) -> str:
@@ -104,6 +120,7 @@ class Listing:
                 weighed=source.weighed,
                 by_minimality=source.by_minimality,
                 drives=source.drives,
+                warnings=source.warnings,
             )
             return listing.checked(one_view=_has_one_view(source.theory))
         if isinstance(source, SSHMap):
@@ -230,6 +247,7 @@ class Listing:
             weighed,
             joins_in(read, answer if maps else {}, steps, drives),
             drives,
+            warnings_in(read, answer),
         )
         return listing.checked(one_view=theory is None or _has_one_view(theory))
 

@@ -29,14 +29,21 @@ from perception.recognition import recogniser as new_recogniser
 from perception.store import written
 from ssh_abduction.data.checks import all_instances
 from ssh_abduction.data.corrections import Corrections
-from ssh_abduction.data.drives import drives_of, pieces_in_words
+from ssh_abduction.data.drives import drives_of
 from ssh_abduction.data.files import json_line
 from ssh_abduction.evaluation.ladder import Rung, UnderWay, ladder, rungs
 from ssh_abduction.page.html import view_page
 from ssh_abduction.robot_logs.log_report import report
 from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.runtime.loggers import log_of
-from ssh_abduction.solver import Solution, Status, find_backbone, obeyed, with_names
+from ssh_abduction.solver import (
+    Solution,
+    Status,
+    find_backbone,
+    obeyed,
+    with_kept_apart,
+    with_names,
+)
 from ssh_abduction.theory.theory import Theory
 
 _log = log_of(__name__)
@@ -154,8 +161,7 @@ class LogMap:
     @property
     def joined(self) -> str:
         """Which drives the first map joins, in words; empty for a single drive or without a map."""
-        maps = self.solution.maps
-        return pieces_in_words(drives_of(self.imported.trace), maps[0]) if maps else ""
+        return self.solution.joined
 
     @property
     def drove(self) -> float | None:
@@ -360,6 +366,15 @@ def map_log(
         tell(f"No map was found yet. The search goes on for up to {allowed:.0f} s.")
         solution = mapping.solve(trace, chosen, time_limit=allowed, max_maps=max_maps)
     mapping.latest = lambda: outcome(solution)
+    if corrections is not None:
+        solution = with_kept_apart(
+            corrections,
+            solution,
+            allowed,
+            lambda trace, theory, seconds: mapping.solve(
+                trace, theory, time_limit=seconds, max_maps=1
+            ),
+        )
     seconds["maps"] = round(time.process_time() - begin, 3)
 
     # 4. Ladder: what each kind of evidence is worth.

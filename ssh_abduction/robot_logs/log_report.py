@@ -14,7 +14,7 @@ from typing import Any
 from perception.places.importing import Imported
 from perception.readers.scans import RobotLog
 from ssh_abduction.checker.joins import joins_in_words
-from ssh_abduction.data.drives import drives_of, pieces_in_words
+from ssh_abduction.data.drives import drives_of
 from ssh_abduction.data.words import counted
 from ssh_abduction.evaluation.ladder import Rung
 from ssh_abduction.output.drawing import escaped
@@ -52,7 +52,7 @@ def report(
     name = imported.trace.name or "log"
     parts = [
         f"<h1>{escaped(name)}</h1>",
-        *map(_paragraph, [_summary(solution, run), *run["notes"]]),
+        *map(_paragraph, [_summary(solution, run), *run["notes"], *solution.warnings]),
         figure(log, imported, solution),
         *_drives(imported, solution, run),
         "<h2>What each kind of evidence is worth</h2>" + _ladder(rungs) if rungs else "",
@@ -115,9 +115,9 @@ def _drives(imported: Imported, solution: Solution, run: Mapping[str, Any]) -> I
         others = set().union(*at[:k], *at[k + 1 :])
         counts = (one["scans"], f"{one['metres']:g} m", one["visits"], one["steps"])
         rows.append((drive.name, *counts, len(at[k]), len(at[k] & others)))
+    joined = solution.joined[0].upper() + solution.joined[1:]
     head = ("drive", "scans", "way", "visits", "steps", "places", "shared with other drives")
-    pieces = pieces_in_words(drives, solution.maps[0])
-    yield "<h2>Drives</h2>" + _table(head, rows) + _paragraph(f"{pieces.capitalize()}.")
+    yield "<h2>Drives</h2>" + _table(head, rows) + _paragraph(f"{joined}.")
     yield "<h2>Joins between drives</h2>" + _joins_of_drives(solution)
 
 

@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.guesses.tree import Sketch
     from ssh_abduction.solver.judging import InternalError, Judging
     from ssh_abduction.solver.misfit import Misfit
-    from ssh_abduction.solver.obeying import drives_kept_apart, obeyed, with_names
+    from ssh_abduction.solver.obeying import obeyed, with_kept_apart, with_names
     from ssh_abduction.solver.ranking import Ranking
-    from ssh_abduction.solver.recorded import drives_in, joins_in, theory_in, trace_in
+    from ssh_abduction.solver.recorded import drives_in, joins_in, theory_in, trace_in, warnings_in
     from ssh_abduction.solver.regions import find_regions, with_regions
     from ssh_abduction.solver.result import Solution
     from ssh_abduction.solver.search import Search
@@ -63,9 +63,9 @@ _HOMES = {  # module: the names that this package exports from it
     "guesses.tree": ("Sketch",),
     "judging": ("InternalError", "Judging"),
     "misfit": ("Misfit",),
-    "obeying": ("drives_kept_apart", "obeyed", "with_names"),
+    "obeying": ("obeyed", "with_kept_apart", "with_names"),
     "ranking": ("Ranking",),
-    "recorded": ("drives_in", "joins_in", "theory_in", "trace_in"),
+    "recorded": ("drives_in", "joins_in", "theory_in", "trace_in", "warnings_in"),
     "regions": ("find_regions", "with_regions"),
     "result": ("Solution",),
     "search": ("Search",),
@@ -123,7 +123,6 @@ __all__ = [
     "check_rules",
     "cost_as_counted",
     "drives_in",
-    "drives_kept_apart",
     "end_all",
     "ending",
     "facts",
@@ -145,6 +144,8 @@ __all__ = [
     "summary_of",
     "theory_in",
     "trace_in",
+    "warnings_in",
+    "with_kept_apart",
     "with_names",
     "with_regions",
     "workers",

@@ -15,19 +15,20 @@ from dataclasses import replace
 
 from ssh_abduction.data.checks import an_instance
 from ssh_abduction.data.corrections import Corrections
-from ssh_abduction.data.drives import together
+from ssh_abduction.data.drives import joined_drives, together
 from ssh_abduction.data.errors import SolverError
 from ssh_abduction.data.maps import check_of_trace
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.runtime.clock import heeding
 from ssh_abduction.runtime.deprecated import renamed_parameters
+from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.limits import LimitError, Watch, check_limit
 from ssh_abduction.solver.backbone import prove_backbone
 from ssh_abduction.solver.choosing import READABLE, labelling_engine, may_name
 from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.judging import Judging
-from ssh_abduction.solver.obeying import obeyed, with_names
+from ssh_abduction.solver.obeying import obeyed, with_kept_apart, with_names
 from ssh_abduction.solver.onto import Solving, solve_onto
 from ssh_abduction.solver.result import Solution
 from ssh_abduction.solver.search import Search
@@ -38,6 +39,7 @@ from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import ALL, Speedups, row
 from ssh_abduction.theory.theory import Theory, checked_theory
 
+_log = log_of(__name__)
 # If the time limit is over, a search gets this many seconds to find any map.
 LEAST_SECONDS = 1e-9
 
@@ -58,7 +60,8 @@ def solve(
 ) -> Solution:
     """Find the minimal maps of a trace.
 
-    Ctrl-C ends the search like a limit does. To get maps one by one, use `Search`.
+    Ctrl-C ends the search like a limit does. To get maps one by one, use `Search`. If the best map
+    joins only some of several drives, the log has a warning (`logging`).
 
     Args:
         trace: The trace; or several traces of one building, for their joint maps
@@ -113,13 +116,37 @@ def solve(
         return search.solution(tuple(search))
 
     if onto is not None:
-        return solve_onto(joint, onto, theory, corrections, Solving(find, speedups, watch))
+        solution = solve_onto(joint, onto, theory, corrections, Solving(find, speedups, watch))
+        return _with_warnings(solution, corrections, time_limit, memory_limit)
     theory = checked_theory(theory)
     theory.check_steps(joint)
-    if corrections is None:
-        return find(joint, theory)
-    joint, theory = obeyed(corrections, joint, theory)
-    return with_names(corrections, find(joint, theory), joint)
+    if corrections is not None:
+        joint, theory = obeyed(corrections, joint, theory)
+    solution = find(joint, theory)
+    if corrections is not None:
+        solution = with_names(corrections, solution, joint)
+    return _with_warnings(solution, corrections, time_limit, memory_limit)
+
+
+def _with_warnings(
+    solution: Solution,
+    corrections: Corrections | None,
+    time_limit: float | None,
+    memory_limit: int | None,
+) -> Solution:
+    """Add and log warnings of drives that are apart."""
+
+    def find(trace: Trace, theory: Theory, seconds: float) -> Solution:
+        search = Search(trace, theory, time_limit=seconds, max_maps=1, memory_limit=memory_limit)
+        return search.solution(tuple(search))
+
+    if corrections is not None:
+        solution = with_kept_apart(corrections, solution, time_limit, find)
+    if solution.maps and len(joined_drives(solution.drives, solution.maps[0])) > 1:
+        _log.warning("%s", solution.joined)
+    for warning in solution.support.kept_apart:
+        _log.warning("%s", warning)
+    return solution
 
 
 def find_backbone(

@@ -23,6 +23,9 @@ from ssh_abduction.solver.result import Solution
 from ssh_abduction.solver.values import Status
 from ssh_abduction.theory.theory import Theory, checked_theory
 
+# A search for a map without corrections of gateways may take this many seconds.
+SHORTEST, DOUBTING = 0.05, 10.0
+
 
 def obeyed(corrections: Corrections, trace: Trace, theory: Theory) -> tuple[Trace, Theory]:
     """Return the trace and the theory that obey the corrections of a person.
@@ -57,10 +60,13 @@ def with_names(corrections: Corrections, solution: Solution, trace: Trace) -> So
     return replace(solution, maps=named(solution.maps))
 
 
-def drives_kept_apart(
-    corrections: Corrections, solution: Solution, find: Callable[[Trace, Theory], Solution]
-) -> Iterator[str]:
-    """Yield warnings of drives that share no place with others because a gateway was corrected.
+def with_kept_apart(
+    corrections: Corrections,
+    solution: Solution,
+    limit: float | None,
+    find: Callable[[Trace, Theory, float], Solution],
+) -> Solution:
+    """Add warnings of drives that share no place with others because a gateway was corrected.
 
     A correction changes only the stars of the steps that it names. If another drive saw the gateway
     as it was before, its steps cannot be at the place any more.
@@ -68,9 +74,24 @@ def drives_kept_apart(
     Args:
         corrections: The corrections that the solution obeys.
         solution: The solution, with its trace.
-        find: Finds a map of a trace and a theory. It is called once, without corrections of
-            gateways, if some drive is apart.
+        limit: The time limit of the search in seconds; None for none.
+        find: Finds a map of a trace and a theory in some seconds. It is called once, without
+            corrections of gateways, if some drive is apart.
     """
+    uses_stars = corrections.gateways and solution.theory.star != "none"
+    if not uses_stars or solution.stopped == "interrupted":
+        return solution
+    left = DOUBTING if limit is None else min(limit - solution.seconds.total, DOUBTING)
+    said = _drives_kept_apart(
+        corrections, solution, lambda trace, theory: find(trace, theory, max(left, SHORTEST))
+    )
+    return replace(solution, support=replace(solution.support, kept_apart=tuple(said)))
+
+
+def _drives_kept_apart(
+    corrections: Corrections, solution: Solution, find: Callable[[Trace, Theory], Solution]
+) -> Iterator[str]:
+    """Yield the warnings that `with_kept_apart` adds."""
     trace = solution.trace
     if trace is None or not solution.maps:
         return

@@ -55,15 +55,11 @@ class Recorded:
             if record.get("certificate") is None
             else read.mapping(record["certificate"], "certificate")
         )
-        warnings = read.list(record, "warnings", optional=True)
-        for i, warning in enumerate(warnings):
-            if not isinstance(warning, str):
-                raise read.wrong(f"warnings[{i}]", "a sentence", warning)
         drives = drives_in(read, record, steps)
         return cls(
             certificate=None if written is None else _certificate(read, written, steps),
             written_certificate=written,
-            warnings=tuple(warnings),
+            warnings=warnings_in(read, record),
             explanation=None
             if record.get("explanation") is None
             else read.mapping(record["explanation"], "explanation"),
@@ -88,6 +84,7 @@ class Support:
         recorded: The certificate and warnings of the file, if the solution was read from a file;
             else None.
         onto: The names of the old drives whose map had to be kept; empty if there are none.
+        kept_apart: Sentences that warn of drives that a corrected gateway keeps apart.
     """
 
     basis: Basis | None = None
@@ -96,6 +93,7 @@ class Support:
     weighed: Weighed | None = None
     recorded: Recorded | None = None
     onto: tuple[str, ...] = ()
+    kept_apart: tuple[str, ...] = ()
 
     @property
     def certificate(self) -> Certificate | None:
@@ -131,6 +129,15 @@ def drives_in(read: FieldReader, record: Mapping[str, Any], steps: int) -> tuple
     if found and ([d.first for d in found] != bounds[:-1] or bounds != sorted({*bounds, steps})):
         raise read.wrong("drives", f"drives that follow each other up to step {steps}", bounds)
     return found
+
+
+def warnings_in(read: FieldReader, record: Mapping[str, Any]) -> tuple[str, ...]:
+    """Read the sentences that warn of the trace. Raises MapError if one is no text."""
+    warnings = read.list(record, "warnings", optional=True)
+    for i, warning in enumerate(warnings):
+        if not isinstance(warning, str):
+            raise read.wrong(f"warnings[{i}]", "a sentence", warning)
+    return tuple(warnings)
 
 
 def joins_in(

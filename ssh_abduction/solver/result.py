@@ -99,9 +99,8 @@ class Solution(MapSequence):
 
     def _repr_html_(self) -> str:
         """Return the HTML for notebooks: how the search ended, the summary, and the first map."""
-        parts = []
-        if self.status is not Status.UNSATISFIABLE:
-            parts.append(cards.paragraph(self.summary))
+        parts = [] if self.status is Status.UNSATISFIABLE else [cards.paragraph(self.summary)]
+        parts += [cards.paragraph(self.joined)] if self.joined else []
         warnings = () if self.stopped == "interrupted" else self.warnings
         parts += [cards.paragraph(f"warning: {warning}") for warning in warnings]
         if self.count > 1:
@@ -293,16 +292,16 @@ class Solution(MapSequence):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Sentences about what is suspicious in the trace.
+        """Sentences about what is suspicious in the trace, or in corrections of a person.
 
-        They are about a step that looks like noise, and about the noise or the units of the
-        odometry.
+        They are about a step that looks like noise, about the noise or the units of the odometry,
+        and about drives that a corrected gateway keeps apart.
         """
         if self.support.recorded is not None:
             return self.support.recorded.warnings
         noise = [self.noise.sentence(self.trace)] if self.noise and self.trace else []
         others = (self.support.odometry_warning, self.support.weigh_warning)
-        return (*noise, *(warning for warning in others if warning))
+        return (*noise, *filter(None, others), *self.support.kept_apart)
 
     @property
     def noise(self) -> Noise | None:

@@ -60,6 +60,8 @@ function load(judging = true) {
 // Joins of the first map that may be wrong. A click chooses the two steps of a join.
 function tellDoubts() {
   $("sureness").textContent = data.sureness;
+  $("warnings").replaceChildren();
+  for (const warning of data.warnings) element("p", {}, `Warning: ${warning}`, $("warnings"));
   $("joins").replaceChildren();
   $("doubts").hidden = !data.joins.length;
   const weighed = data.joins.length && data.joins[0][2] !== null;
