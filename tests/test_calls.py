@@ -161,6 +161,7 @@ RIGHT: dict[str, set[str]] = {
     "Theory.from_dict.data": {"dict"},
     "difference.drives": EMPTY,
     "explain_pair.known": EMPTY,
+    "explain_place.known": EMPTY,
     "Theory.prefer": {"list"},
     "Theory.without": {"list"},
     "Theory.rules": {"empty text", *EMPTY},

@@ -21,6 +21,8 @@ from ssh_abduction.explain.mend import explain_trace
 from ssh_abduction.explain.pairs import explain_pair
 from ssh_abduction.explain.piece import Piece
 from ssh_abduction.explain.verdict import PairExplanation, Verdict
+from ssh_abduction.rivals import Listing
+from ssh_abduction.rivals.pair_in_map import PairInMap
 from ssh_abduction.solver import Search, Start, Status
 from ssh_abduction.solver.asp.facts import derivation_lp, further_rules
 from ssh_abduction.theory.encodings import axioms
@@ -292,6 +294,22 @@ def test_known_maps_change_no_answer_that_is_proven(trace: Trace, within: int) -
     assert (search.count, search.cost, search.status) == (anew.count, anew.cost, anew.status)
     pair = 0, len(trace) - 1
     assert explain_pair(trace, *pair, known=known) == explain_pair(trace, *pair)
+
+
+def test_a_map_like_the_best_one_is_known_for_the_other_side() -> None:
+    """No time is left for any search, but a visit to a new place makes a map that is accepted."""
+    solution = solve(SQUARE)
+    assert solution.weighed
+    rival = solution.weighed.rival_if_other(0, 8)
+    assert rival
+    explanation = explain_pair(SQUARE, 0, 8, time_limit=1e-9, known=solution.maps)
+    assert explanation.different.nats == pytest.approx(rival.nats)
+    more = rival.nats - solution.weighed.nats
+    assert explanation.assuming["different"] == f"costs at most {more:.1f} nats more"
+    in_map = PairInMap.of(Listing.of(solution), 0, 8)
+    assert str(in_map).endswith(
+        f"; a map with two places may cost only {more:.1f} nats more, but was not checked"
+    )
 
 
 def test_known_maps_that_the_theory_forbids_are_ignored() -> None:

@@ -204,3 +204,14 @@ def test_a_name_of_a_region_stands_everywhere(
         assert "region 3 (east ward)" in export_map(ssh_map, to)
     assert main(["name", "maps.json", "region9", "nowhere"]) == 1
     assert "expected a region of the map" in capsys.readouterr().err
+
+
+def test_the_first_map_costs_no_more_than_a_known_one() -> None:
+    """No time is left for a search, and a map without one has more places."""
+    trace = Trace.load(ACES3)
+    known = solve(trace).maps
+    searched, told, anew = (
+        [side.sentence for side in explain_place(trace, 0, **more).sides]
+        for more in ({}, {"time_limit": 1e-9, "known": known}, {"time_limit": 1e-9})
+    )
+    assert anew != told == searched

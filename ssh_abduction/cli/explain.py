@@ -40,7 +40,7 @@ from ssh_abduction.solver import Stop
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
-    from ssh_abduction.data.maps import SSHMap
+    from ssh_abduction.rivals.listing import Listing
     from ssh_abduction.rivals.pair_in_map import PairInMap
 
 EXIT_NO_MAP, EXIT_UNKNOWN = 20, 30
@@ -114,8 +114,10 @@ def run(options: argparse.Namespace) -> int:
         "time_limit": options.time_limit,
         "memory_limit": options.memory_limit,
     }
+    listing = _listing_of(maps, data, len(trace)) if found and options.steps else None
+    if listing is not None:
+        limits["known"] = listing.maps
     question: PairQuestion | TraceQuestion | PlaceQuestion
-    known: tuple[SSHMap, ...] = ()
     pair: PairInMap | None = None
     if of_place:
         place, path = (None if n is None else int(n) for n in of_place.groups())
@@ -123,15 +125,12 @@ def run(options: argparse.Namespace) -> int:
         question = PlaceQuestion(trace, place, path, theory, **limits)
     elif options.steps:
         first, second = (step_named(trace, step) for step in options.steps)
-        if maps and found and data.get("maps"):
-            from ssh_abduction.rivals.listing import Listing  # loads numpy
-            from ssh_abduction.rivals.pair_in_map import PairInMap
+        if listing is not None:
+            from ssh_abduction.rivals.pair_in_map import PairInMap  # loads numpy
 
-            listing = Listing.from_dict(data, named(maps))
-            if listing.steps == len(trace):  # else --theory names the maps of another trace
-                known, pair = listing.maps, PairInMap.of(listing, first, second)
+            pair = PairInMap.of(listing, first, second)
         question = PairQuestion(
-            trace, first, second, theory, max_maps=options.maps or None, known=known, **limits
+            trace, first, second, theory, max_maps=options.maps or None, **limits
         )
     else:
         question = TraceQuestion(trace, theory, **limits)
@@ -165,6 +164,16 @@ def _maps_of(options: argparse.Namespace) -> tuple[str | None, Theory | None, An
         return file, None, None
     data, options.theory = read_json(file), None
     return file, theory_of_maps(data, file), data
+
+
+def _listing_of(file: str | None, data: Any, steps: int) -> Listing | None:
+    """Read the maps in the data of a file; None if there are none of a trace of so many steps."""
+    if file is None or not data.get("maps"):
+        return None
+    from ssh_abduction.rivals.listing import Listing  # loads numpy
+
+    listing = Listing.from_dict(data, named(file))
+    return listing if listing.steps == steps else None
 
 
 def _as_text(in_map: PairInMap | None, seconds: float, explanation: Answer) -> str:

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from itertools import islice
 
 from ssh_abduction.data.checks import a_count_of_maps
 from ssh_abduction.data.closure import match_in_words
@@ -50,6 +51,8 @@ CONFIRMING = 5.0
 # Share of the remaining time that the search for minimal maps may take, and then the search for the
 # best map of the other side.
 SHARE = 0.45
+# Estimating maps of the other side, which are like the best known map, may take this many seconds.
+ESTIMATING = 0.5
 
 
 @renamed_parameters("limit", "maps", "memory")
@@ -240,15 +243,29 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
             self._changes = self._changes_in_words(ssh_map, places, side.cost, side.nats)
 
     def _begin_with_known_maps(self) -> None:
-        """Take over the known maps that satisfy the theory, with their costs."""
+        """Take over the known maps that satisfy the theory, with their costs.
+
+        If maps are weighed and the best one has the steps at one dstate, also take a map like it
+        that has them at different dstates.
+        """
         if not self._known_maps:
             return
-        from ssh_abduction.solver import Misfit  # loads numpy
+        from ssh_abduction.solver import Misfit, maps_apart  # loads numpy
 
         judging = Judging(self.problem)
         misfit = Misfit(self.problem) if self.theory.weigh == "cost" else None
-        for ssh_map in filter(judging.accepts, self._known_maps):
+
+        def keep(ssh_map: SSHMap) -> None:
             self._keep(ssh_map, Cost.of(ssh_map), misfit.nats_of(ssh_map) if misfit else None)
+
+        for ssh_map in filter(judging.accepts, self._known_maps):
+            keep(ssh_map)
+        if self._best and misfit and self._best[1] is self._sides[True]:
+            pair = self.first, self.second
+            apart = maps_apart(self.problem, misfit, self._best[0], pair, ESTIMATING)
+            for ssh_map in islice(filter(judging.accepts, apart), 1):
+                self._known_maps.append(ssh_map)
+                keep(ssh_map)
 
     def _keep(
         self, ssh_map: SSHMap, cost: Cost | None, nats: float | None, *, proven: bool = False

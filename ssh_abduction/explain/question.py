@@ -57,7 +57,7 @@ class LimitedQuestion(ABC, Generic[_Answer]):
         self.theory.check_steps(trace)
         check_rules(self.theory)
         self.limit, self.memory = time_limit, memory_limit
-        self._known_maps = checked_maps(known)
+        self._known_maps = [*checked_maps(known)]
         check_of_trace(self._known_maps, trace, "known", views=False)
         self.stopped: Stop | None = None
         self._watch = Watch(time_limit, memory_limit)
@@ -112,7 +112,7 @@ class LimitedQuestion(ABC, Generic[_Answer]):
             memory_limit=self.memory,
             max_maps=maps,
             on_progress=end_with_this,
-            _start=Start(known=self._known_maps),
+            _start=Start(known=tuple(self._known_maps)),
         )
         return search
 

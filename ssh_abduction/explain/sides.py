@@ -43,6 +43,7 @@ def explain_place(
     *,
     time_limit: float | None = None,
     memory_limit: int | None = None,
+    known: Iterable[SSHMap] = (),
 ) -> PlaceExplanation:
     """Explain on which side of a path a place lies, or in which regions it lies.
 
@@ -53,16 +54,24 @@ def explain_place(
         theory: The theory; Theory.topological() if None.
         time_limit: Seconds; None for no limit.
         memory_limit: MiB; None for no limit.
+        known: Maps of the trace that are known. The search begins with those that satisfy the
+            theory, so that the first map costs no more than they do.
 
     Returns:
         A reason for each side that is known, and the number of minimal maps that agree.
 
     Raises:
-        MapError: The map has no such place or path.
+        MapError: The map has no such place or path, or a known map is of another trace.
         TraceError, TheoryError: As `solve` does.
     """
     return PlaceQuestion(
-        trace, place, path, checked_theory(theory), time_limit=time_limit, memory_limit=memory_limit
+        trace,
+        place,
+        path,
+        checked_theory(theory),
+        time_limit=time_limit,
+        memory_limit=memory_limit,
+        known=known,
     ).answer()
 
 
@@ -150,8 +159,9 @@ class PlaceQuestion(LimitedQuestion[PlaceExplanation]):
         *,
         time_limit: float | None = None,
         memory_limit: int | None = None,
+        known: Iterable[SSHMap] = (),
     ) -> None:
-        super().__init__(trace, theory, time_limit, memory_limit)
+        super().__init__(trace, theory, time_limit, memory_limit, known)
         a_whole_number("place", place, MapError, 0)
         if path is not None:
             a_whole_number("path", path, MapError, 0)

@@ -18,11 +18,13 @@ class PairInMap:
         probability: The probability that they are; None if maps were not compared by cost.
         nats: The extra cost, in nats, of the best known map that contradicts `is_one_place`; None
             if no such map is known.
+        is_estimated: Whether that map was only estimated, so that it may break axioms.
     """
 
     is_one_place: bool
     probability: float | None
     nats: float | None
+    is_estimated: bool = False
 
     @classmethod
     def of(cls, listing: Listing, first: int, second: int) -> PairInMap | None:
@@ -31,12 +33,14 @@ class PairInMap:
         if None in at:
             return None
         weighed = listing.weighed
+        if weighed is None:
+            return cls(at[0] == at[1], None, None)
+        rival = weighed.rival_if_other(first, second)
         return cls(
             at[0] == at[1],
-            None
-            if weighed is None or weighed.doubt is not None
-            else weighed.probability(first, second, "place"),
-            None if weighed is None else weighed.nats_if_other(first, second),
+            None if weighed.doubt is not None else weighed.probability(first, second, "place"),
+            rival.nats - weighed.nats if rival else None,
+            rival is not None and rival.estimated,
         )
 
     def __str__(self) -> str:
@@ -45,7 +49,11 @@ class PairInMap:
             text += f"; the probability of one place is {probability_in_words(self.probability)}"
         if self.nats is not None:
             other = "two places" if self.is_one_place else "one place"
-            text += f"; the best known map with {other} costs {self.nats:.1f} nats more"
+            text += (
+                f"; a map with {other} may cost only {self.nats:.1f} nats more, but was not checked"
+                if self.is_estimated
+                else f"; the best known map with {other} costs {self.nats:.1f} nats more"
+            )
         return text
 
     def to_dict(self) -> dict[str, Any]:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.asp.rules import check_rules
     from ssh_abduction.solver.asp.workers import end_all, in_process
     from ssh_abduction.solver.entry import find_backbone, solve
+    from ssh_abduction.solver.estimating import maps_apart
     from ssh_abduction.solver.front import Front, Point, fault_front
     from ssh_abduction.solver.guesses.gated import sketch_beyond, sketches_of
     from ssh_abduction.solver.guesses.tree import Sketch
@@ -58,6 +59,7 @@ _HOMES = {  # module: the names that this package exports from it
     "asp.workers": ("end_all", "in_process"),
     "asp.rules": ("check_rules",),
     "entry": ("find_backbone", "solve"),
+    "estimating": ("maps_apart",),
     "front": ("Front", "Point", "fault_front"),
     "guesses.gated": ("sketch_beyond", "sketches_of"),
     "guesses.tree": ("Sketch",),
@@ -132,6 +134,7 @@ __all__ = [
     "has_processors",
     "in_process",
     "joins_in",
+    "maps_apart",
     "obeyed",
     "observation",
     "opening",

@@ -7,16 +7,22 @@ to a new place. They fit the displacements, and may break axioms.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import replace
 from itertools import chain
 from typing import TypeAlias
 
-from ssh_abduction.data.drives import Drive
+from ssh_abduction.data.drives import Drive, drives_of
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import heeding, look_at_clock
 from ssh_abduction.solver.asp.limits import LimitError, Watch
+from ssh_abduction.solver.guesses.completing import completed
+from ssh_abduction.solver.misfit import Misfit
 from ssh_abduction.solver.steps.chart import numbered
+from ssh_abduction.solver.values import Cost, nats_of
 from ssh_abduction.solver.weighed import CHANCE, Rival
+from ssh_abduction.theory.evidence.displacement import jumped
 from ssh_abduction.theory.settle import Problem
 
 # The dstate and the place of each step, numbered by first visit.
@@ -26,6 +32,46 @@ CostOf: TypeAlias = Callable[[Sequence[int], Sequence[int]], float]
 # Leave out rivals that cost CERTAIN nats more than the best map. Even a million of them together
 # have a probability of only 0.005.
 CERTAIN = 19.0
+
+
+def rivals_of(problem: Problem, misfit: Misfit, best: SSHMap, seconds: float) -> Iterator[Rival]:
+    """Yield estimated rivals of a map of a trace that cost little more than it, each once.
+
+    `seconds` is the time that this may take. `estimated` says what the rivals are. Drives that
+    closures tie to others do not overlap by chance, so they are not put apart.
+    """
+    dstate, place, _ = problem.theory.prices
+    kept = nats_of(replace(Cost.of(best), dstates=0, places=0), problem.theory)
+    drives = drives_of(problem.trace)
+    free = [drive for i, drive in enumerate(drives) if not problem.overlap.is_tied(i)]
+
+    def cost_of(dstates: Sequence[int], places: Sequence[int]) -> float:
+        nats: float = kept + misfit.of_course(dstates, places or dstates, jumped(best)) / 2
+        return nats + dstate * len(set(dstates)) + place * len(set(places))
+
+    rival = rival_of(best, misfit.nats_of(best))
+    return estimated(rival, misfit.visit, free, cost_of, seconds)
+
+
+def maps_apart(
+    problem: Problem, misfit: Misfit, best: SSHMap, pair: tuple[int, int], seconds: float
+) -> Iterator[SSHMap]:
+    """Yield maps like `best` in which two steps are different dstates, the cheapest first.
+
+    They are estimated rivals, so they may break axioms. `seconds` is the time that it takes to
+    estimate them.
+    """
+    at = [best.dstates[label] for label in best.dstate_at]
+    rivals = rivals_of(problem, misfit, best, seconds)
+    apart = [rival for rival in rivals if len({rival.dstates[step] for step in pair}) > 1]
+    for rival in sorted(apart, key=lambda rival: rival.nats):
+        like = dict(zip(rival.dstates, at, strict=True))
+        place = dict(zip(rival.dstates, rival.places or rival.dstates, strict=True))
+        places = [place[label] for label in range(len(place))]
+        facing = [-math.pi / 2 * (like[label].heading or 0) for label in range(len(like))]
+        found = completed(problem.trace, problem.theory, rival.dstates, places, facing)
+        if found is not None:
+            yield found
 
 
 def estimated(

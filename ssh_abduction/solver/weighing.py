@@ -44,12 +44,11 @@ from ssh_abduction.solver.choosing import READABLE, labelling_engine
 from ssh_abduction.solver.engines.base import Found, Task
 from ssh_abduction.solver.equations import spreads_of
 from ssh_abduction.solver.estimating import (
-    CostOf,
     Course,
     dstates_and_places,
-    estimated,
     least_places,
     rival_of,
+    rivals_of,
 )
 from ssh_abduction.solver.forced import Forcing
 from ssh_abduction.solver.judging import Judging
@@ -59,7 +58,7 @@ from ssh_abduction.solver.misfit import Misfit
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.prefixes import Prefixes
 from ssh_abduction.solver.scatter import is_for, least_cost
-from ssh_abduction.solver.values import Cost, Status, nats_of
+from ssh_abduction.solver.values import Cost, Status
 from ssh_abduction.solver.weighed import EQUAL, Rival, Weighed
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.evidence.displacement import jumped
@@ -368,26 +367,10 @@ class Weighing:
         """
         least = best.nats + self._within if self.proven else -math.inf
         seconds = min(max(self._parts.watch.left() + OVERTIME, LEAST_ESTIMATING), ESTIMATING)
-        task, visit = self._parts.task, self._misfit.visit
-        # Drives that closures tie to others do not overlap by chance.
-        overlap = task.problem.overlap
-        free = [drive for i, drive in enumerate(drives_of(task.trace)) if not overlap.is_tied(i)]
-        for rival in estimated(best, visit, free, self._cost_like(best), seconds):
+        of_best = self._parts.task.problem, self._misfit, self.candidates[0].map
+        for rival in rivals_of(*of_best, seconds):
             if rival.nats >= least and (rival.dstates, rival.places) not in known:
                 yield rival
-
-    def _cost_like(self, best: Rival) -> CostOf:
-        """Return a function for the cost of maps with the paths and faults of the best map."""
-        theory = self._parts.task.theory
-        dstate, place, _ = theory.prices
-        kept = nats_of(replace(Cost.of(self.candidates[0].map), dstates=0, places=0), theory)
-        wrong = [step for kind, step in best.faults if kind == "jumped"]
-
-        def cost_of(dstates: Sequence[int], places: Sequence[int]) -> float:
-            nats: float = kept + self._misfit.of_course(dstates, places or dstates, wrong) / 2
-            return nats + dstate * len(set(dstates)) + place * len(set(places))
-
-        return cost_of
 
 
 def _prices_of(theory: Theory) -> dict[str, float]:
