@@ -87,10 +87,13 @@ def test_a_name_is_moved_and_a_gateway_changes_its_mind() -> None:
     said = Corrections(MARKS).with_name("hall", "place", "monday:1")
     assert [n.name for n in said.with_name("kitchen", "place", "monday:1").names] == ["kitchen"]
     with pytest.raises(
-        MapError, match=r"another name than 'hall', as names\[0\] at monday:1 has it"
+        MapError, match=r"another name than 'hall', as names\[0\], the place of monday:1, has it"
     ):
         said.with_name("hall", "place", "monday:3")
-    assert len(said.with_name("hall", "path", "monday:3").names) == 2
+    for kind in ("path", "region"):
+        with pytest.raises(MapError, match=f"got name 'hall' of the {kind} of monday:3; rename"):
+            said.with_name("hall", kind, "monday:3")
+        assert len(said.with_name("long hall", kind, "monday:3").names) == 2
     closed = said.with_gateway(False, [("monday:1", 90.0)])
     assert [g.is_open for g in closed.with_gateway(True, [("monday:1", 90.0)]).gateways] == [True]
 
@@ -100,6 +103,7 @@ def test_a_name_is_moved_and_a_gateway_changes_its_mind() -> None:
     [
         ("", None),
         ("names:\n- {name: a, place: monday:1}\n- {name: a, place: tuesday:1}\n", "another name"),
+        ("names:\n- {name: a, place: monday:1}\n- {name: a, region: monday:1}\n", "another name"),
         ("names:\n- {name: a, place: monday:1}\n- {name: b, place: monday:1}\n", "one name for"),
         ("names:\n- {name: a}\n", r"names\[0\]: expected one of place, path, region"),
         ("names:\n- {name: a, place: p4}\n", r"names\[0\].place: expected a drive, a colon"),
@@ -408,6 +412,11 @@ def test_names_stand_in_all_that_is_made_of_a_map(
     assert ssh_map.called("place", 1) == "place 1 (kitchen)"
     assert ssh_map.renumbered().names == ssh_map.names
     assert SSHMap.from_dict(ssh_map.to_dict()).names == ssh_map.names
+    twice = ssh_map.to_dict() | {
+        "names": [{"place": 1, "name": "hall"}, {"path": 0, "name": "hall"}]
+    }
+    with pytest.raises(MapError, match="names: expected each once, got"):
+        SSHMap.from_dict(twice)
     for to in ("nav2", "tmap2", "graphml", "dot", "svg", "networkx-json"):
         text = export_map(ssh_map, to)
         assert "kitchen" in text, to

@@ -151,7 +151,7 @@ class Corrections:
             step: The step, such as "monday:12".
 
         Raises:
-            MapError: Another thing of this kind has this name, or an argument is wrong.
+            MapError: Another place, path or region has this name, or an argument is wrong.
         """
         one_of("kind", kind, NAMED, MapError)
         kept = [n for n in self.names if (n.kind, n.step) != (kind, step)]
@@ -359,13 +359,14 @@ class Corrections:
                     f"by its number; give another one, such as 'room {naming.name}'"
                 )
             for key, what in (
-                ((naming.kind, naming.name), f"another name than {brief(naming.name)}"),
+                ((naming.name,), f"another name than {brief(naming.name)}"),
                 ((naming.kind, naming.step, ""), f"one name for the {naming.kind}"),
             ):
                 if key in first:
+                    other = self.names[first[key]]
                     raise MapError(
-                        f"{where}: names[{i}]: expected {what}, as names[{first[key]}] at "
-                        f"{self.names[first[key]].step} has it, got {naming}; rename one of them"
+                        f"{where}: names[{i}]: expected {what}, as names[{first[key]}], the "
+                        f"{other.kind} of {other.step}, has it, got {naming}; rename one of them"
                     )
                 first[key] = i
 

@@ -152,9 +152,11 @@ def map_fields(data: Any, where: str) -> dict[str, Any]:
     labels = read.each(record, "labels", read.integer)
     if not labels:
         raise read.wrong("labels", "the dstate of each step", [])
-    for name, numbers in (("places", places), ("paths", path_ids)):
-        if len(set(numbers)) < len(numbers):
-            raise read.wrong(name, "each id once", list(numbers))
+    names = read.each(record, "names", lambda x, name: _name(read, x, name), optional=True)
+    once = {"places": places, "paths": path_ids, "names": [name.text for name in names]}
+    for name, values in once.items():
+        if len(set(values)) < len(values):
+            raise read.wrong(name, "each once", list(values))
     for i, label in enumerate(labels):
         if not 0 <= label < len(dstates):
             raise MapError(
@@ -177,7 +179,7 @@ def map_fields(data: Any, where: str) -> dict[str, Any]:
         ),
         "fit": _fit(read, record, len(dstates)),
         "regions": _regions(read, record, {*places}, {*path_ids}),
-        "names": read.each(record, "names", lambda x, name: _name(read, x, name), optional=True),
+        "names": names,
     }
 
 
