@@ -239,7 +239,7 @@ class World:
 
         Args:
             start: Text "x,y,degrees", with x and y in metres.
-            route: Text "travel,right,…", or names of places with commas between.
+            route: Actions, or names of places, separated by commas, such as "travel,right".
             reach: Half the width of a corridor in metres.
 
         Raises:

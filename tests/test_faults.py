@@ -452,7 +452,7 @@ def test_a_dstate_whose_views_are_all_misread_has_a_view() -> None:
     [
         (["--same", "0,9"], 1, r"same \(--same\): expected steps from 0 to 3, got 0,9"),
         (["--different", "0,9"], 1, "different"),
-        (["--same", "0,1"], 20, "no map has at most 0 faults: what is asserted .* contradicts"),
+        (["--same", "0,1"], 20, "no map has at most 0 faults: the asserted pairs .* contradict"),
         (["--same", "0,1", "--json"], 20, r'"front": \[\]'),
     ],
 )
@@ -465,7 +465,8 @@ def test_a_front_without_points_says_why(
     assert re.search(said, "".join(capsys.readouterr()))
     if code == 20 and "--json" not in options:  # a view that is misread mends it
         assert main(["solve", path, "--front", "1", *options]) == 0
-        assert "no map has fewer than 1 fault, as something is asserted" in capsys.readouterr().out
+        shown = capsys.readouterr().out
+        assert "no map with the asserted pairs of steps has fewer than 1 fault" in shown
 
 
 def fewest(
@@ -509,7 +510,7 @@ def test_the_front_in_the_shell(
     assert re.search(
         r"^  1 +4 +knee +the view at step 9 is misread: v0, expected v1$", said, re.MULTILINE
     )
-    assert "a fault that costs more than 0 and less than 9 dstates" in said
+    assert "if a fault costs more than 0 and less than 9 dstates" in said
     assert main(["solve", "trace.jsonl", "--front", "1", "--json"]) == 0
     assert [point["dstates"] for point in json.loads(capsys.readouterr().out)["front"]] == [13, 4]
     assert main(["solve", "trace.jsonl", "--front", "2", "--theory", "topological"]) == 1

@@ -378,8 +378,8 @@ def test_a_warning_names_the_step(noisy: Path, capsys: pytest.CaptureFixture[str
     assert err == f"ssh-abduction: warning: {warning}\n"
     assert warning.startswith(f"{noisy}:{last + 2}: view ")
     assert (
-        f"looks like noise at step {last}: because of it {last} of the {last + 1} steps up to "
-        "there have to be dstates of their own" in warning
+        f"looks like noise at step {last}: it forces {last} of the {last + 1} steps up to there to "
+        "be different dstates" in warning
     )
 
 

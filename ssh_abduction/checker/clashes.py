@@ -116,8 +116,8 @@ def _gateways(name: str, m: Reading) -> Found:
         else:
             yield (
                 clash.steps,
-                f"What is seen at steps {steps} cannot be one place, {clash.place}: the gateways "
-                "do not agree, however turned.",
+                f"Steps {steps} cannot all be at place {clash.place}: in no rotation do the "
+                "gateways seen there agree.",
             )
 
 

@@ -168,8 +168,8 @@ def planar(m: Reading) -> Found:
     ways = ", ".join(f"{t.source.place} to {t.target.place} (step {t.step})" for t in kept)
     yield (
         [step for t in kept for step in t.steps],
-        "However it is drawn, paths cross where there is no place; travels lead along them from "
-        f"place {ways}.",
+        "In every drawing, paths cross where there is no place. These travels follow the paths: "
+        f"from place {ways}.",
     )
 
 

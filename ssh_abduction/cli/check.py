@@ -90,7 +90,7 @@ class _Judgement:
         yield f"{sound} of {len(self.violations)} maps satisfy the {self.checked} axioms"
         if self.not_checked:
             names = printable(", ".join(self.not_checked))
-            yield f"not checked, as they are a user's own: {names}"
+            yield f"not checked, as they come from a user's own rules: {names}"
         yield from self.said
 
 

@@ -73,7 +73,7 @@ def run(options: argparse.Namespace) -> int:
         raise AbductionError(f"{options.trace}: {error}") from None
     except ValueError as error:  # the message of scikit-learn says why it cannot cluster them
         raise AbductionError(
-            f"{options.trace}: images: {error}; log more images, or others"
+            f"{options.trace}: images: {error}; log more images, or different ones"
         ) from None
     truth = true_dstate_names(trace)
     uncertainty: dict[int, float] = {}

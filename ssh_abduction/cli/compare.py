@@ -166,7 +166,8 @@ def _lines(found: Comparison) -> Iterator[str]:
             for (dstates, places, paths), count in found.sizes
         )
     if found.fits and found.fits[0] != found.fits[1]:
-        yield f"  they close with chi-squares of {found.fits[0]:.1f} to {found.fits[1]:.1f}"
+        least, most = found.fits
+        yield f"  their misfit to the displacements is a chi-square of {least:.1f} to {most:.1f}"
     if found.unlisted:
         yield f"  only in maps that are not listed: {depending(found.unlisted)}"
     if found.others:

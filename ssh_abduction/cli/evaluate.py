@@ -53,16 +53,17 @@ def add_parser(verbs: Verbs) -> None:
         "compare maps with the truth",
         "Compare maps with the truth in the trace. Reports which map is true, and how far the "
         "others are from it.",
-        "The table gives two shares each for pairs of steps at one place, for edges, and for "
-        "links: precision and recall. If steps have true poses but no true names, as in an "
-        "imported log, visits near each other count as one place. docs/reference/formats.md "
-        "describes what is counted.",
+        "The table gives precision and recall (shares from 0 to 1) for pairs of steps at one "
+        "place, for edges (two places that a travel joins), and for links. If steps have true "
+        "poses but no true names, as in an imported log, visits near each other count as one "
+        "place. docs/reference/formats.md describes what is counted.",
     )
     add_maps(parser)
     add_trace(parser, " with truth")
     parser.add_setting(
         "near METRES",
-        "also judge by true poses; visits within this distance count as one place (default: 2)",
+        "judge by true poses, too: visits within this distance count as one place (if no step "
+        "names its true place, this is done anyway, with 2 metres)",
         type=float,
     )
     parser.add_setting(

@@ -90,7 +90,7 @@ def add_parser(verbs: Verbs) -> None:
     add_limits(parser, "what is known", SECONDS)
     parser.add(
         "--corrections FILE",
-        "obey the corrections in this file, or in corrections.yaml of this folder (default: "
+        "obey the corrections in this file; for a folder, in its corrections.yaml (default: "
         "corrections.yaml beside the file of --theory, if both exist)",
     )
     add_theory(parser)

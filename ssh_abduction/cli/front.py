@@ -43,9 +43,9 @@ def _as_text(front: Front, most: int) -> str:
     """Write a front of at most `most` faults as a table, with sentences below it."""
     if not front.points:
         return (
-            f"no map has at most {counted(most, 'faults')}: what is asserted (--same, "
-            "--different, --elsewhere) contradicts what was seen and done; "
-            f"allow more faults (--front), or assert less"
+            f"no map has at most {counted(most, 'faults')}: the asserted pairs of steps (--same, "
+            "--different, --elsewhere) contradict what was seen and done; "
+            "allow more faults (--front), or assert less"
         )
     rows = []
     for point in front.points:
@@ -57,8 +57,8 @@ def _as_text(front: Front, most: int) -> str:
     lines = [table(["faults", "dstates", "", "of the map found"], rows)]
     if front.prices:
         lines.append(
-            f"a fault that costs more than {front.prices[0]:g} and less than {front.prices[1]:g} "
-            "dstates makes the map at the knee minimal among these"
+            f"if a fault costs more than {front.prices[0]:g} and less than {front.prices[1]:g} "
+            "dstates, the map at the knee costs least of these"
         )
     elif not front.stopped:
         lines.append("no knee: each further fault saves about as many dstates")
@@ -66,7 +66,9 @@ def _as_text(front: Front, most: int) -> str:
         why = "interrupted" if program.raised else "stopped by the time limit"
         lines.append(f"{why} at {front.points[-1].faults} faults")
     if first := front.points[0].faults:
-        lines.append(f"no map has fewer than {counted(first, 'faults')}, as something is asserted")
+        lines.append(
+            f"no map with the asserted pairs of steps has fewer than {counted(first, 'faults')}"
+        )
     return "\n".join(lines)
 
 

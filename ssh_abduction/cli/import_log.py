@@ -41,7 +41,7 @@ def add_parser(verbs: Verbs) -> None:
         "make a trace of a robot's log",
         "Read a robot's log of laser scans and odometry, find the distinctive places that it "
         "passed, and write a trace with views, stars, displacements and actions. Corrected "
-        "poses in the log become the truth for evaluate. No other command uses them.",
+        "poses in the log become the truth, which only the command 'evaluate' uses.",
     )
     parser.add(
         "log",

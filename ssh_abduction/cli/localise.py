@@ -60,15 +60,15 @@ def add_parser(verbs: Verbs) -> None:
         "recogniser that train wrote for this map, to use images instead of views",
     )
     said = {
-        "misread": "the robot sees a view or star of another dstate (default: 0.01)",
-        "slipped": "the action fails, or the robot is kidnapped (default: 0.01)",
-        "unmapped": "a robot that may be anywhere is outside the map (default: 0.1)",
+        "misread": "at each step, the view or star does not fit the dstate where the robot is "
+        "(default: 0.01)",
+        "slipped": "an action fails, or the robot is kidnapped during it (default: 0.01)",
+        "unmapped": "the robot is outside the map at the start, after a slip, or after an action "
+        "for which the map has no link (default: 0.1)",
         "reentered": "a robot outside the map is back on it after its next action (default: 0.1)",
     }
     for name in CHANCES:
-        parser.add_setting(
-            name, f"at each step, the probability that {said[name]}", type=float, metavar="P"
-        )
+        parser.add_setting(name, f"the probability that {said[name]}", type=float, metavar="P")
     parser.add_setting(
         "zero_one",
         "whether views and actions never fail: the defaults of misread, slipped and unmapped are "

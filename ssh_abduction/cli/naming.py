@@ -16,8 +16,8 @@ def add_parser(verbs: Verbs) -> None:
         run,
         "name a place, path or region",
         "Name a place, a path or a region of a map. The name is written to corrections.yaml beside "
-        "the map. It belongs to a step of a drive at this place: solving again may renumber "
-        "places, but the name stays with the place of its step.",
+        "the map, for a step at this place. Solving again may renumber the places, but the name "
+        "stays with the place of that step.",
     )
     add_maps(parser)
     parser.add(

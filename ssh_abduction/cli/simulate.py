@@ -61,8 +61,8 @@ def add_parser(verbs: Verbs) -> None:
     parser.add("--seed", "random seed of all noise (default: 0)", type=seed, default=0)
     parser.add(
         "--route ACTIONS",
-        "drive this route instead of the world's own: actions (travel, right, left, around) "
-        "separated by commas",
+        "drive this route instead of the world's own: actions (travel, right, left, around, or the "
+        "name of a lift) or, with --format, names of places, separated by commas",
     )
     for name, text, default, details in (
         (
@@ -82,12 +82,18 @@ def add_parser(verbs: Verbs) -> None:
         ),
         (
             "start",
-            "start here instead of at the world's own start: metres, metres, and degrees "
-            "counterclockwise from x",
+            "start here instead of at the world's own start: x and y in metres, and the heading "
+            "in degrees counterclockwise from the x axis",
             None,
             {"metavar": "X,Y,DEGREES"},
         ),
-        ("reach", "the distance that the robot keeps from a wall that it follows", None, METRES),
+        (
+            "reach",
+            "half the width of a corridor: the distance that the robot keeps from a wall that it "
+            "follows (default: that of the world)",
+            None,
+            METRES,
+        ),
         (
             "odometry_noise",
             "standard deviation of the odometry, as a share of each motion (default: 0.02); with "

@@ -96,14 +96,15 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.add(
         "--corrections FILE",
-        "obey the names and corrections in this file, or in corrections.yaml of this folder "
+        "obey the names and corrections in this file; for a folder, in its corrections.yaml "
         "(default: corrections.yaml beside the file of --output, if it exists)",
     )
     parser.add(
         "--front K",
         "report the fewest dstates of a map with at most 0, 1, … K faults (steps that are treated "
-        "as wrong), by the causal theory. If misread or slipped is set, only faults of these kinds "
-        "count. The report also names the knee: with more faults than that, few dstates are saved",
+        "as wrong), by the causal theory. If misread or slipped is set, only faults of the kinds "
+        "that are set count. The report also names the knee: the number of faults beyond which "
+        "further faults save few dstates",
         type=int,
     )
     add_limits(parser, "the best answer so far")

@@ -63,7 +63,7 @@ def headline(solution: Solution, count: int, explanation: Explanation | None) ->
     )
     if solution.cost is None:
         return (
-            f"{solution.status.value}{why}: no map of all {solution.steps} steps yet; any has "
+            f"{solution.status.value}{why}: no map of all {solution.steps} steps yet; any map has "
             f"{bound or 'no proven bound'}; {seconds}"
         )
     counts = ", ".join(
@@ -114,14 +114,14 @@ def by_displacements(solution: Solution) -> Iterator[str]:
     text = f"displacements: they exclude {counted(said['pairs'], 'pairs')} of steps{sets}"
     best = solution.maps[0].fit if solution.maps else None
     if best is not None:
-        which = "the map closes" if solution.count == 1 else "map 1, which closes best, does so"
+        which = "the map" if solution.count == 1 else "map 1, which fits best,"
         text += (
-            f"; {which} with a chi-square of {best.chi2:.1f} for {best.dof} degrees of freedom (p "
-            f"= {best.p:.2g})"
+            f"; {which} fits them with a chi-square of {best.chi2:.1f} for {best.dof} degrees of "
+            f"freedom (p = {best.p:.2g})"
         )
         if best.scale or best.bend:
             text += (
-                f", scale off by {100 * best.scale:+z.1f} %, headings drift by "
+                f", if reported distances are {100 * best.scale:+z.1f} % off and headings drift by "
                 f"{math.degrees(best.bend):+z.3f} degrees a metre"
             )
     yield text
@@ -155,7 +155,9 @@ def describe(ssh_map: SSHMap) -> str:
         order = " – ".join(ssh_map.numbered("place", place) for place in p.order)
         parts.append(printable(f"  {ssh_map.called('path', p.id)}: places {order}"))
     if ssh_map.excused:
-        parts += [f"  excused from sides: paths {h} and {g}" for h, g in ssh_map.excused]
+        parts += [
+            f"  side_of_branch is not applied to paths {h} and {g}" for h, g in ssh_map.excused
+        ]
     leads: dict[int, list[str]] = {}
     for source, action, target in ssh_map.links:
         leads.setdefault(source, []).append(f"{action} → {target}")

@@ -182,7 +182,7 @@ class PairExplanation:
             counts = f"{effect} {', '.join(text for _, text in changed)} ({abs(price):.1f} nats)"
         else:
             priced = (f"{text} {'more' if number > 0 else 'less'}" for number, text in changed)
-            counts = f"{_effect(price)} of price ({', '.join(priced) or 'the same counts'})"
+            counts = f"{_effect(price)} for its parts ({', '.join(priced) or 'the same counts'})"
         loop = f": {self.loop}" if self.loop else ""
         laying = " and of laying drives on each other" if self.theory.several_drives else ""
         return f"{what} {counts} and {_effect(misfit)} of misfit{laying}{loop}"

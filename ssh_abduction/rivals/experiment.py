@@ -222,7 +222,8 @@ def _sentence(experiment: Experiment) -> str:
         left = (
             "leaves one of them"
             if plan.worst == 1
-            else f"leaves {plan.worst} of them in the worst case, as known links tell no more"
+            else f"leaves {plan.worst} of them in the worst case, as known links do not tell them "
+            "apart"
         )
         text = f"{count} maps: after {_acts(plan.actions)} their predictions differ; this {left}"
         if any(branch.plan.branches for branch in plan.branches):

@@ -147,13 +147,10 @@ def _ladder(rungs: Sequence[Rung]) -> str:
 
 
 def _doubts(solution: Solution) -> str:
-    """Make the table of the visits that the first map joins though they may be two places."""
+    """Make the table of the joins of the first map that are not sure."""
     doubts = doubtful_joins(solution)
     if not doubts:
-        return _paragraph(
-            f"Each join of the first map has a probability of at least {SURE:g}, or the map joins "
-            "nothing."
-        )
+        return _paragraph(f"None: the first map has no join with a probability below {SURE:g}.")
     places = place_of_steps(solution.maps[0])
     rows = [
         (first, second, places[second], f"{probability:.2f}")
@@ -202,8 +199,8 @@ def _time(run: Mapping[str, Any]) -> str:
     ]
     text = f"All stages together took {total:.1f} s of processor time"
     if run["drove"]:
-        share = f"a share of 1/{run['drove'] / max(total, 1e-9):.0f}"
-        text = f"The robot drove {run['drove']:.0f} s. {text}, {share}"
+        share = f"1/{run['drove'] / max(total, 1e-9):.0f} of the duration of the drive"
+        text = f"The robot drove {run['drove']:.0f} s. {text}, which is {share}"
     return _table(("stage", "processor", "share"), rows) + _paragraph(
         f"{text}. The search for the minimal maps had {run['limit']:g} s at most."
     )

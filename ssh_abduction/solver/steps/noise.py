@@ -54,9 +54,9 @@ class Noise:
         """Return the warning for a user, as a sentence."""
         return (
             f"{trace.at(self.step)}: view {trace.steps[self.step].view!r} looks like noise at step "
-            f"{self.step}: because of it {self.told_apart} of the {self.step + 1} steps up to there"
-            " have to be dstates of their own, and without it no more than "
-            f"{self.without} of all steps; look at what was seen and done there, and mend the trace"
+            f"{self.step}: it forces {self.told_apart} of the {self.step + 1} steps up to there to "
+            f"be different dstates. Without it, only {self.without} of all steps have to be; look "
+            "at what was seen and done there, and mend the trace"
         )
 
 
