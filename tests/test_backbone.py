@@ -183,6 +183,7 @@ def test_every_engine_leaves_what_it_takes_to_reason(frame_after: float, engine:
     assert (first.effort.prefix < len(trace)) == (engine is StepEngine)
 
 
+@pytest.mark.slow
 def test_a_maze_with_stars_is_reasoned_about_by_its_labels() -> None:
     """Seven maps in three labellings."""
     trace = maze(5, 5, steps=100, seed=1, stars=True).trace

@@ -209,6 +209,7 @@ def test_a_warning_names_its_trace_once(traces: Path, capsys: pytest.CaptureFixt
     assert warning.startswith("ssh-abduction: warning: noisy.jsonl:42: view 'v2' looks like noise")
 
 
+@pytest.mark.slow
 def test_everywhere_the_same(
     traces: Path, scheduler_here: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

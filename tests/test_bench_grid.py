@@ -17,6 +17,8 @@ from grid_worlds import Scene, boxes, comb, maze, rectangle, ring, taylor_hall
 from simulator.laser import Laser
 from simulator.world import World
 
+pytestmark = pytest.mark.slow
+
 WORLD = World.named("notched-rectangle")
 SURE = np.diag([1e-4, 1e-4, 1e-4])
 

@@ -25,6 +25,8 @@ from suite import INSTANCES, SUITE
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.theory.speedups import SPEEDUPS, Speedups
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parent.parent
 STORED = sorted((ROOT / "benchmarks" / "results").glob("*.json"))
 ALWAYS = {"instance", "theory", "tool", "seed", "status", "reason"}

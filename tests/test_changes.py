@@ -278,6 +278,7 @@ def test_theories_that_know_no_gateways_are_refused(theory: dict[str, Any], said
         Theory.causal().replace(changed=1.5)
 
 
+@pytest.mark.slow
 def test_the_beam_finds_changes_of_drives_with_displacements() -> None:
     """On Tuesday there is no way to the right at the first end of a corridor.
 

@@ -461,6 +461,7 @@ def test_the_shell_prints_what_python_says(
     assert capsys.readouterr().out == "the maps are the same\n"
 
 
+@pytest.mark.slow
 def test_where_not_all_are_listed_the_backbone_says_what_all_share(
     file_of: Callable[..., Path], capsys: pytest.CaptureFixture[str]
 ) -> None:

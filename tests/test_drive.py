@@ -231,6 +231,7 @@ def test_a_school_can_be_driven() -> None:
 # Worlds with a route of places
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "tours"), [("curved", 1), ("cluttered", 1), ("doors", 1)])
 def test_shipped_worlds_are_driven_off_their_walls_and_furniture(name: str, tours: int) -> None:
     """Each place is visited as often as the route says, also when the furniture has moved.

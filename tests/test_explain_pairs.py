@@ -250,7 +250,6 @@ def test_what_a_join_costs_in_nats() -> None:
     ]
 
 
-ACES3 = Trace.load(Path(__file__).parent.parent / "examples" / "aces3-route.jsonl")
 # A square whose loop closes 3 m off, and a second round.
 SQUARE = Trace.from_steps(
     "abcdefghabcdefgha",
@@ -259,7 +258,7 @@ SQUARE = Trace.from_steps(
 )
 
 
-@pytest.mark.parametrize(("trace", "within"), [(ACES3, 1), (SQUARE, 16)])
+@pytest.mark.parametrize(("trace", "within"), [(SQUARE, 16)])
 def test_an_answer_is_never_worse_than_the_known_maps(trace: Trace, within: int) -> None:
     """No time is left for any search, but the known maps are still there."""
     solution = solve(trace)
@@ -286,7 +285,7 @@ def test_an_answer_is_never_worse_than_the_known_maps(trace: Trace, within: int)
     assert (search.status, search.cost) == (Status.FEASIBLE, solution.cost)
 
 
-@pytest.mark.parametrize(("trace", "within"), [(SQUARE, 16)])
+@pytest.mark.parametrize(("trace", "within"), [(SQUARE, 8)])
 def test_known_maps_change_no_answer_that_is_proven(trace: Trace, within: int) -> None:
     anew, known = Search(trace, within=within), solve(trace, within=within + 1).maps
     search = Search(trace, within=within, _start=Start(known=known))

@@ -193,7 +193,9 @@ def driven(floors: int) -> Trace:
     return simulate(World.named(f"tower-{floors}"), seed=3)
 
 
-@pytest.mark.parametrize(("floors", "dstates"), [(2, 42), (3, 60)])
+@pytest.mark.parametrize(
+    ("floors", "dstates"), [(2, 42), pytest.param(3, 60, marks=pytest.mark.slow)]
+)
 def test_a_robot_in_a_simulated_tower_changes_floors_by_lifts_only(
     floors: int, dstates: int
 ) -> None:

@@ -95,6 +95,7 @@ def test_minimal_maps_are_the_best_of_all_ways_to_leave_displacements_out(
     assert all(check(trace, ssh_map, theory) == () for ssh_map in solution.maps)
 
 
+@pytest.mark.slow
 def test_a_robot_that_was_carried_away_finds_its_circuit_again() -> None:
     trace, solution = circuit(18, (9,)), carried()
     without = solve(trace, Theory(weigh="count")).cost

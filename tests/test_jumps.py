@@ -105,6 +105,7 @@ def test_a_robot_that_stands_is_not_carried(scans: tuple[Scan, ...]) -> None:
     assert unknown_steps(RobotLog((*scans[:60], *stands, *scans[60:]))) == Unknown()
 
 
+@pytest.mark.slow
 def test_a_robot_that_was_carried_unseen_is_mapped_as_two_ways(scans: tuple[Scan, ...]) -> None:
     """The laser is off while the robot is carried, and the odometer is where it was."""
     lifted = stepwise((*scans[:60], *scans[85:]), lambda i, step: START if i == 60 else step)

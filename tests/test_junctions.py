@@ -143,6 +143,7 @@ def test_a_panorama_is_what_is_around() -> None:
 # --- control laws
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("graph", "start"),
     [
@@ -278,6 +279,7 @@ def test_images_at_even_distances() -> None:
 # --- maps
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "tours", "seed"),
     [

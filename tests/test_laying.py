@@ -64,7 +64,7 @@ ERRORS = st.lists(st.floats(-0.2, 0.2), min_size=3, max_size=3)
 @pytest.mark.filterwarnings("ignore:traces 1 and 2 have the same steps")
 @pytest.mark.filterwarnings("ignore:views. trace")
 @pytest.mark.filterwarnings("ignore:.*no view in common")
-@settings(max_examples=8)
+@settings(max_examples=4)
 @given(
     st.tuples(st.integers(0, 3), st.integers(1, 3), ERRORS),
     st.tuples(st.integers(0, 3), st.integers(1, 3), ERRORS),

@@ -766,6 +766,7 @@ def test_reproduce_writes_the_page_and_all_that_made_it(
     assert json.loads(capsys.readouterr().out)["claims"] == claimed
 
 
+@pytest.mark.slow
 def test_a_summary_counts_the_seeds_in_which_a_claim_holds(measured: SeedRun) -> None:
     good = measured
     bad = replace(

@@ -123,7 +123,7 @@ def test_the_search_ends_in_time_with_its_best_map(noisy: Path) -> None:
 
 @pytest.mark.parametrize(
     "case",
-    list(cases(4, seed=1, longest=300, seconds=(0.3, 0.5))),
+    list(cases(2, seed=1, longest=300, seconds=(0.3, 0.5))),
     ids=lambda case: f"{case.family}, {len(case.trace)} steps",
 )
 @POSIX

@@ -248,6 +248,7 @@ def test_flags_of_a_theory_make_it_again() -> None:
         assert theory_of(parser.parse_args(flags_of(theory))) == theory
 
 
+@pytest.mark.slow
 def test_page_of_many_maps_of_500_dstates_in_metres_is_small() -> None:
     """A page has a limited number of drawings, each with its own poses. Further maps share them."""
     rng, places, maps = np.random.default_rng(0), 250, []
@@ -410,6 +411,7 @@ def test_question_whose_asker_is_gone_is_given_up(
     assert b"expected a pair" in asked(server, "POST", own + "explain", {})[1]
 
 
+@pytest.mark.slow
 def test_answers_begin_with_the_maps_of_the_page() -> None:
     """The time is too short for a search that would find these maps again."""
     trace = Trace.load(Path(__file__).parent.parent / "examples" / "aces3-route.jsonl")

@@ -298,6 +298,7 @@ def test_control_never_reads_the_true_pose() -> None:
 # Tours
 
 
+@pytest.mark.slow
 def test_every_dstate_is_reached_in_order(circuits: Trace, tours: Trace) -> None:
     assert [step.truth["dstate"] for step in circuits.steps] == [f"x{i % 8}" for i in range(48)]
     assert [a.name for a in circuits.actions[:8]] == list(RECTANGLE.route)

@@ -455,6 +455,7 @@ def maps_of_all_tours() -> list[tuple[Trace, Theory, SSHMap]]:
     ]
 
 
+@pytest.mark.slow
 def test_a_map_predicts_the_trace_it_was_made_for() -> None:
     for trace, theory, ssh_map in maps_of_all_tours():
         replayed = Log(trace, settle(trace, theory).theory).replay(ssh_map.labels)

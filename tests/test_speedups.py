@@ -335,6 +335,7 @@ def test_a_limit_leaves_a_map_of_merged_steps() -> None:
     assert check(walk.trace, solution.maps[0], Theory.causal()) == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0])
 def test_a_limit_leaves_the_small_map_of_a_guess(seed: int) -> None:
     """A machine without turns."""

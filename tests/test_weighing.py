@@ -423,6 +423,7 @@ def test_each_map_is_listed_once() -> None:
     assert 1 < len(solution.maps) == len(set(solution.maps))
 
 
+@pytest.mark.slow
 def test_maps_of_one_cost_are_minimal_whatever_their_paths(tmp_path: Path) -> None:
     """Two drives share a corner of a square, but nothing says which. Paths cost nothing."""
     square = [(10, 0, 0), (0, 0, math.pi / 2)] * 4

@@ -71,6 +71,7 @@ def test_the_brute_force_for_near_minimal_maps_begins_with_the_minimal_ones() ->
     assert [cost[0] for cost in near_minimal_maps(trace, Theory.topological(), 1)] == [2, 3]
 
 
+@pytest.mark.slow
 def test_the_true_map_of_the_real_route_is_within_three_dstates() -> None:
     """With stars, and places before paths, it is one of the best twelve that have 22 dstates."""
     trace = Trace.load(ACES3)
