@@ -417,9 +417,7 @@ def test_a_busy_machine_has_a_map_when_the_limit_is_long_over(
 ) -> None:
     """The clock runs twenty times too fast: the limit is over before the search begins."""
     for module in ("asp.limits", "search"):
-        monkeypatch.setattr(
-            f"ssh_abduction.solver.{module}.now", lambda: 20 * time.perf_counter()
-        )
+        monkeypatch.setattr(f"ssh_abduction.solver.{module}.now", lambda: 20 * time.perf_counter())
     trace = Trace.load(Path(__file__).parent.parent / "examples" / "aces3-route.jsonl")
     for theory in (Theory.topological(), Theory.causal()):
         solution = solve(trace, theory, time_limit=0.002, max_maps=1)
