@@ -17,7 +17,7 @@ class PerceptionError(AbductionError, ValueError):
 class LogError(AbductionError, ValueError):
     """A robot's log, or its content, cannot be read or written.
 
-    The text says what was expected, what came, and how to fix it.
+    The text says what was expected, what was found, and how to correct it.
     """
 
 

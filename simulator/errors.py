@@ -6,7 +6,7 @@ from ssh_abduction.data.errors import AbductionError
 class SimulatorError(AbductionError, ValueError):
     """A world, pose or tour that cannot be simulated.
 
-    The text says what was expected, what came, and how to fix it.
+    The text says what was expected, what was found, and how to correct it.
     """
 
 

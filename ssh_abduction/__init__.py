@@ -1,8 +1,8 @@
 """Find every minimal topological map that explains what a robot saw and did.
 
 Each exported name is loaded when it is first used. So the command line starts at once, and Ctrl-C
-works from its start. This module itself imports nothing when it is loaded, not even `__future__`:
-Python may still search the current folder first then, where a file could take the place of a
+works from its start. This module itself imports nothing when it is loaded, not even `__future__`.
+At that time, Python may still search the current folder first, and a file there could replace a
 module of Python. `__main__` moves that folder to the end of the search path.
 """
 

@@ -517,4 +517,4 @@ def test_a_route_avoids_a_place_whose_name_has_a_comma(
     assert main(["name", maps, "p1", "room 1, left"]) == 0
     capsys.readouterr()
     assert main(["route", maps, "--from", "0", "--to", "p1", "--avoid", "room 1, left"]) == 1
-    assert "avoid: expected other dstates and places than those of to" in capsys.readouterr().err
+    assert "avoid: expected a dstate of 'to' that is not avoided" in capsys.readouterr().err

@@ -276,7 +276,7 @@ def test_both_verbs_show_all_notes_and_take_the_same_options(
     main([verb, str(path), *out])
     said = capsys.readouterr().err
     for note in (
-        "Scans are those of",
+        "Scans come from",
         "Ranges of 5 m repeat",
         "Scan matching and odometry disagree",
     ):
@@ -303,7 +303,7 @@ def test_both_verbs_show_all_notes_and_take_the_same_options(
             ]
         )
         said = capsys.readouterr().err
-        assert "Scans are those of" in said
+        assert "Scans come from" in said
         assert "repeat" not in said
         assert "Scan matching and odometry" not in said
 

@@ -237,7 +237,7 @@ def test_logs_that_do_not_go_together_are_refused(
     logs = [str(tmp_path / folder / "run.log") for folder in "ab"]
     out = ["--together", "-o", str(tmp_path / "building")]
     assert main(["map", *logs, *out]) == 1
-    assert "expected another name than that of" in capsys.readouterr().err
+    assert "expected a name different from" in capsys.readouterr().err
     assert main(["map", *logs, *out, "--jobs", "2"]) == 1
     assert "--together: expected one search for all logs" in capsys.readouterr().err
     assert distinct([logs[0], logs[1], logs[0]]) == ([*logs], [(logs[0], logs[0])])

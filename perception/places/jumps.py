@@ -66,8 +66,8 @@ def keep_one_source(log: RobotLog) -> tuple[RobotLog, list[str]]:
         return log, []
     said = (
         f"The poses of several sources alternate in the odometry, {len(sources[0])} and "
-        f"{len(sources[1])} of {len(log)}: those of the first are used. "
-        "Stop the other source, and record again, if it is the better one."
+        f"{len(sources[1])} of {len(log)}. The source of more poses is used. If the other one is "
+        "better, stop the source that was used, and record again."
     )
     return replace(log, scans=_of_source(log.scans, sources[0])), [said]
 

@@ -204,9 +204,9 @@ def judged(log: RobotLog, track: Track, explained: bool) -> tuple[Track, list[st
         )
     if track.way[-1] > 2 * AWAY and not _returns(track):
         notes.append(
-            f"In {track.way[-1]:.0f} m the robot never comes back to where it was {AWAY:.0f} m or "
-            "more of its way before, so nothing confirms the map, and no loop is closed. Drive "
-            "each corridor twice, or end where the drive began."
+            f"In {track.way[-1]:.0f} m the robot never comes back to where it was before, at least "
+            f"{AWAY:.0f} m earlier on its way. So no loop is closed, and nothing confirms the map. "
+            "Drive each corridor twice, or end where the drive began."
         )
     return replace(track, is_reliable=is_reliable), notes
 

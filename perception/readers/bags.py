@@ -66,12 +66,12 @@ def read(bag: Bag, scan_topics: Sequence[str], odom_topic: str | None) -> Survey
     frame = seen.most_common(1)[0][0]
     if odometers is not None:
         odometer, odom, base = _odometer(bag, odometers, damaged, notes)
-        notes.insert(len(bag.notes), f"Scans are those of {said}, odometry that of {odometers}.")
+        notes.insert(len(bag.notes), f"Scans come from {said}, odometry from {odometers}.")
         called = odometers
     else:
         odometer, odom, base = _odometer_of_transforms(bag, frames, frame)
         notes.append(
-            f"Scans are those of {said}. There are no messages Odometry: odometry is the "
+            f"Scans come from {said}. There are no Odometry messages, so odometry is the "
             f"transform from {odom} to {base}."
         )
         called = f"the transforms from {odom} to {base}"
@@ -99,7 +99,7 @@ def read(bag: Bag, scan_topics: Sequence[str], odom_topic: str | None) -> Survey
     by_stamp, contradictions = clock_of(clocks)
     notes += contradictions
     if above:
-        notes.append(f"Corrected poses are those of the transforms above {odom}.")
+        notes.append(f"Corrected poses come from the transforms above {odom}.")
     where = _ScanPoses(
         TimedPoses.of(odometer, by_stamp),
         [TimedPoses.of(track, by_stamp) for track in above],
@@ -250,8 +250,9 @@ def _of_one_source(track: RecordedTrack, called: str, notes: list[str]) -> Recor
     apart = max(math.dist(here.at(time)[:2], there.at(time)[:2]) for time in there.times)
     notes.append(
         f"Several sources publish {called}, whose poses alternate, up to {apart:.1f} m apart: "
-        f"{len(sources[0])} and {len(sources[1])} of {len(table)} messages. "
-        "The first source is read. If the other one is better, stop the first and record again."
+        f"{len(sources[0])} and {len(sources[1])} of {len(table)} messages. The source of more "
+        "messages is read. If the other one is better, stop the source that was read, and record "
+        "again."
     )
     return first
 

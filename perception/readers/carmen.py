@@ -135,14 +135,12 @@ def read(
         if other != kind and (other in found.kinds or found.tags[other])
     ]
     if others:
-        notes.append(
-            f"The scans are those of the lines {kind}; those of {', '.join(others)} are not read."
-        )
+        notes.append(f"Scans are read from the lines {kind} only, not from {', '.join(others)}.")
     meaning = meaning_of(found, survey, kind, source, notes)
     is_corrected = meaning != "edges" or found.graph.is_corrected(CORRECTED)
     if not is_corrected:
         notes.append(
-            "The poses of the vertices have not been corrected: they are the chain of the edges."
+            "The poses of the vertices have not been corrected: they only add up the edges."
         )
     assumed: dict[str, str] = {}
     mount = mount_in_log(found, survey, meaning, kind)

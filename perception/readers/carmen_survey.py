@@ -239,10 +239,10 @@ def meaning_of(
                 "ODOM); take the log before it was corrected"
             )
         notes.append(
-            f"The poses in {kind} are corrected ones, from which the ODOM lines start anew after "
-            "each scan, as GMapping writes them. Odometry was pieced together: it is the "
-            "chain of the increments of the ODOM lines between two scans, without the jumps of the "
-            "correction. It is no recorded odometry."
+            f"The poses in {kind} are corrected, and after each scan the ODOM lines go on from its "
+            "corrected pose, as in logs of GMapping. So the log has no odometry as it was "
+            "recorded. It was pieced together: the motions that ODOM lines show between two scans "
+            "were added up, without the jumps of the correction."
         )
         if survey.unmoved:
             notes.append(
@@ -268,8 +268,8 @@ def _meaning_beside_graph(
     """
     if graph.share_at_vertices(survey.poses) < MOST_SCANS:
         notes.append(
-            f"The poses in {kind} differ from those of VERTEX2: the former are used as "
-            "odometry, the latter as corrected poses."
+            f"The poses in {kind} and in VERTEX2 differ: those in {kind} are used as odometry, "
+            "those in VERTEX2 as corrected poses."
         )
         return "raw"
     # Corrected poses without edges give no odometry.
@@ -279,8 +279,8 @@ def _meaning_beside_graph(
             f"in {kind}) and no EDGE2; take the log before it was corrected"
         )
     notes.append(
-        f"The robot's poses in {kind} are those of VERTEX2, and so corrected ones. Odometry "
-        "is the chain of the EDGE2 from each vertex to the next."
+        f"The robot's poses in {kind} and in VERTEX2 are equal, so they are corrected poses. "
+        "Odometry is made by adding up the motions in EDGE2 from each vertex to the next."
     )
     if gaps := graph.chain.gaps:
         notes.append(

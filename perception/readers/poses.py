@@ -124,14 +124,14 @@ def _wrong_stamps(name: str, stamps: Array) -> str | None:
     """Describe what is wrong with the stamps of one topic; None if nothing is wrong."""
     none = int((stamps == 0).sum())
     if none == len(stamps) or none > 2:  # A simulated clock may begin at 0.
-        return f"{none} of {len(stamps)} messages of {name} have none"
+        return f"{none} of {len(stamps)} messages of {name} have no time"
     if len(stamps) > 1 and np.ptp(stamps) == 0:
-        return f"those of {name} are the same in all {len(stamps)} messages"
+        return f"the times of {name} are the same in all {len(stamps)} messages"
     back = np.diff(stamps)
     if len(back) and back.min() < -SAME_CLOCK:
         return (
-            f"those of {name} run back by {-back.min():.1f} s, {int((back < -SAME_CLOCK).sum())} "
-            f"times in {len(stamps)} messages"
+            f"the times of {name} run back {int((back < -SAME_CLOCK).sum())} times in "
+            f"{len(stamps)} messages, by up to {-back.min():.1f} s"
         )
     return None
 
@@ -175,9 +175,9 @@ def _apart(topics: Mapping[str, Array]) -> list[str]:
         if abs(off[worst]) > SAME_CLOCK:
             since = when[int(np.argmax(np.abs(off) > SAME_CLOCK))]
             said.append(
-                f"relative to those of {first}, those of {name} are {off[0]:+.1f} s off at first "
-                f"and {off[-1]:+.1f} s at last, at most {off[worst]:+.1f} s, and more than "
-                f"{SAME_CLOCK:g} s from {since:.0f} s on"
+                f"the times of {name} differ from those of {first} by {off[0]:+.1f} s at the "
+                f"beginning, {off[-1]:+.1f} s at the end, and {off[worst]:+.1f} s at most; from "
+                f"{since:.0f} s on they differ by more than {SAME_CLOCK:g} s"
             )
     return said
 

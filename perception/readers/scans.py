@@ -95,7 +95,7 @@ class Damage:
 
     Attributes:
         line: Line in the log, or number of the message in a bag, from 1.
-        what: Text that says what was expected there, and what came.
+        what: Text that says what was expected there, and what was found.
     """
 
     line: int

@@ -106,7 +106,7 @@ def write_bag(
     target = Path(path)
     if target.is_dir():
         raise LogError(
-            f"{named(path)}: expected a folder that is not there yet, got one that is; name "
+            f"{named(path)}: expected the name of a new folder, got an existing folder; name "
             "another, or remove it"
         )
     try:

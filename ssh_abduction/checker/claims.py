@@ -213,8 +213,8 @@ class _Claims:
                 best, here = self._preferred(i - 1), self._preferred(i)
                 preferred = ", ".join(self.theory.priorities)
                 yield (
-                    f"maps: expected equal numbers of {preferred}, as those of one level have, got "
-                    f"{best} in map {i} and {here} in map {i + 1}"
+                    f"maps: expected equal numbers of {preferred} in maps {i} and {i + 1}, which "
+                    f"are of one level, got {best} and {here}"
                 )
         shown = [{k: v for k, v in counts.items() if v or k != "excuses"} for counts in self.counts]
         yield from self._costs_of_each(shown)

@@ -31,7 +31,7 @@ class Reading:
         trace: The trace.
         map: The map.
         theory: The theory.
-        steps: The numbers of all steps. In words, those of several drives have names of drives.
+        steps: The numbers of all steps. With several drives, a step prints with its drive's name.
         axioms: Names of the axioms that hold.
         records: For each id, the dstates of the map with this id. A malformed map may have several.
         first: The first step of each label.
@@ -129,7 +129,7 @@ class Reading:
         return {s.place: i for i, s in reversed(self.visited) if s.place is not None}
 
     def steps_at(self, place: int) -> list[int]:
-        """List the first step at a place, alone; empty if no step is there."""
+        """Return a list with the first step at a place; empty if no step is there."""
         return [self.place_seen[place]] if place in self.place_seen else []
 
     @cached_property

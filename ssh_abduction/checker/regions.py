@@ -157,9 +157,9 @@ def region_beside(m: Reading) -> Found:
 
 
 def region_between(m: Reading) -> Found:
-    """Check that for each place, the places right of all courses that it is right of are a region.
+    """Check the regions between courses (a course is a path and a direction).
 
-    A course is a path and a direction.
+    Take all courses that a place is right of. The places right of all of these are a region.
     """
     yield from _missing(m, m.once(_between))
 

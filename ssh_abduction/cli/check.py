@@ -101,7 +101,7 @@ def add_parser(verbs: Verbs) -> None:
         "judge maps by the axioms",
         "Check maps against a trace and the axioms, without clingo. Reports each axiom that a "
         "map breaks, and at which steps.",
-        "Without --theory, the theory is that of the file of maps. The other options change "
+        "Without --theory, the theory in the file of maps is used. The other options change "
         "single fields of it. Corrections in corrections.yaml beside the maps are obeyed. "
         "docs/reference/formats.md describes the JSON.",
     )

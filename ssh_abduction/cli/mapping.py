@@ -361,8 +361,8 @@ def _together(question: MapQuestion, options: argparse.Namespace) -> int:
     for log in logs:
         if (other := names.setdefault(named_after(log), log)) != log:
             raise AbductionError(
-                f"{named(log)}: expected another name than that of {named(other)}, as logs name "
-                "the drives; rename one of them"
+                f"{named(log)}: expected a name different from {named(other)}, as each drive gets "
+                "the name of its log; rename one of them"
             )
     folder = Path(options.output)
     if not options.again and is_done(folder, logs, question.obeying(folder).settings):

@@ -142,7 +142,10 @@ class Action:
 
     @property
     def leaves_paths(self) -> bool:
-        """Whether no path leads from this step to the next, and both may be at any places."""
+        """Whether this action leads off all paths: the next step may be at any place.
+
+        This holds for a lift, an action that slipped, and the start of another drive.
+        """
         return self.unlinked or self.changes_floor
 
     @property

@@ -96,7 +96,7 @@ class Closure:
 
 
 def match_in_words(closure: Closure, first: int, last: int) -> str:
-    """Say how well the local maps of two steps match. `first` and `last` say what to call them."""
+    """Say how well the local maps of two steps match. `first` and `last` are the steps' names."""
     offset = math.hypot(*closure.displacement[:2])
     return f"the local maps of steps {first} and {last} match with an offset of {offset:.2f} m"
 

@@ -160,7 +160,7 @@ class Corrections:
     def with_pair(self, kind: str, first: str, second: str) -> Corrections:
         """Say that two steps are one dstate or at one place, or that they are different ones.
 
-        What was said before of these steps, and contradicts it, is replaced.
+        Earlier sentences about these steps that contradict this one are replaced.
 
         Args:
             kind: "same", "different", "elsewhere" or "same_place".

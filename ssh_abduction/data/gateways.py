@@ -184,7 +184,7 @@ class Facing:
 def facing(
     trace: Trace, ssh_map: SSHMap, axioms: Collection[str], changes: bool = False
 ) -> Facing | None:
-    """Say how the dstates face by the stars of a map whose paths may still be merged.
+    """Find how the dstates of a map face, by its stars. Paths of the map may still be merged.
 
     None if no frame fits the stars of some place. The headings of the map are ignored. `axioms`
     and `changes` are as in `with_allowed_headings`.

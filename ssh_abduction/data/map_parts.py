@@ -94,7 +94,8 @@ class Fault:
             are numbered 0 to 3, clockwise from the heading of the first dstate there.
         bearing: For a change of a gateway at a bearing, its direction in degrees, clockwise from
             the heading of the first dstate at the place.
-        towards: For a change in a map with poses, where the gateway is: north is up in pictures.
+        towards: For a change in a map with poses, the direction of the gateway in pictures, such as
+            "north" for up.
     """
 
     step: int

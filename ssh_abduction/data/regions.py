@@ -71,9 +71,10 @@ def described(region: Region, called: Callable[[str, int], str]) -> str:
 
 
 def of_members(members: Mapping[Reason, Collection[int]]) -> tuple[Region, ...]:
-    """Make a region of each different set of places, the largest first, with those inside it.
+    """Make a region of each different set of places, and find which regions contain which.
 
-    `members` has the places of the region that each reason makes. An empty set makes no region.
+    The largest comes first. `members` has, for each reason to make a region, the places of the
+    region. An empty set makes no region.
     All directed paths that bound a set are its bounds.
     """
     right: dict[tuple[int, int], set[int]] = {}

@@ -58,7 +58,7 @@ def angle_between(a: float, b: float) -> float:
 
 
 def turns_so(action: Action, before: Frame, found: frozenset[int]) -> bool:
-    """Whether a turn can be by one of some angles, in degrees clockwise.
+    """Whether the angle of a turn may be one of `found`, in degrees clockwise.
 
     `before` has the gateways that the robot saw before the turn.
     """

@@ -81,7 +81,7 @@ class Robot(Protocol):
     """The robot that an explorer drives. Implement these three methods."""
 
     def look(self) -> Step:
-        """Return what the robot sees here: a view, and whatever else the theory uses.
+        """Return what the robot sees here: a view, and what else the theory uses.
 
         This may be a star (the openings around the robot), and the displacement since the last
         look. A simulation may add the truth. The explorer does not use the truth to decide.

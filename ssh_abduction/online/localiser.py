@@ -141,7 +141,7 @@ class Localiser:
         Args:
             view: The view, for a localiser without a recogniser.
             image: The image, (d,), for a localiser with a recogniser: laser ranges in metres, or
-                whatever it was trained on.
+                another kind of image that the recogniser was trained on.
 
         Raises:
             TraceError: The view is malformed.
@@ -167,7 +167,7 @@ class Localiser:
                 as "turn 91.3", give a turn as an Action with its bearing.
             view: The view after it, for a localiser without a recogniser.
             image: The image after it, (d,), for a localiser with a recogniser: laser ranges in
-                metres, or whatever it was trained on.
+                metres, or another kind of image that the recogniser was trained on.
 
         Raises:
             TraceError: The action or the view is malformed.

@@ -16,8 +16,8 @@ new action at the robot's dstate. The map *predicts* the new step if the dstate 
 link shows what is seen. If that dstate shows something else, the map *contradicts* the step. If
 there is no such link, the step is *unknown* to the map.
 
-*Claim.* If some map of M predicts the step and it is unknown to none, then the maps that predict
-it are all minimal maps of the longer trace.
+*Claim.* If some map of M predicts the step, and no map of M has no link for it, then the maps of M
+that predict the step are exactly the minimal maps of the longer trace.
 
 *Proof.* By (1) of the claim in `solver/prefixes.py`, no map of the longer trace costs less than c.
 A map that predicts the step costs c, by (2). Conversely let F be a minimal map of the longer trace.
@@ -42,8 +42,8 @@ Two parts of a theory depend on the whole trace, and may change as it grows. Fir
 are used as soon as there is one; from then on, places are minimised before paths. Second, the
 probability of rejecting a true map is shared among all returns that may be true. Their number is
 rounded up to a power of two, so that it changes only when it doubles. When one of the two parts
-changes, the minimal maps so far may not be minimal any more, so clingo searches again. As a larger
-number of returns rejects less, the maps so far become drafts.
+changes, the minimal maps so far may not be minimal any more, so clingo searches again. If the
+number of returns has grown, fewer maps are rejected, so the maps so far serve as drafts.
 
 When time is short
 ------------------
@@ -201,7 +201,7 @@ class OnlineMapper:
             star: The star now: the openings seen, as in Step. None if there is none.
             displacement: [dx, dy, dtheta] of the action, in metres and radians, as in Step; None
                 if it is unknown.
-            covariance: The covariance of the displacement, (3, 3); None takes that of the odometry.
+            covariance: The covariance of the displacement, (3, 3); None takes it from the odometry.
             confidence: Probability that the view and the star are right, as in Step. The lower it
                 is, the less it costs to treat them as wrong.
 

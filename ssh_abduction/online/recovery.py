@@ -23,9 +23,9 @@ the logical representation can be restored" (Kuipers & Beeson 2002). This module
 * **Minimal maps**, proven, with their faults. As long as some of them predict what is seen, these
   stay minimal by the claim in `mapper.py`. The claim also holds with faults: suppose that a minimal
   map of the longer trace treats the last step as wrong. Without that step it would cost less than
-  the minimum, which is impossible. An action that was never tried loses no minimal map in the
-  causal theory either. A map is extended by a link to each dstate that looks right. These
-  extensions cost nothing, and all others cost more. If no minimal map predicts the step, the trace
+  the minimum, which is impossible. In the causal theory, the same holds for an action that was
+  never tried: each map is extended by a link to each dstate that looks right. These extensions
+  cost nothing, and all others cost more. If no minimal map predicts the step, the trace
   is solved again: within the time of a step, or in another process while the robot drives
   (`background.py`).
 * **Rivals** (`rival_maps.py`): besides the minimal maps, explanations that cost a little more,

@@ -204,10 +204,10 @@ def route(
         maps: A solution, maps of one trace, or one map.
         start: The number of a dstate; or a place or region, such as "p3", "region2" or "kitchen",
             which means any dstate there; None for the dstate of the last step.
-        goal: A dstate, place or region, named likewise.
+        goal: A dstate, place or region, named in the same way.
         by: What to minimise. "actions" and "metres" use links only, so the robot did each move
             before. "places" minimises travels, and also uses moves that the paths of the map imply.
-        avoid: Dstates, places and regions that the route must not visit, named likewise.
+        avoid: Dstates, places and regions that the route must not visit, named in the same way.
         map: The number of the map to use, from 1, or its id.
 
     Raises:
@@ -231,8 +231,8 @@ def route(
     for nodes, name in ((here, "from"), (there, "to")):
         if nodes <= closed:
             raise MapError(
-                f"avoid: expected other dstates and places than those of {name}, got the same; "
-                "do not avoid them"
+                f"avoid: expected a dstate of '{name}' that is not avoided, got none; do not avoid "
+                "the start or the goal"
             )
     start_place, goal_place = _place_of(graph, here), _place_of(graph, there)
     aside: set[Node] = set()

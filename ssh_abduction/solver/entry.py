@@ -79,9 +79,9 @@ def solve(
         speedups: The speed-ups that are on. None of them changes the answer.
         on_progress: A function that is called now and then with a `Progress`.
         corrections: Names and corrections of a person, to be obeyed.
-        onto: The solution of earlier drives, with their trace. Its first map is kept: only maps
-            that have its dstates and places are considered, and the minimal ones of these are
-            found. This takes about as long as solving the new drive.
+        onto: The solution of earlier drives, with their trace. The new drive is added to its first
+            map: all maps found have the dstates and places of that map. This takes about as long as
+            solving the new drive.
 
     Returns:
         The maps, their cost, and what is proven about them.

@@ -61,7 +61,7 @@ class Solution(MapSequence):
         cost: The counts of the first map; None if there is no map. All minimal maps share the
             counts that the theory minimises.
         bound: Proven lower bounds on the counts of any map.
-        complete: Whether all maps are listed: all minimal ones and, with `within`, all others that
+        complete: Whether all maps are listed: all minimal maps and, with `within`, all others that
             it asks for.
         theory: The theory. Each "auto" in it is replaced by the value that was used.
         steps: The number of steps of the trace.

@@ -1,9 +1,9 @@
-"""What it costs that a map lays drives on each other.
+"""Compute the price of laying drives on each other, which is part of the cost of a joint map.
 
 Nothing is known of where a drive starts. So it can be laid on a map of other drives in very many
-ways, and some of them make a place or two coincide by chance. A map pays for this choice each time
-that it joins drives which neither closures nor other places join. Then only drives are joined that
-have more in common than chance explains.
+ways, and in some of these ways a place or two look the same by chance. Closures tie some drives
+into groups. A map pays the price each time that common places join two groups. So drives are joined
+only if they have more in common than chance explains.
 """
 
 from __future__ import annotations

@@ -68,7 +68,7 @@ def said_by(
     """Count by kind of evidence the pairs of steps and the sets of equalities that it excluded.
 
     For each name of a kind, "pairs" is the number of pairs of steps that are different dstates,
-    and "refused" that of rejected sets, as `refused` has it.
+    and "refused" is the number of rejected sets, which is taken from `refused`.
     """
     return {
         kind.name: {

@@ -51,7 +51,7 @@ class Evidence(Protocol):
         ...
 
     def remembering(self, known: Any) -> Evidence:
-        """Return this evidence with the results about traces that earlier evidence computed."""
+        """Return this evidence, with the results that earlier evidence of its kind computed."""
         return self
 
     def pairs(self, trace: Trace) -> Pairs:
