@@ -196,22 +196,24 @@ def verdict(of_switch: Collection[list[float]]) -> str:
 def table(results: dict[str, Any]) -> str:
     """Make a table in Markdown, with a row for each speed-up."""
     rows = [
-        "| speed-up | without it, as a ratio to with it: the median over the seeds "
-        "(least to most) | verdict |",
-        "| -- | -- | -- |",
+        "| speed-up | families with a gain: median ratio (least to most) | other families: "
+        "medians | verdict |",
+        "| -- | -- | -- | -- |",
     ]
     for switch, trials in ratios(results).items():
-        of_seeds = {
-            trial: "" if len(found) == results["seeds"] else f", {len(found)} seeds"
-            for trial, found in trials.items()
-        }
-        cells = [
-            f"{trial.family}{_meant(trial)}{of_seeds[trial]}: {_spread(found)}"
-            for trial, found in trials.items()
-        ]
-        rows.append(f"| {switch} | {'<br>'.join(cells)} | {verdict(trials.values())} |")
+        gains, others = [], []
+        for trial, found in trials.items():
+            median = statistics.median(found)
+            if median < GAIN:
+                others.append(median)
+            else:
+                seeds = "" if len(found) == results["seeds"] else f", {len(found)} seeds"
+                gains.append(f"{trial.family}{_meant(trial)}{seeds}: {_spread(found)}")
+        rest = f"{len(others)}: {min(others):.2f} to {max(others):.2f}" if others else "–"
+        verdict_of = verdict(trials.values())
+        rows.append(f"| {switch} | {'<br>'.join(gains) or '–'} | {rest} | {verdict_of} |")
     rows += [
-        f"| {switch} |  | not measured yet |"
+        f"| {switch} | – | – | not measured yet |"
         for switch in SWITCHES
         if switch not in ratios(results)
     ]
@@ -234,11 +236,7 @@ def _spread(found: list[float]) -> str:
         f"{number:.2f}" if number < math.inf else "∞"
         for number in (statistics.median(found), min(found), max(found))
     ]
-    return (
-        f"**{shown[0]}** ({shown[1]} to {shown[2]})"
-        if statistics.median(found) >= GAIN
-        else f"{shown[0]} ({shown[1]} to {shown[2]})"
-    )
+    return f"{shown[0]} ({shown[1]} to {shown[2]})"
 
 
 def measure(results: dict[str, Any], trials: Iterable[Trial], seeds: int, out: Path) -> None:
