@@ -10,18 +10,21 @@ ladder is a rung. The call can use the workers of a Dask cluster, and it does no
 runs. So a sweep that was stopped can be started again.
 
 The file rows.jsonl gets a line for each solve: one for the maps of a log, and one for each rung.
-Then a table is printed. It counts the drives that have a map, and those that have only one. It
-gives precision and recall of the pairs of visits that the first map has at one place.
+Then a table is printed. It counts the drives that have a map, and those that have a single minimal
+map. It gives precision and recall of the pairs of visits that the first map has at one place.
 
-*A hundred machines*, a plan that nobody has run yet: 17 floor plans x 5 drives x 9 theories are 765
-runs, with 5 rungs each 3,825 solves. Mapping a drive of 200 m through a plan takes 28 s of CPU
-time, nearly all of it for perception (8 runs, two plans; the log has 1.0 to 1.7 MB). It takes two
-minutes if all solves use their time limit. That is 6 to 25 hours on one processor, and two to eight
-minutes on a hundred machines with two. One machine runs the scheduler (`dask scheduler`). Each
-other machine runs `dask worker tcp://host:8786 --nworkers 2 --nthreads 1 --memory-limit 8GiB`. Logs
-are sent to the workers, and folders are sent back, so no disk is shared. If a worker is killed,
-another one does its run. A run that kills two workers becomes an error on its line. A run returns
-130 kB on average (31 runs of six worlds and plans; 370 kB at most), so 100 MB in all.
+*A hundred machines* can share a sweep. Nobody has done this yet, so this is an estimate. 17 floor
+plans, 5 drives through each and 9 theories are 765 runs. With 5 rungs each, these are 3,825 solves.
+Mapping a drive of 200 m through a plan took 28 s of CPU time, nearly all of it for perception (8
+runs, two plans; a log has 1.0 to 1.7 MB). It takes two minutes if all solves use their time limit.
+So the sweep takes 6 to 25 hours on one processor, and two to eight minutes on a hundred machines
+with two processors each. A run returns 130 kB on average (31 runs of six worlds and plans; 370 kB
+at most), so all runs return 100 MB.
+
+One machine runs the scheduler (`dask scheduler`). Each other machine runs `dask worker
+tcp://host:8786 --nworkers 2 --nthreads 1 --memory-limit 8GiB`. Logs are sent to the workers, and
+folders are sent back, so the machines need no common disk. If a worker is killed, another one does
+its run. A run that kills two workers becomes an error on its line.
 """
 
 from __future__ import annotations
@@ -43,7 +46,7 @@ Row = dict[str, Any]
 # The solve of a row: the maps, or a rung of the ladder; None if the drive could not be mapped.
 RUNGS = ("maps", "views", "+ star", "+ pairs", "+ geometry", "+ planarity", None)
 INTERRUPTED = 130  # the exit code after Ctrl-C
-# The options of each theory. Without --theory they change the theory that suits the building.
+# The options of each theory. Without --theory they change the default theory of the verb `map`.
 THEORIES = {
     "as it suits": [],
     "stars and sides": ["--theory", "topological"],

@@ -33,7 +33,9 @@ TINY = np.finfo(float).tiny
 
 
 class BeliefVerdict(Enum):
-    """A belief summed up in one word. NOWHERE comes before LOCATED, and LOCATED before LOST.
+    """A belief summed up in one word.
+
+    If several words apply, NOWHERE is preferred to LOCATED, and LOCATED to LOST.
 
     Attributes:
         LOCATED: One dstate has at least a probability of 0.9.

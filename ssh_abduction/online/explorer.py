@@ -472,10 +472,10 @@ class Abilities:
             names.intersection_update(self.here)
 
     def names(self, seen: Seen) -> set[str]:
-        """Return the names of the actions that the robot could do at every step with what is seen.
+        """Return the names of the actions that were possible at every step with this observation.
 
-        The star is the set of openings that are seen. If the robot never saw this star with this
-        view, the view alone decides.
+        An observation is a view and a star (the openings seen). If the robot never saw this star
+        with this view, all steps with this view count.
         """
         names = self._names.get((seen.view, seen.star))
         return names or self._names.get((seen.view, None), set())

@@ -111,7 +111,7 @@ class MinimalMaps:
     def replace(
         self, found: Iterable[SSHMap], status: Status, complete: bool, cost: Cost | None
     ) -> None:
-        """Take the result of a search. Known minimal maps stay if it listed fewer.
+        """Take the result of a search. Keep the known minimal maps if the search listed fewer.
 
         `complete` says whether these are all minimal maps. `cost` has the counts of one, if
         any.

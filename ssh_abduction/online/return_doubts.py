@@ -66,8 +66,8 @@ class ReturnDoubts:
     def rival(self, doubt: Doubt, trace: Trace, theory: Theory, dstates: int) -> SSHMap | None:
         """Find the best map without a return. Stop doubting the return if there is none.
 
-        `dstates` is the number in a minimal map. A map counts if it has at most `margin` more and
-        is found in time. Otherwise return None. The theory is settled.
+        `dstates` is the number of dstates of a minimal map. A map counts if it has at most `margin`
+        dstates more, and is found in time. Otherwise return None. The theory is settled.
         """
         kind = "different" if theory.level == "causal" else "elsewhere"
         denied = theory.replace(**{kind: (*getattr(theory, kind), doubt)})

@@ -137,7 +137,8 @@ class RivalMaps:
     def absorb(self, found: Solved) -> None:
         """Use a result of the solver: add its maps to the rivals, and record what is proven.
 
-        If the result is about fewer steps than there are now, its maps are extended by the others.
+        If the result is about fewer steps than there are now, its maps are extended by the later
+        steps.
         """
         steps, self.solved = len(self._trace), found
         if (found.bound.tenths or 0) >= (self.bound.tenths or 0):

@@ -56,7 +56,7 @@ class Standing:
             predict the same from here on. They may still differ in the past: which step to treat as
             wrong.
         broke: A sentence for each step that contradicted the best map since the mapper was last
-            certain. The step at which it becomes certain again still lists them.
+            certain. They are still listed at the step at which the mapper becomes certain again.
         hypotheses: The possible explanations, the most probable first.
         where: The belief about where the robot is in the first map, by Markov localisation that
             begins just before the first step in `broke`; None if `broke` is empty.

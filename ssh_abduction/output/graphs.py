@@ -47,7 +47,8 @@ def to_networkx(
             has no poses.
 
     Raises:
-        MapError: An argument is wrong.
+        MapError: `ssh_map` is not a map, `level` is none of these, or `turns` has a value that is
+            no turn.
     """
     checked_map(ssh_map)
     one_of("level", level, LEVELS, MapError)

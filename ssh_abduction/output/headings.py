@@ -172,7 +172,7 @@ def degrees_of(turns: Trace | Turns | None) -> dict[str, tuple[float, float]]:
     """Find by how many degrees each action turns.
 
     Args:
-        turns: The trace that was mapped; or a dict that gives for names of actions "right", "left",
+        turns: The trace that was mapped; or a dict from the name of an action to "right", "left",
             "around" or degrees clockwise. Actions that are themselves named right, left or around
             need no entry.
 

@@ -45,12 +45,12 @@ def to_svg(ssh_map: SSHMap, turns: Trace | Turns | None = None) -> str:
 
     Args:
         ssh_map: The map.
-        turns: How actions turn, for a map without poses: the trace that was mapped; or a dict that
-            gives for names of actions "right", "left", "around" or degrees clockwise. Actions that
+        turns: How actions turn, for a map without poses: the trace that was mapped; or a dict from
+            the name of an action to "right", "left", "around" or degrees clockwise. Actions that
             are themselves named right, left or around need no entry.
 
     Raises:
-        MapError: An argument is wrong.
+        MapError: `ssh_map` is not a map, or `turns` has a value that is no turn.
     """
     checked_map(ssh_map)
     degrees_of(turns)

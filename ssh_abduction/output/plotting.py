@@ -31,7 +31,8 @@ def plot(ssh_map: SSHMap, ax: Any = None, turns: Trace | Turns | None = None) ->
         The axes. Their attribute `figure` can be shown or saved.
 
     Raises:
-        MapError: An argument is wrong, or matplotlib is not installed.
+        MapError: `ssh_map` is not a map, `ax` is no axes of matplotlib, `turns` has a value that is
+            no turn, or matplotlib is not installed.
     """
     checked_map(ssh_map)
     if ax is not None and not hasattr(ax, "annotate"):

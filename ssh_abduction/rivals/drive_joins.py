@@ -50,8 +50,8 @@ class DriveJoin:
 class DrivePair:
     """The places that two drives share.
 
-    For each place of one drive and place of the other, by the first map, there is at most one join,
-    the surest one.
+    Take a place of one drive and a place of the other drive, in the first map. For each such pair
+    of places, only the most probable join is listed.
 
     Attributes:
         first: The name of the earlier drive.

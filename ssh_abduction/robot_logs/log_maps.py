@@ -306,10 +306,10 @@ def map_log(
     then true.
 
     Args:
-        log: The robot's log; or the logs of several drives through one building. Nothing needs to
-            be known of where a drive starts.
+        log: The robot's log; or the logs of several drives through one building. It may be unknown
+            where each drive starts.
         theory: The axioms; None for BARE, which uses no stars, sides or paths.
-        choices: Values of fields of Theory, by name. They replace those of the theory.
+        choices: Values for some fields of Theory, by name. They replace the values in `theory`.
         width: The width of the robot in metres. It cannot pass narrower parts of the free space.
         name: The name of the trace, or the names of the drives. None for no name, or for "drive 1",
             "drive 2" and so on.
@@ -321,7 +321,8 @@ def map_log(
             kind contributes.
         corrections: Names and corrections of a person, to be obeyed.
         mapping: An object through which another thread can interrupt the mapping; None for none.
-        tell: Takes each note on the log and on the search as soon as it is known.
+        tell: A function that is called with each note on the log and on the search, as soon as the
+            note is known.
 
     Raises:
         LogError: A log cannot be imported.
