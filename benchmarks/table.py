@@ -24,10 +24,7 @@ Cells: TypeAlias = Sequence[dict[str, Any]]
 
 
 def times(results: dict[str, Any]) -> str:
-    """Make the table of time and memory of each tool on each instance.
-
-    It also has the time of each other program divided by ours.
-    """
+    """Make the table of time and memory of each tool on each instance."""
     tools = list(dict.fromkeys(cell["tool"] for cell in results["cells"] if cell["tool"] != OURS))
     reasons: list[str] = []
     rows = []
@@ -42,7 +39,7 @@ def times(results: dict[str, Any]) -> str:
             if ours
             else ["–", "–"]
         )
-        peers = [_peer(by_tool.get(tool, []), ours, results["limit"], reasons) for tool in tools]
+        peers = [_peer(by_tool.get(tool, []), results["limit"], reasons) for tool in tools]
         rows.append(
             [
                 name,
@@ -158,27 +155,16 @@ def dstates(cells: Cells) -> str:
     )
 
 
-def _peer(cells: Cells, ours: Cells, limit: float, reasons: list[str]) -> str:
-    """The cell of another program: time, memory, and time divided by ours.
+def _peer(cells: Cells, limit: float, reasons: list[str]) -> str:
+    """The cell of another program: time and memory.
 
     If its machine is not proven minimal, the cell also has the number of states.
     """
     if not any("seconds" in cell for cell in cells):
         return "–" + _mark(cells, reasons)
-    there, here = median_seconds(cells), median_seconds(ours) if ours else math.inf
-    sign = "<" if here == math.inf else ">" if there == math.inf else ""
-    known = min(there, here) < math.inf and all(
-        cell["status"] in ("ok", "timeout") for cell in (*cells, *ours)
-    )
-    ratio = f"{sign}×{_figures(min(there, limit) / min(here, limit))}" if known else ""
     unproven = [cell["dstates"] for cell in cells if cell["status"] == "ok" and not cell["proven"]]
-    states = f"{statistics.median(unproven):,g} states" if unproven else ""
-    return ", ".join(
-        filter(
-            None,
-            (_time(cells, limit) + _mark(cells, reasons), f"{_memory(cells)} MB", ratio, states),
-        )
-    )
+    states = [f"{statistics.median(unproven):,g} states"] if unproven else []
+    return ", ".join([_time(cells, limit) + _mark(cells, reasons), f"{_memory(cells)} MB", *states])
 
 
 def _time(cells: Cells, limit: float) -> str:
