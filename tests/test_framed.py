@@ -29,7 +29,6 @@ from ssh_abduction.solver.engines import (
     transitive,
     visit_program,
 )
-from ssh_abduction.solver.engines import paths as paths_module
 from ssh_abduction.solver.engines import visit_labels as same
 from ssh_abduction.solver.engines.framed import FramedEngine
 from ssh_abduction.solver.engines.framed_paths import FramedPaths
@@ -95,13 +94,6 @@ def framed_theories(draw: st.DrawFn) -> Theory:
     )
 
 
-def plainly_charted(
-    engine: FramedEngine, size: int, before: FramedChart | None = None
-) -> FramedChart | None:
-    """Leave out what the trace implies about order and sides, so the search has to find it."""
-    return Chart.framed(engine._task.trace, engine._task.log, size)
-
-
 @settings(max_examples=12)
 @given(framed_traces(), framed_theories(), st.sets(st.sampled_from(SPEEDUPS)), st.data())
 def test_lists_the_maps_of_the_plain_encoding(
@@ -123,7 +115,6 @@ def test_lists_the_maps_of_the_plain_encoding(
     }
     many_pairs = data.draw(st.sampled_from([5, framed.MANY_PAIRS]), label="many pairs")
     off = off - {"names"}
-    charted = data.draw(st.sampled_from([FramedEngine._charted, plainly_charted]), label="charted")
     prefixes = patch.object(engine, "FIRST_PREFIXES", first)
     with (
         patch.object(choosing, "FEW_STEPS", 0),
@@ -132,7 +123,6 @@ def test_lists_the_maps_of_the_plain_encoding(
         patch.object(transitive, "AT_A_TIME", at_a_time),
         patch.multiple(framed_paths, **fitted),
         patch.multiple(framed, MANY_PAIRS=many_pairs),
-        patch.object(FramedEngine, "_charted", charted),
     ):
         search = Search(trace, theory, max_maps=None, speedups=Speedups.without(off))
         maps = tuple(search)
@@ -158,7 +148,6 @@ def test_a_trace_that_grows_has_the_maps_of_the_plain_encoding(
 ) -> None:
     """Whether clingo gets only what is new, or everything again."""
     grown = data.draw(st.sampled_from([1, 1.5, 100]), label="grown")
-    charted = data.draw(st.sampled_from([FramedEngine._charted, plainly_charted]), label="charted")
     first, *rest = trace.steps
     with (
         patch.object(choosing, "FEW_STEPS", 0),
@@ -167,7 +156,6 @@ def test_a_trace_that_grows_has_the_maps_of_the_plain_encoding(
             GROWN=grown,
             FIRST_PAIRS=data.draw(st.sampled_from([0, 5, same.FIRST_PAIRS]), label="first pairs"),
         ),
-        patch.object(FramedEngine, "_charted", charted),
     ):
         mapper = OnlineMapper(
             first.view or "", theory, star=first.star, time_limit=None, max_maps=None
@@ -235,17 +223,13 @@ def test_apart_nodes_are_different_dstates_of_the_world() -> None:
     for seed in range(6):
         walk = maze(3, 3, steps=120, seed=seed, stars=True)
         search = Search(walk.trace, Theory.topological())
-        engine = search._parts.prefixes.engine
-        assert isinstance(engine, FramedEngine)
-        chart = engine._charted(len(walk.trace), None)
+        chart = Chart.framed(walk.trace, Log(walk.trace, search.theory))
         assert chart
         truth = dict(zip(chart.node_of, walk.truth, strict=True))
         assert len(truth) == len(chart.seen)
         apart = chart.apart()
         assert (apart == apart.T).all()
         assert not any(truth[i] == truth[j] for i, j in zip(*apart.nonzero(), strict=True))
-        assert any(truth[i][:2] != truth[j][:2] for i, j in chart.elsewhere)
-        assert not any(truth[i][:2] == truth[j][:2] for i, j in chart.elsewhere)
 
 
 def test_pairs_that_are_too_many_are_not_listed() -> None:
@@ -329,14 +313,14 @@ def test_pinned_stretches_leave_all_maps() -> None:
     def rivals(
         among: Sequence[int],
         pairs: Sequence[tuple[int, int]],
-        sought: Callable[..., list[int]] = paths_module.pairwise_distinct,
+        sought: Callable[..., list[int]] = framed_paths.pairwise_distinct,
     ) -> list[int]:
         found = sought(among, pairs)
         assert set(combinations(found, 2)) <= set(pairs)
         given.append((found, among))
         return found
 
-    with patch.object(paths_module, "pairwise_distinct", rivals):
+    with patch.object(framed_paths, "pairwise_distinct", rivals):
         maps = solve(trace, max_maps=None).maps
     assert any((len(found), len(among)) == (3, 5) for found, among in given)
     assert len(maps) > 1
@@ -353,7 +337,7 @@ def test_what_is_not_told_beforehand_is_found() -> None:
         ("sides", FramedPaths, "clashing"),
     ):
         finding = patch.object(kind, asked, autospec=True, side_effect=getattr(kind, asked))
-        with patch.object(FramedEngine, "_charted", plainly_charted), finding as found:
+        with finding as found:
             maps = solve(
                 walk.trace, Theory.topological(), max_maps=None, speedups=Speedups.without(off)
             ).maps
@@ -367,15 +351,13 @@ def test_clingo_is_told_of_a_path_that_an_answer_contradicts() -> None:
     trace = maze(3, 3, steps=60, seed=0, stars=True).trace
     asked = Search(trace, Theory(star="frame"))._parts.prefixes.engine
     assert isinstance(asked, FramedEngine)
-    with patch.object(FramedEngine, "_charted", plainly_charted):
-        asked.grow(len(trace))
-    labels, chart, paths = asked._visits.fewest(), asked._chart, asked._fitting.paths
+    asked.grow(len(trace))
+    labels, chart = asked._visits.fewest(), asked._chart
     assert isinstance(labels, list)
-    control = paths.contrary(chart, labels)
-    contrary, _ = next(asked.asker.answers(paths_lp.read_contrary, "ignore", 1, control=control))
+    contrary, twice = asked._fitting.contrary(chart, labels)
     standing = asked._visits.program.standing(labels)
     assert contrary
-    assert asked._sides.say_of_path(paths, chart, labels, standing)
+    assert asked._sides.say_of_path(contrary, twice, standing)
     (told,) = asked._sides._said
     assert told in {("path", standing[dstate]) for dstate in contrary}
 
@@ -396,13 +378,11 @@ def test_sides_and_streets_say_the_same(theory: Theory) -> None:
         trace = maze(3, 3, steps=60, seed=seed, stars=True).trace
         engine = Search(trace, theory)._parts.prefixes.engine
         assert isinstance(engine, FramedEngine)
-        with patch.object(FramedEngine, "_charted", plainly_charted):
-            engine.grow(len(trace))
+        engine.grow(len(trace))
         labels = engine._visits.fewest()
         assert labels
         chart = engine._chart
-        control = engine._fitting.paths.control(chart)
-        control.add("base", [], paths_lp.settled_labels(enumerate(labels)))
+        control = engine._fitting._control(chart, paths_lp.settled_labels(enumerate(labels)))
         control.ground([("base", []), ("contrary", [])])
         contrary, _ = next(
             engine.asker.answers(paths_lp.read_contrary, "ignore", 1, control=control)
@@ -529,7 +509,7 @@ def test_what_was_stopped_while_it_was_prepared_is_prepared_again() -> None:
     engine = search._parts.prefixes.engine
     engine.grow(40)
     with (
-        patch.object(engine._visits, "_charted", side_effect=KeyboardInterrupt),
+        patch.object(Chart, "framed", side_effect=KeyboardInterrupt),
         pytest.raises(KeyboardInterrupt),
     ):
         engine.grow(121)

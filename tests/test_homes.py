@@ -13,7 +13,7 @@ from ssh_abduction.solver.asp.facts.paths_lp import Segments
 from ssh_abduction.solver.engines import frameless_paths as frameless
 from ssh_abduction.solver.engines.frameless_paths import PlacesAndPaths
 from ssh_abduction.solver.engines.homes import fewest_paths, homes_of
-from ssh_abduction.solver.engines.paths import pairwise_distinct
+from ssh_abduction.solver.steps.apart import pairwise_distinct
 from ssh_abduction.theory.speedups import SPEEDUPS, Speedups
 
 PLAIN = Speedups.without(SPEEDUPS)

@@ -65,7 +65,7 @@ class FramedEngine:
         self._task = task
         self._sides = FramedSides(task.theory, self.asker)
         self._fitting = FramedPaths(task, self.asker)
-        self._visits = VisitLabels(task, self.asker, self._charted, self._sides)
+        self._visits = VisitLabels(task, self.asker, self._sides)
         self._unframed_size = 0  # the size of the prefix, in case that its visits fit no frames
         self._framed = True  # whether the visits fit their frames
         # The minimal cost, and all labels with maps of that cost.
@@ -206,7 +206,7 @@ class FramedEngine:
             self._task.speedups.sides
             and len(visits.program.fits) <= MANY_PAIRS
             and self._sides.say_of_path(
-                fitting.paths, self._chart, labels, visits.program.standing(labels)
+                *fitting.contrary(self._chart, labels), visits.program.standing(labels)
             )
         )
         if not passed:
@@ -223,15 +223,6 @@ class FramedEngine:
             [(a, b) for a, b, of in nodes if of == "place"],
         )
         return True
-
-    def _charted(self, size: int, before: FramedChart | None) -> FramedChart | None:
-        """Chart the first steps, with the pairs of nodes that must be at different places.
-
-        The pairs follow from the trace alone, by the axioms of order and sides. If `before`, the
-        chart of fewer steps, is given, only its pairs are taken. None if the steps fit no frames.
-        """
-        chart = Chart.framed(self._task.trace, self._task.log, size)
-        return None if chart is None else self._fitting.charted(chart, before)
 
 
 def maps_with_frames(problem: Problem, watch: Watch, speedups: Speedups) -> Iterator[SSHMap]:

@@ -2,8 +2,13 @@
 
 The input is a label, the number of a dstate, for each node. A node is the steps of a visit that
 face one direction. paths_framed.lp finds the fewest places and paths that fit the labels. If none
-fit, it finds clashes: minimal sets of nodes whose labels no paths fit. Paths are *separate* if they
-are only merged when they must be one.
+fit, it finds clashes: minimal sets of nodes whose labels no paths fit.
+
+*Separate paths.* To find out whether labels have any paths, places and segments are only merged if
+they must be. That takes a small part of the time for grounding all ways to merge them.
+
+*Pinned segments.* To find the fewest paths, pairwise distinct segments get paths of their own. Then
+other segments are assigned to these paths, or to new ones.
 
 Reading answers would take most of the time of a long list. So the reader starts from the atoms of
 the previous answer. And clingo searches for the next answer while a map is made from this one.
@@ -16,18 +21,23 @@ from dataclasses import dataclass, replace
 
 import clingo
 
-from ssh_abduction.solver.asp.control import Asker
+from ssh_abduction.solver.asp.control import Asker, Control
 from ssh_abduction.solver.asp.facts import names_lp, path_reader, paths_lp
 from ssh_abduction.solver.engines.base import BETTERING, Found, Task, maps_of_labels
 from ssh_abduction.solver.engines.doubts import Settled
-from ssh_abduction.solver.engines.paths import Paths
 from ssh_abduction.solver.engines.refusing import minimal_part
+from ssh_abduction.solver.steps.apart import pairwise_distinct
 from ssh_abduction.solver.steps.chart import FramedChart
 from ssh_abduction.theory.evidence import Equality
 
 # Give clingo up to this many clashes at once. Each of them saves a question, and one control lists
 # them all.
 CLASHES = 30
+# With these options, clasp lists the answers with minimal sets of shown atoms.
+SMALLEST = ("--heuristic=Domain", "--dom-mod=5,16", "--enum-mode=domRec")
+# Clasp prepares to solve for about these multiples of the time and the memory that grounding took.
+# It cannot be stopped meanwhile.
+PREPARING = (1.6, 2.1)
 
 
 @dataclass(frozen=True)
@@ -58,11 +68,6 @@ class FramedPaths:
         self.task = task
         self.forbidden: list[Collection[Equality]] = []
         self._asker = asker
-
-    @property
-    def paths(self) -> Paths:
-        """The program with the axioms of places and paths for this trace."""
-        return Paths(self.task, tuple(self.forbidden))
 
     def some(self, chart: FramedChart, labels: Sequence[int]) -> Fitted | None:
         """Find a map with these dstates, as `Fitted`; None if no paths fit them."""
@@ -129,13 +134,41 @@ class FramedPaths:
         """
         self._asker.watch.check()
         with self._asker.grounding_timed():
-            control = self.paths.settled(chart, labels, options, nodes, single=single)
+            theory, nodes = self.task.theory, range(len(labels)) if nodes is None else nodes
+            facts = paths_lp.settled_facts(theory, chart, labels, nodes, single=single)
+            where = [labels[node] for node in chart.node_of]
+            stretches = paths_lp.stretch_facts(self.task.trace, theory, where)
+            control = self._control(chart, f"{facts}\n{stretches}", options)
+            control.load_encodings("preference")
+            parts = ("base", *(("again",) if single else ()), "segments", "least")
+            control.ground([(part, []) for part in parts])
+            if self.task.speedups.clique and not single:
+                pinned = pairwise_distinct(*paths_lp.read_distinct(control))
+                control.add("pinned", [], paths_lp.pinned_facts(pinned))
+            control.ground([("pinned", []), ("paths", []), ("each", [])])
         self._asker.watch.check()
         return control
 
+    def _control(self, chart: FramedChart, facts: str, options: Sequence[str] = ()) -> Control:
+        """Make a control with the axioms and facts of a chart. Nothing is grounded yet."""
+        control = Control(options, self.task.watch.check, PREPARING)
+        control.load_encodings("paths_framed")
+        trace, theory = self.task.trace, self.task.theory
+        known = paths_lp.paths_framed_facts(trace, theory, chart, self.forbidden)
+        control.add("base", [], f"{known}\n{facts}")
+        return control
+
+    def contrary(self, chart: FramedChart, labels: Sequence[int]) -> tuple[list[int], list[int]]:
+        """Find the dstates that show which single paths contradict the axioms."""
+        control = self._control(chart, paths_lp.settled_labels(enumerate(labels)))
+        control.ground([("base", []), ("again", []), ("contrary", [])])
+        return next(self._asker.answers(paths_lp.read_contrary, "ignore", 1, control=control))
+
     def clashing(self, chart: FramedChart, labels: Sequence[int]) -> list[list[int]]:
         """Find up to `CLASHES` clashes: minimal sets of nodes whose labels no paths fit."""
-        control = self.paths.clashing(chart, labels)
+        # Clingo finds only sets that clash however segments are merged to paths.
+        control = self._control(chart, paths_lp.open_labels(labels), SMALLEST)
+        control.ground([("base", [])])
         clashes = list(
             self._asker.answers(
                 lambda model: sorted(names_lp.read_names(model)), "ignore", CLASHES, control=control
@@ -151,16 +184,3 @@ class FramedPaths:
             return next(self._asker.answers(lambda _: False, "ignore", 1, control=control), True)
 
         return minimal_part(clashes, list(range(len(labels))))
-
-    def charted(self, chart: FramedChart, before: FramedChart | None = None) -> FramedChart:
-        """Return the chart with pairs of nodes added that cannot be at one place.
-
-        The pairs follow from the trace alone, by the axioms of order and sides. If `before`, the
-        chart of fewer steps, is given, only its pairs are added.
-        """
-        if before is not None:
-            return chart.with_elsewhere(before.elsewhere)
-        control = self.paths.apart(chart)
-        self._asker.watch.check()
-        elsewhere = next(self._asker.answers(paths_lp.read_elsewhere, "ignore", 1, control=control))
-        return chart.with_elsewhere(elsewhere)

@@ -22,9 +22,9 @@ from ssh_abduction.solver.asp.facts import names_lp, path_reader, paths_lp, side
 from ssh_abduction.solver.asp.facts.atoms import number_symbols
 from ssh_abduction.solver.engines.base import BETTERING, Found, Task, maps_of_labels
 from ssh_abduction.solver.engines.doubts import Settled
+from ssh_abduction.solver.engines.framed_paths import PREPARING
 from ssh_abduction.solver.engines.homes import fewest_paths, homes_of
 from ssh_abduction.solver.engines.named_labels import NamedLabels
-from ssh_abduction.solver.engines.paths import PREPARING
 from ssh_abduction.solver.engines.refusing import minimal_part
 from ssh_abduction.solver.steps.chart import Link
 from ssh_abduction.theory import encodings

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.asp.facts.paths_lp import Segments
-from ssh_abduction.solver.engines.paths import pairwise_distinct
+from ssh_abduction.solver.steps.apart import pairwise_distinct
 
 
 def homes_of(segments: Segments) -> Mapping[int, list[int]] | None:

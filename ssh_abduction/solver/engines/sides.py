@@ -9,13 +9,11 @@ exclude nearly all of them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 
 from ssh_abduction.solver.asp.control import Asker
-from ssh_abduction.solver.asp.facts import paths_lp, sides_lp
+from ssh_abduction.solver.asp.facts import sides_lp
 from ssh_abduction.solver.asp.facts.atoms import number_symbols
-from ssh_abduction.solver.engines.paths import Paths
-from ssh_abduction.solver.steps.chart import FramedChart
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.theory import Theory
 
@@ -47,21 +45,16 @@ class FramedSides:
 
     def say_of_path(
         self,
-        paths: Paths,
-        chart: FramedChart,
-        labels: Sequence[int],
+        contrary: Iterable[int],
+        twice: Iterable[int],
         standing: Mapping[int, tuple[int, int]],
     ) -> bool:
-        """Add the axioms of a path that these labels contradict, and return whether there was one.
+        """Add the axioms of a path that labels contradict, and return whether there was one.
 
+        `contrary` and `twice` are the dstates that show such paths (`paths_lp.read_contrary`).
         `standing` has, for each dstate that has a node in clingo, the visit and the slot
         (direction) of such a node.
         """
-        contrary, twice = next(
-            self._asker.answers(
-                paths_lp.read_contrary, "ignore", 1, control=paths.contrary(chart, labels)
-            )
-        )
         if any(self._say_once("path", *standing[dstate]) for dstate in contrary):
             return True
         for visit in (standing[dstate][0] for dstate in twice):

@@ -38,7 +38,7 @@ from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.transitive import Pair
 from ssh_abduction.solver.engines.visit_program import Sides, VisitProgram, fits_in_time
 from ssh_abduction.solver.steps.apart import clique
-from ssh_abduction.solver.steps.chart import FramedChart
+from ssh_abduction.solver.steps.chart import Chart, FramedChart
 
 # At first, give clingo as many first visits that at most this many pairs of them may be at one
 # place. It gets other visits if answers need them.
@@ -60,19 +60,13 @@ class VisitLabels:
         self,
         task: Task,
         asker: Asker,
-        charted: Callable[[int, FramedChart | None], FramedChart | None],
         sides: Sides,
     ) -> None:
-        """Begin without any steps.
-
-        `charted` makes a chart of this many first steps, given a chart of fewer steps or None, and
-        returns None if the steps fit no frames. `sides` adds axioms of order and sides to each new
-        control and batch.
-        """
+        """Begin without any steps. `sides` adds axioms to each new control and batch."""
         self.bound: int | None = None
         self.clique: list[int] = []
         self.size = 0
-        self._task, self._asker, self._charted, self._sides = task, asker, charted, sides
+        self._task, self._asker, self._sides = task, asker, sides
         self._program: VisitProgram | None = None
         self._nodes_at_start = 0  # the number of nodes when the control was made
         self._found: list[tuple[int, ...]] = []  # labels with the fewest dstates
@@ -102,16 +96,15 @@ class VisitLabels:
         if size == self.size:
             return True
         with self._asker.grounding_timed():
-            grown = self._charted(size, self.chart) if self.size else None
-            if grown is not None and len(grown.seen) <= GROWN * self._nodes_at_start:
+            chart = Chart.framed(self._task.trace, self._task.log, size)
+            if chart is None:
+                return False
+            if self.size and len(chart.seen) <= GROWN * self._nodes_at_start:
                 program = self.program
                 has_all = len(program.visits) == len(self.chart.stars)
-                new = range(len(self.chart.stars), len(grown.stars)) if has_all else ()
-                self._give(grown, {*program.visits, *new}, range(len(grown.seen)))
+                new = range(len(self.chart.stars), len(chart.stars)) if has_all else ()
+                self._give(chart, {*program.visits, *new}, range(len(chart.seen)))
             else:
-                chart = self._charted(size, None)
-                if chart is None:
-                    return False
                 # `_order_of_choice` also finds the clique, and `_first_visits` needs it.
                 order = self._order_of_choice(chart)
                 self._give(chart, self._first_visits(chart), order, anew=True)

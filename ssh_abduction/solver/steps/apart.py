@@ -26,7 +26,7 @@ finds all steps that are apart from a given step.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -201,6 +201,19 @@ def large_clique(apart: Matrix) -> list[int]:
     found = [grown_clique(apart, [node], random) for node in range(len(apart))]
     largest: list[int] = max(found, key=len, default=[])
     return sorted(largest)
+
+
+def pairwise_distinct(members: Sequence[int], pairs: Iterable[tuple[int, int]]) -> list[int]:
+    """Find a large clique: a list of segments, or places, that are pairwise distinct.
+
+    `pairs` are distinct. A pair of a member with itself means that the labels contradict the
+    axioms, and is ignored.
+    """
+    number = {member: i for i, member in enumerate(members)}
+    rivals = np.zeros((len(members), len(members)), dtype=bool)
+    for g, h in pairs:
+        rivals[number[g], number[h]] = g != h
+    return [members[i] for i in large_clique(rivals)]
 
 
 def _greedy_clique(apart: Matrix) -> list[int]:

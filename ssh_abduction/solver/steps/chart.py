@@ -21,7 +21,7 @@ they are different dstates, as in `steps/apart.py`.
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, TypeAlias
@@ -199,7 +199,6 @@ class Chart:
             tuple(stars),
             tuple(travels),
             frozenset(away),
-            frozenset(away),
             excluded=frozenset(excluded),
         )
 
@@ -215,20 +214,13 @@ class FramedChart(Chart):
             observation at each slot.
         travels: The links that are travels, in order: travel V leads from visit V to visit V + 1.
             An action that slipped counts as a travel by an action that occurs only once.
-        elsewhere: Pairs of nodes that are known to be at different places, by evidence or by the
-            axioms of order and sides.
-        away: The pairs of `elsewhere` that evidence names.
+        away: Pairs of nodes that are at different places by evidence.
     """
 
     facing: tuple[tuple[int, int], ...]
     stars: tuple[tuple[int, ...], ...]
     travels: tuple[Link, ...]
-    elsewhere: frozenset[tuple[int, int]] = frozenset()
     away: frozenset[tuple[int, int]] = frozenset()
-
-    def with_elsewhere(self, more: Iterable[tuple[int, int]]) -> FramedChart:
-        """Return the same chart with more pairs of nodes in `elsewhere`."""
-        return replace(self, elsewhere=self.elsewhere | frozenset(more))
 
     def apart(self) -> NDArray[np.bool_]:
         """Return the pairs of nodes that are apart, as a matrix of flags, nodes x nodes."""
@@ -304,7 +296,7 @@ class FramedChart(Chart):
         for visit, (slot, done) in self.leaves.items():
             leaves[visit], action[visit] = slot, done
         misfits = np.zeros((4, visits, visits), dtype=bool)
-        for s, x in self.elsewhere:
+        for s, x in self.away:
             misfits[:, self.facing[s][0], self.facing[x][0]] = misfits[
                 :, self.facing[x][0], self.facing[s][0]
             ] = True

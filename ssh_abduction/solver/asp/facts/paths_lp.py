@@ -194,14 +194,6 @@ def pinned_facts(segments: Iterable[int]) -> str:
     return " ".join(f"pinned({segment})." for segment in segments)
 
 
-def read_elsewhere(model: Model) -> list[tuple[int, int]]:
-    """Read the pairs of dstates that are at different places; none if no paths fit the dstates."""
-    found = [read_atom(symbol) for symbol in model.symbols(shown=True)]
-    if any(name == "violated" for name, _ in found):
-        return []
-    return [(args[0], args[1]) for _, args in found]
-
-
 def settled_labels(labels: Iterable[tuple[int, int]]) -> str:
     """Return the facts that give nodes their dstates, from pairs of both."""
     return "\n".join(f"is({node},{label})." for node, label in labels)
