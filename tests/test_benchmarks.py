@@ -286,7 +286,7 @@ def test_seconds_of_the_processor_are_what_a_search_is_limited_by() -> None:
 def test_following_is_no_speedup_of_a_user_and_can_be_left_out() -> None:
     script = (
         "from cell import all_but; from ssh_abduction.solver.engines.small_maps import SmallMaps "
-        "as E; print(all_but('following'), list(E.from_beginning(None)))"
+        "as E; print(all_but('following'), list(E.from_beginning(E)))"
     )
     said = subprocess.run(
         [sys.executable, "-c", script],

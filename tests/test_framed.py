@@ -37,7 +37,7 @@ from ssh_abduction.solver.engines.visit_labels import VisitLabels
 from ssh_abduction.solver.engines.visit_program import VisitProgram
 from ssh_abduction.solver.guesses import annealing, sampling
 from ssh_abduction.solver.guesses.annealing import annealed
-from ssh_abduction.solver.guesses.merging import merged_near
+from ssh_abduction.solver.guesses.merging import merged
 from ssh_abduction.solver.prefixes import Prefixes
 from ssh_abduction.solver.steps.chart import QUARTERS, Chart, FramedChart
 from ssh_abduction.solver.steps.log import Log
@@ -656,9 +656,9 @@ def test_any_guess_is_merged_to_a_map(trace: Trace, theory: Theory, guess: list[
         return  # the trace fits no frame
     chart = asked._chart
     apart = chart.apart()
-    labels = merged_near(apart, chart.links, guess[: len(chart.seen)])
+    labels = merged(chart, guess=guess[: len(chart.seen)])
     assert chart.is_map(labels)
     assert not any(
         apart[i, j] for i in range(len(labels)) for j in range(i) if labels[i] == labels[j]
     )
-    assert merged_near(apart, chart.links, labels) == labels
+    assert merged(chart, guess=labels) == labels

@@ -297,10 +297,9 @@ def test_steps_merged_by_evidence_make_a_map(trace: Trace) -> None:
     theory = settle(trace, Theory.causal().replace(joint=1)).theory  # merging knows only pairs
     log = Log(trace, theory)
     chart = Chart.of_steps(log, len(trace))
-    apart, links = chart.apart(), chart.links
     fewest = solve(trace, theory).cost
     assert fewest
-    known = merged(apart, links, chart.continuations.clique())
+    known = merged(chart, chart.continuations.clique())
     for labels in known, dstates_merged(chart, range(len(trace))), dstates_merged(chart, known):
         found = answer_maps.causal_map(labels, trace)
         assert check(trace, found, theory) == ()

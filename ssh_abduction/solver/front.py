@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from ssh_abduction.data.errors import TheoryError, brief, is_whole
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace, checked_trace
+from ssh_abduction.runtime.clock import each_heeding
 from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver.asp.limits import LimitError, Watch, check_limit
 from ssh_abduction.solver.engines.base import Found, Task
@@ -146,7 +147,7 @@ def fault_front(
     problem = settle(trace, theory if theory.has_faults else theory.replace(**KINDS))
     watch = Watch(time_limit)
     watch.start()
-    points = tuple(_points(Task.of(problem, watch), most))
+    points = tuple(each_heeding(watch.check, _points(Task.of(problem, watch), most)))
     return Front(points, stopped=any(not point.proven for point in points))
 
 

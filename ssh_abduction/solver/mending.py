@@ -83,9 +83,7 @@ class Mending:
     def maps(self) -> Iterator[Found]:
         """Yield maps of the whole trace, each better than the one before."""
         if self._task.theory.jumped and self._task.theory.star == "frame":
-            merging = Merging(
-                self._task.trace, self._task.theory, self._task.log.pairs, self._task.watch.check
-            )
+            merging = Merging(self._task.trace, self._task.theory, self._task.log.pairs)
             merging.merge()
             yield from self._by_missing_displacements(merging.labels(), merging.places())
         yield from self._by_merging(self._task.trace)
@@ -147,7 +145,7 @@ class Mending:
         before: Found | None = None
         pairs = self._problem(trace).pairs
         for _ in range(ROUNDS):
-            merging = Merging(trace, theory, pairs, self._task.watch.check)
+            merging = Merging(trace, theory, pairs)
             if before is not None:
                 merging.start_from(_places(before.map))
             merging.merge()

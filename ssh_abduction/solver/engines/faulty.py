@@ -64,7 +64,7 @@ class FaultyEngine:
         }
         self._best: int | None = None  # cost of the incumbent, in tenths of dstates
         self._known: SSHMap | None = None  # the incumbent
-        self._explainer = Explainer(self._seen, self._actions, self._price, task.watch.check)
+        self._explainer = Explainer(self._seen, self._actions, self._price)
         self._control = FaultyControl(task, self.asker, self._price, most_faults, self._raise_bound)
 
     def next_size(self, failed: int) -> int:

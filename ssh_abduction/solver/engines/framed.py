@@ -42,7 +42,7 @@ from ssh_abduction.solver.engines.framed_paths import Fitted, FramedPaths, NodeL
 from ssh_abduction.solver.engines.refusing import all_accepted, first_accepted
 from ssh_abduction.solver.engines.sides import FramedSides
 from ssh_abduction.solver.engines.visit_labels import VisitLabels
-from ssh_abduction.solver.guesses.merging import kept
+from ssh_abduction.solver.guesses.merging import merged
 from ssh_abduction.solver.steps.chart import Chart, FramedChart
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.settle import Problem
@@ -151,7 +151,7 @@ class FramedEngine:
         guess = [-1] * len(chart.seen)
         for node, label in zip(chart.node_of, known, strict=False):
             guess[node] = label
-        return self._fitting.separate(chart, kept(chart.apart(), chart.links, guess))
+        return self._fitting.separate(chart, merged(chart, guess=guess, settles=False))
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
         """Yield the maps of the prefix that have this cost: `enough` of them, or all if it is 0."""

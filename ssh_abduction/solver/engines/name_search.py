@@ -10,7 +10,7 @@ best one, one fewer each time. The search ends as soon as some map has as few ds
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 
 from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.facts import names_lp
@@ -154,7 +154,7 @@ class NameSearch:
     def _helped(self) -> Iterator[list[int]]:
         """Look for small maps in other ways, as clingo's search takes long. Yield their labels."""
         if self._may_help and not self._hard and not self._program.pinned.is_long:
-            yield from self._small.merged(self._asker.watch.check)
+            yield from self._small.merged()
         self._hard = True
         if self._program.has_all_links and self._may_help and not self._had_all_help:
             self._had_all_help = True
@@ -162,10 +162,12 @@ class NameSearch:
 
     def _near_a_guess(self) -> Iterator[list[int]]:
         """Guess a map, and look for maps with fewer dstates for a while. Yield their labels."""
-        check, known = self._asker.watch.check, self._incumbent.labels
         is_long = self._program.pinned.is_long
-        guessed = self._small.from_beginning(check) if is_long else self._small.guessed(check)
-        yield from _ever_fewer(guessed, known)
+        known = self._incumbent.labels
+        for labels in self._small.from_beginning() if is_long else self._small.guessed():
+            if known is None or len(set(labels)) < len(set(known)):
+                known = labels
+                yield labels
         if self._incumbent.labels and not is_long:
             yield from self._fewer(self._incumbent.labels)
 
@@ -201,11 +203,3 @@ class NameSearch:
             if answer is not None or core is None:
                 return answer, False
         return None, True
-
-
-def _ever_fewer(found: Iterable[list[int]], known: list[int] | None = None) -> Iterator[list[int]]:
-    """Yield only the labels that have fewer dstates than all earlier ones, and than `known`."""
-    for labels in found:
-        if known is None or len(set(labels)) < len(set(known)):
-            known = labels
-            yield labels

@@ -12,14 +12,14 @@ other steps (`guesses/continuing.py`).
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
 
 from ssh_abduction.solver.engines.base import AT_ONCE, Task
 from ssh_abduction.solver.engines.pinned import Pinned
 from ssh_abduction.solver.guesses.annealing import annealed, annealed_steps
 from ssh_abduction.solver.guesses.continuing import labels_continued
-from ssh_abduction.solver.guesses.merging import dstates_merged, merged, merged_near
+from ssh_abduction.solver.guesses.merging import dstates_merged, merged
 from ssh_abduction.solver.steps.chart import Chart
 
 # If turns cannot be rotations, stop after this many guesses, even if none of them is a map. Guesses
@@ -36,13 +36,12 @@ class SmallMaps:
         """Prepare for a chart of the first steps, each of them a node."""
         self._task, self._pinned = task, pinned
 
-    def merged(self, check: Callable[[], None]) -> Iterator[list[int]]:
+    def merged(self) -> Iterator[list[int]]:
         """Merge nodes by evidence, and yield the labels of the map; none without `greedy`."""
         if self._task.speedups.greedy:
-            chart = self._pinned.chart
-            yield merged(chart.apart(), chart.links, self._pinned.clique, check)
+            yield merged(self._pinned.chart, self._pinned.clique)
 
-    def from_beginning(self, check: Callable[[], None]) -> Iterator[list[int]]:
+    def from_beginning(self) -> Iterator[list[int]]:
         """Guess a map of the first steps of a long trace, extend it, and yield labels of all steps.
 
         Guess ever longer prefixes, until the map of the whole trace needs no more dstates than the
@@ -53,42 +52,40 @@ class SmallMaps:
         most = size if size <= GUESSED else 2 * AT_ONCE
         while self._task.speedups.annealed:
             beginning = Pinned.of_steps(self._task.log, steps)
-            near = self._map_of_guess(beginning, check)
-            tried = () if near is None else (dstates_merged(beginning.chart, near, check), near)
+            near = self._map_of_guess(beginning)
+            tried = () if near is None else (dstates_merged(beginning.chart, near), near)
             for known in tried:
-                if labels := labels_continued(self._task.log, known, check):
+                if labels := labels_continued(self._task.log, known):
                     yield labels[:size]
-                    yield (labels := dstates_merged(chart, labels[:size], check))
+                    yield (labels := dstates_merged(chart, labels[:size]))
                     if len(set(labels)) <= len(set(known)):
                         return
             if steps == most:
                 return
             steps = min(2 * steps, most)
 
-    def guessed(self, check: Callable[[], None]) -> Iterator[list[int]]:
+    def guessed(self) -> Iterator[list[int]]:
         """Yield the labels of a guessed map; none without `annealed`, or without a guess."""
         if self._task.speedups.annealed:
-            near = self._map_of_guess(self._pinned, check)
+            near = self._map_of_guess(self._pinned)
             if near is not None:
-                yield dstates_merged(self._pinned.chart, near, check)
+                yield dstates_merged(self._pinned.chart, near)
 
-    def _map_of_guess(self, pinned: Pinned, check: Callable[[], None]) -> list[int] | None:
+    def _map_of_guess(self, pinned: Pinned) -> list[int] | None:
         """Guess dstates, and return the labels of a map near the guess; None without a guess."""
-        guess = self._guessed(pinned, check)
-        if guess is None:
-            return None
-        return merged_near(pinned.chart.apart(), pinned.chart.links, guess, check)
+        guess = self._guessed(pinned)
+        return None if guess is None else merged(pinned.chart, guess=guess)
 
-    def _guessed(self, pinned: Pinned, check: Callable[[], None]) -> list[int] | None:
+    def _guessed(self, pinned: Pinned) -> list[int] | None:
         """Guess the dstates of these steps, -1 if not sure; None if that takes too much memory."""
         steps = pinned.chart
         chart = Chart.turned(self._task.trace, self._task.log, len(steps.seen))
         if chart is None:  # turns cannot be rotations by right angles
             guesses: Iterable[list[int]] = islice(
-                annealed_steps(steps, pinned.clique, pinned.may_be, check), GUESSES
+                annealed_steps(steps, pinned.clique, pinned.may_be), GUESSES
             )
         else:
-            labels = annealed(chart, check).labels(chart)
+            labels = annealed(chart).labels(chart)
             guesses = [[labels[node] for node in chart.node_of]]
         guess = None
         for labels in guesses:

@@ -35,7 +35,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, cycle, repeat
 from typing import TypeVar
@@ -98,7 +98,7 @@ class Guess:
         ]
 
 
-def annealed(chart: FramedChart, check: Callable[[], None] = lambda: None) -> Guess:
+def annealed(chart: FramedChart) -> Guess:
     """Guess the states of all visits of a chart.
 
     A travel is bad if it leads elsewhere than most travels with the same state and action. The
@@ -107,29 +107,26 @@ def annealed(chart: FramedChart, check: Callable[[], None] = lambda: None) -> Gu
     """
     found: dict[int, Guess] = {}
     began = time.perf_counter()
-    for failed, guess in _attempts(chart, check):
+    for failed, guess in _attempts(chart):
         found.setdefault(failed, guess)
         if failed <= len(chart.travels) // FEW or time.perf_counter() - began > SECONDS:
             return found[min(found)]
     raise AssertionError
 
 
-def _attempts(chart: FramedChart, check: Callable[[], None]) -> Iterator[tuple[int, Guess]]:
+def _attempts(chart: FramedChart) -> Iterator[tuple[int, Guess]]:
     """Yield guesses without end, each with the number of its bad travels."""
     leaves = list(chart.leaves.values())
     for attempt, more in enumerate(cycle(MORE), 1):
         options = _options(chart, SPARES * more)
         drawn = Sampler(options, leaves, 4, np.random.default_rng(attempt))
         for first, sweeps in STAGES:
-            drawn.anneal(first, sweeps, check)
+            drawn.anneal(first, sweeps)
             yield drawn.failed(), Guess(drawn.labels, drawn.sure())
 
 
 def annealed_steps(
-    chart: Chart,
-    clique: Sequence[int],
-    may_be: Sequence[Sequence[int]],
-    check: Callable[[], None] = lambda: None,
+    chart: Chart, clique: Sequence[int], may_be: Sequence[Sequence[int]]
 ) -> Iterator[list[int]]:
     """Yield better and better guesses at the dstates of all steps; -1 if a guess is not sure.
 
@@ -144,7 +141,7 @@ def annealed_steps(
         return
     drawn = Sampler(options, leaves, 1, np.random.default_rng(0))
     for first, sweeps in chain(STEPS, repeat(STEPS[-1])):
-        drawn.anneal(first, sweeps, check)
+        drawn.anneal(first, sweeps)
         yield np.where(drawn.sure(), drawn.labels, -1).tolist()
 
 

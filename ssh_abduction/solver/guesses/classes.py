@@ -14,8 +14,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.steps.apart import Matrix
-from ssh_abduction.solver.steps.chart import Link, numbered
+from ssh_abduction.solver.steps.chart import Link
 
 # The demands on the merge of a step with a known dstate, from strict to lenient. The first number
 # is by how much its evidence has to exceed that for the next best merge of the step. The second
@@ -54,7 +55,6 @@ class Classes:
         self,
         apart: Matrix,
         links: Iterable[Link],
-        check: Callable[[], None] = lambda: None,
         nodes: NDArray[np.int_] | None = None,
     ) -> None:
         """Begin with a class for each step. The matrix `apart` has the shape steps x steps.
@@ -78,7 +78,6 @@ class Classes:
             tuple[int, int, bool, NDArray[np.bool_], dict[int, int], NDArray[np.int_]]
         ] = []
         self._has_merged = False
-        self._check = check
 
     def take(self, guess: Sequence[int]) -> None:
         """Merge the steps that share a label in a guess, if they can be one dstate.
@@ -88,13 +87,9 @@ class Classes:
         first = {label: node for node, label in reversed(list(enumerate(guess))) if label >= 0}
         self.known[list(first.values())] = True
         for node, label in enumerate(guess):
-            self._check()
+            look_at_clock()
             if label >= 0:
                 self.merge(first[label], node)
-
-    def labels(self) -> list[int]:
-        """Return the class of each step, as a number. Classes are numbered by first steps."""
-        return numbered(self.root.tolist())
 
     def settle_all(self) -> None:
         """Merge classes with known dstates, or make them known, until every class is known."""
@@ -102,7 +97,7 @@ class Classes:
             while self._advanced(partial(self.settle, evidence, rivals)):
                 pass
         while self._advanced(self.settle_at_any_rate):
-            self._check()
+            look_at_clock()
 
     def thin_all(self) -> None:
         """Merge known dstates until no two of them can be one."""
@@ -138,7 +133,7 @@ class Classes:
         steps = self.unsettled()
         fitting = (~self._apart[np.flatnonzero(self.known)][:, steps]).sum(axis=0)
         for t in steps[np.argsort(fitting, kind="stable")].tolist():
-            self._check()
+            look_at_clock()
             root = int(self.root[t])
             if self.known[root]:
                 continue
@@ -169,7 +164,7 @@ class Classes:
         """
         nodes = np.bincount(self.root, self._nodes)
         for root in sorted(np.flatnonzero(self.known).tolist(), key=lambda root: nodes[root]):
-            self._check()
+            look_at_clock()
             if self.known[root]:  # it was not merged meanwhile
                 ranked = self._ranked(
                     root, [dstate for dstate in self._fitting(root) if dstate != root], forced=True

@@ -22,9 +22,10 @@ dstates before it. The result may have dstates that could be one. `guesses/mergi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import TypeAlias
 
+from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.steps.log import Log
 
 # The most steps to predict from a dstate, to find out whether the robot is there.
@@ -44,15 +45,13 @@ MANY = 10
 _Link: TypeAlias = tuple[int, int]  # dstate, action
 
 
-def labels_continued(
-    log: Log, labels: Sequence[int], check: Callable[[], None] = lambda: None
-) -> list[int] | None:
+def labels_continued(log: Log, labels: Sequence[int]) -> list[int] | None:
     """Label all steps of a trace by extending, and if need be correcting, a map of its first steps.
 
     `labels` has the dstate of each of the first steps, numbered from 0. Returns None if there are
     still contradictions after WALKS walks, or the map has become too large.
     """
-    known = _Map(log, labels, check)
+    known = _Map(log, labels)
     may_be_lost, furthest, back = True, 0, 1
     for walk in range(WALKS):
         links = len(known.leads)
@@ -77,8 +76,7 @@ class _Map:
         leads: For each (dstate, action) with a link, the dstate that it leads to.
     """
 
-    def __init__(self, log: Log, labels: Sequence[int], check: Callable[[], None]) -> None:
-        self._check = check
+    def __init__(self, log: Log, labels: Sequence[int]) -> None:
         self._seen, self._actions = log.seen, log.actions
         self._shows = dict(zip(labels, log.seen, strict=False))  # the observation of each dstate
         self.leads = {(labels[t], log.actions[t]): labels[t + 1] for t in range(len(labels) - 1)}
@@ -143,7 +141,7 @@ class _Map:
         the dstate predicts fewer than `least` steps, or not AHEAD steps more than any other, or if
         a contradiction ends its prediction.
         """
-        self._check()
+        look_at_clock()
         # Keep the two longest predictions, to compare them in the end.
         best, most, next_most = None, 0, 0
         for dstate in self._like.get(self._seen[step], ()):

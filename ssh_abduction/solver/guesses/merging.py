@@ -1,9 +1,9 @@
 """Finds small maps of the causal theory without a search: it merges steps by evidence.
 
->>> from ssh_abduction.solver.steps.apart import Continuations
+>>> from ssh_abduction.solver.steps.chart import Chart
 >>> from ssh_abduction.solver.guesses.merging import merged
->>> links = [(0, 0, 1), (1, 0, 2), (2, 0, 3)]
->>> merged(Continuations([0, 1, 0, 1], [0, 0, 0]).apart(), links, [0, 1])
+>>> links = ((0, 0, 1), (1, 0, 2), (2, 0, 3))
+>>> merged(Chart((0, 1, 0, 1), links, range(4)), [0, 1])
 [0, 1, 0, 1]
 
 Two steps are *apart* if they are known to be different dstates. At first, the steps of a clique,
@@ -30,65 +30,36 @@ trace instead of at a root.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.guesses.classes import Classes
 from ssh_abduction.solver.steps.apart import Matrix
 from ssh_abduction.solver.steps.chart import Chart, Link, numbered
 
 
 def merged(
-    apart: Matrix,
-    links: Iterable[Link],
-    clique: Sequence[int],
-    check: Callable[[], None] = lambda: None,
+    chart: Chart, clique: Iterable[int] = (), guess: Sequence[int] = (), *, settles: bool = True
 ) -> list[int]:
-    """Return the dstate of each node in a small map of the causal theory.
+    """Return the dstate of each node of a chart in a small map of the causal theory.
 
-    `apart` has the pairs of nodes that are apart, as a matrix of nodes x nodes. Links are triples
-    (node, action, node). The nodes of the clique are pairwise distinct. `check` is called now and
-    then; it may raise to stop. Dstates are numbered in the order of their first nodes.
+    The nodes of the clique are pairwise distinct. The map is near the guess, if one is given: a
+    label for each node, or -1. A label is ignored if the node cannot be one dstate with earlier
+    nodes of that label. Unless the rest `settles`, all other nodes are dstates of their own, if the
+    links allow that. Dstates are numbered in the order of their first nodes.
     """
-    classes = Classes(apart, links, check)
+    classes = Classes(chart.apart(), chart.links)
     classes.known[list(clique)] = True
-    classes.settle_all()
-    return classes.labels()
-
-
-def merged_near(
-    apart: Matrix,
-    links: Iterable[Link],
-    guess: Sequence[int],
-    check: Callable[[], None] = lambda: None,
-) -> list[int]:
-    """Return the dstate of each node in a small map of the causal theory near a guess.
-
-    `apart`, `links` and `check` are as for `merged`. In the guess, the label of a node is -1 if it
-    is unknown. It is ignored if the node cannot be one dstate with earlier nodes of that label.
-    """
-    classes = Classes(apart, links, check)
     classes.take(guess)
-    classes.settle_all()
-    return classes.labels()
+    if settles:
+        classes.settle_all()
+    return numbered(classes.root.tolist())
 
 
-def kept(apart: Matrix, links: Iterable[Link], guess: Sequence[int]) -> list[int]:
-    """Make a map that keeps the labels of a guess as far as possible, and merges nothing else.
-
-    Nodes whose label is unknown (-1) or cannot be kept are dstates of their own, unless the links
-    make them one with others. `apart` and `links` are as for `merged`.
-    """
-    classes = Classes(apart, links)
-    classes.take(guess)
-    return classes.labels()
-
-
-def dstates_merged(
-    chart: Chart, labels: Sequence[int], check: Callable[[], None] = lambda: None
-) -> list[int]:
+def dstates_merged(chart: Chart, labels: Sequence[int]) -> list[int]:
     """Merge dstates of a map of a chart until no two can be one.
 
     Dstates with the fewest nodes are merged first, each with the dstate for which there is most
@@ -103,7 +74,6 @@ def dstates_merged(
             np.asarray(chart.seen)[first].tolist(),
             links,
             np.bincount(dstates).tolist(),
-            check,
             excluded,
         )
     )
@@ -114,7 +84,6 @@ def thinned_map(
     shows: Sequence[int],
     links: Sequence[Link],
     visits: Sequence[int],
-    check: Callable[[], None] = lambda: None,
     excluded: Sequence[tuple[int, int]] = (),
 ) -> list[int]:
     """Merge dstates of a map until no two can be one, and return which dstate represents each.
@@ -123,9 +92,8 @@ def thinned_map(
     dstate, links (dstate, action, dstate), and the number of nodes at each dstate. `excluded` pairs
     must not be merged. A dstate that was not merged represents itself.
     """
-    classes = Classes(
-        _apart_in_map(np.asarray(shows), links, excluded, check), links, check, np.asarray(visits)
-    )
+    apart = _apart_in_map(np.asarray(shows), links, excluded)
+    classes = Classes(apart, links, np.asarray(visits))
     classes.known[:] = True
     classes.thin_all()
     root: list[int] = classes.root.tolist()
@@ -136,7 +104,6 @@ def _apart_in_map(
     seen: NDArray[np.int_],
     links: Sequence[Link],
     excluded: Sequence[tuple[int, int]],
-    check: Callable[[], None],
 ) -> Matrix:
     """Find the pairs of dstates of a map that are apart, as a matrix of dstates x dstates.
 
@@ -150,7 +117,7 @@ def _apart_in_map(
     for s, x in excluded:
         apart[s, x] = apart[x, s] = True
     while True:
-        check()
+        look_at_clock()
         before = apart.copy()
         for there in leads.values():
             known = np.flatnonzero(there >= 0)

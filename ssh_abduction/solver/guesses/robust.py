@@ -21,12 +21,13 @@ merged if they can be one.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.guesses.merging import thinned_map
 from ssh_abduction.solver.steps.chart import Link, numbered
 
@@ -97,7 +98,6 @@ class Explainer:
     seen: Sequence[int]
     actions: Sequence[int]
     price: Mapping[str, Sequence[int]]
-    check: Callable[[], None] = field(default=lambda: None)
 
     def explained(self, machine: PartialMachine) -> Explained:
         """Find the labels with the cheapest faults for a machine, by a Viterbi pass.
@@ -120,7 +120,7 @@ class Explainer:
         came = np.zeros((steps, count), dtype=np.int32)
         for t in range(1, steps):
             if t % 500 == 0:
-                self.check()
+                look_at_clock()
             action = self.actions[t - 1]
             # There are three ways to reach a dstate: by a slip from the cheapest dstate, from the
             # cheapest dstate without a link for this action, or by a link.
@@ -193,7 +193,7 @@ class Explainer:
             visits = Counter(labels)
             links: list[Link] = [(s, action, x) for (s, action), x in machine.goes.items()]
             counts = [visits[s] for s in range(len(machine.shows))]
-            root = thinned_map(machine.shows, links, counts, self.check)
+            root = thinned_map(machine.shows, links, counts)
             if len(set(root)) == len(machine.shows):
                 return best
             better = self._settled([root[label] for label in labels])
@@ -295,13 +295,13 @@ class _Model:
             scale[t] = message.sum()
             ahead[t] = message / scale[t]
             if t % 500 == 0:
-                self._explainer.check()
+                look_at_clock()
         for t in range(steps - 2, -1, -1):
             behind[t] = (
                 matrices[self._actions[t]] @ (behind[t + 1] * self._sees[t + 1]) / scale[t + 1]
             )
             if t % 500 == 0:
-                self._explainer.check()
+                look_at_clock()
         then = behind[1:] * self._sees[1:] / scale[1:, None]
         taken = [
             self._chances[a] * (ahead[:-1][self._actions == a].T @ then[self._actions == a])

@@ -7,12 +7,14 @@ each visit.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ssh_abduction.runtime.clock import look_at_clock
 
 # The weight of each state in the Dirichlet prior, in visits. One visit outweighs the whole prior.
 WEIGHT = 0.002
@@ -163,14 +165,14 @@ class Sampler:
         states = ways * (int(options.max()) // ways + 1)
         self._transitions = _Transitions(leaves, ways, states, self.labels)
 
-    def anneal(self, first: float, sweeps: int, check: Callable[[], None]) -> None:
+    def anneal(self, first: float, sweeps: int) -> None:
         """Draw the states again and again, with rising power of probabilities.
 
         The power rises from `first` to COLD in this many sweeps. LAST more sweeps have the power
         QUENCHED.
         """
         for sweep in range(sweeps + LAST):
-            check()
+            look_at_clock()
             power = first + (COLD - first) * sweep / sweeps if sweep < sweeps else QUENCHED
             if sweep % ROUND == 0:
                 choice = self._choose(power)

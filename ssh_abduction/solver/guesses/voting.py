@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import heapq
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -28,6 +28,7 @@ import numpy as np
 
 from ssh_abduction.data.star import Openings
 from ssh_abduction.data.trace import Trace, View
+from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.steps.chart import QUARTERS
 from ssh_abduction.theory.pairs import Pairs, pairs_in
 from ssh_abduction.theory.theory import Theory
@@ -93,10 +94,8 @@ class _Group:
 class Merging:
     """The visits of a trace, in order, in groups, which are merged to places with frames."""
 
-    def __init__(
-        self, trace: Trace, theory: Theory, pairs: Pairs, check: Callable[[], None]
-    ) -> None:
-        self._trace, self._theory, self._check = trace, theory, check
+    def __init__(self, trace: Trace, theory: Theory, pairs: Pairs) -> None:
+        self._trace, self._theory = trace, theory
         self.visits = list(_visits(trace))
         self._groups = {number: self._of_visit(number) for number in range(len(self.visits))}
         self._group_of = {number: number for number in self._groups}
@@ -139,7 +138,7 @@ class Merging:
                 for parts in joined:
                     self._merge(parts)
                 merged = True
-                self._check()
+                look_at_clock()
             if not merged:
                 return
 
@@ -270,7 +269,7 @@ class Merging:
             for x in mine:
                 together[x] = mine
             if len(work) > len(self.visits):
-                self._check()
+                look_at_clock()
         joined = list({id(parts): list(parts.items()) for parts in together.values()}.values())
         before = sum(self._groups[x].cost for parts in joined for x, _ in parts)
         return before - sum(
