@@ -328,7 +328,7 @@ def test_the_shell_tells_the_backbone_where_the_list_is_cut_off(
     assert cut["backbone"]["places"]["sometimes"] == [[0, 4], [1, 4]]
 
 
-def test_of_many_pairs_so_many_are_printed_and_all_are_counted() -> None:
+def test_a_backbone_writes_a_thousand_pairs_and_counts_all() -> None:
     pairs = tuple((0, t) for t in range(1, 1501))
     told = Shared((*range(1501),), pairs).to_dict([0, 1])
     assert (told["always"], len(told["sometimes"]), told["pairs"]) == ([0, 1], 1000, 1500)

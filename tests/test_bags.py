@@ -96,7 +96,7 @@ def test_other_bytes_after_packed_lines_are_said_to_be_damage(tmp_path: Path) ->
 
 @pytest.mark.parametrize("format", FILES)
 @pytest.mark.parametrize("share", [0.4, 0.8, 0.97])
-def test_of_a_bag_that_was_cut_the_whole_part_is_read_and_it_is_said(
+def test_the_intact_part_of_a_cut_bag_is_read_with_a_note(
     tmp_path: Path, format: str, share: float
 ) -> None:
     file = written(tmp_path, format, drive(200, SMALL))

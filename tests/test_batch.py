@@ -210,7 +210,7 @@ def test_a_warning_names_its_trace_once(traces: Path, capsys: pytest.CaptureFixt
 
 
 @pytest.mark.slow
-def test_everywhere_the_same(
+def test_results_are_the_same_with_processes_and_dask(
     traces: Path, scheduler_here: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     paths = [f"{name}.jsonl" for name in ("broken", "impossible", "quick")]
@@ -359,7 +359,7 @@ def test_without_the_extra(
     assert capsys.readouterr().err.endswith("; pip install 'ssh-abduction[cluster]'\n")
 
 
-def test_what_nobody_foresaw_is_an_answer_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unexpected_error_becomes_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
     def load(path: str) -> Trace:
         raise MemoryError("no room for\nso many steps")
 

@@ -68,7 +68,9 @@ def test_what_solve_prints_is_true(
     assert code == 0, out
 
 
-def test_that_there_is_no_map_is_no_lie(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_accepts_an_unsatisfiable_answer(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = str(tmp_path / "trace.jsonl")
     Trace.from_steps("xyabcd", ["right", "travel", "travel", "around", "around"]).save(path)
     data = answer(path, capsys)
@@ -202,7 +204,9 @@ LIES: dict[str, tuple[dict[str, Any] | Callable[[dict[str, Any]], Any], str]] = 
 
 
 @pytest.mark.parametrize("case", LIES)
-def test_a_lie_is_named(case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_names_each_false_claim(
+    case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     change, line = LIES[case]
     data = json.loads(aces.answer())
     if callable(change):

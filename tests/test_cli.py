@@ -281,7 +281,9 @@ def test_flags_are_laid_over_the_theory_of_the_file(
         assert message in capsys.readouterr().err
 
 
-def test_one_is_not_many(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_count_of_one_has_a_singular_noun(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = saved(Trace.from_steps("a", []), tmp_path)
     assert main(["solve", path, "--theory", "topological"]) == 0
     assert capsys.readouterr().out.startswith(
@@ -425,7 +427,9 @@ def test_contradicting_choices_are_one_line(capsys: pytest.CaptureFixture[str]) 
     )
 
 
-def test_the_level_alone_is_a_choice(room: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_setting_level_causal_gives_the_causal_preset(
+    room: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["solve", room, "--set", "level=causal"]) == 0
     alone = capsys.readouterr().out
     assert main(["solve", room, "--theory", "causal"]) == 0
@@ -492,7 +496,7 @@ def printed_in(letters: str, *words: str, given: bytes = b"") -> bytes:
     return out.buffer.getvalue()  # type: ignore[attr-defined, no-any-return]
 
 
-def test_a_terminal_of_few_letters(room: str) -> None:
+def test_characters_that_a_terminal_lacks_are_replaced(room: str) -> None:
     assert b"right ? 1" in printed_in("ascii", "solve", room)
 
 

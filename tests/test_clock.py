@@ -85,7 +85,7 @@ LONG: dict[str, Callable[[], object]] = {
 
 
 @pytest.mark.parametrize("name", LONG)
-def test_what_takes_long_looks_at_the_clock(name: str) -> None:
+def test_long_computations_check_the_limits(name: str) -> None:
     looks = []
     with heeding(lambda: looks.append(None)):
         LONG[name]()
@@ -103,7 +103,7 @@ def test_limits_within_limits_are_all_heeded() -> None:
     assert len(calls) == 2
 
 
-def test_whoever_uses_an_item_is_not_under_the_limit_of_whoever_makes_it() -> None:
+def test_a_limit_holds_for_the_generator_and_not_for_its_caller() -> None:
     def made() -> object:
         look_at_clock()
         yield 1

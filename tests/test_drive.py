@@ -514,7 +514,7 @@ def test_simulate_writes_logs_that_can_be_read(
     )
 
 
-def test_a_bag_says_what_its_odometry_is_worth(tmp_path: Path) -> None:
+def test_a_bag_has_the_covariance_of_its_odometry(tmp_path: Path) -> None:
     """The covariance of the pose grows from zero, as the odometer states."""
     rosbags = pytest.importorskip("rosbags.highlevel")
     bag = tmp_path / "run.bag"

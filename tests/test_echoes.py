@@ -114,7 +114,7 @@ def test_a_range_that_repeats_is_no_return(
         (lambda ranges, _: ranges, 8.0),
     ],
 )
-def test_walls_are_walls(
+def test_ranges_of_walls_stay_measurements(
     drive: tuple[Scan, ...], say: Callable[[Array, Array], Array], reach: float
 ) -> None:
     scans, notes = interpret_log(written(drive, say, reach), LaserOptions())
@@ -180,7 +180,7 @@ def test_what_the_user_says_of_zeros_is_obeyed_in_silence(
         assert np.array_equal(scan.ranges, alone.ranges, equal_nan=True)
 
 
-def test_ranges_from_no_return_on_are_none(drive: tuple[Scan, ...]) -> None:
+def test_ranges_of_at_least_no_return_are_infinite(drive: tuple[Scan, ...]) -> None:
     scans, _ = interpret_log(drive, LaserOptions(no_return=3.0))
     assert all(
         np.array_equal(np.isinf(scan.ranges), true.ranges >= 3.0)

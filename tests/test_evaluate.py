@@ -241,7 +241,7 @@ def test_the_route_that_a_robot_drove_has_no_true_map_among_the_minimal_ones() -
         assert each.accuracy == 19 / 23  # four steps are at a dstate that the map takes for another
 
 
-def test_edges_are_counted_by_hand() -> None:
+def test_precision_and_recall_of_edges_are_those_counted_by_hand() -> None:
     # Truth: A – B – C – A, driven once around and back to B. The map takes C for A, so that it has
     # the edges A – B and A – A.
     trace = walk([{"place": p} for p in "ABCABA"])
@@ -347,7 +347,7 @@ def test_ambiguity_is_of_dstates_and_not_of_steps() -> None:
     assert evaluate([], told(blind, "uvwxux")).ambiguity is None
 
 
-def test_values_print_as_they_are_called() -> None:
+def test_the_dict_of_an_evaluation_has_its_attributes() -> None:
     found = evaluate([labelled([0, 1, 0])], walk(["a", "b", "a"]))
     assert (found.rank, len({found, replace(found)})) == (1, 1)
     data = found.to_dict()
@@ -415,7 +415,7 @@ def test_maps_that_cannot_be_used() -> None:
         evaluate([], "trace.jsonl")  # type: ignore[arg-type]
 
 
-def test_it_loads_nothing_that_infers() -> None:
+def test_evaluation_imports_nothing_that_infers() -> None:
     program = "import sys, ssh_abduction.evaluation; print(*sys.modules)"
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT

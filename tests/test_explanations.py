@@ -44,7 +44,7 @@ def uneven() -> Trace:
     return Trace.from_steps(trace.views, trace.actions, displacements=moved, odometry=WHITE)
 
 
-def test_a_turn_on_the_spot_that_does_not_come_round() -> None:
+def test_four_right_turns_that_odometry_contradicts_are_explained() -> None:
     """Four right turns make steps 0 and 4 one dstate, but the odometry says 60 degrees each."""
     explanation = explain(TURNS)
     assert explanation

@@ -88,7 +88,7 @@ def partition(names: Collection[Any]) -> list[int]:
     [(STREET, "a", 1), (TEE, "W", 0), (RING, "a", 0)],
     ids=["street", "tee", "ring"],
 )
-def test_streets_are_known_when_it_is_done(world: Streets, start: str, margin: int) -> None:
+def test_exploring_ends_when_all_streets_are_known(world: Streets, start: str, margin: int) -> None:
     robot = Streetwalker(world, start, "E")
     found = Explorer(robot, margin=margin, time_limit=None).explore(200)
     assert (found.ending, found.is_unique, found.is_true) == ("done", True, True)
@@ -186,7 +186,7 @@ class Crooked(Streetwalker):
         return Step("here", star=(1, 0, 0, 0))
 
 
-def test_no_map_is_said() -> None:
+def test_an_exploration_ends_as_contradicted_without_a_map() -> None:
     explorer = Explorer(Crooked(TEE, "W", "E", told=False), time_limit=None)
     found = explorer.explore(10)
     assert (found.ending, found.is_unique, found.solution.status) == (

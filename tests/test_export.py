@@ -326,7 +326,7 @@ def test_maps_of_dstates_alone_are_exported(square: SSHMap) -> None:
         "yes",
     ],
 )
-def test_any_text_comes_back_from_yaml(text: str) -> None:
+def test_a_tmap2_file_holds_any_text(text: str) -> None:
     ssh_map = SSHMap((0, 1), (DState(0, text), DState(1, "b")), ((0, text, 1),))
     data = checked_tmap2(export_map(ssh_map, "tmap2", name=text))
     assert data["name"] == text

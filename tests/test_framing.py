@@ -62,7 +62,7 @@ def test_a_maze_has_a_small_map_before_the_proof() -> None:
     assert check(walk.trace, solution.maps[0], solution.theory) == ()
 
 
-def test_only_patterns_need_it() -> None:
+def test_framing_is_on_only_for_star_patterns() -> None:
     trace = maze(2, 2, steps=20, seed=0, stars=True).trace
     assert row("framing").holds_for(settle(trace, PATTERN).theory)
     for theory in (Theory(), Theory(star="none"), Theory.causal()):
@@ -70,5 +70,5 @@ def test_only_patterns_need_it() -> None:
 
 
 @pytest.mark.parametrize("name", ["frame", "gateways", "alike"])
-def test_it_is_off_for_other_stars(name: str) -> None:
+def test_framing_is_off_for_other_stars(name: str) -> None:
     assert not row("framing").holds_for(Theory(star=name))  # type: ignore[arg-type]

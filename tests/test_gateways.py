@@ -57,7 +57,7 @@ def test_a_star_survives_a_round_trip(tmp_path: Path) -> None:
     assert trace.steps[2].star == (0, Gateway(180, 90, None, None))
 
 
-def test_what_is_in_quarters() -> None:
+def test_which_stars_and_turns_fit_right_angles() -> None:
     fits = [
         (1, 0, 1, 1),
         (0, 90),

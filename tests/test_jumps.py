@@ -165,7 +165,7 @@ def test_poses_of_two_sources_that_alternate_are_those_of_one(
     assert "The poses of several sources alternate in the odometry" in notes
 
 
-def test_poses_that_alternate_nearby_are_said(scans: tuple[Scan, ...]) -> None:
+def test_alternating_poses_that_are_near_give_a_note(scans: tuple[Scan, ...]) -> None:
     draw = random.Random(1)
     poses = [
         moved((1.0, 0.8, 0.05), scan.odometry) if draw.random() < 0.5 else scan.odometry

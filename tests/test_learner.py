@@ -157,7 +157,7 @@ def test_where_maps_disagree_nothing_is_learnt_unless_one_is_chosen() -> None:
         labels_of([])
 
 
-def test_an_incomplete_list_of_maps_is_said() -> None:
+def test_an_incomplete_list_of_maps_gives_a_warning() -> None:
     maps = solve(Trace.from_steps("aba", ["travel", "travel"])).maps
     with pytest.warns(AmbiguousMapWarning, match="at least 1 minimal map remains, and agree"):
         labels_of(maps, complete=False)
@@ -847,7 +847,7 @@ def test_bad_images_are_named_where_no_fault_is_allowed() -> None:
     assert any("(image 9" in str(w.message) for w in caught)
 
 
-def test_who_is_isolated_is_a_number_above_one(run: Trace) -> None:
+def test_isolated_must_be_a_number_above_one(run: Trace) -> None:
     for wrong in (1, -3.0, math.nan, "far"):
         with pytest.raises(
             PerceptionError, match="isolated: expected a number of more than 1, or None"

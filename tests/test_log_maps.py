@@ -385,7 +385,7 @@ def test_a_search_says_why_it_has_no_map_or_no_proof() -> None:
         (["-o", "x", "--maps", "-1"], "--maps: expected how many minimal maps to list"),
     ],
 )
-def test_what_cannot_be_is_said_before_a_log_is_read(
+def test_map_refuses_wrong_options_before_it_reads_a_log(
     tmp_path: Path, flags: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "no.log"

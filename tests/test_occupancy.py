@@ -278,7 +278,7 @@ def test_a_map_with_yaw_is_turned_about_its_lower_left_corner(tmp_path: Path) ->
         (b"image: a\0b\n", "expected the YAML file of an occupancy map, got none"),
     ],
 )
-def test_what_is_wrong_in_a_map_is_named_with_its_file(
+def test_errors_of_occupancy_maps_name_the_file(
     text: str | bytes, message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(SimulatorError, match=f"map.yaml: .*{message}"):

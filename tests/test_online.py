@@ -104,7 +104,7 @@ def test_a_theory_without_an_axiom_is_solved_anew(name: str) -> None:
 
 @settings(max_examples=5)
 @given(st.data())
-def test_no_more_maps_than_asked_for(data: st.DataObject) -> None:
+def test_a_mapper_keeps_at_most_max_maps(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=6), label="trace")
     theory = settle(trace, data.draw(theories(trace), label="theory")).theory
     _, answers = follow(
@@ -225,7 +225,7 @@ def test_a_map_that_goes_on_like_a_sketch_is_consistent(data: st.DataObject) -> 
     )
 
 
-def test_a_map_whose_turns_lead_back_is_not_sure_to_go_on() -> None:
+def test_a_draft_whose_turns_lead_back_may_contradict_an_axiom() -> None:
     """Two turns to the right lead back, so a new place ahead would be on both sides of a path."""
     trace = Trace.from_steps("aaaa", ["right", "right", "travel"])
     theory = settle(trace, Theory(star="none", path_order="partial", all_on_paths=True)).theory
@@ -233,7 +233,7 @@ def test_a_map_whose_turns_lead_back_is_not_sure_to_go_on() -> None:
 
 
 @pytest.mark.parametrize("stars", [False, True])
-def test_a_map_goes_on_through_a_maze(stars: bool) -> None:
+def test_a_draft_follows_a_robot_through_a_maze(stars: bool) -> None:
     doubts: list[bool] = []
     for seed in range(3):
         trace = maze(3, 3, steps=60, seed=seed, loops=0.5, stars=True).trace
@@ -302,7 +302,7 @@ def explore(trace: Trace, mapper: OnlineMapper) -> list[Solution]:
     ]
 
 
-def test_what_cannot_be_leaves_no_map() -> None:
+def test_a_contradicting_step_leaves_a_mapper_without_maps() -> None:
     mapper = OnlineMapper("a", star=[1, 0, 0, 0], time_limit=None)
     assert mapper.observe("around", "b", star=[0, 0, 1, 0]).status is Status.OPTIMAL
     for view in ("a", "c", "a"):

@@ -49,7 +49,7 @@ def keeps(ssh_map: SSHMap) -> Callable[[Key], bool]:
 @pytest.mark.filterwarnings("ignore:views. trace")
 @settings(max_examples=6)
 @given(st.data())
-def test_the_maps_are_the_least_of_those_that_keep_the_standing_map(data: st.DataObject) -> None:
+def test_onto_finds_the_minimal_maps_that_keep_the_existing_map(data: st.DataObject) -> None:
     joint = data.draw(joint_traces(), label="trace")
     theory = data.draw(theories(joint), label="theory")
     toys = [toy for toy in TOYS if toy.rules in theory.rules]
@@ -160,7 +160,7 @@ def test_a_short_time_gives_a_map_that_keeps_the_standing_one() -> None:
     assert solution[0].dstate_at[: len(around)] == standing[0].dstate_at
 
 
-def test_a_map_without_its_trace_does_not_stand(tmp_path: Path) -> None:
+def test_onto_needs_a_map_with_its_trace(tmp_path: Path) -> None:
     standing = solve(MONDAY)
     for bad in (replace(standing, trace=None), replace(standing, maps=())):
         with pytest.raises(SolverError, match="onto: expected a solution with a map and its trace"):

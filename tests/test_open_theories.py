@@ -162,7 +162,7 @@ def test_an_axiom_put_into_the_encodings_and_the_theory_alone_is_obeyed(
 @pytest.mark.parametrize(
     ("speedup", "theory"), [("visits", Theory(star="frame")), ("ways", Theory(star="none"))]
 )
-def test_what_a_shared_encoding_no_longer_keeps_switches_off_both_that_share_it(
+def test_an_axiom_that_a_shared_encoding_drops_switches_off_its_speedups(
     own_encodings: Path, speedup: str, theory: Theory
 ) -> None:
     assert row(speedup).holds_for(theory)
@@ -278,7 +278,7 @@ FAST = {
 @pytest.mark.parametrize("name", FAST)
 @settings(max_examples=10)
 @given(data=st.data())
-def test_what_evidence_refuses_is_forbidden_in_every_engine(name: str, data: st.DataObject) -> None:
+def test_every_engine_forbids_maps_that_evidence_refuses(name: str, data: st.DataObject) -> None:
     """An engine that settles dstates first obeys it, too. Its maps are those of the brute force."""
     theory, kind = FAST[name]
     trace = data.draw(traces(max_steps=5), label="trace")
@@ -465,7 +465,7 @@ def test_characters_that_end_clingo_are_refused(
             Rules("own.lp", data)
 
 
-def test_what_is_no_text_is_no_rules() -> None:
+def test_malformed_rules_are_refused() -> None:
     with pytest.raises(TheoryError, match="half a character"):
         Rules("own.lp", 'a("\ud800").')
     with pytest.raises(TheoryError, match="expected a name and a text"):

@@ -137,7 +137,7 @@ def test_a_closed_pipe_and_a_ring_of_links_are_errors(
         "learning-curve x y --plot",
     ],
 )
-def test_no_name_is_no_file(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_empty_name_of_a_file_is_refused(words: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
         main([*words.split(), *([] if words.endswith("--plot") else ["-o"]), ""])
     assert (
@@ -156,7 +156,7 @@ def test_no_name_is_no_file(words: str, capsys: pytest.CaptureFixture[str]) -> N
         "check x y --set prefer=--",
     ],
 )
-def test_two_dashes_are_no_value(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_two_dashes_as_a_value_are_refused(words: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
         main(words.split())
     assert "expected a value, got '--'" in capsys.readouterr().err
@@ -212,7 +212,7 @@ def learnt(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
     ]
 
 
-def test_matplotlib_is_looked_for_before_anything_is_done(
+def test_a_missing_matplotlib_is_an_error_before_the_work(
     tmp_path: Path,
     learnt: list[str],
     capsys: pytest.CaptureFixture[str],
@@ -466,7 +466,7 @@ def test_what_would_steer_a_terminal_is_escaped(
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is full")
-def test_what_cannot_be_printed_is_named(tmp_path: Path) -> None:
+def test_a_full_standard_output_is_an_error(tmp_path: Path) -> None:
     Trace.from_steps("aba", ["travel"] * 2).save(tmp_path / "trace.jsonl")
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
@@ -482,7 +482,7 @@ def test_what_cannot_be_printed_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["", "a\0b"])
-def test_a_name_that_is_none_stands_in_its_error(name: str) -> None:
+def test_save_refuses_a_name_that_is_no_file(name: str) -> None:
     with pytest.raises(TraceError, match=r"cannot write the trace: .*; name a file") as error:
         Trace.from_steps("aba", ["travel"] * 2).save(name)
     assert not str(error.value).startswith("output")

@@ -228,7 +228,7 @@ def cielab(rgb: Any) -> Any:
     return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
 
 
-def test_flags_of_a_theory_make_it_again() -> None:
+def test_the_flags_shown_for_a_theory_give_that_theory() -> None:
     parser = Parser()
     add_theory(parser)
     for theory in (
@@ -319,7 +319,7 @@ def test_view_writes_a_page_with_beliefs(
         assert said in capsys.readouterr().err
 
 
-def test_what_assumptions_cost_is_what_an_explanation_says() -> None:
+def test_costs_of_assumptions_are_those_of_explain_pair() -> None:
     trace = Trace.from_steps("abab", ["travel", "travel", "around"])
     solution = solve(trace, max_maps=None)
     known = assumptions(Listing.of(solution), trace, Theory(), seconds=1000)
@@ -385,7 +385,7 @@ def test_server_answers_only_who_knows_its_token_from_this_computer(server: Page
 @pytest.mark.parametrize(
     "length", ["9" * 5000, "-1", "", "+2", " ", "2.0", "0x2", "²", "٢", "2\r\nContent-Length: 3"]
 )
-def test_a_length_that_is_none_is_refused(server: PageServer, length: str) -> None:
+def test_a_request_with_a_wrong_length_is_refused(server: PageServer, length: str) -> None:
     own = server.url.partition(str(server.port))[2]
     with socket.create_connection(("127.0.0.1", server.port), timeout=20) as connection:
         head = (

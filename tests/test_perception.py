@@ -89,7 +89,7 @@ def test_reciprocals_are_of_metres_and_clipped_at_the_floor() -> None:
     assert ReciprocalTransformer(0.1).fit_transform([[0.5, 0.05, 4.0]]).tolist() == [[2, 10, 0.25]]
 
 
-def test_what_is_no_range_is_replaced_and_counted_once() -> None:
+def test_invalid_ranges_are_replaced_with_one_warning() -> None:
     images = [[np.inf, np.nan, np.inf], [0.0, -1.0, -np.inf]]
     transformer = ReciprocalTransformer(0.5).fit(images)
     with pytest.warns(
@@ -218,7 +218,7 @@ def test_quality_where_it_degenerates() -> None:
     assert spanning_tree([[1.0, 2.0]]).distinct == 1
 
 
-def test_many_equal_images_are_no_burden() -> None:
+def test_many_equal_images_are_clustered_quickly() -> None:
     images = np.repeat(np.random.default_rng(0).normal(size=(3, 5)), 1_000, axis=0)
     assert spanning_tree(images).distinct == 3
     assert cluster_quality(images, np.arange(3_000) // 1_000) == math.inf
@@ -451,7 +451,7 @@ def test_a_given_clusterer_becomes_one_of_views() -> None:
         ).fit(images)
 
 
-def test_components_that_stay_empty_are_no_views() -> None:
+def test_empty_components_of_a_mixture_give_no_views() -> None:
     images = np.repeat(np.arange(6.0)[:, None] // 2 * 5, 10, axis=0) + np.random.default_rng(
         0
     ).normal(0, 0.1, (60, 2))
@@ -549,7 +549,9 @@ def test_a_few_different_images_bound_k() -> None:
         ({"clusterer": DBSCAN(), "k": 2}, "k: DBSCAN finds the number of clusters itself"),
     ],
 )
-def test_settings_that_contradict(settings: dict[str, Any], message: str) -> None:
+def test_contradicting_settings_of_a_view_clusterer_are_refused(
+    settings: dict[str, Any], message: str
+) -> None:
     with pytest.raises(PerceptionError, match=message):
         ViewClusterer(**settings).fit(np.repeat(np.eye(3), 2, axis=0))
 
@@ -812,7 +814,7 @@ def test_files_that_are_not_there(tmp_path: Path) -> None:
         store.save(fitted(), tmp_path / "none" / "a.skops")
 
 
-def test_what_could_not_be_read_is_not_written(tmp_path: Path) -> None:
+def test_a_model_that_load_would_reject_is_not_saved(tmp_path: Path) -> None:
     with pytest.raises(PerceptionError, match="expected a model of types that can be read back"):
         store.save(
             make_pipeline(FunctionTransformer(functools.partial(os.mkdir, "x"))),

@@ -59,7 +59,7 @@ def test_the_result_comes_from_another_process() -> None:
     assert process != os.getpid()
 
 
-def test_what_else_is_written_is_not_part_of_the_answer(
+def test_output_of_a_startup_file_does_not_disturb_a_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "sitecustomize.py").write_text("print('good morning' * 1000)")

@@ -92,7 +92,9 @@ def test_without_p_the_program_puts_the_current_folder_behind_all_others(tmp_pat
     assert done.returncode == 0, done.stderr
 
 
-def test_where_modules_are_looked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_current_folder_is_searched_last_for_modules(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     with patch.object(sys, "path", ["", "/other", str(tmp_path), "/lib"]):
         assert program.search_path() == ["/other", "/lib", "", str(tmp_path)]
@@ -118,9 +120,7 @@ __main__.run()
 
 @POSIX
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_verb_that_hears_nothing_is_ended_with_the_code_of_the_signal(
-    number: int, code: int
-) -> None:
+def test_a_verb_that_ignores_a_signal_ends_with_its_exit_code(number: int, code: int) -> None:
     with subprocess.Popen(
         [sys.executable, "-c", DEAF, "facts", ACES], stdout=subprocess.PIPE, text=True
     ) as process:
@@ -162,7 +162,7 @@ def test_ladder_prints_the_rungs_so_far(
 
 @pytest.mark.slow
 @POSIX
-def test_map_that_is_interrupted_says_so_and_is_done_again(
+def test_an_interrupted_map_says_so_and_the_next_call_maps_again(
     tmp_path: Path,
     signals: None,
     monkeypatch: pytest.MonkeyPatch,

@@ -289,7 +289,7 @@ def test_where_beams_go_and_how_far(
 
 
 @pytest.mark.parametrize("lines", [[], ["PARAM robot_front_laser_max 81.92 host 1"]])
-def test_the_codes_of_a_sick_are_no_ranges(tmp_path: Path, lines: list[str]) -> None:
+def test_ranges_that_a_sick_uses_as_codes_mean_no_return(tmp_path: Path, lines: list[str]) -> None:
     scan = read_text(
         tmp_path / "a.log", *lines, flaser(START, START, ranges="81.91 81.87 40 2 1")
     ).scans[0]

@@ -315,7 +315,7 @@ def test_displacements_that_come_later_are_used() -> None:
     assert {(m, m.faults) for m in solution.maps} == {(m, m.faults) for m in anew.maps}
 
 
-def test_what_is_decided_is_what_will_be() -> None:
+def test_a_certain_map_may_leave_past_faults_undecided() -> None:
     """One of two actions in a row slipped. Nothing tells which one, but the map is certain."""
     for seed in range(40):
         for mapper, solution in followed(
@@ -349,7 +349,7 @@ def test_rivals_are_weighed_by_faults_and_by_what_they_assume() -> None:
     assert shares[1] == pytest.approx(shares[0] / 4)  # a link more, to one of four dstates
 
 
-def test_what_does_not_fit_is_refused_and_changes_nothing() -> None:
+def test_a_refused_step_leaves_a_mapper_with_faults_unchanged() -> None:
     mapper = OnlineMapper("v0", BOTH, time_limit=None)
     before = mapper.observe("right", "v1")
     with pytest.raises(TraceError, match="action"):

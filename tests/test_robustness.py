@@ -32,7 +32,7 @@ def test_each_row_names_its_tests(row: list[str]) -> None:
     assert set(tests) <= names_in(file)
 
 
-def test_no_kind_of_input_stands_twice() -> None:
+def test_each_kind_of_input_has_one_row() -> None:
     kinds = [row[0] for row in ROWS]
     assert len(kinds) > 40
     assert sorted(set(kinds)) == sorted(kinds)

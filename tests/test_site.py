@@ -85,7 +85,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("tag", ["", *BROKEN])
-def test_what_leads_nowhere_or_is_loaded_from_elsewhere_is_found(tag: str, tmp_path: Path) -> None:
+def test_broken_links_and_foreign_files_of_pages_are_found(tag: str, tmp_path: Path) -> None:
     (tmp_path / "a.html").write_text(SOUND + tag)
     (tmp_path / "b.html").write_text('<h2 id="there"></h2>')
     (tmp_path / "s.css").write_text("p { background: url(data:image/png;base64,AA) }")

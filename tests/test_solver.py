@@ -200,7 +200,7 @@ def test_arguments_of_another_kind_are_errors_of_the_package(
 
 
 @pytest.mark.parametrize("maps", [0, 1.5, True])
-def test_a_number_of_maps_is_whole(maps: Any) -> None:
+def test_max_maps_must_be_a_whole_number(maps: Any) -> None:
     with pytest.raises(SolverError, match="maps"):
         solve(rectangle(8), max_maps=maps)
 
@@ -240,7 +240,7 @@ def test_a_surprise_after_many_circuits_is_not_missed() -> None:
     )  # after a loop of four the view is v0, so no loop may be closed: 48 dstates + 1
 
 
-def test_at_most_so_many_maps() -> None:
+def test_at_most_max_maps_are_listed() -> None:
     world, place, heading, actions = TOURS["comb"]
     trace = drive(world, place, heading, actions[:14])
     theory = Theory(boundary="none", path_order="partial", prefer=("paths", "places", "dstates"))
@@ -696,7 +696,7 @@ def test_a_map_of_a_prefix_goes_on_when_time_is_over() -> None:
     assert len(found[250].maps[0].dstates) < 0.5 * len(found[8].maps[0].dstates)
 
 
-def test_whether_there_is_one_more_map_is_not_sought_for_long() -> None:
+def test_the_search_for_a_further_map_ends_soon() -> None:
     """The search ends after the last map asked for, although the next one would take long."""
     trace = maze(2, 2, steps=200, seed=0).trace
     every = solve(trace, Theory.causal(), max_maps=None)

@@ -94,7 +94,7 @@ def test_a_sketch_with_frames_is_smaller(theory: Theory) -> None:
     assert framed < homing / 2
 
 
-def test_while_a_robot_drives_the_time_is_clingos() -> None:
+def test_a_mapper_without_time_still_has_a_small_map() -> None:
     """The sketch is small enough. The robot was in 27 dstates."""
     trace = maze(3, 3, steps=120, seed=0).trace
     mapper = OnlineMapper(trace.steps[0].view or "", time_limit=0.01)
@@ -106,7 +106,7 @@ def test_while_a_robot_drives_the_time_is_clingos() -> None:
     assert check(trace, answer.maps[0], answer.theory) == ()
 
 
-def test_a_pause_comes_once() -> None:
+def test_a_stage_limit_raises_once() -> None:
     watch = started(60)
     watch.end_stage_after(-1)
     with pytest.raises(StageTimeError):
@@ -114,7 +114,7 @@ def test_a_pause_comes_once() -> None:
     watch.check()
 
 
-def test_a_limit_gets_only_shorter() -> None:
+def test_shorten_never_extends_a_limit() -> None:
     watch = started(60)
     watch.shorten(70)
     watch.check()

@@ -54,7 +54,7 @@ def test_a_stream_has_the_visits_of_the_whole_log(name: str) -> None:
     assert fields(streamed) == fields(list(find_visits(log, follow(log))))
 
 
-def test_a_visit_is_final_soon_after_it() -> None:
+def test_a_visit_is_final_within_the_promised_distance() -> None:
     log, fed = log_of(FORK, [(1, 0), (18, 0), (10, 0), (10, 8), (10, 0), (1, 0)])[0], 0
 
     def scans() -> Iterator[Scan | Damage]:

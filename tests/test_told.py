@@ -207,7 +207,7 @@ def test_a_view_cannot_steer_the_terminal_by_the_log(
         ("completion bsh", "bash"),
     ],
 )
-def test_what_was_perhaps_meant_is_named(
+def test_a_misspelt_word_gets_a_suggestion(
     words: str, meant: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit, match="2"):
@@ -219,7 +219,7 @@ def test_what_was_perhaps_meant_is_named(
     "words",
     ["frobnicate", "solve trace.jsonl --xyzzy", "solve a b --set star=\x1b[2J", "check a b c"],
 )
-def test_what_is_near_nothing_is_no_question(
+def test_no_suggestion_is_made_for_unknown_words(
     words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit, match="2"):

@@ -109,7 +109,7 @@ def test_actions_that_say_nothing_of_themselves_are_tried_where_they_were_not() 
     assert next_tour(ssh_map, trace, theory=Theory.causal(), actions=["q"]) == ("q",)
 
 
-def test_returns_arewith_doubted_returns_until_enough_was_seen_there() -> None:
+def test_returns_are_doubted_until_enough_is_seen_there() -> None:
     explorer = Explorer(Streetwalker(RING, "a", "E"), time_limit=None)
     doubts = 0
     for _ in range(16):

@@ -218,7 +218,7 @@ def test_between_two_poses_the_robot_is_on_the_way(
         ("a\0b", TIMES, "true.tum"),
     ],
 )
-def test_a_trajectory_that_does_not_fit_is_no_silent_nothing(
+def test_a_trajectory_that_does_not_fit_is_an_error(
     text: str,
     times: tuple[float | None, ...],
     message: str,
@@ -233,7 +233,7 @@ def test_a_trajectory_that_does_not_fit_is_no_silent_nothing(
     assert printed.err.startswith("ssh-abduction: ")
 
 
-def test_no_text_is_no_trajectory(tmp_path: Path) -> None:
+def test_a_binary_file_is_no_trajectory(tmp_path: Path) -> None:
     with pytest.raises(TraceError, match="expected a trajectory in TUM format, got another file"):
         read(tmp_path, b"\xff\xfe\0\x01")
 
@@ -273,7 +273,7 @@ def test_where_nothing_is_judged_that_is_said(
         "".join(f"{t} 0 0 {t} 0 0 0 1\n" for t in range(9)),
     ],
 )
-def test_a_way_that_is_on_no_floor_is_noticed(text: str, tmp_path: Path) -> None:
+def test_a_trajectory_off_the_floor_gives_a_warning(text: str, tmp_path: Path) -> None:
     with pytest.warns(TrajectoryWarning, match="expected a trajectory on a floor"):
         read(tmp_path, text)
 

@@ -46,7 +46,7 @@ def test_solver_and_checker_agree_with_the_brute_force(data: st.DataObject) -> N
 
 @settings(max_examples=13)
 @given(st.data())
-def test_to_hide_a_view_never_costs_anything(data: st.DataObject) -> None:
+def test_hiding_a_view_never_raises_the_cost(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=5), label="trace")
     choices = data.draw(
         st.sampled_from([{}, {"misread": 1.5}, {"slipped": 1.0}, {"misread": 0.5, "slipped": 2.0}]),

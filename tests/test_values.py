@@ -261,7 +261,7 @@ def test_bad_input_is_a_value_error(bad: Callable[[], object]) -> None:
     assert isinstance(caught.value, AbductionError)
 
 
-def test_what_is_no_bad_input_is_no_value_error() -> None:
+def test_errors_not_caused_by_bad_input_are_no_value_errors() -> None:
     assert not issubclass(InternalError, ValueError)
     assert not issubclass(AbductionError, ValueError)
     assert all(issubclass(error, ValueError) for error in (LearnerError, SimulatorError))
@@ -399,7 +399,7 @@ def saved() -> dict[str, Any]:
         ({"warnings": [3]}, r"warnings\[0\]: expected a sentence"),
     ],
 )
-def test_nonsense_is_named(
+def test_wrong_fields_of_a_solution_file_are_named(
     fields: dict[str, Any] | Callable[[], dict[str, Any]], said: str, tmp_path: Path
 ) -> None:
     """`fields` replace those of a file that is right; `...` leaves one out."""
@@ -423,7 +423,9 @@ def test_nonsense_is_named(
         (dict, "maps: expected what solve --json"),
     ],
 )
-def test_what_is_no_solution_is_named(data: Callable[[], Any], said: str, tmp_path: Path) -> None:
+def test_a_file_that_is_no_solution_is_refused(
+    data: Callable[[], Any], said: str, tmp_path: Path
+) -> None:
     refuses(data(), said, tmp_path)
 
 
@@ -445,7 +447,7 @@ def refuses(data: object, said: str, folder: Path) -> None:
         ("\0", "broken JSON"),
     ],
 )
-def test_what_is_no_json_is_named(text: str, said: str, tmp_path: Path) -> None:
+def test_a_file_that_is_no_json_is_refused(text: str, said: str, tmp_path: Path) -> None:
     (tmp_path / "maps.json").write_text(text)
     with pytest.raises(MapError, match=said):
         Solution.load(tmp_path / "maps.json")

@@ -240,7 +240,7 @@ def test_few_of_many_maps() -> None:
 
 
 @pytest.mark.parametrize("name", ["forget", "fits", "_control_for"])
-def test_what_ends_the_settling_of_dstates_leaves_the_map(name: str) -> None:
+def test_an_interrupt_while_dstates_are_sought_leaves_the_known_map(name: str) -> None:
     """At any time, the map that was known before is the answer."""
     trace = maze(2, 2, steps=120, seed=1).trace
     with (
@@ -252,7 +252,7 @@ def test_what_ends_the_settling_of_dstates_leaves_the_map(name: str) -> None:
     assert check(trace, found.maps[0], found.theory) == ()
 
 
-def test_a_robot_that_goes_on_where_that_ended() -> None:
+def test_a_later_search_continues_from_an_engine_without_frames() -> None:
     """The first search of a mapper may have many steps. What it proved holds for later steps."""
     trace = maze(2, 2, steps=30, seed=1).trace
     first = trace.prefix(26)

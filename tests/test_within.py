@@ -160,7 +160,7 @@ def test_what_was_found_is_kept_where_a_limit_cuts_the_list() -> None:
     assert solution.count == sum(level.count for level in solution.levels) == len(solution.costs)
 
 
-def test_more_dstates_than_steps_are_not_asked_for() -> None:
+def test_within_may_exceed_the_number_of_steps() -> None:
     solution = solve(Trace.from_steps("aa", ["travel"]), within=10**12)
     assert solution.complete
     assert solution.count == 1
