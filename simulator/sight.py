@@ -47,9 +47,10 @@ class WallPositions:
     def to_go(self, reach: float, streets: bool = True) -> float | None:
         """Measure how far ahead the fixed point of the next place is, in metres.
 
-        The fixed point is `reach`, half the width of a corridor, before the wall ahead, or
-        in the middle of a side street, if `streets` count, whichever is nearer. Negative if
-        the robot is beyond the point. None if neither a wall nor a side street is near.
+        The fixed point is half the width of a corridor (`reach`) before the wall ahead. If
+        `streets` is true, the middle of a side street counts, too, if it is nearer. The
+        result is negative if the robot is beyond the point, and None if neither a wall nor a
+        side street is near.
         """
         marks = [self.front] if self.front is not None and self.front < 2.5 * reach else []
         if streets:

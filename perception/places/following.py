@@ -145,9 +145,9 @@ class Followed:
 def poses_of_scans(
     scans: Iterable[Scan], doubt_of: Callable[[int, Pose], Doubt], trust: Trust
 ) -> Iterator[Followed]:
-    """Compute the pose of each scan from the scans before it. The next one is not read before.
+    """Compute the pose of each scan from the scans before it, and yield it before the next is read.
 
-    `doubt_of` says for the index of a scan, and for the motion to it by odometry, how far the
+    `doubt_of` takes the index of a scan and the motion to it by odometry. It says how far the
     odometry of this step can be trusted. `trust` has the standard deviations of its errors.
     """
     recent: deque[tuple[Array, Array]] = deque(maxlen=RECENT)

@@ -138,9 +138,9 @@ def import_live(
     Args:
         items: The scans with odometry, in order, for example those of `stream_log` or `live_log`.
         width: Width of the robot in metres.
-        tell: Takes each note on suspicious scans and odometry as soon as it is known.
-        show: Takes each visit when it is final, except those where stretches of the drive diverge
-            (`partings`).
+        tell: A function that gets each note on suspicious scans and odometry, at once.
+        show: A function that gets each visit when it is final, except visits where stretches of the
+            drive diverge (`partings`).
         source: Name of the log, for errors.
 
     Returns:
@@ -229,7 +229,7 @@ def stream_visits(
         scans: The scans with odometry, in order, for example those of `stream_log`. Damaged parts
             are skipped.
         width: Width of the robot in metres. It cannot pass narrower parts of the free space.
-        tell: Takes each note on suspicious scans and odometry as soon as it is known.
+        tell: A function that gets each note on suspicious scans and odometry, at once.
 
     Yields:
         Each visit with its local map. Scans are counted from 0.

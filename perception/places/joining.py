@@ -30,9 +30,9 @@ from perception.readers.scans import RobotLog
 from ssh_abduction.data.drives import together
 from ssh_abduction.data.trace import Trace
 
-# Two matches agree if the middle of the visit of one is where the other one says, within NEAR
-# metres and DRIFT metres for each metre between the two visits, and if their rotations differ by
-# less than TWIST radians.
+# A match predicts where the visit of another match is. Two matches agree if this is right to within
+# NEAR metres, plus DRIFT metres for each metre between the two visits, and if their rotations
+# differ by less than TWIST radians.
 NEAR, DRIFT, TWIST = 0.7, 0.05, math.radians(10)
 VOTES = 3
 TURNS = [k * TURN for k in range(round(math.tau / TURN))]

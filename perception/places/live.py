@@ -53,7 +53,7 @@ class LiveLog:
     Args:
         items: The scans with odometry, in order. Damaged parts are skipped.
         width: Width of the robot in metres. It cannot pass narrower parts of the free space.
-        tell: Takes each note on suspicious scans as soon as it is known.
+        tell: A function that gets each note on suspicious scans, as soon as it is known.
         source: Name of the log.
 
     Raises:
@@ -189,7 +189,7 @@ class Teller:
     """Tells each kind of note once, as soon as it is known.
 
     Args:
-        tell: Takes the notes.
+        tell: A function that gets each note.
 
     Attributes:
         notes: The notes so far.

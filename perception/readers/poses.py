@@ -89,7 +89,7 @@ def clock_of(topics: Mapping[str, Array]) -> tuple[bool, tuple[str, ...]]:
 
     Stamps are used if those of each topic are consistent and those of all topics agree.
     Otherwise, the times of recording are used, even if they are wrong, too. `topics` has, for
-    each, (n, 2) stamps and times of recording in seconds, in the order of the bag.
+    each topic, (n, 2) stamps and times of recording in seconds, in the order of the bag.
     """
     wrong = [text for name, times in topics.items() if (text := _wrong_stamps(name, times[:, 0]))]
     held = [

@@ -13,12 +13,19 @@ from ssh_abduction.theory.theory import Theory, checked_theory
 
 
 class Status(Enum):
-    """What a search has proven about its trace."""
+    """What a search has proven about its trace.
 
-    OPTIMAL = "optimal"  # minimal maps, proven
-    FEASIBLE = "feasible"  # a map of the whole trace and a bound, but no proof that it is minimal
-    UNSATISFIABLE = "unsatisfiable"  # no map satisfies the axioms, proven
-    UNKNOWN = "unknown"  # stopped before any map of the whole trace was found
+    Attributes:
+        OPTIMAL: Maps are proven to be minimal.
+        FEASIBLE: There is a map of the whole trace, and no proof that it is minimal.
+        UNSATISFIABLE: It is proven that no map satisfies the axioms.
+        UNKNOWN: The search was stopped before it found any map of the whole trace.
+    """
+
+    OPTIMAL = "optimal"
+    FEASIBLE = "feasible"
+    UNSATISFIABLE = "unsatisfiable"
+    UNKNOWN = "unknown"
 
 
 @dataclass(frozen=True, slots=True)

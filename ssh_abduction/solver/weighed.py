@@ -24,8 +24,8 @@ EQUAL = 1e-6  # costs in nats that differ by less count as equal
 BROKEN, SAID = 12.0, 1.0
 # Mention that two steps may be at one place, too, if that is more probable than this.
 DOUBTED = 0.05
-# Drives coincide by chance more often than costs say: of false joins of two drives, one in e saves
-# this many nats more (docs/measurements/truth.md).
+# Drives look alike by chance more often than costs say. So the gain from laying drives on each
+# other is divided by this before it becomes a probability (docs/measurements/truth.md).
 CHANCE = 10.0
 MOST = 700.0  # exp of more nats overflows
 

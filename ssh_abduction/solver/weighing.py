@@ -68,8 +68,8 @@ from ssh_abduction.theory.theory import Theory
 
 _log = log_of(__name__)
 
-# Find all maps that cost less than this many nats more than the best one: these are less than 100
-# times less probable.
+# Find all maps that cost less than this many nats more than the best one. All others are at least
+# 100 times less probable than the best one.
 WITHIN = math.log(100)
 # Keep at most this many maps. If there are more, use fewer nats instead of WITHIN.
 RIVALS = 50
@@ -177,7 +177,7 @@ class Weighing:
         self.keep_best()
 
     def _take_bound(self, least: int | None) -> None:
-        """Raise the bound if clingo proved that each cheap map has at least so many dstates."""
+        """Raise the bound if clingo proved that each cheap map has at least `least` dstates."""
         if self.candidates and "dstates" in self._prices:
             nats = self._price({**self._least, "dstates": least or 0}) + self._base
             self.bound = max(self.bound, min(nats, self.candidates[0].nats))
@@ -224,7 +224,7 @@ class Weighing:
         """
         parts, theory = self._parts, self._parts.task.theory
         complete = True
-        listed: set[SSHMap] = set()  # Candidates with the same dstates and places list one another.
+        listed: set[SSHMap] = set()  # Candidates with the same dstates and places give equal maps.
         for candidate in self.minimal():
             maps, proven = self._with_other_paths(candidate.map)
             complete &= proven

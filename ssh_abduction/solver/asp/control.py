@@ -163,7 +163,7 @@ class _GroundingCheck:
         self._next = time.perf_counter() + POLL
 
     def go_on(self, *_: clingo.Symbol) -> clingo.Symbol:
-        """Return 1, unless `check` raises. That is called only every POLL seconds, to save time."""
+        """Return 1, unless `check` raises. To save time, call `check` only every POLL seconds."""
         try:
             if time.perf_counter() > self._next:
                 self._check()

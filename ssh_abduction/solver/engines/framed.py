@@ -66,7 +66,7 @@ class FramedEngine:
         self._sides = FramedSides(task.theory, self.asker)
         self._fitting = FramedPaths(task, self.asker)
         self._visits = VisitLabels(task, self.asker, self._sides)
-        self._unframed_size = 0  # the size of the prefix, in case that its visits fit no frames
+        self._unframed_size = 0  # the size of a prefix whose visits fit no frames
         self._framed = True  # whether the visits fit their frames
         # The minimal cost, and all labels with maps of that cost.
         self._best: tuple[tuple[int, ...], list[NodeLabels]] | None = None
