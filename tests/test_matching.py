@@ -11,12 +11,12 @@ import pytest
 from test_distinctive import log_of
 
 from perception.places import closures, matching
-from perception.places.closures import VisitMatch, find_closures, relative, uncertainty
+from perception.places.closures import VisitMatch, find_closures, uncertainty
 from perception.places.distinctive import WINDOW, find_visits
 from perception.places.following import _matched
 from perception.places.local_map import CELL, PackedPatch, Patch
 from perception.places.matching import Match, Scene, Turned, match
-from perception.places.tracing import to_trace
+from perception.places.tracing import closure_of, to_trace
 from perception.places.track import Track, Trust, points_turned
 from perception.places.visits import Visit
 from perception.readers.scans import RobotLog
@@ -152,9 +152,8 @@ def test_a_trace_has_the_closures_of_its_visits() -> None:
 
 def test_a_pose_is_relative_to_the_heading_of_the_earlier_step() -> None:
     shift = Match(1.0, 0.1, np.array([1.0, 0.0]), 1.0, 0.1)
-    x, y, turn = relative(VisitMatch(0, 1, shift), math.pi / 2, math.pi)
-    assert (x, y) == pytest.approx((0.0, -1.0))
-    assert turn == pytest.approx(math.pi / 2 + 0.1)
+    closure = closure_of(VisitMatch(0, 1, shift), [(0, math.pi / 2), (1, math.pi)])
+    assert closure.displacement == pytest.approx((0.0, -1.0, math.pi / 2 + 0.1), abs=1e-4)
 
 
 @pytest.mark.parametrize(("share", "is_wide"), [(1.0, False), (0.7, True)])

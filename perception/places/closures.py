@@ -17,7 +17,7 @@ import numpy as np
 
 from perception.places.local_map import PackedPatch
 from perception.places.matching import MOST, Match, Scene, Turned, match
-from perception.places.track import Array, Track, points_turned, wrapped
+from perception.places.track import Array, Track, points_turned
 from perception.places.visits import Visit
 
 # A match is reliable with at least this score and share of area that both maps observed.
@@ -256,14 +256,3 @@ def uncertainty(track: Track, first: int, last: int, end: Array) -> Array:
     first, last = min(first, last), max(first, last)
     arm = np.array([[1.0, 0.0, -end[1]], [0.0, 1.0, end[0]], [0.0, 0.0, 1.0]])
     return np.asarray(arm @ (track.spreads[last] - track.spreads[first]) @ arm.T)
-
-
-def relative(closing: VisitMatch, first: float, last: float) -> tuple[float, float, float]:
-    """Compute the pose at a later step relative to an earlier one from a closure.
-
-    The headings of both steps are in radians, in the frame of the track. The pose is in metres
-    ahead and to the left, and radians counterclockwise.
-    """
-    x, y = closing.match.shift
-    cos, sin = math.cos(first), math.sin(first)
-    return cos * x + sin * y, cos * y - sin * x, wrapped(last + closing.match.turn - first)

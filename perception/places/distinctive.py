@@ -62,11 +62,7 @@ def find_visits(log: RobotLog, track: Track, width: float = WIDTH) -> tuple[Visi
     The width of the robot is in metres.
     """
     breaks = set(track.breaks)
-    poses = ((float(x), float(y), float(heading)) for x, y, heading in track.poses)
-    posed = (
-        Followed(scan, pose, broken=i in breaks)
-        for i, (scan, pose) in enumerate(zip(log.scans, poses, strict=True))
-    )
+    posed = (Followed(scan, track.pose(i), broken=i in breaks) for i, scan in enumerate(log.scans))
     return tuple(visits_of(posed, width))
 
 
@@ -237,10 +233,6 @@ class _Chain:
 
     number: int
     sightings: list[_Sighting]
-
-    @property
-    def first(self) -> int:
-        return self.sightings[0].milestone
 
     @property
     def last(self) -> int:

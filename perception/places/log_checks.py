@@ -17,7 +17,7 @@ from perception.places import jumps
 from perception.places.following import POOR
 from perception.places.track import Array, Track, Trust, wrapped
 from perception.places.units import FAR_OFF, LEAST_WAY, SIDEWAYS, SPARSE, ahead, units_of, way_of
-from perception.readers.scans import Pose, RobotLog
+from perception.readers.scans import RobotLog
 from ssh_abduction.data.errors import named
 from ssh_abduction.data.odometry import displacement_between, moved
 
@@ -254,7 +254,7 @@ def _overriding(log: RobotLog, track: Track) -> float:
     trust, count = Trust(), 0
     for i in range(1, len(log)):
         measured = displacement_between(log.scans[i - 1].odometry, log.scans[i].odometry)
-        seen = displacement_between(_pose(track, i - 1), _pose(track, i))
+        seen = displacement_between(track.pose(i - 1), track.pose(i))
         off = np.array([*np.subtract(seen[:2], measured[:2]), wrapped(seen[2] - measured[2])])
         spread = np.diag(trust.covariance(measured))
         count += i not in track.cuts and float((off**2 / spread).sum()) > CONTRADICTS
@@ -294,9 +294,9 @@ def _contradictions(log: RobotLog, track: Track) -> list[int]:
 
 def _intruding(log: RobotLog, track: Track, one: int, other: int) -> tuple[int, int]:
     """Count the points of scan `one` in the free space of `other`, and those in its view."""
-    pose = moved(_pose(track, one), log.scans[one].laser.mount)
+    pose = moved(track.pose(one), log.scans[one].laser.mount)
     scan, laser = log.scans[other], log.scans[other].laser
-    x, y, heading = displacement_between(moved(_pose(track, other), laser.mount), pose)
+    x, y, heading = displacement_between(moved(track.pose(other), laser.mount), pose)
     met = np.isfinite(log.scans[one].ranges) & (log.scans[one].ranges > 0)
     angles = log.scans[one].laser.bearings[met] + heading
     points = log.scans[one].ranges[met] * np.exp(1j * angles) + complex(x, y)
@@ -314,8 +314,3 @@ def _intruding(log: RobotLog, track: Track, one: int, other: int) -> tuple[int, 
 def _neighbours(ranges: Array, beam: Array, best: Callable[..., Array]) -> Array:
     """The `best` (np.min or np.max) range of each beam and its two neighbours, (k,)."""
     return best([ranges[beam - 1], ranges[beam], ranges[beam + 1]], axis=0)
-
-
-def _pose(track: Track, scan: int) -> Pose:
-    x, y, heading = track.poses[scan]
-    return float(x), float(y), float(heading)

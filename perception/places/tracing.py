@@ -14,9 +14,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from perception.places.closures import NOISE, VisitMatch, relative, uncertainty
+from perception.places.closures import NOISE, VisitMatch, uncertainty
 from perception.places.local_map import CELL, PackedPatch
-from perception.places.track import Array, Track, points_turned, wrapped
+from perception.places.track import Array, Track, points_turned, rotation, wrapped
 from perception.places.visits import Visit, patches_of
 from perception.readers.scans import Pose, RobotLog
 from ssh_abduction.data.closure import Closure
@@ -93,7 +93,8 @@ def closure_of(found: VisitMatch, arrivals: Sequence[tuple[int, float]]) -> Clos
     `arrivals` has the first step of each visit, and its heading in radians.
     """
     (first, heading), (last, other) = arrivals[found.first], arrivals[found.last]
-    x, y, turn = relative(found, heading, other)
+    later = (*found.match.shift, other + found.match.turn)
+    x, y, turn = displacement_between((0.0, 0.0, heading), later)
     spread = [float(value**2) for value in NOISE]
     return Closure(
         first,
@@ -142,7 +143,7 @@ def _step(
     if cuts:  # They explain why there is no displacement.
         extra["cuts"] = cuts
     truth = None
-    seen = displacement_between(_pose(track, visit.scan), pose)
+    seen = displacement_between(track.pose(visit.scan), pose)
     extra["seen"] = [round(x, 4) for x in seen]
     if scan.corrected is not None:
         truth = {"pose": [round(x, 4) for x in moved(scan.corrected, seen)]}
@@ -174,11 +175,6 @@ def _course(track: Track, first: Visit, last: Visit, heading: float) -> list[lis
     chain = approximate_polygon(np.array([first.middle, *part, last.middle]), DETAIL)
     points = points_turned(-heading, chain[1:] - first.middle)
     return [[round(x, 2), round(y, 2)] for x, y in points.tolist()]
-
-
-def _pose(track: Track, scan: int) -> Pose:
-    x, y, heading = track.poses[scan]
-    return float(x), float(y), float(heading)
 
 
 def _star(visit: Visit, heading: float) -> tuple[Gateway, ...]:
@@ -218,8 +214,7 @@ def _covariance(track: Track, begin: int, end: int, first: Pose, last: Pose) -> 
     """The covariance of the displacement between two steps, in the frame of the first."""
     total = uncertainty(track, begin, end, np.array(last[:2]))
     turned = np.eye(3)
-    cos, sin = math.cos(first[2]), math.sin(first[2])
-    turned[:2, :2] = [[cos, sin], [-sin, cos]]
+    turned[:2, :2] = rotation(-first[2])
     found = turned @ total @ turned.T
     found += np.diag(FLOOR) ** 2
     found = (found + found.T) / 2

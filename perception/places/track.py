@@ -41,6 +41,11 @@ class Track:
     breaks: tuple[int, ...] = ()
     is_reliable: bool = True
 
+    def pose(self, scan: int) -> Pose:
+        """The pose of the robot at a scan: x, y in metres and heading in radians."""
+        x, y, heading = self.poses[scan].tolist()
+        return x, y, heading
+
     @cached_property
     def way(self) -> Array:
         """The distance travelled up to each scan: (n,), metres."""

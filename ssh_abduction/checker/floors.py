@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ssh_abduction.checker.reading import Found, Reading
+from ssh_abduction.data.reach import parts
 
 _LIFTS = ("lift", "stairs")
 
@@ -21,14 +22,9 @@ def floors_of(m: Reading) -> dict[int, int]:
     for one, other in pairs:
         beside[one].add(other)
         beside[other].add(one)
-    floor: dict[int, int] = {}
-    for first in sorted(beside, key=lambda label: m.first.get(label, len(m.trace))):
-        reached = [] if first in floor else [first]
-        while reached:
-            label = reached.pop()
-            floor[label] = first
-            reached += [x for x in beside[label] if x not in floor]
-    return floor
+    in_order = sorted(beside, key=lambda label: m.first.get(label, len(m.trace)))
+    floors = parts(in_order, beside.__getitem__)
+    return {label: next(iter(floor)) for floor in floors for label in floor}
 
 
 def other_floor(m: Reading) -> Found:

@@ -20,6 +20,7 @@ from typing import Any
 
 from ssh_abduction.data.drives import drives_of, named_steps
 from ssh_abduction.data.maps import SSHMap, check_of_trace, checked_map
+from ssh_abduction.data.reach import NodeClasses
 from ssh_abduction.data.trace import Action, Trace, checked_trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.theory.theory import Theory, checked_theory
@@ -109,31 +110,6 @@ def _named(joins: Sequence[Join]) -> str:
     return f"steps {pairs}" + (f", and {counted(more, 'more joins')}" if more > 0 else "")
 
 
-class _StepClasses:
-    """Classes of steps that share a property.
-
-    At first each step is a class. Classes can be merged.
-    """
-
-    def __init__(self, steps: int) -> None:
-        self._above = list(range(steps))
-
-    def of(self, step: int) -> int:
-        """Return the step that stands for the class of a step."""
-        while self._above[step] != step:
-            self._above[step] = self._above[self._above[step]]
-            step = self._above[step]
-        return step
-
-    def merge(self, first: int, second: int) -> None:
-        """Merge the classes of two steps."""
-        self._above[self.of(second)] = self.of(first)
-
-    def are_one(self, first: int, second: int) -> bool:
-        """Whether two steps are in one class."""
-        return self.of(first) == self.of(second)
-
-
 class _JoinCollector:
     """Reads a trace step by step, and collects the joins that do not follow from earlier ones.
 
@@ -145,7 +121,7 @@ class _JoinCollector:
 
     def __init__(self, trace: Trace, ssh_map: SSHMap, theory: Theory) -> None:
         self.trace, self.map, self.axioms = trace, ssh_map, set(theory.axioms)
-        self.places, self.courses = _StepClasses(len(trace)), _StepClasses(len(trace))
+        self.places, self.courses = NodeClasses[int](), NodeClasses[int]()
         self.by_heading = any(headings <= self.axioms for headings in HEADINGS)
         self.by_course = "one_dstate_per_course" in self.axioms
         asserted = [sorted(pair) for pair in theory.same if max(pair) < len(trace)]

@@ -28,8 +28,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import TypeAlias
 
 from ssh_abduction.data.star import Openings
-from ssh_abduction.runtime.clock import each_looking, look_at_clock
-from ssh_abduction.theory.planarity import can_be_drawn
+from ssh_abduction.runtime.clock import look_at_clock
+from ssh_abduction.theory.planarity import can_be_drawn, clockwise_orders, is_planar
 
 # A dstate, and 1 (ahead) or -1 (behind).
 Arm: TypeAlias = tuple[int, int]
@@ -154,8 +154,9 @@ class Edges:
         }
         ends = [choose(edge, key=repr) for edge in edges for choose in (min, max)]
         orders = {
-            p: _orders(
-                sorted({arm for arms in sequences[p] for arm in arms}, key=repr), sequences[p]
+            p: clockwise_orders(
+                sorted({arm for arms in sequences[p] for arm in arms}, key=repr),
+                lambda order, p=p: all(_goes_round(order, some) for some in sequences[p]),  # type: ignore[misc]
             )
             for p in self._at
         }
@@ -235,52 +236,17 @@ class Edges:
             for s, t in self.travels
             if (s, 1) in position and (t, -1) in position
         }
-        beyond: dict[tuple[int, int], tuple[int, int]] = {}
-        for edge in joined:
-            first, *_, last = *edge, *edge
-            for here, there in ((first, last), (last, first)):
-                if beyond.setdefault(here, there) != there:
-                    return False
-        around: dict[int, list[tuple[int, int]]] = defaultdict(list)
-        for gateway in sorted(beyond):
-            around[gateway[0]].append(gateway)
-        # the next gateway counterclockwise
-        after = {
-            gateway: gateways[i - 1]
-            for gateways in around.values()
-            for i, gateway in enumerate(gateways)
-        }
-        # an edge that leads back to its own gateway gets an extra place at its other end
-        places = len(around) + sum(len(edge) == 1 for edge in joined)
-        faces = _cycles({gateway: after[other] for gateway, other in beyond.items()})
-        return places - len(joined) + faces == 2 * _parts(around, beyond)
-
-
-def _cycles(following: Mapping[tuple[int, int], tuple[int, int]]) -> int:
-    """Count the cycles of a permutation."""
-    left, cycles = set(following), 0
-    while left:
-        cycles += 1
-        here = left.pop()
-        while (here := following[here]) in left:
-            left.remove(here)
-    return cycles
-
-
-def _parts(
-    around: Mapping[int, Sequence[tuple[int, int]]],
-    beyond: Mapping[tuple[int, int], tuple[int, int]],
-) -> int:
-    """Count the connected parts of a drawing."""
-    left, parts = set(around), 0
-    while left:
-        parts += 1
-        queue = [left.pop()]
-        while queue:
-            new = {beyond[gateway][0] for gateway in around[queue.pop()]} & left
-            left -= new
-            queue.extend(new)
-    return parts
+        # An edge that leads back to its own gateway gets an extra place at its other end.
+        ends = [(*edge, None)[:2] for edge in joined]
+        around: dict[object, list[tuple[int, int]]] = defaultdict(list)
+        for number, edge in enumerate(ends):
+            for end, gateway in enumerate(edge, 2 * number):
+                place, slot = gateway or (("beyond", number), 0)
+                around[place].append((slot, end))
+        gateways = [gateway for edge in joined for gateway in edge]
+        return len(set(gateways)) == len(gateways) and is_planar(
+            {place: tuple(end for _, end in sorted(here)) for place, here in around.items()}
+        )
 
 
 def _is_turned(faced: Mapping[int, int], turn: tuple[int, int, int]) -> bool:
@@ -299,23 +265,3 @@ def _goes_round(order: Sequence[Arm], sequence: Sequence[Arm]) -> bool:
         len(set(sequence)) == len(sequence)
         and sum(j < i for i, j in zip(there, [*there[1:], *there[:1]], strict=True)) <= 1
     )
-
-
-def _orders(gateways: Sequence[Arm], sequences: Sequence[Sequence[Arm]]) -> list[tuple[Arm, ...]]:
-    """List all clockwise orders of gateways that agree with sequences known to be clockwise.
-
-    Orders that differ by a rotation are listed once: each starts with the first gateway.
-    """
-    orders: list[tuple[Arm, ...]] = [()]
-    for gateway in gateways:
-        longer = (
-            (*order[:gap], gateway, *order[gap:])
-            for order in orders
-            for gap in range(min(1, len(order)), len(order) + 1)
-        )
-        orders = [
-            order
-            for order in each_looking(longer)
-            if all(_goes_round(order, some) for some in sequences)
-        ]
-    return orders

@@ -11,6 +11,7 @@ from typing import Any, TypeAlias, TypeVar
 from ssh_abduction.checker.moves import Course, MapLink, course_of
 from ssh_abduction.data.drives import drives_of, named_steps
 from ssh_abduction.data.maps import DState, SSHMap
+from ssh_abduction.data.reach import reached
 from ssh_abduction.data.star import Openings
 from ssh_abduction.data.trace import Trace, View
 from ssh_abduction.theory.theory import Theory
@@ -266,13 +267,7 @@ class Order:
         follows = self._follows(p, direction)
         if not self._transitive:
             return follows
-        reached = dict.fromkeys(follows)
-        queue = deque(reached)
-        while queue:
-            new = [q for q in self._follows(queue.popleft(), direction) if q not in reached]
-            reached.update(dict.fromkeys(new))
-            queue.extend(new)
-        return reached
+        return reached(follows, lambda q: self._follows(q, direction))
 
     def between(self, p: int, q: int, direction: int) -> set[int]:
         """Find the places after p and before q on the path, in this direction (+1 or -1)."""

@@ -12,6 +12,7 @@ from typing import TypeAlias
 from ssh_abduction.checker.moves import Course, along, course_of, opposite
 from ssh_abduction.checker.reading import Check, Found, Reading
 from ssh_abduction.checker.sides import RightBranch, branches_right_of
+from ssh_abduction.data.reach import reached
 from ssh_abduction.data.regions import Region, list_in_words
 
 _Places: TypeAlias = frozenset[int]
@@ -34,13 +35,10 @@ def known_sides(m: Reading) -> Mapping[Course, Mapping[int, RightBranch]]:
 
     def after(place: int, course: Course) -> set[int]:
         next_of = follows[course]
-        reached = set(next_of[place])
-        waiting = list(reached) if "order_transitive" in m.axioms else []
-        while waiting:
-            new = next_of[waiting.pop()] - reached
-            reached |= new
-            waiting += new
-        return reached - {place}
+        later = set(next_of[place])
+        if "order_transitive" in m.axioms:
+            later = set(reached(later, next_of.__getitem__))
+        return later - {place}
 
     return branches_right_of(m, after)
 
@@ -74,7 +72,8 @@ def _behind(m: Reading) -> dict[_Places, int]:
     links = _links(m)
     parts: dict[_Places, int] = {}
     for node in [node for node in links if node[0] == "place"]:
-        behind = {_places(_reached(links, start, node)) for start in links[node]}
+        others = {other: ends - {node} for other, ends in links.items()}
+        behind = {_places(reached([start], others.__getitem__)) for start in links[node]}
         whole = 1 + len(frozenset().union(*behind))
         parts |= {part: node[1] for part in behind if part and 2 * len(part) < whole}
     return {
@@ -102,17 +101,6 @@ def _links(m: Reading) -> dict[_Node, set[_Node]]:
         links[one].add(other)
         links[other].add(one)
     return links
-
-
-def _reached(links: Mapping[_Node, set[_Node]], start: _Node, closed: _Node) -> set[_Node]:
-    """Find the nodes that links lead to from a node, without a closed one."""
-    reached = {start}
-    waiting = [start]
-    while waiting:
-        new = links[waiting.pop()] - reached - {closed}
-        reached |= new
-        waiting += new
-    return reached
 
 
 def _places(nodes: Iterable[_Node]) -> _Places:

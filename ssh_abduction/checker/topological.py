@@ -6,6 +6,7 @@ from collections import defaultdict
 
 from ssh_abduction.checker.moves import Course, along, course_of, going, opposite
 from ssh_abduction.checker.reading import Check, Found, Reading
+from ssh_abduction.data.reach import reached
 
 
 def one_place(m: Reading) -> Found:
@@ -194,12 +195,8 @@ def course_needs_travel(m: Reading) -> Found:
         if t.action.turn == "around":
             linked[t.source.id].append(t.target.id)
             linked[t.target.id].append(t.source.id)
-    queue = [s.id for t in m.travels for s in (t.source, t.target)]
-    supported = set(queue)
-    while queue:
-        new = set(linked[queue.pop()]) - supported
-        supported |= new
-        queue.extend(new)
+    ends = (s.id for t in m.travels for s in (t.source, t.target))
+    supported = reached(ends, linked.__getitem__)
     for s in m.states.values():
         if course_of(s) and s.id not in supported:
             yield (

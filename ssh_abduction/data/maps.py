@@ -37,6 +37,7 @@ from ssh_abduction.data.map_file import (
 )
 from ssh_abduction.data.map_parts import FAULTS, NAMED, DState, Fault, Fit, MapPath, Name, Pose
 from ssh_abduction.data.notebook import in_output
+from ssh_abduction.data.reach import parts
 from ssh_abduction.data.regions import Region, renumbered, right_of
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted
@@ -233,16 +234,8 @@ class SSHMap:
         for one, other in pairs:
             beside[one].append(other)
             beside[other].append(one)
-        pieces = []
-        while beside:
-            reached = {min(beside)}
-            waiting = list(reached)
-            while waiting:
-                new = set(beside.pop(waiting.pop())) - reached
-                reached |= new
-                waiting += new
-            pieces.append(tuple(sorted(reached)))
-        return tuple(pieces)
+        found = parts(sorted(beside), beside.__getitem__)
+        return tuple(tuple(sorted(piece)) for piece in found)
 
     @property
     def floors(self) -> tuple[tuple[int, ...], ...]:

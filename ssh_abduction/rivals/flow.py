@@ -15,6 +15,7 @@ import numpy as np
 from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import coo_array
 
+from ssh_abduction.data.reach import reached
 from ssh_abduction.rivals.stances import StanceMove
 
 T = TypeVar("T")
@@ -198,10 +199,4 @@ def followed_from(links: Iterable[tuple[T, T]], start: T) -> set[T]:
     after: dict[T, list[T]] = {}
     for source, target in links:
         after.setdefault(source, []).append(target)
-    found = {start}
-    queue = [start]
-    for n in queue:
-        new = {*after.get(n, ())} - found
-        found |= new
-        queue += new
-    return found
+    return set(reached([start], lambda n: after.get(n, ())))

@@ -21,12 +21,14 @@ from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import TypeAlias, TypeVar
 
+from ssh_abduction.data.reach import parts
 from ssh_abduction.runtime.clock import each_looking, look_at_clock
 
 Ends: TypeAlias = tuple[int, ...]
 Place = TypeVar("Place", bound=Hashable)
 State = TypeVar("State")
 Step = TypeVar("Step")
+End = TypeVar("End")
 
 
 def is_planar(around: Mapping[Place, Ends]) -> bool:
@@ -36,9 +38,10 @@ def is_planar(around: Mapping[Place, Ends]) -> bool:
         around: For each place, the ends of edges around it, clockwise from any end. Edge e has the
             ends 2e and 2e + 1. Both ends of each edge must be given.
     """
-    places = [place for place, ends in around.items() if ends]
-    edges = sum(len(around[place]) for place in places) // 2
-    return len(places) - edges + _faces(around) == 2 * _parts(around)
+    place_of = {end: place for place, ends in around.items() for end in ends}
+    places = dict.fromkeys(place_of.values())
+    pieces = parts(places, lambda place: [place_of[end ^ 1] for end in around[place]])
+    return len(places) - len(place_of) // 2 + _faces(around) == 2 * len(pieces)
 
 
 def _faces(around: Mapping[Place, Ends]) -> int:
@@ -54,21 +57,6 @@ def _faces(around: Mapping[Place, Ends]) -> int:
         while (end := following[end ^ 1]) != start:
             left.remove(end)
     return faces
-
-
-def _parts(around: Mapping[Place, Ends]) -> int:
-    """Count the connected parts of a rotation system. Places without edges are ignored."""
-    place_of = {end: place for place, ends in around.items() for end in ends}
-    parts = 0
-    left = set(place_of.values())
-    while left:
-        parts += 1
-        queue = [left.pop()]
-        while queue:
-            new = {place_of[end ^ 1] for end in around[queue.pop()]} & left
-            left -= new
-            queue.extend(new)
-    return parts
 
 
 def can_be_drawn(
@@ -88,7 +76,9 @@ def can_be_drawn(
     ends_at: dict[Place, list[int]] = {}
     for end in sorted(end for edge in _on_rings(place_of) for end in (2 * edge, 2 * edge + 1)):
         ends_at.setdefault(place_of[end], []).append(end)
-    orders = {place: _orders(ends, partial(allows, place)) for place, ends in ends_at.items()}
+    orders = {
+        place: clockwise_orders(ends, partial(allows, place)) for place, ends in ends_at.items()
+    }
     nothing: dict[Place, Ends] = {}
     return has_way(
         nothing, range(len(orders)), lambda drawn, _: _one_place_more(drawn, orders, place_of)
@@ -113,9 +103,14 @@ def _on_rings(place_of: Sequence[Place]) -> set[int]:
     return {end // 2 for ends in ends_at.values() for end in ends}
 
 
-def _orders(ends: Sequence[int], allows: Callable[[Ends], bool]) -> list[Ends]:
-    """List the clockwise orders of some ends that are allowed. Each begins with the first end."""
-    orders: list[Ends] = [()]
+def clockwise_orders(
+    ends: Sequence[End], allows: Callable[[tuple[End, ...]], bool]
+) -> list[tuple[End, ...]]:
+    """List the clockwise orders of some ends that are allowed. Each begins with the first end.
+
+    An order that is not allowed has no allowed order with more ends.
+    """
+    orders: list[tuple[End, ...]] = [()]
     for end in ends:
         longer = (
             (*order[:gap], end, *order[gap:])
@@ -162,17 +157,23 @@ def _leaves_room(
     To test this, shrink each such part to one place. Its ends are in the order in which the face
     meets them.
     """
-    part = _parts_of_rest(drawn, orders, place_of)
+
+    def beside(place: Place) -> Iterator[Place]:
+        others = (place_of[end ^ 1] for end in next(iter(orders[place]), ()))
+        return (other for other in others if other not in drawn)
+
+    pieces = parts((place for place in orders if place not in drawn), beside)
+    part = {place: number for number, piece in enumerate(pieces) for place in piece}
     following = {
         end: ends[i - len(ends) + 1] for ends in drawn.values() for i, end in enumerate(ends)
     }
     met: dict[
-        Place, list[int]
+        int, list[int]
     ] = {}  # the ends of each part, in the order in which its face meets them
     left = set(following)
     while left:
         here = start = left.pop()
-        there: dict[Place, list[int]] = {}
+        there: dict[int, list[int]] = {}
         while True:
             other = here ^ 1
             if other not in following:
@@ -190,28 +191,6 @@ def _leaves_room(
     return is_planar(
         {**drawn, **{("rest", number): tuple(reversed(ends)) for number, ends in met.items()}}
     )
-
-
-def _parts_of_rest(
-    drawn: Mapping[Place, Ends], orders: Mapping[Place, Sequence[Ends]], place_of: Sequence[Place]
-) -> dict[Place, Place]:
-    """Map each place that is not drawn to one place of its connected part."""
-    part: dict[Place, Place] = {}
-    for first in orders:
-        queue = [] if first in drawn or first in part else [first]
-        while queue:
-            place = queue.pop()
-            part[place] = first
-            queue += (
-                [
-                    q
-                    for end in orders[place][0]
-                    if (q := place_of[end ^ 1]) not in drawn and q not in part
-                ]
-                if orders[place]
-                else []
-            )
-    return part
 
 
 def has_way(

@@ -28,6 +28,7 @@ from itertools import combinations, pairwise, product
 from typing import TYPE_CHECKING, ClassVar, TypeAlias, TypeVar
 
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.reach import NodeClasses
 from ssh_abduction.data.star import Openings
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
@@ -290,10 +291,10 @@ def _can_draw_sided(shown: _Shown, crossing: bool) -> bool:
     A turn shows which gateway is to the right of an edge, if both its dstates are at an edge.
     After turning around, a robot faces the gateway that was behind it.
     """
-    same = _ArmClasses()
+    same = NodeClasses[Arm]()
     for x, turn, y in shown.turns:
         if turn == "around":
-            same.join((x, AHEAD), (y, BACK))
+            _join(same, (x, AHEAD), (y, BACK))
     edges = _paired(shown, same)
     if edges is None:
         return False
@@ -321,7 +322,7 @@ def _can_draw_sided(shown: _Shown, crossing: bool) -> bool:
     )
 
 
-def _paired(shown: _Shown, same: _ArmClasses) -> list[frozenset[Gateway]] | None:
+def _paired(shown: _Shown, same: NodeClasses[Arm]) -> list[frozenset[Gateway]] | None:
     """Find the edges, each between two gateways. None if a gateway leads to two places.
 
     If two gateways of a place lead to the same gateway, they are merged. This changes `same`.
@@ -340,7 +341,7 @@ def _paired(shown: _Shown, same: _ArmClasses) -> list[frozenset[Gateway]] | None
                 first = beyond.setdefault(end, other)
                 if first[0] != other[0]:
                     return None
-                same.join(first[1], other[1])
+                _join(same, first[1], other[1])
         if _are_paired(edges):
             return edges
 
@@ -375,23 +376,10 @@ def _is_clockwise(order: Sequence[Arm], sequence: Sequence[Arm]) -> bool:
     return sum(positions[i - 1] > positions[i] for i in range(len(positions))) <= 1
 
 
-class _ArmClasses:
-    """Classes of arms that are one gateway. An arm is the way ahead of a dstate, or behind it."""
-
-    def __init__(self) -> None:
-        self._one_of: dict[Arm, Arm] = {}
-
-    def of(self, arm: Arm) -> Arm:
-        while arm in self._one_of:
-            arm = self._one_of[arm]
-        return arm
-
-    def join(self, first: Arm, second: Arm) -> None:
-        """Record that two arms are one gateway. Then their opposite arms are also one gateway."""
-        for turned in (1, -1):
-            one, other = (self.of((dstate, side * turned)) for dstate, side in (first, second))
-            if one != other:
-                self._one_of[one] = other
+def _join(same: NodeClasses[Arm], first: Arm, second: Arm) -> None:
+    """Record that two arms are one gateway. Then their opposite arms are also one gateway."""
+    for turned in (1, -1):
+        same.merge((second[0], second[1] * turned), (first[0], first[1] * turned))
 
 
 def fewest(moves: list[int], cross: Callable[[list[int]], bool]) -> list[int]:

@@ -1,0 +1,58 @@
+"""Follow links from node to node, and merge nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Hashable, Iterable
+from typing import Generic, TypeVar
+
+Node = TypeVar("Node", bound=Hashable)
+
+
+def reached(starts: Iterable[Node], beside: Callable[[Node], Iterable[Node]]) -> dict[Node, None]:
+    """Find the nodes that links lead to from some starts, the nearest first, with the starts.
+
+    `beside` gives the nodes to which links of a node lead. The result is a set in order.
+    """
+    found = dict.fromkeys(starts)
+    waiting = list(found)
+    for node in waiting:  # the list grows
+        new = dict.fromkeys(other for other in beside(node) if other not in found)
+        found |= new
+        waiting += new
+    return found
+
+
+def parts(
+    nodes: Iterable[Node], beside: Callable[[Node], Iterable[Node]]
+) -> list[Collection[Node]]:
+    """Group nodes that links connect. Links lead both ways."""
+    found: list[Collection[Node]] = []
+    known = set[Node]()
+    for node in nodes:
+        if node not in known:
+            found.append(reached([node], beside).keys())
+            known.update(found[-1])
+    return found
+
+
+class NodeClasses(Generic[Node]):
+    """Classes of nodes that count as one. At first, each node is alone."""
+
+    def __init__(self) -> None:
+        self._above: dict[Node, Node] = {}
+
+    def of(self, node: Node) -> Node:
+        """Return the node that stands for the class of a node."""
+        while (above := self._above.get(node, node)) != node:
+            self._above[node] = node = self._above.get(above, above)
+        return node
+
+    def merge(self, first: Node, second: Node) -> None:
+        """Merge the classes of two nodes. The node that stands for the first one remains."""
+        one, other = self.of(first), self.of(second)
+        if one != other:
+            self._above[other] = one
+
+    def are_one(self, first: Node, second: Node) -> bool:
+        """Whether two nodes are in one class."""
+        return self.of(first) == self.of(second)
