@@ -137,7 +137,7 @@ def test_what_the_map_says_about_the_places_of_two_steps(
             assert told["probability"] == pytest.approx(probability)
             assert told["nats"] == pytest.approx(min(others) - weighed.nats)
     main(["explain", str(runs / "hall"), str(first), str(second)])
-    assert capsys.readouterr().out.startswith("map 1 has both steps at one place; the probability")
+    assert capsys.readouterr().out.startswith("in map 1, the steps are at one place; the prob")
 
 
 def test_maps_without_a_trace_beside_them_need_one(

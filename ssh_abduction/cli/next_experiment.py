@@ -170,7 +170,7 @@ def _expected(untried: Untried) -> Iterator[str]:
     """Yield a table of what the rivals predict for an untried action."""
     shown = untried.expects[:SHOWN_LINES]
     yield table(
-        ["maps", "leads to", "seen there", "which is"],
+        ["maps", "leads to", "seen there", "how sure"],
         [[_rivals_in_words(said.rivals), *_says(said.says)] for said in shown],
     )
     if len(untried.expects) > len(shown):

@@ -257,7 +257,7 @@ def run_tell_apart(options: argparse.Namespace) -> int:
             table(
                 [
                     "dstates",
-                    "told apart",
+                    "recognised",
                     *(f"beams by {method}" for method in next(iter(found.values())).methods),
                 ],
                 rows,

@@ -318,12 +318,13 @@ def _raise_no_route(
         raise MapError(
             f"avoid: expected a way around what is avoided, got none to {named}; avoid less"
         )
-    mend = "drive on: next says what to try"
+    mend = "drive on (ssh-abduction next says what to try)"
     if graph.by != "places" and graph.map.paths:
         mend = "take --by places, which may lead where the robot has not driven, or drive on"
     reached = counted(graph.dstates_from(here), "dstates")
     raise MapError(
-        f"to: expected one of the {reached} that known links lead to, got {named}; {mend}"
+        f"to: expected a goal that known links lead to (they lead to {reached}), got {named}; "
+        f"{mend}"
     )
 
 

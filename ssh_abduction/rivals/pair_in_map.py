@@ -44,7 +44,7 @@ class PairInMap:
         )
 
     def __str__(self) -> str:
-        text = f"map 1 has both steps at {'one place' if self.is_one_place else 'two places'}"
+        text = f"in map 1, the steps are at {'one place' if self.is_one_place else 'two places'}"
         if self.probability is not None:
             text += f"; the probability of one place is {probability_in_words(self.probability)}"
         if self.nats is not None:

@@ -8,7 +8,7 @@ from enum import Enum
 from typing import Any
 
 from ssh_abduction.data.maps import SSHMap, checked_map
-from ssh_abduction.data.words import shortly
+from ssh_abduction.data.words import counted, shortly
 from ssh_abduction.theory.theory import Theory, checked_theory
 
 
@@ -99,10 +99,10 @@ def cost_as_counted(ssh_map: SSHMap, cost: tuple[int, ...], theory: Theory) -> C
     """
     if theory.weigh == "cost":
         return Cost.of(ssh_map)
-    counted = {
+    counts = {
         name: count for name, count in zip(theory.priorities, cost, strict=True) if name != "tenths"
     }
-    return replace(Cost.of(ssh_map), **counted)
+    return replace(Cost.of(ssh_map), **counts)
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,5 +232,5 @@ class Progress:
         bound = ", ".join(f"{k} ≥ {v}" for k, v in self.bound.to_dict().items()) or "no bound yet"
         return (
             f"clingo has {self.prefix} of {self.steps} steps; {best}; {bound}; "
-            f"{self.maps} maps listed; {self.seconds:.1f} s"
+            f"{counted(self.maps, 'maps')} listed; {self.seconds:.1f} s"
         )
