@@ -58,12 +58,8 @@ class Candidates:
         self, task: Task, known: Known, judging: Judging, report: Callable[[], None]
     ) -> None:
         self._trace = task.trace  # some of its views may be unknown
-        self._task, self._known, self._judging, self._report = (
-            _with_all_views(task),
-            known,
-            judging,
-            report,
-        )
+        self._task, self._known, self._judging = _with_all_views(task), known, judging
+        self._report = report
         self._beams: dict[int, Beam] = {}  # by their widths
         self.contradicting: dict[int, None] = {}
         # A snapshot waits for a sketch under way instead of making another one.
@@ -145,10 +141,8 @@ class Candidates:
                 # The others take longer than the surest one.
                 if self._known.best is not None and whole.left() < whole.elapsed():
                     return
-                before, share = (
-                    self._known.best,
-                    1.0 if attempt in (surest, *smaller[-1:]) else SKETCH_SHARE,
-                )
+                before = self._known.best
+                share = 1.0 if attempt in (surest, *smaller[-1:]) else SKETCH_SHARE
                 part = (
                     Watch().part(max(seconds, SUREST), processor_clock())
                     if attempt is surest

@@ -182,10 +182,8 @@ class Poses:
     def _begun(self) -> Array:
         """Compute initial values of the unknowns, as one vector."""
         unknown = np.zeros(self._size)
-        at, heading = (
-            unknown[: 2 * self._positions].reshape(-1, 2),
-            unknown[2 * self._positions : -2],
-        )
+        at = unknown[: 2 * self._positions].reshape(-1, 2)
+        heading = unknown[2 * self._positions : -2]
         # Solve for the headings first: that is linear, except for whole turns. Once the headings
         # are known, solving for the positions is linear, too (Carlone et al. 2014).
         reckoned = self._reckoned()
@@ -292,10 +290,8 @@ class Poses:
 
         Also return the cosine and the sine of the heading in the middle of each displacement.
         """
-        at, heading = (
-            unknown[: 2 * self._positions].reshape(-1, 2),
-            unknown[2 * self._positions : -2],
-        )
+        at = unknown[: 2 * self._positions].reshape(-1, 2)
+        heading = unknown[2 * self._positions : -2]
         scale, bend = unknown[-2:] * self._sigma
         gone = at[self._place[self._to]] - at[self._place[self._from]]
         facing = heading[self._from] - bend * self._way / 2
@@ -320,10 +316,8 @@ class Poses:
         m, heading = len(self._moved), 2 * self._positions
         zero, one = np.zeros(m), np.ones(m)
         ahead, left = predicted[:, 0], predicted[:, 1]
-        by_x, by_y = (
-            np.stack([scale * cos, -scale * sin, zero], 1),
-            np.stack([scale * sin, scale * cos, zero], 1),
-        )
+        by_x = np.stack([scale * cos, -scale * sin, zero], 1)
+        by_y = np.stack([scale * sin, scale * cos, zero], 1)
         by_facing = np.stack([left, -ahead, zero], 1)
         columns = [
             (2 * self._place[self._to], by_x),
@@ -411,10 +405,8 @@ class Poses:
 
     def _poses(self, unknown: Array) -> tuple[Pose, ...]:
         """Compute the pose and covariance of each dstate, relative to the first of its part."""
-        at, heading = (
-            unknown[: 2 * self._positions].reshape(-1, 2),
-            unknown[2 * self._positions : -2],
-        )
+        at = unknown[: 2 * self._positions].reshape(-1, 2)
+        heading = unknown[2 * self._positions : -2]
         part = self._parts()
         first = {int(part[self._place[s]]): s for s in range(self._headings - 1, -1, -1)}
         poses: list[Pose] = []

@@ -181,10 +181,8 @@ class Mending:
             yield from self._improving(self._minimal(without, MERGED)[0], without)
             if self._best is None or self._best is before:
                 return
-            labels, places = (
-                self._best.map.dstate_at,
-                [self._best.map.dstates[label].place for label in self._best.map.dstate_at],
-            )
+            labels = self._best.map.dstate_at
+            places = [self._best.map.dstates[label].place for label in self._best.map.dstate_at]
 
     def _by_causal_maps(self) -> Iterator[Trace]:
         """Yield the traces that causal maps mend, each map cheaper than the one before."""

@@ -15,9 +15,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.solver import prefixes
 from ssh_abduction.solver.asp.control import Asker
-from ssh_abduction.solver.asp.facts import readable
+from ssh_abduction.solver.choosing import step_engine
 from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.judging import Judging
@@ -37,14 +36,9 @@ class NearMinimal:
         """Prepare an engine for `most` maps (0: all). Its times begin with those of `before`."""
         self._task = replace(task, speedups=replace(task.speedups, prefixes=False))
         self._judging, self._most, self._report = judging, most, report
-        names = readable.most_paths(task.trace, task.theory, len(task.trace))
-        self.engine = StepEngine(
-            self._task, min(prefixes.FIRST_PATHS, names) if task.speedups.path_names else names
-        )
-        self.engine.asker.ground_seconds, self.engine.asker.solve_seconds = (
-            before.ground_seconds,
-            before.solve_seconds,
-        )
+        self.engine = step_engine(self._task)
+        self.engine.asker.ground_seconds = before.ground_seconds
+        self.engine.asker.solve_seconds = before.solve_seconds
 
     def maps(
         self, minimal: tuple[int, ...], within: int

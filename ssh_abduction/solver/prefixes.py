@@ -92,13 +92,8 @@ class Prefixes:
     ) -> None:
         """Prepare the search for `most` maps (0: all). `find_minimum` begins it."""
         self.engine = engine
-        self._task, self._known, self._judging, self._most, self._report = (
-            task,
-            known,
-            judging,
-            most,
-            report,
-        )
+        self._task, self._known, self._judging, self._most = task, known, judging, most
+        self._report = report
         self._at_once = not task.speedups.prefixes
         self._in_tolerance = task.theory.star == "gateways"
         self.start = len(task.trace) if self._at_once else FIRST_PREFIX

@@ -203,15 +203,8 @@ class _MovedPoints(Facilities):
 
     def only(self, chosen: NDArray[np.bool_]) -> _MovedPoints:
         """Return the chosen points."""
-        return replace(
-            self,
-            points=self.points[chosen],
-            variances=self.variances[chosen],
-            kinds=self.kinds[chosen],
-            fees=self.fees[chosen],
-            piece=self.piece[chosen],
-            moves=self.moves[chosen],
-        )
+        of_points = ("points", "variances", "kinds", "fees", "piece", "moves")
+        return replace(self, **{name: getattr(self, name)[chosen] for name in of_points})
 
     def of_best_pieces(self) -> tuple[_MovedPoints, Array, Array]:
         """Return the points of one piece for each kind: the piece with the greatest shares.

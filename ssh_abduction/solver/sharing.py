@@ -224,16 +224,13 @@ class Sharing:
         self.maps += 1
         if ssh_map.dstate_at != self._labels:
             self._split_by(ssh_map.dstate_at)
-        for sort, kept in self._sorts(ssh_map.dstates).items():
+        if not self._kept:  # the first map decides whether there are places
+            has_places = any(s.place is not None for s in ssh_map.dstates)
+            sorts = SORTS if has_places else SORTS[:1]
+            self._kept = {sort: Kept(len(self._label_of)) for sort in sorts}
+        for sort, kept in self._kept.items():
             names = tuple(_name(ssh_map.dstates[label], sort) for label in self._label_of)
             kept.absorb(names)
-
-    def _sorts(self, dstates: Sequence[DState]) -> Mapping[Sort, Kept]:
-        """Return what is kept for each sort. The first map decides whether there are places."""
-        if not self._kept:
-            sorts = SORTS if any(s.place is not None for s in dstates) else SORTS[:1]
-            self._kept = {sort: Kept(len(self._label_of)) for sort in sorts}
-        return self._kept
 
     def _split_by(self, labels: tuple[int, ...]) -> None:
         """Split classes so that all steps of a class have the same label in this map, too."""

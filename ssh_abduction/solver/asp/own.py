@@ -33,21 +33,8 @@ from ssh_abduction.theory.theory import Theory
 
 # The predicates that rules may read. SHOWN are those of a map, OF_TRACE those of a trace and its
 # theory.
-SHOWN = frozenset(
-    {
-        "is",
-        "same",
-        "at",
-        "same_place",
-        "along",
-        "same_course",
-        "on_some_path",
-        "on",
-        "before",
-        "travel",
-        "turn",
-    }
-)
+SHOWN = {"is", "same", "at", "same_place", "along", "same_course", "on_some_path", "on", "before"}
+SHOWN |= {"travel", "turn"}
 OF_TRACE = frozenset({"view", "act", "kind", "turns", "open", "axiom", "path", "prefer", "query"})
 FRAME = """
 #defined query/1. #defined violation/2. #defined is/2. #defined same/2. #defined at/2.

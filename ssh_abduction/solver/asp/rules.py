@@ -173,10 +173,8 @@ def _statements(rules: Rules) -> list[tuple[ast.AST, str, str]]:
     def take(statement: ast.AST) -> None:
         nonlocal part, parameter
         if statement.ast_type is ast.ASTType.Program:
-            part, parameter = (
-                str(statement.name),
-                ",".join(str(p.name) for p in statement.parameters),
-            )
+            part = str(statement.name)
+            parameter = ",".join(str(p.name) for p in statement.parameters)
             if PARTS.get(part) != len(statement.parameters):
                 where = f"{rules.name}:{statement.location.begin.line}"
                 raise TheoryError(

@@ -90,10 +90,8 @@ class Blocks:
         a fault. The least costs of the faults of all blocks are added up.
         """
         total = begin = 0
-        steps, places = (
-            len(self.seen),
-            sorted(step for found in self.faults.values() for step in found),
-        )
+        steps = len(self.seen)
+        places = sorted(step for found in self.faults.values() for step in found)
         reach = 0  # how many steps after a fault the last block ended
         while begin < steps:
             following = begin
@@ -109,7 +107,10 @@ class Blocks:
             if most >= self.dstates and (wider := self._wider(begin, end, places, most)):
                 end, least = wider
             else:
-                least = self._least_price(begin, end)
+                least = min(
+                    min(price[begin : end - (kind == "slipped")])
+                    for kind, price in self.price.items()
+                )
             total += least
             begin = end
         return total
@@ -220,10 +221,4 @@ class Blocks:
                 for t in found[bisect_left(found, begin) : bisect_right(found, last[kind] - 1)]
             )
             for kind, found in self.faults.items()
-        )
-
-    def _least_price(self, begin: int, end: int) -> int:
-        """Return the cost of the cheapest fault that is possible in a block, in tenths."""
-        return min(
-            min(found[begin : end - (kind == "slipped")]) for kind, found in self.price.items()
         )

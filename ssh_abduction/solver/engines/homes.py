@@ -49,9 +49,10 @@ def homes_of(segments: Segments) -> Mapping[int, list[int]] | None:
     may_be = ~different[:, columns]
     may_be[columns] = np.eye(len(fixed), dtype=bool)
     steps = [(segment, number[c], number[b]) for segment, c, b in segments.travels]
-    follows = {
-        segment: _may_follow(pairs, columns) for segment, pairs in _by_segment(steps).items()
-    }
+    travels: dict[int, list[tuple[int, int]]] = defaultdict(list)
+    for segment, c, b in steps:
+        travels[segment].append((c, b))
+    follows = {segment: _may_follow(pairs, columns) for segment, pairs in travels.items()}
     before = -1
     while before != (before := int(may_be.sum())):
         for segment, c, b in [*steps, *reversed(steps)]:
@@ -69,14 +70,6 @@ def homes_of(segments: Segments) -> Mapping[int, list[int]] | None:
 def fewest_paths(segments: Segments) -> int:
     """Return a lower bound on the number of paths, from pairwise distinct segments."""
     return len(pairwise_distinct(segments.segments, segments.distinct))
-
-
-def _by_segment(steps: list[tuple[int, int, int]]) -> Mapping[int, list[tuple[int, int]]]:
-    """Group travels (segment, from place, to place) by their segments."""
-    found: dict[int, list[tuple[int, int]]] = defaultdict(list)
-    for segment, c, b in steps:
-        found[segment].append((c, b))
-    return found
 
 
 def _may_follow(pairs: list[tuple[int, int]], columns: list[int]) -> NDArray[np.bool_]:

@@ -54,10 +54,8 @@ class StepEngine:
     def with_paths(self, paths: int) -> StepEngine:
         """Make a new engine with this many names for paths. Its prefix is empty."""
         engine = StepEngine(self._task, paths)
-        engine.asker.ground_seconds, engine.asker.solve_seconds = (
-            self.asker.ground_seconds,
-            self.asker.solve_seconds,
-        )
+        engine.asker.ground_seconds = self.asker.ground_seconds
+        engine.asker.solve_seconds = self.asker.solve_seconds
         engine._forbidden, engine._number = list(self._forbidden), self._number
         return engine
 

@@ -84,10 +84,8 @@ def scattered(pairs: Sequence[Pair], visits: int) -> list[Pair]:
     turned = np.zeros(visits, dtype=int)  # the slot that is slot 0 of that first visit
     at_first = group[second] == first
     turned[second[at_first]] = turns[at_first]
-    members, joined = (
-        np.bincount(group, minlength=visits),
-        np.bincount(group[first], minlength=visits),
-    )
+    members = np.bincount(group, minlength=visits)
+    joined = np.bincount(group[first], minlength=visits)
     wrong = (group[first] != group[second]) | ((turned[second] - turned[first]) % 4 != turns)
     bad = joined != members * (members - 1) // 2
     bad[group[first[wrong]]] = bad[group[second[wrong]]] = True

@@ -35,8 +35,9 @@ from itertools import combinations
 from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.facts import visits_lp
 from ssh_abduction.solver.engines.base import Task
+from ssh_abduction.solver.engines.sides import FramedSides
 from ssh_abduction.solver.engines.transitive import Pair
-from ssh_abduction.solver.engines.visit_program import Sides, VisitProgram, fits_in_time
+from ssh_abduction.solver.engines.visit_program import VisitProgram, fits_in_time
 from ssh_abduction.solver.steps.apart import clique
 from ssh_abduction.solver.steps.chart import Chart, FramedChart
 
@@ -60,7 +61,7 @@ class VisitLabels:
         self,
         task: Task,
         asker: Asker,
-        sides: Sides,
+        sides: FramedSides,
     ) -> None:
         """Begin without any steps. `sides` adds axioms to each new control and batch."""
         self.bound: int | None = None

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence, Set
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import clingo
 
@@ -17,6 +16,7 @@ from ssh_abduction.solver.asp.facts import sides_lp, visits_lp
 from ssh_abduction.solver.asp.facts.atoms import number_symbols
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.engines.base import Task
+from ssh_abduction.solver.engines.sides import FramedSides
 from ssh_abduction.solver.engines.transitive import Pair, PairOf, Three, intransitive
 from ssh_abduction.solver.steps.chart import FramedChart, numbered
 from ssh_abduction.solver.steps.localising import Located, State, faced, located
@@ -25,18 +25,6 @@ from ssh_abduction.theory.pairs import pairs_in
 # Clingo takes about this many seconds to ground one pair of visits that may be at one place. It
 # cannot be stopped meanwhile.
 SECONDS_A_PAIR = 3e-5
-
-
-class Sides(Protocol):
-    """Adds axioms of order and sides to those of visits (`engines/sides.py`)."""
-
-    def begin(self) -> None:
-        """Start again, with a new control."""
-        ...
-
-    def extend(self, batch: int) -> None:
-        """Extend the axioms to the visits of a new batch."""
-        ...
 
 
 @dataclass
@@ -67,7 +55,7 @@ class VisitProgram:
         least: A lower bound on the dstates: the number of nodes that are first in every answer.
     """
 
-    def __init__(self, task: Task, asker: Asker, chart: FramedChart, sides: Sides) -> None:
+    def __init__(self, task: Task, asker: Asker, chart: FramedChart, sides: FramedSides) -> None:
         """Make a control without visits. `sides` adds axioms to it and to each batch."""
         self.chart = chart
         self.batch = -1

@@ -230,12 +230,8 @@ class Classes:
     def _take_back(self) -> None:
         """Undo the last merge."""
         for a, b, known, apart, leads, members in reversed(self._undo):
-            self._apart[a], self._leads[a], self._members[a], self.known[b] = (
-                apart,
-                leads,
-                members,
-                known,
-            )
+            self._apart[a], self._leads[a], self._members[a] = apart, leads, members
+            self.known[b] = known
             self.root[self._members[b]] = b
         self._undo = []
 

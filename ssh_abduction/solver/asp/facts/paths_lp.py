@@ -172,10 +172,8 @@ class Segments:
             return [tuple(read_atom(atom.symbol)[1]) for atom in symbols.by_signature(name, arity)]
 
         places = sorted(place for (place,) in atoms("visited", 1))
-        elsewhere, travels = (
-            [(c, p) for c, p in atoms("elsewhere", 2)],
-            [(g, c, b) for g, c, b in atoms("travel_on", 3)],
-        )
+        elsewhere = [(c, p) for c, p in atoms("elsewhere", 2)]
+        travels = [(g, c, b) for g, c, b in atoms("travel_on", 3)]
         return cls(places, elsewhere, travels, *read_distinct(control))
 
 
