@@ -185,7 +185,7 @@ def _settings(run: Mapping[str, Any]) -> str:
             "where the free space forks, or the robot turned, began or ended",
         ),
         ("width", f"{run['width']:g} m", "of the robot; it cannot pass narrower parts"),
-        ("theory", theory, "the axioms, and the choices in them"),
+        ("theory", theory, "which axioms hold, and what is minimised"),
     ]
     return _table(("", "", ""), rows)
 

@@ -41,7 +41,7 @@ function legend() {
       ["street", "most", "more than two thirds"],
       ["street", "half", "about half"],
       ["street", "few", "less than a third"],
-      ["dstate", "hollow half", "rivals dispute what else is along its path"],
+      ["dstate", "hollow half", "rivals differ in what else is along its path"],
     );
   if (state.mode === "two")
     rows.push(
@@ -50,13 +50,13 @@ function legend() {
       ["street", "course", "there too, but along another path"],
     );
   if (state.mode === "one" && mapOf(state.map).streets.some((street) => !street.travelled))
-    rows.push(["street", "order", "nobody travelled there: the order of the path says so"]);
+    rows.push(["street", "order", "not travelled: the order of the path implies it"]);
   if (data.places[0].some(([place]) => place !== null))
-    rows.push(["node", "", "a place"], ["dstate", "", "a dstate, headed as it faces"]);
+    rows.push(["node", "", "a place"], ["dstate", "", "a dstate, with its heading"]);
   data.drives.forEach(({ name }, k) => rows.push(["trail", colourOf(k), `the way of ${name}`]));
   if (!replay().other) rows.push(["here", "", "where the robot is at this step"]);
   if (replay().beliefs)
-    rows.push(["believed", "", "where it is believed to be: the larger, the more probable"]);
+    rows.push(["believed", "", "where the robot may be: larger is more probable"]);
   if (figures.some((figure) => figure.bands?.length))
     rows.push(["band", "", "a region: all known ways to it lead through one place"]);
   if (state.region && state.mode === "one")
@@ -76,8 +76,8 @@ function legend() {
       changes
         ? "a gateway that changed between drives"
         : state.mode === "one"
-          ? "what the map disbelieves"
-          : "what all disbelieve",
+          ? "a step that the map treats as wrong"
+          : "a step that all maps treat as wrong",
     ]);
   if (data.faults.length && state.mode !== "one")
     rows.push([
@@ -86,8 +86,8 @@ function legend() {
       changes
         ? "a gateway that did not change in other maps"
         : state.mode === "two"
-          ? "what the other map does not disbelieve"
-          : "what some maps disbelieve",
+          ? "not treated as wrong by the other map"
+          : "treated as wrong by some maps",
     ]);
   for (const [shape, kind, text] of rows) {
     const row = element("p", { class: "key" }, null, $("legend")),

@@ -11,8 +11,8 @@ function overviewFigure() {
     caption:
       all === 1
         ? "The map"
-        : `What all ${all} maps share is solid; what some dispute is dashed, ` +
-          "in colours that say how many have it",
+        : `What all ${all} maps share is solid. What only some have is dashed, ` +
+          "in colours that show how many",
   };
   const isPlaces = dstates.length > 0;
   figure.nodes = isPlaces
@@ -122,7 +122,7 @@ function mapFigure(i, rival) {
       title:
         `${path === null ? "way" : `${ssh.called("path", path)},`} from ` +
         `${ssh.called("place", from)} to ${ssh.called("place", to)}` +
-        (travelled ? "" : ": only the order of the path says so, nobody travelled there"),
+        (travelled ? "" : ", not travelled: the order of the path implies it"),
     }));
   for (const { from, to, actions, key } of ssh.links.values())
     figure.streets.push({

@@ -42,7 +42,7 @@ function load(judging = true) {
     element(
       "p",
       {},
-      data.maps.length > 1 ? "In nothing that is asked of steps." : "There is one map only.",
+      data.maps.length > 1 ? "In no answer to a question about steps." : "There is one map only.",
       $("choices"),
     );
   if (data.maps.length === 1 && state.mode !== "one") state.mode = "one";

@@ -199,7 +199,7 @@ function paintEllipses(figure, see) {
     element(
       "svg:title",
       {},
-      "where this is, by two standard deviations, as seen from the first dstate",
+      "two standard deviations of this position, relative to the first dstate",
       drawn,
     );
   }

@@ -79,7 +79,7 @@ function tellVerdict(a, b) {
           ? `${best[side]} dstates in the best map listed, not ${least}`
           : proven
             ? `more than the ${least} dstates of these maps, if there is such a map`
-            : "no map listed has them so";
+            : "no listed map does this";
   }
   const told = data.assuming?.pairs[`${Math.min(a, b)},${Math.max(a, b)}`];
   if (told && !theory()) [cost.same, cost.different] = told.map((k) => data.assuming.texts[k]);

@@ -29,7 +29,7 @@ function setStep(t) {
         ? "the trace ends"
         : t === last
           ? "this drive ends"
-          : "then an action that the maps do not tell"
+          : "then an action that the maps do not name"
       : `then ${step.action}`,
   );
   $("seen").textContent = parts.join("; ");
@@ -71,7 +71,7 @@ function tellRivals(t) {
     const name =
       label === null
         ? belief
-          ? "nowhere that it knows"
+          ? "at no place of the map"
           : "not localised there"
         : `dstate ${label} (${stretches(steps)})`;
     const key2 = label === null ? name : `${steps}`,
