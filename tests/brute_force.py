@@ -95,10 +95,10 @@ def key(ssh_map: SSHMap) -> Key:
 def minimal_maps(
     trace: Trace, theory: Theory, allows: Callable[[Key], bool] = lambda _: True
 ) -> tuple[Counts | None, set[Key]]:
-    """The counts and the keys of the consistent maps that come first by `theory.priorities`; (None,
-    empty) where there is none.
+    """The counts and the keys of the minimal maps by `theory.priorities`; (None, empty) if there is
+    no map.
 
-    allows  what an axiom says of a map that the brute force does not know
+    `allows` tells whether a map satisfies an axiom that the brute force does not know.
 
     The maps agree in the counts that the theory minimises. The other counts are those of one of
     them.

@@ -149,7 +149,7 @@ def test_a_broad_beam_and_a_small_misfit_make_sure() -> None:
     assert weighed.broken == pytest.approx(0.0, abs=0.01)
     assert weighed.confidence > 0.95
     least = math.floor(100 * weighed.bound / weighed.nats)
-    assert f"without a proof, but each map costs at least {least} % as much" in weighed.sentence
+    assert f"(not proven: no map costs less than {least} % of this one)" in weighed.sentence
 
 
 def test_a_cheaper_map_that_breaks_axioms_makes_unsure() -> None:

@@ -186,7 +186,7 @@ def test_what_a_person_says_is_obeyed_at_each_later_solve(
     assert "obeying 2 corrections of" in capsys.readouterr().err
     assert main(solving(folder, "monday")) == 0
     assert "obeying 1 correction of" in (told := capsys.readouterr()).err
-    assert "1 are of drives that are not solved" in told.err
+    assert "1 more are about other drives" in told.err
     elsewhere = ["solve", *solving(folder)[1:4], "--corrections", building, "--json"]
     assert main(elsewhere) == 0
     assert json.loads(capsys.readouterr().out)["theory"]["different"] == [[1, 4]]

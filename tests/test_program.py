@@ -233,7 +233,7 @@ def test_work_in_processes_gives_results_in_order_and_raises_what_it_raises() ->
 
 def test_work_that_is_killed_is_an_error() -> None:
     killed = patch.object(workers, "answers", lambda *_: iter([workers.Lost(0, late=False)]))
-    with killed, pytest.raises(AbductionError, match="expected an answer, got killed"):
+    with killed, pytest.raises(AbductionError, match="expected an answer, got a killed process"):
         list(report._each(divmod, [(9, 4), (9, 3)], 2))
 
 

@@ -91,7 +91,7 @@ class SolveQuestion(FileQuestion):
 
     patience: ClassVar = 3.0
     killed: ClassVar = (
-        "process: expected an answer, got killed, as happens when memory runs out; set "
+        "process: expected an answer, got a killed process, as when memory runs out; set "
         "--memory-limit, or solve fewer traces at a time"
     )
     late: ClassVar = (

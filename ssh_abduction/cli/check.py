@@ -250,8 +250,7 @@ def _bound(
             else str(bound.refuted[0])
         )
         said.append(
-            f"at least {counted(total, 'dstates')}, if clingo is right that there is no map of "
-            f"{sizes}"
+            f"at least {counted(total, 'dstates')}, if clingo is right that no map has {sizes}"
         )
     if fewest is not None:
         beyond = (

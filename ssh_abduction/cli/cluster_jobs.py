@@ -24,7 +24,7 @@ Task: TypeAlias = tuple[int, str]  # the number of a file, and its path
 PATIENCE = 10  # seconds to wait for a Dask scheduler, and for its first worker
 LOOK = 1.0  # seconds between two checks that the cluster still has a worker
 LOST = (
-    "scheduler: expected an answer, got disconnected; see whether it still runs, and solve this "
+    "scheduler: expected an answer, got a lost connection; see whether it runs, and solve this "
     "trace again"
 )
 

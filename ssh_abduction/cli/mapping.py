@@ -94,8 +94,8 @@ class MapQuestion(FileQuestion):
 
     patience: ClassVar = 10.0
     killed: ClassVar = (
-        "process: expected an answer, got killed, as happens when memory runs out; map fewer logs "
-        "at a time (--jobs)"
+        "process: expected an answer, got a killed process, as when memory runs out; map fewer "
+        "logs at a time (--jobs)"
     )
 
     def obeying(self, folder: Path) -> MapQuestion:

@@ -56,7 +56,7 @@ def say_obeyed(said: Corrections, trace: Trace) -> None:
     here, all_of_them = (
         sum(1 for _ in sentences_of(some)) for some in (said.known_in(drives_of(trace)), said)
     )
-    aside = f"; {all_of_them - here} are of drives that are not solved" * (here < all_of_them)
+    aside = f"; {all_of_them - here} more are about other drives" * (here < all_of_them)
     text = f"obeying {counted(here, 'corrections')} of {named(said.source)}{aside}"
     print(printable(text), file=sys.stderr)
 

@@ -172,7 +172,7 @@ class OnlineMapper:
         """
         if self._keeper.standing is None:
             raise TheoryError(
-                "theory: expected one that allows faults, as else no map is in doubt, got one "
+                "theory: expected one that allows faults, as `standing` is about faults, got one "
                 "without; set misread or slipped, or read `solution`"
             )
         return self._keeper.standing

@@ -81,7 +81,7 @@ class Stages:
             and parts.known.status is Status.UNKNOWN
             and not self._find_minimum_soon(choosing.STEPWISE)
         ):
-            _log.info("no minimum after %.1f s step by step", parts.watch.elapsed())
+            _log.info("no minimal map after %.1f s step by step", parts.watch.elapsed())
             if may_frame:
                 _log.info("looking for maps in which places have frames, as candidates")
                 parts.candidates.frame(parts.speedups)

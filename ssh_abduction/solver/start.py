@@ -38,7 +38,7 @@ class Limits:
         if not is_whole(self.within) or self.within < 0:
             raise SolverError(
                 "within (--set within=K): expected a whole number, 0 or more, got "
-                f"{brief(self.within)}; say how much more than the least a map may cost"
+                f"{brief(self.within)}; give how much more than a minimal map others may cost"
             )
         check_limit("time_limit (--time-limit)", "seconds", self.time_limit)
         check_limit("memory_limit (--memory-limit)", "MiB", self.memory_limit)

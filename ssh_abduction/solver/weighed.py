@@ -226,7 +226,7 @@ class Weighed:
             text += f"; a map that breaks axioms costs {self.broken:.1f} nats less"
         elif self.searched and not self.proven:
             least = math.floor(100 * self.bound / self.nats)
-            text += f", without a proof, but each map costs at least {least} % as much"
+            text += f" (not proven: no map costs less than {least} % of this one)"
         doubted = 1 - self.joins[0][2] if self.joins else 0.0
         if self.missed and self.missed[2] > max(doubted, DOUBTED):
             first, second, probability = self.missed

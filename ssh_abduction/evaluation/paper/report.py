@@ -120,7 +120,7 @@ def _each(work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], jobs: int)
     for answer in workers.answers(_done, numbered, processes, lambda: False, None, 0.0):
         if isinstance(answer, workers.Lost):
             raise AbductionError(
-                "process: expected an answer, got killed, as happens when memory runs out; "
+                "process: expected an answer, got a killed process (when memory runs out); "
                 "take fewer --jobs"
             )
         number, ready[number] = answer
