@@ -11,19 +11,21 @@ import math
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 from ssh_abduction.data.drives import Drive, drives_of
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import heeding, look_at_clock
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.guesses.completing import completed
-from ssh_abduction.solver.misfit import Misfit
 from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.solver.values import Cost, nats_of
 from ssh_abduction.solver.weighed import CHANCE, Rival
 from ssh_abduction.theory.evidence.displacement import jumped
 from ssh_abduction.theory.settle import Problem
+
+if TYPE_CHECKING:
+    from ssh_abduction.solver.misfit import Misfit  # loads numpy
 
 # The dstate and the place of each step, numbered by first visit.
 Course: TypeAlias = tuple[tuple[int, ...], tuple[int, ...]]
