@@ -28,7 +28,6 @@ from ssh_abduction.solver.engines import (
 )
 from ssh_abduction.solver.engines.base import Found
 from ssh_abduction.solver.engines.causal import CausalEngine
-from ssh_abduction.solver.engines.name_search import NameSearch
 from ssh_abduction.solver.engines.pinned import Pinned
 from ssh_abduction.solver.guesses import annealing
 from ssh_abduction.solver.guesses.annealing import annealed
@@ -56,12 +55,7 @@ def test_a_search_near_a_guess_changes_no_answer(
     with (
         patch.object(choosing, "FEW_STEPS", 0),
         patch.object(engine, "FIRST_PREFIXES", len(trace)),
-        patch.multiple(
-            name_search,
-            PATIENCE=0,
-            CORES=cores,
-            FEWER=data.draw(st.sampled_from([(1,), (1, 20_000), (20_000,)]), label="fewer"),
-        ),
+        patch.multiple(name_search, PATIENCE=0, CORES=cores),
         patch.object(small_maps, "annealed", lambda *_, **__: Mock(labels=lambda _: guess)),
         patch.object(small_maps.Chart, "turned", turned),
     ):
@@ -128,12 +122,13 @@ def test_a_limit_leaves_the_small_map_found_near_a_guess() -> None:
     """The guess has no more dstates than the robot visited. A map by greedy merging has more than
     twice as many."""
     walk = maze(4, 4, steps=600, seed=1)
-    best: list[int] = []
+    more_links = name_program.NameProgram.more_links
 
-    def stop(_: NameSearch, labels: list[int], __: int) -> tuple[None, bool]:
+    def stop(program: name_program.NameProgram) -> list[tuple[int, int, int]]:
         """The time is over when there is a small map."""
-        best.append(len(set(labels)))
-        raise KeyboardInterrupt
+        if program.has_all_links:
+            raise KeyboardInterrupt
+        return more_links(program)
 
     limited = Search(walk.trace, CAUSAL, speedups=Speedups.without("prefixes"))
     truth = {state: number for number, state in enumerate(dict.fromkeys(walk.truth))}
@@ -143,18 +138,14 @@ def test_a_limit_leaves_the_small_map_found_near_a_guess() -> None:
             "annealed",
             lambda *_, **__: Mock(labels=lambda chart: _labels_of(chart, walk.truth, truth)),
         ),
-        patch.object(NameSearch, "_with_fewer", stop),
+        patch.object(name_program.NameProgram, "more_links", stop),
         patch.multiple(name_search, PATIENCE=1, CORES=1),
     ):
         solution = limited.solution(tuple(limited))
     assert solution.stopped == "interrupted"
     assert solution.cost
-    assert (
-        solution.cost.dstates
-        == best[0]
-        <= len(truth)
-        < len(set(Log(walk.trace, CAUSAL).merged())) / 2
-    )
+    merged = len(set(Log(walk.trace, CAUSAL).merged()))
+    assert solution.cost.dstates <= len(truth) < merged / 2
     assert check(walk.trace, solution.maps[0], CAUSAL) == ()
 
 

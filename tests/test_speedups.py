@@ -37,7 +37,6 @@ from ssh_abduction.solver.engines import (
     small_maps,
 )
 from ssh_abduction.solver.engines import named_labels as named
-from ssh_abduction.solver.engines.name_search import NameSearch
 from ssh_abduction.solver.guesses import annealing
 from ssh_abduction.solver.guesses.annealing import annealed_steps
 from ssh_abduction.solver.guesses.merging import dstates_merged, merged
@@ -339,12 +338,19 @@ def test_a_limit_leaves_a_map_of_merged_steps() -> None:
 def test_a_limit_leaves_the_small_map_of_a_guess(seed: int) -> None:
     """A machine without turns."""
     walk = moore(12, 2, steps=800, seed=seed)
+    more_links = name_program.NameProgram.more_links
+
+    def stop(program: name_program.NameProgram) -> list[tuple[int, int, int]]:
+        if program.has_all_links:
+            raise KeyboardInterrupt
+        return more_links(program)
+
     with (
         patch.multiple(name_search, PATIENCE=1, CORES=1),
         patch.object(annealing, "STEPS", ((0.75, 300),)),
-        patch.object(NameSearch, "_with_fewer", side_effect=KeyboardInterrupt),
+        patch.object(name_program.NameProgram, "more_links", stop),
     ):
-        solution = solve(walk.trace, Theory.causal(), speedups=Speedups.without("prefixes"))
+        solution = solve(walk.trace, Theory.causal(), speedups=Speedups.without("prefixes,clique"))
     assert solution.status is Status.FEASIBLE
     assert solution.cost
     assert solution.cost.dstates <= 1.2 * len(set(walk.truth))

@@ -246,41 +246,6 @@ class NameProgram:
         used = set(answer.values())
         return {view for view, spare in self._known.spare.items() if spare[-1] in used}
 
-    def make_room_for(self, labels: Sequence[int]) -> None:
-        """Give each view one spare name more than these labels of a map need, if it has fewer."""
-        spares = self._labels_by_view(labels)
-        short = [view for view, some in spares.items() if len(some) >= self._spares[view]]
-        for view in short:
-            self._spares[view] = len(spares[view])  # `name_more` adds one
-        if short:
-            self.name_more(short)
-
-    def _labels_by_view(self, labels: Sequence[int]) -> dict[int, list[int]]:
-        """List the labels of a map that no pinned node has, by their views."""
-        pinned = {labels[node] for node in self.pinned.clique}
-        found: dict[int, dict[int, None]] = {}
-        for node in (end for t, _, u in self._known.links for end in (t, u)):
-            if labels[node] not in pinned:
-                found.setdefault(self.chart.seen[node], {})[labels[node]] = None
-        return {view: list(some) for view, some in found.items()}
-
-    def literals_of(self, labels: Sequence[int]) -> list[int]:
-        """Return the literals that give nodes the names of their dstates in a map."""
-        name_of = {labels[node]: name for name, node in enumerate(self.pinned.clique)}
-        for view, some in self._labels_by_view(labels).items():
-            name_of |= dict(zip(some, self._known.spare[view], strict=False))
-        atoms = self._asker.control.symbolic_atoms
-        return [
-            atom.literal
-            for node, label in enumerate(labels)
-            if (atom := atoms[names_lp.named_atom(node, name_of[label])])
-        ]
-
-    def no_rests(self) -> list[int]:
-        """Return the literals that forbid every node to have a rest as its name."""
-        atom = self._asker.control.symbolic_atoms[self.resting(True)[0]]
-        return [-atom.literal] if atom else []
-
     def resting(self, value: bool) -> tuple[clingo.Symbol, bool]:
         """Return the assumption that some node has a rest as its name (True), or none (False).
 

@@ -4,13 +4,13 @@ Clasp raises the lower bound by one for each core. A core is a set of spare name
 of them is needed. Cores are small at first, as views share no names.
 
 If that takes long, the search also looks for small maps in other ways (`engines/small_maps.py`):
-first it merges steps, and later it guesses a map. Then it asks for maps with fewer dstates than the
-best one, one fewer each time. The search ends as soon as some map has as few dstates as the bound.
+first it merges steps, and later it guesses a map. The search ends as soon as some map has as few
+dstates as the bound.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator
 
 from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.facts import names_lp
@@ -24,8 +24,6 @@ from ssh_abduction.solver.engines.small_maps import SmallMaps
 PATIENCE = 2000
 # After this many conflicts with all links, guess a map. Then clingo continues without a limit.
 CORES = 10_000
-# Ask for a map with fewer dstates than the best one with these limits of conflicts, in turn.
-FEWER = (20_000, 40_000)
 
 
 class Incumbent:
@@ -161,45 +159,10 @@ class NameSearch:
             yield from self._near_a_guess()
 
     def _near_a_guess(self) -> Iterator[list[int]]:
-        """Guess a map, and look for maps with fewer dstates for a while. Yield their labels."""
+        """Guess maps, and yield the labels of those with fewer dstates than all maps before."""
         is_long = self._program.pinned.is_long
         known = self._incumbent.labels
         for labels in self._small.from_beginning() if is_long else self._small.guessed():
             if known is None or len(set(labels)) < len(set(known)):
                 known = labels
                 yield labels
-        if self._incumbent.labels and not is_long:
-            yield from self._fewer(self._incumbent.labels)
-
-    def _fewer(self, labels: list[int]) -> Iterator[list[int]]:
-        """Yield maps with ever fewer dstates than a known one, while clingo finds them soon."""
-        self._program.make_room_for(labels)
-        # Clasp begins each search with the choices of its last answer. So ask for this map first.
-        self._asker.verdict(names_lp.read_names, self._program.literals_of(labels), FEWER[0])
-        for conflicts in FEWER:
-            found: dict[int, int] | None = {}
-            while found is not None:
-                found, proven = self._with_fewer(labels, conflicts)
-                if proven:
-                    self._incumbent.raise_bound(len(set(labels)))
-                    return
-                if found and (views := self._program.rests(found)):
-                    self._program.name_more(views)
-                elif found:
-                    labels, _ = self._program.follow(found)
-                    yield labels
-
-    def _with_fewer(
-        self, labels: Sequence[int], conflicts: int
-    ) -> tuple[dict[int, int] | None, bool]:
-        """Ask for an answer with fewer dstates. Also say whether it is proven that none exists."""
-        most = len(set(labels)) - 1 - len(self._program.pinned.clique)
-        if most < 0:
-            return None, True
-        for assumed in (self._program.no_rests(), []):
-            answer, core = self._asker.verdict(
-                names_lp.read_names, assumed, conflicts, f"enum,{most},{most}"
-            )
-            if answer is not None or core is None:
-                return answer, False
-        return None, True
