@@ -13,7 +13,6 @@ from pathlib import Path
 from unittest.mock import patch
 
 import aces
-import clingo
 import networkx as nx
 import numpy as np
 import pytest
@@ -27,7 +26,7 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main
 from ssh_abduction.data import SolverError
 from ssh_abduction.solver import Search, Status, choosing
-from ssh_abduction.solver.asp.facts import answer_maps, names_lp
+from ssh_abduction.solver.asp.facts import answer_maps
 from ssh_abduction.solver.asp.limits import LimitError
 from ssh_abduction.solver.engines import base as engine
 from ssh_abduction.solver.engines import (
@@ -102,29 +101,6 @@ def test_any_choice_of_speedups_lists_the_maps_of_the_plain_encoding(
     assert set(found.maps) == set(expected.maps)
     assert found.count == len(set(found.maps))
     assert found.complete
-
-
-@pytest.mark.parametrize("seed", [0, 3])
-def test_names_read_from_where_actions_lead_are_those_read_whole(seed: int) -> None:
-    """At first there are no spare names, so some have to be added."""
-    read, answers = names_lp.NameReader.read, []
-
-    def compared(reader: names_lp.NameReader, model: clingo.Model) -> dict[int, int]:
-        names = names_lp.read_names(model)
-        assert read(reader, model) == names
-        answers.append(names)
-        return names
-
-    with (
-        patch.object(named, "SPARES", 0),
-        patch.multiple(name_search, PATIENCE=0, CORES=0),
-        patch.object(names_lp.NameReader, "read", compared),
-    ):
-        speedups = Speedups.without("annealed")
-        assert solve(
-            moore(8, 2, steps=60, seed=seed).trace, Theory.causal(), max_maps=20, speedups=speedups
-        ).complete
-    assert answers
 
 
 @contextmanager

@@ -253,11 +253,6 @@ class NameProgram:
         """
         return names_lp.resting(self._known.batches - 1), value
 
-    def reader(self) -> names_lp.NameReader:
-        """Make a reader of answers, for a control that has all links."""
-        actions = self._task.log.actions[: len(self.chart.seen) - 1]
-        return names_lp.NameReader(actions, self._known.choices)
-
     def follow(self, answer: dict[int, int]) -> tuple[list[int], list[Link]]:
         """Follow the links of an answer through all nodes of the chart.
 

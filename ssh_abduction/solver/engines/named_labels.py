@@ -28,9 +28,7 @@ that of all steps.
 
 The search for the fewest dstates is in `engines/name_search.py`.
 
-Python reads an answer more slowly than clingo finds it. So only the atoms that say where actions
-lead are read, and the labels of all steps are derived from these. While a map is made from one
-answer, clingo searches for the next.
+While a map is made from one answer, clingo searches for the next.
 """
 
 from __future__ import annotations
@@ -255,8 +253,5 @@ class NamedLabels:
 
     def _answers_of(self, spares: int) -> Iterator[dict[int, int]]:
         """Yield all answers that cost this many spare names and use no rest."""
-        program = self.program
-        read = program.reader().read if program.has_all_links else names_lp.read_names
-        return self._asker.answers(
-            read, f"enum,{spares},0", 0, assumptions=[program.resting(False)], ahead=True
-        )
+        resting, mode = self.program.resting(False), f"enum,{spares},0"
+        return self._asker.answers(names_lp.read_names, mode, 0, assumptions=[resting], ahead=True)

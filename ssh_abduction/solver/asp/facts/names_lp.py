@@ -79,11 +79,6 @@ def resting(batch: int) -> Symbol:
     return Function("resting", number_symbols(batch))
 
 
-def named_atom(t: int, name: int) -> Symbol:
-    """Return the atom that says that step t is at the dstate of that name."""
-    return Function("is", number_symbols(t, name))
-
-
 def read_names(model: Model) -> dict[int, int]:
     """Read an answer: a dict from the steps that clingo was given to their names."""
     return dict(map(_named, model.symbols(shown=True)))
@@ -94,52 +89,6 @@ def _named(symbol: Symbol) -> tuple[int, int]:
     """Read a step and its name from an atom. This is cached, as answers share most atoms."""
     step, name = symbol.arguments
     return step.number, name.number
-
-
-class NameReader:
-    """Reads answers of names.lp, if clingo was given all links of a trace.
-
-    It reads only the links (where each action leads from each dstate), and follows the trace along
-    them. This takes fewer calls of clingo than reading the name of each step. `actions` has the
-    action after each step but the last, as a number, and `choices` the names that each step can
-    have.
-    """
-
-    def __init__(self, actions: Sequence[int], choices: Sequence[Sequence[int]]) -> None:
-        self._actions = actions
-        self._choices = choices
-        # For each (name, action) in the last answer: the name that the action leads to, and the
-        # literal of the atom `goes` that says so.
-        self._last: dict[tuple[int, int], tuple[int, int]] = {}
-
-    def read(self, model: Model) -> dict[int, int]:
-        """Read the name of each step from an answer in which no step is at a rest."""
-        atoms = model.context.symbolic_atoms
-        leads: dict[tuple[int, int], int] = {}
-        name = next(
-            s
-            for s in self._choices[0]
-            if (atom := atoms[named_atom(0, s)]) and model.is_true(atom.literal)
-        )
-        names = {0: name}
-        for t, action in enumerate(self._actions, 1):
-            key = name, action
-            if key not in leads:
-                there, literal = self._last.get(key, (-1, 0))
-                if not literal or not model.is_true(literal):
-                    asked = (
-                        (x, atoms[Function("goes", number_symbols(*key, x))])
-                        for x in self._choices[t]
-                    )
-                    there, literal = next(
-                        (x, atom.literal)
-                        for x, atom in asked
-                        if atom and model.is_true(atom.literal)
-                    )
-                    self._last[key] = there, literal
-                leads[key] = there
-            names[t] = name = leads[key]
-        return names
 
 
 def not_together(number: int, pairs: Sequence[tuple[int, int]]) -> str:
