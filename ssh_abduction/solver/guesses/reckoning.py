@@ -273,11 +273,11 @@ def conditioned(
     if len(off) % 2:
         off[-1] = math.remainder(off[-1], math.tau)
     across = covariance[:, first] - covariance[:, second]
-    spread = across[first] - across[second] + np.diag(spreads[: len(off)])
-    gain = np.linalg.solve(spread, across.T).T
-    less = covariance - gain @ across.T
-    square = float(off @ np.linalg.solve(spread, off))
-    return mean - gain @ off, (less + less.T) / 2, square
+    root = np.linalg.cholesky(across[first] - across[second] + np.diag(spreads[: len(off)]))
+    white = np.linalg.solve(root, across.T)
+    misfit = np.linalg.solve(root, off)
+    less = white.T @ white  # symmetric
+    return mean - misfit @ white, np.subtract(covariance, less, out=less), float(misfit @ misfit)
 
 
 def first_pose() -> tuple[Array, Array]:
