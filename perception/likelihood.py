@@ -12,10 +12,10 @@ distances into densities:
 
 - p(o|x), the density of image o at place x. The squared distance from o to the nearest image of x
   is modelled as a sum of `dimensions` squared Gaussian deviations of equal variance. Its mean and
-  variance are fitted to the distances from each remembered image to the nearest other image of its
-  place, or of any place if each place has one image (moment matching, Satterthwaite 1946). So
-  `dimensions` is the number of beams that vary independently. It is smaller than the number of
-  beams.
+  variance are those of the squared distances from each remembered image to the nearest other image
+  of its place (moment matching, Satterthwaite 1946). If each place has one image, the nearest image
+  of any place is taken. So `dimensions` is the number of beams that vary independently. It is
+  smaller than the number of beams.
 - p(o|novel), the density of an unknown appearance. It is a Gaussian around the mean of all
   remembered images, with their spread.
 - p(o|nowhere) = (sum over places x of p(o|x) + p(o|novel)) / (places + 1), the density at an

@@ -41,8 +41,8 @@ LAMPS, LAMPLIGHT = 0.3, np.array([1.15, 1.0, 0.7])
 DAYLIGHT, SUNRISE = np.array([0.95, 1.0, 1.1]), np.array([1.3, 0.95, 0.6])
 # Share by which a wall is brighter facing the sun at noon, and darker facing away.
 SIDEWAYS = 0.35
-# Pixel value of a wall of albedo 1 at noon without adaptation, and mean value to which a camera
-# adapts, which is that of a grey wall at noon.
+# Pixel value of a wall of albedo 1 at noon, if the camera does not adapt. Mean pixel value to which
+# a camera adapts: that of a grey wall at noon.
 WHITE_VALUE, GREY_VALUE = 330.0, 120.0
 # Number of waves in the pattern of a texture.
 WAVES = 6

@@ -25,8 +25,8 @@ from ssh_abduction.data.odometry import displacement_between, moved
 # their distances differ by at most this factor. In a drive, they grow with the number of steps. If
 # two sources of odometry alternate, the lower quartile is that of one source.
 LAGS, ALIKE = (2, 4, 8), 1.3
-# Good logs have matches that fail in at most 1.5 % of the scans, and matches that contradict the
-# odometer (chi-square above CONTRADICTS, three degrees of freedom) in at most 2 % of the steps.
+# In good logs, matches fail in at most 1.5 % of the scans, and contradict the odometer in at most
+# 2 % of the steps. A contradiction is a chi-square above CONTRADICTS (three degrees of freedom).
 FAILING, OVERRIDING, CONTRADICTS = 0.05, 0.08, 25.0
 # A log is refused if more than this share of its scans fails to match.
 HOPELESS = 0.5

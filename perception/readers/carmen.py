@@ -24,9 +24,9 @@ range means "nothing near". The second pass yields the scans. There are four cas
 - The first ODOM line after each scan repeats the pose of the scan, although the ODOM line before
   the scan had another pose. Then the poses of the scans are corrected. GMapping writes such logs,
   with a NEFF line after each scan. Its ODOM lines add the motions of the odometer to the corrected
-  pose of the last scan. Odometry is computed by adding up these motions, from the line that repeats
-  a pose to the last line before the next scan, which has the same time as that scan. The jump from
-  that line to the pose of the scan is a correction, and is left out.
+  pose of the last scan. Odometry is computed by adding up these motions: from the line that repeats
+  a pose to the last line before the next scan. That line has the time of the next scan. The jump
+  from that line to the pose of the next scan is a correction, and is left out.
 - The difference between the two poses of a scan varies widely. Then the first pose is corrected,
   and the second is the odometer's.
 - Otherwise, the second pose is the odometer's. The first is the laser's, or equals the second.

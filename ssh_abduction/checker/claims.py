@@ -190,9 +190,9 @@ class _Claims:
         """Check the maps of an answer that also lists maps above the minimum.
 
         The level of a map is its number of dstates, or of the first other count that the theory
-        minimises, except excuses. The maps must be sorted by level, no level may exceed the minimum
-        by more than `within`, maps of one level must be equally good, and each map and each level
-        must have the claimed cost.
+        minimises, except excuses. The maps must be sorted by level. No level may exceed the minimum
+        by more than `within`. Maps of one level must be equally good. Each map and each level must
+        have the claimed cost.
         """
         counted = next((name for name in self.theory.priorities if name != "excuses"), None)
         if not is_whole(within) or within < 0:

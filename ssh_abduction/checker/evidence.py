@@ -176,9 +176,8 @@ def planar(m: Reading) -> Found:
 def _may_show_the_same(one: Star, other: Star) -> bool:
     """Tell whether two stars may show the same gateways, seen by a robot that has not turned.
 
-    They may if the gateways of the two stars can be matched in pairs such that the bearings of a
-    pair differ by no more than their spreads, and each gateway that is seen open in one star is in
-    a pair.
+    To test this, pair gateways of one star with gateways of the other. The bearings of a pair may
+    differ by at most the sum of their spreads. Each gateway that is seen open must be in a pair.
     """
     import numpy as np
     from scipy.optimize import linear_sum_assignment

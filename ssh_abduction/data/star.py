@@ -177,8 +177,8 @@ class Star:
     def openings(self) -> Openings | None:
         """Four flags: is there a gateway ahead, right, back and left? Or None.
 
-        It is None if a gateway was not observed or is in none of these directions, if two gateways
-        are in one direction, or if two that are declared opposite are not straight opposite.
+        None in these cases: a gateway was not observed or is in none of these directions; two
+        gateways are in one direction; or two gateways are declared opposite without being so.
         """
         found: dict[int, int] = {}
         for k, gateway in enumerate(self.gateways):

@@ -21,8 +21,8 @@ class Chances:
             example, a person stands in front of the laser, or an image got the wrong view.
         slipped: Probability that the action does not lead where the link of the map says: it
             failed, or the robot was kidnapped.
-        unmapped: Probability that the robot is at no dstate of the map, if nothing is known of
-            where it is: at the start, after a slip, and after an action that has no link.
+        unmapped: Probability that the robot is at no dstate of the map if its position is unknown:
+            at the start, after a slip, and after an action that has no link.
         reentered: Probability that a robot at no dstate of the map is at one after its next action.
     """
 

@@ -260,8 +260,8 @@ class Localiser:
         """Compute the belief after an action and before the observation: the sum in equation 2."""
         chances, p = self.chances, belief.probabilities
         links = self._moves.links(move)
-        # `anywhere` is the probability that the robot was in the map, and that no link leads to
-        # where it is now: the action slipped, or has no link.
+        # `anywhere` is the probability that the robot was in the map and that the action slipped or
+        # has no link. Then the map does not say where the robot is now.
         if links is None:
             moved, anywhere = np.zeros(self._number), 1 - belief.nowhere
         else:

@@ -25,8 +25,9 @@ Streets: TypeAlias = Mapping[tuple[int, int], tuple[float, float]]
 _Condition: TypeAlias = tuple[dict[int, float], float]
 _Points: TypeAlias = NDArray[np.float64]
 
-# Costs; a unit of a street's length costs 1. ASTRAY is for each unit that a street leaves its
-# heading, SHORT for each unit that it is too short, CROSSING for two streets that overlap or cross.
+# Costs. A unit of a street's length costs 1. Each unit by which a street leaves its heading costs
+# ASTRAY, and each unit by which it is too short costs SHORT. Two streets that overlap or cross cost
+# CROSSING.
 ASTRAY, SHORT, CROSSING = 300.0, 600.0, 60.0
 LOOSE = 0.001  # the factor for the costs of a street that the robot never travelled
 CROOKED = 0.1  # a street that leaves its heading by more units than this looks bent

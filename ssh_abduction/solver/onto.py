@@ -236,8 +236,8 @@ def _broken(
 ) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
     """Find what a map of a digest and a new drive changes in the existing map.
 
-    Returns pairs of its dstates that are merged (a dstate that is split is paired with itself); and
-    pairs of dstates whose places are merged, or split.
+    Returns pairs of dstates of the existing map that are merged, and pairs of dstates whose places
+    are merged or split. A dstate that is split is paired with itself.
     """
     number: dict[int, int] = {}
     split = {

@@ -148,9 +148,9 @@ def noise_warning(ssh_map: SSHMap, trace: Trace) -> str | None:
         return None
     how, noise = ("smaller", "tight") if factor > 1 else ("larger", "loose")
     return (
-        f"the noise model of the odometry is too {noise}: the best map closes with a chi-square of "
-        f"{fit.chi2:.0f} where {fit.dof} is expected, "
-        f"so its standard deviations are {_times(factor)} {how} than the errors; multiply them by "
+        f"the noise model of the odometry is too {noise}: the best map fits with a chi-square of "
+        f"{fit.chi2:.0f}, where {fit.dof} is expected. "
+        f"So its standard deviations are {_times(factor)} {how} than the errors; multiply them by "
         f"{factor:.2g}"
     )
 

@@ -71,11 +71,11 @@ class Theory:
         next_place: Whether a travel leads to the next place of its path, with no place between.
         all_on_paths: Whether every dstate is on a path, even one where no travel starts or ends.
         star: How to use stars (the gateways seen at a place). none: not at all. alike: a dstate has
-            one star, within tolerance. pattern: the stars of a place are equal up to some rotation.
-            frame: they are equal when each is rotated by the heading of its dstate, and paths go
-            straight on. gateways: like frame, but gateways may lie at any angles, which are
-            compared within a tolerance. auto: frame if the trace has stars, else none. If stars or
-            turns do not fit right angles, frame becomes gateways.
+            one star, within a tolerance. pattern: a place has one star, up to rotation. frame: a
+            place has one star, rotated by the robot's heading; gateways are at right angles, and
+            paths go straight on. gateways: like frame, but with gateways at any angles, within a
+            tolerance. auto: frame if the trace has stars, else none; frame becomes gateways if
+            stars or turns do not fit right angles.
         displacement: Whether displacements are evidence; auto uses them if the trace has any.
         reject: Significance level: the largest probability of rejecting the true map because of
             its displacements.
@@ -290,8 +290,8 @@ class Theory:
     def demands(self) -> frozenset[str]:
         """The names of all that a speed-up must respect.
 
-        These are the hard axioms, "NAME, excusable" for each other axiom, "asserted same" if the
-        user asserts that steps are one dstate, "the rules of FILE" for the user's own rules, and
+        These are the names of hard axioms, and "NAME, excusable" for each other axiom; "asserted
+        same" if steps are asserted to be one dstate; "the rules of FILE" for the user's rules; and
         "the field NAME" for each changed field that no axiom covers.
         """
         excusable = {f"{name}, excusable" for name in set(self.axioms) - self.hard}

@@ -20,8 +20,8 @@ from ssh_abduction.solver.asp.facts import further_rules, path_reader
 from ssh_abduction.solver.sharing import Sort
 
 Answer = TypeVar("Answer")
-# The sort of thing that may be shared, two steps or dstates, and what the doubt says: that they
-# share it (True), or that they do not (False).
+# A sort of thing (such as "places"), two steps or dstates, and a claim: they share a thing of this
+# sort (True), or they do not (False).
 Doubt: TypeAlias = tuple[Sort, int, int, bool]
 
 
@@ -36,8 +36,8 @@ class Doubts:
     ) -> None:
         """Begin without any doubt.
 
-        Given a sort and two steps (or dstates), `condition` returns the body of a rule, which says
-        that they share a thing of that sort; None if they never do.
+        `condition` takes a sort and two steps (or dstates). It returns the body of a rule that is
+        true if they share a thing of this sort; None if they never do.
         """
         self._asker, self._control, self._condition = asker, control, condition
         self._number_of: dict[Doubt, int] = {}  # the number of each doubt that clingo has

@@ -12,8 +12,8 @@ and places that fit these dstates (`engines/framed_paths.py`).
 
 *Claim.* Every map of the topological theory determines an answer of visits.lp: the one in which the
 same visits are at one place. So the fewest dstates of visits.lp are a lower bound. If paths fit
-some answer of that cost, then all minimal maps are among the answers of that cost, with the fewest
-paths that fit them.
+some answer with so few dstates, then each minimal map is such an answer, with the fewest paths that
+fit.
 
 *If no paths fit an answer*, paths_framed.lp is asked for a path that the answer contradicts.
 sides_framed.lp then adds the axioms of order and sides for that path. Perhaps no single path is

@@ -6,9 +6,9 @@ direction. The framed engine uses this module. Clingo is asked which visits are 
 fewer, and lists all labels with that number of dstates. `engines/framed.py` checks them by the
 axioms of order and sides.
 
-Names, as in `engines/named_labels.py`, help little if there are many dstates with few visits: what
-clingo learns about one spare name, it has to learn again about the next one, and each node of the
-view may have each of the names. An equality of two visits, in contrast, is only about these two. A
+Names, as in `engines/named_labels.py`, help little if there are many dstates with few visits. What
+clingo learns about one spare name, it has to learn again about the next one. And each node of a
+view may have each of its names. An equality of two visits, in contrast, is only about these two. A
 node is *first* if no node before it, in an order of choice, is at its dstate. So the number of
 dstates is the number of first nodes.
 

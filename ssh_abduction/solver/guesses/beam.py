@@ -60,7 +60,7 @@ SPARE = 2
 # A false join to a place that looks alike saves some dstates until the drive leads on.
 UNSURE = 60.0
 # With several drives or floors, fit the poses anew if a step adds more than this many nats of
-# misfit: then a return turns or moves other poses by more than a little.
+# misfit. Then a return clearly turns or moves other poses.
 STRAINED = 1.0
 
 

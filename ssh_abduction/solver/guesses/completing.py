@@ -45,8 +45,8 @@ def completed(
 
     `labels` has the dstate of each step, and `places` the place of each dstate, which a causal
     theory ignores. `facing` has the heading of each dstate in radians, counterclockwise, for
-    star=frame. Returns None if an action leads from one dstate to two, if a path would be a circle,
-    if a dstate would face both directions of its path, or if the stars fit no frames.
+    star=frame. Returns None in these cases: an action leads from one dstate to two, a path would be
+    a circle, a dstate would face both directions of its path, or the stars fit no frames.
     """
     links: dict[tuple[int, str], int] = {}
     for here, action, there in zip(labels, trace.actions, labels[1:], strict=False):

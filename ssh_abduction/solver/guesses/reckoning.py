@@ -32,8 +32,8 @@ Array: TypeAlias = NDArray[np.float64]
 BLUR = 1e-6
 # The standard deviations, in metres and radians, of a move without a displacement.
 UNKNOWN = (1e3, 1e3, 3.0)
-# The standard deviation of the sum of all turns, in radians, above which equations are not linear
-# enough: they then miss the position of a robot that drives on for 10 m by about 0.5 m.
+# If the standard deviation of the sum of all turns exceeds this, in radians, linear equations are
+# too rough: if the robot drives on for 10 m, they miss its position by about 0.5 m.
 ROUGH = 0.3
 # The indices of the first entries of the means: the errors of the scale and of the drift of the
 # odometry, in standard deviations.

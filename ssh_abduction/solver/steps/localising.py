@@ -5,9 +5,9 @@ small world, clingo does not need every visit: a map of some visits locates the 
 Markov localisation in which a belief is the set of possible *states* of a visit. A state is a
 placing as a number: the place, and the slot there that is slot 0 of the visit. The map says where
 the action of a visit leads from each possible state. That gives the possible states of the next
-visit. A visit is *missed* if none of its possible states fits what it shows, if the map does not
-know the action that leads to it, or if it faces a slot that no visit of the map faced. Then the map
-needs this visit, and enough visits before it to localise it.
+visit. A visit is *missed* in each of these cases: none of its possible states fits what it shows,
+the map has no link for the action that leads to it, or it faces a slot that no visit of the map
+faced. Then the map needs this visit, and enough visits before it to localise it.
 """
 
 from __future__ import annotations

@@ -28,10 +28,9 @@ from ssh_abduction.data.trace import Trace
 LEAST = 20
 # A step is noise only if at least this share of the steps up to it are dstates of their own.
 MOST = 0.5
-# A step is noise only if the clique up to the step is much larger than two others, which have at
-# most this share of its size: the clique of the steps before, and the clique of the whole trace
-# without the step. A step that doubles the clique is no exploration, as exploring adds at most one
-# dstate a step.
+# A step is noise only if two cliques have at most this share of the size of the clique up to the
+# step: the clique of the steps before, and the clique of the whole trace without the step. A step
+# that doubles the clique is no exploration, as exploring adds at most one dstate a step.
 FALL = 0.5
 
 

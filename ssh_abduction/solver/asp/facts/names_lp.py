@@ -60,9 +60,9 @@ def batch_facts(
 ) -> str:
     """Return the facts for one batch of nodes.
 
-    Each node has its number, its view, the names that it can have, and the last node of that view
-    that was given before, or None. `links` are triples of a node, an action, and the node that it
-    leads to. Nodes that are `apart` are different dstates.
+    Each node has its number, its view, the names that it can have, and the last node with this view
+    that clingo has already (or None). `links` are triples of a node, an action, and the node that
+    the action leads to. Nodes that are `apart` are different dstates.
     """
     facts = []
     for t, view, names, before in nodes:

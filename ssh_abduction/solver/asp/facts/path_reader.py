@@ -32,8 +32,8 @@ class PathAnswer:
     """The places and paths in an answer of paths_framed.lp or paths_frameless.lp.
 
     Attributes:
-        at: For each group of dstates that turns join: the place of the map that it belongs to, and
-            by how many quarters clockwise its frame is rotated from the frame of that place.
+        at: For each group of dstates that turns join: its place in the map, and the rotation from
+            the frame of this place to the frame of the group, in quarters clockwise.
         part: For each segment, its path, and its direction on the path (1 or -1).
         order: For each path, its places in order.
     """

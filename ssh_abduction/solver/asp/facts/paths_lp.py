@@ -88,8 +88,8 @@ def paths_frameless_facts(
 def read_contrary(model: Model) -> tuple[list[int], list[int]]:
     """Read the dstates that show that the labels have no places and paths.
 
-    Returns a dstate of each segment that shows it, the shortest segment first; and the dstates at
-    which two paths cross that seem to meet again.
+    Returns a dstate of each segment that shows it, the shortest segment first. Also returns the
+    dstates at which two paths cross, if these paths seem to meet again.
     """
     atoms = list(map(read_atom, model.symbols(shown=True)))
     contrary = sorted((args[1], args[0]) for name, args in atoms if name == "contrary")
