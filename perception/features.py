@@ -136,7 +136,7 @@ def strongest(shares: ArrayLike, most: float = 0.5) -> str:
 def _neighbours(
     images: Floats, second: NDArray[np.bool_]
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """For each image, the nearest other image of its dstate, and the nearest of the other."""
+    """For each image, the nearest other image of its dstate, and of the other dstate."""
     distances = cdist(images, images)
     np.fill_diagonal(distances, np.inf)
     same = second[:, None] == second

@@ -394,7 +394,7 @@ def moves_unseen(log: RobotLog) -> bool:
 
 
 def shows_motion(first: Scan, last: Scan) -> bool:
-    """Whether so many beams changed between two scans that the robot moved."""
+    """Whether enough beams changed between two scans to show that the robot moved."""
     return _change(first, last) > MOVED
 
 

@@ -167,7 +167,7 @@ def _maps_of(options: argparse.Namespace) -> tuple[str | None, Theory | None, An
 
 
 def _listing_of(file: str | None, data: Any, steps: int) -> Listing | None:
-    """Read the maps in the data of a file; None if there are none of a trace of so many steps."""
+    """Read the maps in the data of a file; None if it has no maps of a trace with `steps` steps."""
     if file is None or not data.get("maps"):
         return None
     from ssh_abduction.rivals.listing import Listing  # loads numpy

@@ -83,7 +83,7 @@ class Guard:
         self._signals.close()
 
     def say(self, text: Callable[[], str]) -> None:
-        """Make a text and print it. The last words on Ctrl-C are never printed inside it."""
+        """Make a text and print it. The last words on Ctrl-C come after it, never inside it."""
         self._printer.say(text)
 
     def _watch(self) -> None:

@@ -134,7 +134,7 @@ class TraceExplanation:
 
 
 class TraceQuestion(LimitedQuestion[TraceExplanation]):
-    """The search for the answer of `explain_trace`. Parameters are as there."""
+    """The search for the answer of `explain_trace`, with the same parameters."""
 
     def __init__(
         self,

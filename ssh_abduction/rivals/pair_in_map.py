@@ -57,5 +57,5 @@ class PairInMap:
         return text
 
     def to_dict(self) -> dict[str, Any]:
-        """Return it as plain data."""
+        """Return the pair as plain data."""
         return {"same_place": self.is_one_place, "probability": self.probability, "nats": self.nats}

@@ -35,8 +35,9 @@ WITH_DISPLACEMENTS: tuple[Count, ...] = ("dstates", "places", "paths")
 # The default prices of a dstate, a place and a path, in nats (docs/measurements/truth.md says how
 # they were chosen), and the highest price.
 PRICES = (8.0, 8.0, 0.0)
-# Laying a drive on others costs as much as LAID dstates at places of their own, as so many coincide
-# by chance: only one with star=alike, which compares bearings (docs/measurements/truth.md).
+# Laying a drive on others costs as much as LAID dstates and their places, because that many may
+# look alike by chance. With star=alike, which compares bearings, it costs as much as one dstate and
+# its place (docs/measurements/truth.md).
 LAID = 2
 DEAREST_PRICE = 1e6
 # The axioms that a fault of each kind may break. Speed-ups cannot rely on them.

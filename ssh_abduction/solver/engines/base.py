@@ -112,7 +112,7 @@ class Engine(Protocol):
         ...
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
-        """Yield the maps of the prefix that have this cost: `enough` of them, or all if it is 0."""
+        """Yield `enough` maps of the prefix with this cost, or all of them if `enough` is 0."""
         ...
 
     def forbid(self, equalities: Collection[Equality]) -> bool:

@@ -12,8 +12,8 @@ and places that fit these dstates (`engines/framed_paths.py`).
 
 *Claim.* Every map of the topological theory determines an answer of visits.lp: the one in which the
 same visits are at one place. So the fewest dstates of visits.lp are a lower bound. If paths fit
-some answer with so few dstates, then each minimal map is such an answer, with the fewest paths that
-fit.
+some answer with that number of dstates, then each minimal map is such an answer, with the fewest
+paths that fit.
 
 *If no paths fit an answer*, paths_framed.lp is asked for a path that the answer contradicts.
 sides_framed.lp then adds the axioms of order and sides for that path. Perhaps no single path is
@@ -154,7 +154,7 @@ class FramedEngine:
         return self._fitting.separate(chart, merged(chart, guess=guess, settles=False))
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
-        """Yield the maps of the prefix that have this cost: `enough` of them, or all if it is 0."""
+        """Yield `enough` maps of the prefix with this cost, or all of them if `enough` is 0."""
         if not self._framed:
             return
         mode = listing(cost)

@@ -113,7 +113,7 @@ class Chart:
 
     @staticmethod
     def around(trace: Trace, log: Log, size: int) -> dict[int, list[int]] | None:
-        """For each observation, find those ahead, right, back and left of a robot that makes it.
+        """For each observation, find what the robot there sees ahead, right, back and left.
 
         Returns None if some action is neither turn nor travel, if a turn leads from one observation
         to two different ones, or if some of the four observations are unknown.
