@@ -35,7 +35,7 @@ TOOLS = (OURS, *PEERS)
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument(
-        "--limit", type=float, default=60, metavar="S", help="seconds a cell has (default 60)"
+        "--limit", type=float, default=60, metavar="S", help="seconds per cell (default 60)"
     )
     parser.add_argument(
         "--memory",

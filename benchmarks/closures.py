@@ -107,7 +107,7 @@ def pairs_line(name: str, closures: int, sides: list[dict[str, int]]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("logs", nargs="+", type=Path, help="logs with corrected or true poses")
-    parser.add_argument("--drift", type=float, help="drift in radians a metre without closures")
+    parser.add_argument("--drift", type=float, help="drift in radians per metre without closures")
     parser.add_argument(
         "--sigma", type=float, default=0.03, help="error of corrected poses in metres"
     )

@@ -88,7 +88,7 @@ def main() -> None:
         "--first", type=int, default=500, metavar="SEED", help="the first seed (default 500)"
     )
     parser.add_argument(
-        "--limit", type=float, default=60, metavar="S", help="CPU seconds a cell has (default 60)"
+        "--limit", type=float, default=60, metavar="S", help="CPU seconds per cell (default 60)"
     )
     parser.add_argument(
         "--memory",

@@ -317,7 +317,7 @@ Saved = dict[str, dict[str, list[list[Judged]]]]  # by part and case: of each se
 
 HEAD = (
     "\n{}\n\n| world | belief over | localised after | in | found after being carried | in | right "
-    "| sure and wrong | map, kB | belief, kB | CPU ms a step | map made in, CPU s |\n"
+    "| sure and wrong | map, kB | belief, kB | CPU ms per step | map made in, CPU s |\n"
     "|---|---|---|---|---|---|---|---|---|---|---|---|"
 )
 

@@ -64,7 +64,7 @@ def simulated(world: str) -> None:
     began = time.perf_counter()
     steps = len(simulate(room, tours=5))
     print(
-        f"{world:18} {steps / (time.perf_counter() - began):9,.0f} dstates a second, driving",
+        f"{world:18} {steps / (time.perf_counter() - began):9,.0f} dstates per second, driving",
         flush=True,
     )
 
@@ -90,7 +90,9 @@ def queries(kind: str, count: int) -> None:
     began = time.perf_counter()
     recogniser.predict(images[count:])
     seconds = time.perf_counter() - began
-    print(f"{kind:9} {count:7,} images known: {2_000 / seconds:9,.0f} queries a second", flush=True)
+    print(
+        f"{kind:9} {count:7,} images known: {2_000 / seconds:9,.0f} queries per second", flush=True
+    )
 
 
 def main() -> None:

@@ -374,7 +374,7 @@ def spliced(drives: Sequence[Sequence[Step]], images: NDArray[np.float64]) -> Tr
 
 def part_speed(seeds: range) -> None:
     """Print the table of localising speed, in steps per second."""
-    print("| dstates | views | steps | CPU seconds | steps a second | made in, CPU seconds |")
+    print("| dstates | views | steps | CPU seconds | steps per second | made in, CPU seconds |")
     print("|---|---|---|---|---|---|")
     for dstates, views in ((100, 10), (1_000, 10), (10_000, 10), (10_000, 1_000), (10_000, 10_000)):
         chance = random.Random(seeds[0])

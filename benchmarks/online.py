@@ -50,7 +50,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--steps", type=int, default=1000, help="actions of the robot")
     parser.add_argument("--size", type=int, default=10, help="cells on a side of the maze")
-    parser.add_argument("--limit", type=float, default=0.5, help="seconds a step may take")
+    parser.add_argument("--limit", type=float, default=0.5, help="seconds that a step may take")
     parser.add_argument("--seed", type=int, default=0, help="seed of the maze and the walk")
     parser.add_argument("--drive", type=float, default=0.05, help="seconds between two steps")
     parser.add_argument("--odometry", choices=NOISE, help="noise of displacements")

@@ -79,7 +79,7 @@ def main() -> None:
     for name, default in numbers.items():
         parser.add_argument(f"--{name}", type=int, default=default, metavar="N")
     parser.add_argument("--displacements", action="store_true", help="give displacements, no looks")
-    parser.add_argument("--limit", type=float, default=60, metavar="S", help="seconds a drive")
+    parser.add_argument("--limit", type=float, default=60, metavar="S", help="seconds per drive")
     options = parser.parse_args()
     print("| maze | dstates | second drive, s | last drive, s | ratio | true |")
     print("|---|--:|--:|--:|--:|---|")

@@ -43,7 +43,7 @@ def block(name: str, results: dict[str, Any], path: Path) -> str:
     if name == "pruning":
         seeds = f"{results['seeds']} seeds where no other number is named"
         return f"{pruning.table(results)}\n\n{measured}, {seeds}. {stored}"
-    limits = f"{results['limit']:g} s and {results['memory']:,} MiB a cell"
+    limits = f"{results['limit']:g} s and {results['memory']:,} MiB per cell"
     seeds = (
         "one trace of each kind"
         if results["seeds"] == 1

@@ -61,7 +61,7 @@ COLUMNS = (
     "map right in the end",
     "fault found: first map, any",
     "truth dearer",
-    "CPU ms a step: median, mean, most",
+    "CPU ms per step: median, mean, most",
 )
 Record = dict[str, Any]
 
@@ -133,7 +133,7 @@ def main() -> None:
         type=float,
         default=0.5,
         metavar="S",
-        help="seconds a step may take (default 0.5)",
+        help="seconds that a step may take (default 0.5)",
     )
     parser.add_argument(
         "--drive",

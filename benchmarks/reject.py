@@ -76,7 +76,7 @@ def main() -> None:
                 refused[line, column] += 1
     print(
         f"| `reject` | white noise only | with {100 * MODEL.scale:g} % scale and "
-        f"{np.degrees(MODEL.bend):.1g} degrees a metre |\n|---|---|---|"
+        f"{np.degrees(MODEL.bend):.1g} degrees per metre |\n|---|---|---|"
     )
     for reject, counts in zip(REJECTS, refused / options.routes, strict=True):
         print(f"| {reject:g} | {counts[0]:.3f} | {counts[1]:.3f} |")

@@ -5,7 +5,7 @@
 A robot drives at random through a grid of corridors, and its scans are given to `import_live` one
 at a time. The script prints a table in Markdown. The time is the CPU time without the simulation:
 of the track with the places, of the trace with its closures, and of the views. The ratio is that of
-the time of the drive to the time of the whole import. The robot drives SPEED metres a second.
+the time of the drive to the time of the whole import. The robot drives SPEED metres per second.
 Memory is the growth of the largest resident set since the imports, so each drive has a process of
 its own. The delay is in metres from the end of a visit, by the odometer, until it is final.
 """

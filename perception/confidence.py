@@ -154,7 +154,7 @@ def _checked(X: ArrayLike, labels: ArrayLike) -> tuple[NDArray[np.float64], NDAr
     of = np.asarray(labels)
     if of.shape != (len(images),) or not np.issubdtype(of.dtype, np.integer):
         raise PerceptionError(
-            f"labels: expected {len(images)} whole numbers, one an image, got an array of "
+            f"labels: expected {len(images)} whole numbers, one per image, got an array of "
             f"shape {of.shape}; give one label for each image"
         )
     return images, of.astype(np.intp)

@@ -83,7 +83,7 @@ def telling_features(
     of = np.asarray(labels)
     if of.shape != (len(images),):
         raise PerceptionError(
-            f"labels: expected {len(images)}, one an image, got an array of shape {of.shape}; "
+            f"labels: expected {len(images)}, one per image, got an array of shape {of.shape}; "
             "give one label for each image"
         )
     if a == b:

@@ -18,7 +18,7 @@ LARGEST = 4 * 2**30
 
 
 def images_of(trace: Trace) -> NDArray[np.float64]:
-    """Collect the images of all steps: (n, d) ranges in metres, one row a step.
+    """Collect the images of all steps: (n, d) ranges in metres, one row per step.
 
     An image is in the trace itself or in its sidecar file. This is a .npy file, or a .npz file
     with one array or with an array named `images`. Raises PerceptionError if a step has no

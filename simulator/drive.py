@@ -22,7 +22,7 @@ from simulator.world import World
 from ssh_abduction.data.errors import brief, is_finite
 
 Array = NDArray[np.float64]
-# Speed of driving in metres a second, and of turning in radians a second.
+# Speed of driving in metres per second, and of turning in radians per second.
 SPEED, SPIN = 0.5, 1.0
 # Default and smallest distance between scans in metres.
 EVERY, CLOSEST = 0.25, 0.01

@@ -33,7 +33,7 @@ def reported(
 
     A displacement is metres ahead and to the left, and radians turned. The noise is drawn with
     the covariance of the odometry. Reported distances are too long by the share `scale`. The
-    reported heading drifts to the left by `bend` radians a metre.
+    reported heading drifts to the left by `bend` radians per metre.
     """
     dx, dy, turned = displacement
     drift = bend * math.hypot(dx, dy)

@@ -85,7 +85,7 @@ def read_occupancy(path: Path) -> tuple[str, NDArray[np.float64]]:
     if fields.resolution * max(cells.shape) > FARTHEST:
         raise SimulatorError(
             f"{named(path)}: resolution: expected a map of at most {FARTHEST:,.0f} m, got "
-            f"{fields.resolution} m a pixel; mend it"
+            f"{fields.resolution} m per pixel; mend it"
         )
     occupied = cells == OCCUPIED
     between = int(((cells > FREE) & ~occupied).sum())
@@ -247,7 +247,7 @@ class _MapFileReader:
     def _resolution(self) -> float:
         number = self._number(self.fields.get("resolution"))
         if not 0 < number <= FARTHEST:
-            raise self._wrong("resolution", "metres a pixel, above 0")
+            raise self._wrong("resolution", "metres per pixel, above 0")
         return number
 
     def _origin(self) -> tuple[float, float, float]:
@@ -324,7 +324,7 @@ def _shades(
     """
     if image.mode == "F":
         raise ValueError("pixels that are floating-point numbers, for which map_server has no rule")
-    if image.mode.startswith("I"):  # Grey, 16 bits a pixel.
+    if image.mode.startswith("I"):  # Grey, 16 bits per pixel.
         return np.asarray(image, dtype=np.float64) / 65535, True
     has_alpha = image.has_transparency_data
     table = np.asarray(image.convert("RGBA" if has_alpha else "RGB"))

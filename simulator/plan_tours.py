@@ -92,7 +92,7 @@ def tour(
             mend="make one with Odometry(), or leave it out",
         )
     a_number("scale", scale, SimulatorError, -1, 1, what="a share")
-    a_number("bend", bend, SimulatorError, -1, 1, what="radians a metre")
+    a_number("bend", bend, SimulatorError, -1, 1, what="radians per metre")
     plan = plan.told_apart(apart)
     if len(plan.connected) < 2:
         raise SimulatorError(

@@ -13,7 +13,7 @@ from simulator.motion import Pose, displacement_between
 from ssh_abduction.data.errors import brief, is_finite
 from ssh_abduction.data.odometry import Displacement
 
-# Largest errors of odometry, as a share and in radians a metre. With larger ones, the robot does
+# Largest errors of odometry, as a share and in radians per metre. With larger ones, the robot does
 # not notice that it left a place.
 WORST = 0.5
 # Options of `simulate` for these errors.
@@ -49,7 +49,7 @@ class Body:
             value = getattr(self, name)
             if not is_finite(value) or not least <= value <= WORST:
                 unit = (
-                    f" radians a metre, which are {math.degrees(WORST):.1f} degrees"
+                    f" radians per metre, which are {math.degrees(WORST):.1f} degrees"
                     if name == "bend"
                     else ""
                 )

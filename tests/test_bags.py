@@ -292,7 +292,7 @@ def clocks(
     odometer: Callable[[float], float],
     recorded: Callable[[float], float],
 ) -> Any:
-    """Read a drive at one metre a second with these clocks of laser, odometer and recorder."""
+    """Read a drive at one metre per second with these clocks of laser, odometer and recorder."""
 
     def messages(m: Messages) -> list[tuple[str, float, Any]]:
         both = [
@@ -554,4 +554,4 @@ def test_import_takes_several_topics(tmp_path: Path, capsys: pytest.CaptureFixtu
         )
         == 1
     )
-    assert "record at least 30 beams a scan" in capsys.readouterr().err
+    assert "record at least 30 beams per scan" in capsys.readouterr().err

@@ -15,7 +15,7 @@ from perception.places.visits import Visit
 
 # The stated standard deviations of a motion, in metres and radians.
 STATED = np.array([0.02, 0.02, 0.01])
-LAPS, SIDE = 8, 20  # a square of SIDE motions of 0.5 m a side
+LAPS, SIDE = 8, 20  # a square of SIDE motions of 0.5 m per side
 
 
 def poses_of(errors: Array, drift: float) -> Array:

@@ -27,7 +27,7 @@ ROOT = Path(__file__).parent.parent
 
 
 def told(trace: Trace, truths: Sequence[Any]) -> Trace:
-    """The trace with this truth, one value a step."""
+    """The trace with this truth, one value per step."""
     return replace(
         trace,
         steps=tuple(

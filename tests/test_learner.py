@@ -194,7 +194,7 @@ def test_the_learner_is_an_estimator(run: Trace) -> None:
     np.testing.assert_array_equal(learner.predict(other), learner.predict(images_of(other)))
     with pytest.raises(LearnerError, match="y: expected the dstates of the images, got none"):
         learner.score(images_of(run))
-    with pytest.raises(LearnerError, match="y: expected 96 dstates, one an image"):
+    with pytest.raises(LearnerError, match="y: expected 96 dstates, one per image"):
         learner.score(run, [1, 2])
     broken = replace(
         other,

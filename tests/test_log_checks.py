@@ -101,7 +101,7 @@ def of_two_clocks(scans: Scans) -> Scans:
             "Record the odometry",
         ),
         (lambda scans: scans[::20], "Take all scans of the drive"),
-        (lambda scans: scans[::8], "take all scans of the drive, at least one a metre"),
+        (lambda scans: scans[::8], "take all scans of the drive, at least one per metre"),
         (lambda scans: scans[:80], "never comes back to where it was"),
     ],
 )
@@ -177,7 +177,7 @@ def test_scans_of_few_beams_are_said_to_have_too_few(
     for some, advised in ((few, True), (scans[:60], False)):
         with pytest.raises(LogError, match="got 60, and") as refused:
             import_log(RobotLog(tuple(some), source="drive"))
-        assert ("record at least 30 beams a scan" in str(refused.value)) == advised
+        assert ("record at least 30 beams per scan" in str(refused.value)) == advised
         assert "; " in str(refused.value)  # there is advice
 
 

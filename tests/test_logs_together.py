@@ -250,7 +250,7 @@ def test_logs_that_do_not_go_together_are_refused(
     [
         ([], None, "log: expected at least one log, got none"),
         (["monday.log"], None, r"log\[0\]: expected a RobotLog, got 'monday.log'"),
-        ([RobotLog(())], ["one", "two"], "name: expected 1, one a drive, got 2"),
+        ([RobotLog(())], ["one", "two"], "name: expected 1, one per drive, got 2"),
     ],
 )
 def test_map_log_says_what_it_takes(given: Any, names: Any, said: str) -> None:

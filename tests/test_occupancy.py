@@ -209,11 +209,11 @@ def test_a_map_with_yaw_is_turned_about_its_lower_left_corner(tmp_path: Path) ->
         ("image: [a, b]\nresolution: 0.1\n" + ORIGIN + TAIL, "image: expected the path"),
         (
             "image: map.pgm\n" + ORIGIN + TAIL,
-            "resolution: expected metres a pixel, above 0, got none",
+            "resolution: expected metres per pixel, above 0, got none",
         ),
         (
             "image: map.pgm\nresolution: no\n" + ORIGIN + TAIL,
-            "resolution: expected metres a pixel, above 0, got 'no'",
+            "resolution: expected metres per pixel, above 0, got 'no'",
         ),
         ("image: map.pgm\nresolution: -1\n" + ORIGIN + TAIL, "resolution: expected"),
         ("image: map.pgm\nresolution: .nan\n" + ORIGIN + TAIL, "resolution: expected"),

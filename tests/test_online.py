@@ -291,7 +291,7 @@ def test_a_limit_leaves_feasible_maps_and_sound_bounds() -> None:
         )
         bound = answer.bound.dstates
     assert mapper.solution.status is Status.FEASIBLE
-    assert mapper.searches <= half + (len(trace) - half) // 2 + 1  # fewer than one a step
+    assert mapper.searches <= half + (len(trace) - half) // 2 + 1  # fewer than one per step
 
 
 def explore(trace: Trace, mapper: OnlineMapper) -> list[Solution]:

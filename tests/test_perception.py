@@ -303,7 +303,7 @@ def test_uncertainty_is_information_over_entropy(pairs: list[tuple[int, str]]) -
 def test_uncertainty_forgives_aliasing_and_not_variability() -> None:
     assert uncertainty_coefficient([0, 0, 1, 1], ["a", "b", "c", "c"]) == pytest.approx(1)
     assert uncertainty_coefficient([0, 1, 0, 1], ["a", "a", "b", "b"]) == pytest.approx(0)
-    with pytest.raises(PerceptionError, match="truth: expected 2 states, one a view, got 1"):
+    with pytest.raises(PerceptionError, match="truth: expected 2 states, one per view, got 1"):
         uncertainty_coefficient([0, 1], ["a"])
 
 
@@ -492,7 +492,7 @@ def test_confidence_where_nothing_tells() -> None:
     assert nearest_views(alone, [*truth, -1]).tolist() == [*truth, 2]
     assert confidence(alone, [0] * 36 + [-1]).tolist() == [1] * 36 + [0]
     assert confidence(np.ones((4, 2)), [0, 0, 1, 1]).tolist() == [0.5] * 4  # all images are equal
-    with pytest.raises(PerceptionError, match="expected 36 whole numbers, one an image"):
+    with pytest.raises(PerceptionError, match="expected 36 whole numbers, one per image"):
         confidence(images, truth[1:])
     with pytest.raises(
         PerceptionError, match="expected some that are in a cluster, got 36 that are noise"
@@ -678,7 +678,7 @@ def test_the_feature_that_differs_tells_two_apart() -> None:
     [
         ([0, 0, 1, 1], (0, 0), "dstates: expected two different ones, got 0 twice"),
         ([0, 0, 1, 2], (0, 1), "dstates: expected at least two images of 1, got 1"),
-        ([0, 1], (0, 1), "labels: expected 4, one an image"),
+        ([0, 1], (0, 1), "labels: expected 4, one per image"),
     ],
 )
 def test_dstates_that_cannot_be_compared(

@@ -148,7 +148,7 @@ OTHER = Trace.from_steps("ab", [{"name": "travel", "kind": "turn", "turn": "left
         ([], None, "traces: expected at least one trace, got none"),
         ([MONDAY, "tuesday"], None, r"traces\[1\]: expected a Trace, got 'tuesday'"),
         ([MONDAY, MONDAY[:2]], None, "a different name for each drive, got 'monday' twice"),
-        ([MONDAY, TUESDAY], ["one"], "names: expected 2, one a drive, got 1"),
+        ([MONDAY, TUESDAY], ["one"], "names: expected 2, one per drive, got 1"),
         ([MONDAY, TUESDAY], ["one", 2], r"names\[1\]: expected a text, got 2"),
         ([MONDAY, WITH_STARS], None, "star: expected the same .* no stars in trace 1 and four"),
         ([WITH_STARS, BEARINGS], None, "star: .* four openings in trace 1 and bearings in trace 2"),

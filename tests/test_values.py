@@ -365,7 +365,7 @@ def saved() -> dict[str, Any]:
         ),
         ({"complete": "yes"}, "complete: expected true or false"),
         ({"count": 5}, "count: expected 4, the number of maps listed, got 5"),
-        ({"steps": 24}, r"maps\[0\].labels: expected 24, one a step, got 23"),
+        ({"steps": 24}, r"maps\[0\].labels: expected 24, one per step, got 23"),
         ({"steps": "23"}, "steps: expected an integer"),
         ({"cost": {"dstates": 18, "places": 10, "paths": 4}}, "cost: expected 19 dstates"),
         ({"bound": {"dstates": 20}}, "bound: expected at most 19 dstates"),

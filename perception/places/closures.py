@@ -25,10 +25,10 @@ SCORE, MUTUAL = 0.75, 0.5
 # Standard deviations of a reliable match, in metres and radians (docs/measurements/logs.md).
 NOISE = (0.1, 0.1, math.radians(1))
 # The covariance of the track is multiplied by INFLATED. The drifts are multiples of BEND up to
-# BENDS times it, in radians a metre. A match may be off by a chi-square of GATE (3 degrees of
+# BENDS times it, in radians per metre. A match may be off by a chi-square of GATE (3 degrees of
 # freedom).
 INFLATED, BEND, BENDS, GATE = 10.0, 2e-4, 10, 20.0
-# The drifts of the heading that are tried, in radians a metre.
+# The drifts of the heading that are tried, in radians per metre.
 DRIFTS = BEND * np.arange(-BENDS, BENDS + 1)
 # Rotations are tried in steps of TURN radians, from the least to the largest that the track allows
 # within SIGMAS standard deviations.
@@ -226,7 +226,7 @@ def without_drift(middles: Array, way: Array, drift: float) -> Array:
     Args:
         middles: (n, 2) middles in metres, according to the track.
         way: (n,) metres driven before each visit.
-        drift: The drift to remove, in radians a metre.
+        drift: The drift to remove, in radians per metre.
 
     Returns:
         (n, 3) x, y in metres and rotation of the axes in radians.

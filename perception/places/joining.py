@@ -39,7 +39,7 @@ TURNS = [k * TURN for k in range(round(math.tau / TURN))]
 
 
 def join_logs(logs: Sequence[RobotLog], parts: Sequence[Imported]) -> tuple[RobotLog, Imported]:
-    """Join logs, one a drive, by the result of `import_log` for each.
+    """Join logs, one per drive, by the result of `import_log` for each.
 
     The views are made of the images of all drives. Visits and scans are numbered over all
     drives. In the steps of the trace, `visit` counts over all drives, and `scan` within the

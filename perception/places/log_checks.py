@@ -145,8 +145,8 @@ def _about_order(log: RobotLog) -> list[str]:
     if (usual := jumps.usual_step(log)) > FAR_OFF:
         notes.append(
             f"The usual step between two scans is {usual:.0f} m by the odometry, so that they "
-            "hardly overlap. Take all scans of the drive, at least one a metre. If they are not so "
-            "far apart, the odometry does not count metres, or the log is not in order."
+            "hardly overlap. Take all scans of the drive, at least one per metre. If they are "
+            "closer together, the odometry does not count metres, or the log is not in order."
         )
     return notes
 
@@ -221,7 +221,7 @@ def advice(log: RobotLog) -> str:
     usual = jumps.usual_step(log)
     if _has_few_beams(log):
         return (
-            f"record at least {FEW_BEAMS} beams a scan, as matching needs them; these scans have "
+            f"record at least {FEW_BEAMS} beams per scan, as matching needs them; these scans have "
             f"{_beams_of(log):.0f}"
         )
     if jumps.is_missing(log):
@@ -231,8 +231,8 @@ def advice(log: RobotLog) -> str:
         )
     if usual > SPARSE:
         return (
-            f"take all scans of the drive, at least one a metre; these are {usual:.1f} m apart by "
-            "the odometry. If they are not, the odometry does not count metres"
+            f"take all scans of the drive, at least one per metre; these are {usual:.1f} m apart "
+            "by the odometry. If they are not, the odometry does not count metres"
         )
     return (
         "put the scans into the order of the drive, and check the unit of the odometry and the "

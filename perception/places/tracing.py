@@ -39,7 +39,7 @@ AHEAD = math.radians(15)
 # radians.
 FLOOR = (0.02, 0.02, 0.002)
 # Systematic errors of a track of matched scans: relative error of the scale, and drift of the
-# heading in radians a metre.
+# heading in radians per metre.
 SCALE, DRIFT = 0.01, 0.001
 # Standard deviation of the bearing of a gateway, in degrees.
 SPREAD = 16.0
@@ -58,7 +58,7 @@ def to_trace(
 ) -> Trace:
     """Make the trace of a log, without views.
 
-    There are one or two steps a visit. A step has an image, a star, the displacement from the
+    There are one or two steps per visit. A step has an image, a star, the displacement from the
     previous step, and the next action.
     """
     steps: list[Step] = []

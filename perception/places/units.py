@@ -99,7 +99,7 @@ def _length(log: RobotLog) -> tuple[float, list[str]]:
         (
             "The odometry does not count metres: its usual step between two scans would be "
             f"{usual:.0f} m. It is read as {found}, which agrees with scan matching: "
-            f"{usual / count:.2f} m a step."
+            f"{usual / count:.2f} m per step."
         )
     ]
 

@@ -122,7 +122,7 @@ def by_displacements(solution: Solution) -> Iterator[str]:
         if best.scale or best.bend:
             text += (
                 f", if reported distances are {100 * best.scale:+z.1f} % off and headings drift by "
-                f"{math.degrees(best.bend):+z.3f} degrees a metre"
+                f"{math.degrees(best.bend):+z.3f} degrees per metre"
             )
     yield text
     weights = solution.weights

@@ -308,7 +308,7 @@ def _names(traces: Sequence[Trace], names: Iterable[str] | None) -> list[str]:
         count = sum(len(drives_of(trace)) for trace in traces)
         if len(found) != count:
             raise TraceError(
-                f"names: expected {count}, one a drive, got {len(found)}; name each drive"
+                f"names: expected {count}, one per drive, got {len(found)}; name each drive"
             )
     twice = next((name for name, count in Counter(found).items() if count > 1 or not name), None)
     if twice is not None:

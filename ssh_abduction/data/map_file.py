@@ -332,7 +332,7 @@ def _fit(read: FieldReader, record: Mapping[str, Any], dstates: int) -> Fit | No
     spreads = read.each(record, "spreads", read.numbers, optional=True)
     for name, listed in (("poses", rows), ("spreads", spreads)):
         if listed and len(listed) != dstates:
-            raise read.wrong(name, f"{dstates}, one a dstate", len(listed))
+            raise read.wrong(name, f"{dstates}, one per dstate", len(listed))
     spreads = spreads or ((0.0, 0.0, 0.0),) * len(rows)
     poses = tuple(Pose(*row, spread) for row, spread in zip(rows, spreads, strict=True))
     return Fit(chi2, int(dof), p, scale, bend, poses)

@@ -157,7 +157,7 @@ class Fit:
         dof: The degrees of freedom. If the map and the noise model are right, chi2 is near dof.
         p: The probability that chi2 has this value or a larger one.
         scale: The share by which displacements are too long.
-        bend: The drift of the heading, in radians a metre.
+        bend: The drift of the heading, in radians per metre.
         poses: The poses of the dstates. The index is the id of the dstate.
     """
 

@@ -47,7 +47,7 @@ class Odometry:
         position: Error of x and of y in each step, in metres.
         angle: Error of heading in each step, in radians.
         scale: Systematic error of all lengths, as a share; it is the same in the whole trace.
-        bend: Systematic drift of heading, in radians a metre; it is the same in the whole trace.
+        bend: Systematic drift of heading, in radians per metre; it is the same in the whole trace.
         offset: Error of x and of y of a dstate (a place and a heading) at each visit, in metres.
             It does not accumulate along the way.
         facing: Error of the heading of a dstate at each visit, in radians.

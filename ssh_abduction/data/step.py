@@ -183,5 +183,5 @@ def of_actions(values: Iterable[Any] | None, name: str, actions: int) -> list[An
 def as_list(values: Any, name: str) -> list[Any]:
     """Return an iterable as a list. A text becomes a list of its letters, which are views."""
     if not isinstance(values, Iterable) or isinstance(values, bytes | Mapping):
-        raise TraceError(f"{name}: expected a list, got {brief(values)}; give one value a step")
+        raise TraceError(f"{name}: expected a list, got {brief(values)}; give one value per step")
     return list(values)

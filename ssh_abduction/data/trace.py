@@ -362,7 +362,9 @@ class Trace:
         sure = [None] * len(seen) if confidences is None else as_list(confidences, "confidences")
         for name, values in (("views", seen), ("confidences", sure)):
             if len(values) != len(self):
-                told = f"expected one a step, {len(self)}, got {len(values)}; add or leave out some"
+                told = (
+                    f"expected one per step, {len(self)}, got {len(values)}; add or leave out some"
+                )
                 raise TraceError(f"{name}: {told}")
         checked = [
             (

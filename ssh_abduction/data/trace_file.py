@@ -59,7 +59,7 @@ def read_trace(file: BinaryIO, source: str) -> dict[str, Any]:
         if len(raw) > LONGEST_LINE:
             raise TraceError(
                 f"{where}: line: expected at most {LONGEST_LINE // 2**20} MiB, got more; "
-                f"write one step a line, and big images to a sidecar file"
+                f"write one step per line, and big images to a sidecar file"
             )
         if not raw.strip():  # empty lines are allowed at the end only
             empty_line = empty_line or number
@@ -76,7 +76,7 @@ def read_trace(file: BinaryIO, source: str) -> dict[str, Any]:
     if header is None:
         raise TraceError(
             f'{source}:1: header: expected {{"format": "{FORMAT}", "version": {VERSION}}}, '
-            f"got an empty file; write the header, then a line a step"
+            f"got an empty file; write the header, then a line per step"
         )
     if not steps:
         raise TraceError(
@@ -127,7 +127,7 @@ def _record(raw: bytes, where: str) -> dict[str, Any]:
     if not isinstance(record, dict):
         raise TraceError(
             f"{where}: line: expected a JSON object in braces, got {brief(record)}; "
-            f"write one step a line"
+            f"write one step per line"
         )
     return record
 

@@ -40,7 +40,7 @@ from ssh_abduction.evaluation.trajectory import is_trajectory
 LARGEST = 2**28
 FIELDS = ("time1", "time2", "x", "y", "z", "roll", "pitch", "yaw")
 # A moment that is not between two related times may be this many seconds from the nearest time.
-# Robots that map buildings drive at most a metre a second.
+# Robots that map buildings drive at most one metre per second.
 NEAREST = 0.5
 # The length of a relation is its distance plus this many metres, as short relations have errors,
 # too. So ways along fewer relations are preferred.

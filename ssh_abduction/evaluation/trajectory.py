@@ -31,7 +31,7 @@ FIELDS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 # Files of more bytes than this are rejected.
 LARGEST = 2**28
 # A step may be this many seconds from the nearest pose, as robots that map buildings drive at most
-# a metre a second. Between two poses that are more than twice this time apart, poses are not
+# a metre per second. Between two poses that are more than twice this time apart, poses are not
 # interpolated.
 NEAREST = 0.5
 # The length of a quaternion may differ from 1 by this much, as numbers in files are rounded.

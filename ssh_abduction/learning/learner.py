@@ -188,7 +188,7 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
         true = np.asarray(self._followed(Traces.of(X), found) if y is None else y)
         if true.shape != found.shape:
             raise LearnerError(
-                f"y: expected {len(found)} dstates, one an image, "
+                f"y: expected {len(found)} dstates, one per image, "
                 f"got an array of shape {true.shape}; give one label for each image"
             )
         if not (true >= 0).any():

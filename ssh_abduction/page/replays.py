@@ -31,7 +31,7 @@ BELIEVED, LEAST = 12, 0.01
 ALPHABET = "".join(chr(c) for c in range(35, 127) if chr(c) not in "&<>\\")
 LOST = "!"  # a beam that measured nothing
 MOST = 100_000  # characters of all images of a page
-# The most beams of an image. If FEWEST beams an image are too many for the page, all images are
+# The most beams of an image. If FEWEST beams per image are too many for the page, all images are
 # left out.
 BEAMS, FEWEST = 181, 24
 PIXELS = (12, 90)  # the most rows and columns of a panorama

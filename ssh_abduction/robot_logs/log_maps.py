@@ -59,7 +59,7 @@ LONGER, PATIENCE = 4.0, 3
 FLOOR = 0.3
 # Largest number of seconds for a rung, because the ladder is only information for the reader.
 RUNG = 10.0
-# Speed of the robot in metres a second, assumed if the log has no clock. Robots whose logs have a
+# Speed of the robot in metres per second, assumed if the log has no clock. Robots whose logs have a
 # clock drove 0.2 to 0.4 on average.
 SPEED = 0.5
 # At most this many minimal maps are listed. They are ranked by how well their loops close.
@@ -417,7 +417,9 @@ def _imported(
         raise LogError("log: expected at least one log, got none; read one with read_log")
     names = [f"drive {i + 1}" for i in range(len(logs))] if name is None else list(name)
     if len(names) != len(logs):
-        raise LogError(f"name: expected {len(logs)}, one a drive, got {len(names)}; name each log")
+        raise LogError(
+            f"name: expected {len(logs)}, one per drive, got {len(names)}; name each log"
+        )
 
     def telling(drive: str) -> Callable[[str], None]:
         return lambda note: tell(f"{drive}: {note}")

@@ -469,7 +469,7 @@ def _check_steps(
     for i, ssh_map in enumerate(maps):
         if len(ssh_map.dstate_at) != steps:
             raise MapError(
-                f"{where}: maps[{i}].labels: expected {steps}, one a step, got "
+                f"{where}: maps[{i}].labels: expected {steps}, one per step, got "
                 f"{len(ssh_map.dstate_at)}; it was changed by hand"
             )
     if trace is not None:

@@ -77,8 +77,8 @@ class Loops:
         ways: Metres driven up to each step, and the sum of metres times positions, turned by S (a
             quarter turn), n x 3.
         odometry: The noise model, for errors that all displacements share.
-        bend: The drift of heading that was removed from the displacements, in radians a metre.
-        drift: The standard deviation of the drift that is left, in radians a metre.
+        bend: The drift of heading that was removed from the displacements, in radians per metre.
+        drift: The standard deviation of the drift that is left, in radians per metre.
     """
 
     poses: Array
@@ -91,7 +91,7 @@ class Loops:
 
     @staticmethod
     def of(trace: Trace, bend: float = 0.0, drift: float | None = None) -> Loops:
-        """Make the loops of a trace, without a steady drift of heading in radians a metre.
+        """Make the loops of a trace, without a steady drift of heading in radians per metre.
 
         `drift` is the standard deviation of the remaining drift; that of the odometry by
         default.
@@ -245,7 +245,7 @@ class Reckoning:
     """Dead reckoning of a trace for each drift of heading that it may have.
 
     Attributes:
-        bends: The drifts, in radians a metre. The first one is 0.
+        bends: The drifts, in radians per metre. The first one is 0.
         unlikely: The chi-square of each drift.
         begins: For each step, the earliest step with a known pose relative to it: no displacement
             is missing since then, and the heading is not lost. It does not depend on the drift, or
@@ -364,7 +364,8 @@ def _parts(trace: Trace, start: int = 0, missing: int = 0) -> Steps:
 def _sums(trace: Trace, start: int, stop: int, bends: Array, last: Array) -> Array:
     """The poses, moments and ways of steps, as in Loops: drifts x steps x COLUMNS.
 
-    `bends` are the drifts in radians a metre, `last` the row of the step before, drifts x COLUMNS.
+    `bends` are the drifts in radians per metre. `last` is the row of the step before, drifts x
+    COLUMNS.
     """
     moved, noise = np.zeros((stop - start, 3)), np.zeros((stop - start, 3, 3))
     for t in range(max(start, 1), stop):
