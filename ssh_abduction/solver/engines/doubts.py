@@ -2,13 +2,13 @@
 
 Every engine uses this. Two steps may share a dstate, place, path or course (a path in one
 direction) in all known maps, but not in some unknown map. Or they may share it in no known map, but
-in some unknown map. Either possibility is a *doubt*. Clingo gets the rule for each doubt once. Then
-it is asked for an answer in which at least one doubt of a set holds.
+in some unknown map. Either possibility is a *doubt*. Clingo is asked for an answer in which at
+least one doubt of a set holds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from contextlib import closing
 from typing import TypeAlias, TypeVar
 
@@ -40,44 +40,34 @@ class Doubts:
         true if they share a thing of this sort; None if they never do.
         """
         self._asker, self._control, self._condition = asker, control, condition
-        self._number_of: dict[Doubt, int] = {}  # the number of each doubt that clingo has
-        self._open: set[Doubt] = set()
-        self._parts = 0
+        # The number of each pair of things that clingo has, and the number of questions so far.
+        self._number_of: dict[tuple[Sort, int, int], int] = {}
+        self._questions = 0
 
     def answer(
         self, doubts: Collection[Doubt], read: Callable[[clingo.Model], Answer], mode: str
     ) -> Answer | None:
         """Return an answer, as `read` gives it, in which a doubt holds; None if there is none."""
-        doubts = set(doubts)
         if not doubts:
             return None
-        self._ground([doubt for doubt in doubts if doubt not in self._number_of])
-        for doubt in self._open ^ doubts:
-            self._control.assign_external(
-                further_rules.open_doubt(self._number_of[doubt]), doubt in doubts
-            )
-        self._open = doubts
-        assumed = [(further_rules.some_doubt(self._parts), True)]
-        with closing(
-            self._asker.answers(read, mode, 1, assumptions=assumed, control=self._control)
-        ) as answers:
-            return next(answers, None)
-
-    def _ground(self, doubts: Sequence[Doubt]) -> None:
-        """Ground the rules for doubts that clingo does not have yet."""
-        if not doubts:
-            return
-        self._parts += 1
-        rules = [further_rules.doubts_before(self._parts)]
-        for sort, i, j, one in doubts:
-            number = self._number_of[sort, i, j, one] = len(self._number_of)
-            rules.append(
-                further_rules.doubt(number, self._parts, self._condition(sort, i, j), one=one)
-            )
-        part = f"doubts_{self._parts}"
+        rules: list[str] = []
+        for sort, i, j, _ in doubts:
+            if (sort, i, j) not in self._number_of:
+                number = self._number_of[sort, i, j] = len(self._number_of)
+                rules.append(further_rules.one_in_doubt(number, self._condition(sort, i, j)))
+        numbers = [(self._number_of[sort, i, j], one) for sort, i, j, one in doubts]
+        rules.append(further_rules.some_doubt(self._questions, numbers))
+        part, asked = f"doubts_{self._questions}", further_rules.asked(self._questions)
+        self._questions += 1
         with self._asker.grounding_timed():
             self._control.add(part, [], "\n".join(rules))
             self._control.ground([(part, [])])
+        self._control.assign_external(asked, True)
+        try:
+            with closing(self._asker.answers(read, mode, 1, control=self._control)) as answers:
+                return next(answers, None)
+        finally:
+            self._control.release_external(asked)
 
 
 class Settled:

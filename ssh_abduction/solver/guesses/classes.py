@@ -8,8 +8,7 @@ earlier merges that it confirms (`guesses/merging.py`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from functools import partial
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +19,7 @@ from ssh_abduction.solver.steps.chart import Link
 
 # The demands on the merge of a step with a known dstate, from strict to lenient. The first number
 # is by how much its evidence has to exceed that for the next best merge of the step. The second
-# number is how many known dstates may fit the step at most. The last demand allows almost anything.
+# number is how many known dstates may fit the step at most. The last demand allows anything.
 DEMANDS = (
     (10, 1),
     (5, 1),
@@ -33,7 +32,7 @@ DEMANDS = (
     (1, 100),
     (0, 1),
     (0, 2),
-    (0, 1000),
+    (0, 10**9),
 )
 # When a map is thinned, the evidence for a merge of two known dstates has to exceed that for the
 # next best merge by these numbers. They are tried in this order.
@@ -77,7 +76,6 @@ class Classes:
         self._undo: list[
             tuple[int, int, bool, NDArray[np.bool_], dict[int, int], NDArray[np.int_]]
         ] = []
-        self._has_merged = False
 
     def take(self, guess: Sequence[int]) -> None:
         """Merge the steps that share a label in a guess, if they can be one dstate.
@@ -94,43 +92,25 @@ class Classes:
     def settle_all(self) -> None:
         """Merge classes with known dstates, or make them known, until every class is known."""
         for evidence, rivals in DEMANDS:
-            while self._advanced(partial(self.settle, evidence, rivals)):
+            while self._settle(evidence, rivals):
                 pass
-        while self._advanced(self.settle_at_any_rate):
-            look_at_clock()
 
     def thin_all(self) -> None:
         """Merge known dstates until no two of them can be one."""
         for evidence in THINNED:
-            while self._advanced(partial(self.thin, evidence)):
+            while self._thin(evidence):
                 pass
 
-    def _advanced(self, step: Callable[[], None]) -> bool:
-        """Call `step`, and return whether it made any merges."""
-        self._has_merged = False
-        step()
-        return self._has_merged
-
-    def make(self, a: int, b: int) -> None:
-        """Merge two classes, given by their roots. If these are equal, make the class known."""
-        if a == b:
-            self.known[a] = True
-        else:
-            self.merge(a, b, forced=True)
-        self._has_merged = True
-
-    def unsettled(self) -> NDArray[np.int_]:
-        """List the steps whose classes are not known dstates."""
-        return np.flatnonzero(~self.known[self.root])
-
-    def settle(self, evidence: int, rivals: int) -> None:
+    def _settle(self, evidence: int, rivals: int) -> bool:
         """Merge each class that is not known with its best known dstate, if that is clear enough.
 
         A class that fits no known dstate becomes known. The classes that fit the fewest known
         dstates come first. The evidence for the best dstate has to exceed that for the next by
-        `evidence`. A class that fits more than `rivals` known dstates is left as it is.
+        `evidence`. A class that fits more than `rivals` known dstates is left as it is. Returns
+        whether anything changed.
         """
-        steps = self.unsettled()
+        has_changed = False
+        steps = np.flatnonzero(~self.known[self.root])
         fitting = (~self._apart[np.flatnonzero(self.known)][:, steps]).sum(axis=0)
         for t in steps[np.argsort(fitting, kind="stable")].tolist():
             look_at_clock()
@@ -142,26 +122,19 @@ class Classes:
                 continue
             ranked = self._ranked(root, fits)
             if not ranked:
-                self.make(root, root)
+                self.known[root] = has_changed = True
             elif _is_ahead(ranked, evidence):
-                self.make(ranked[0][1], root)
+                self.merge(ranked[0][1], root, forced=True)
+                has_changed = True
+        return has_changed
 
-    def settle_at_any_rate(self) -> None:
-        """Merge the class of the first step that is not at a known dstate with the best one.
-
-        The best known dstate is the one with most evidence. If none fits, the class becomes known.
-        """
-        for t in self.unsettled()[:1].tolist():
-            root = int(self.root[t])
-            ranked = self._ranked(root, self._fitting(root))
-            self.make(ranked[0][1] if ranked else root, root)
-
-    def thin(self, evidence: int) -> None:
+    def _thin(self, evidence: int) -> bool:
         """Merge each known dstate with another one, if the evidence for that one is clear enough.
 
         Dstates with the fewest nodes come first. The evidence for the best dstate has to exceed
-        that for the next by `evidence`.
+        that for the next by `evidence`. Returns whether any were merged.
         """
+        has_merged = False
         nodes = np.bincount(self.root, self._nodes)
         for root in sorted(np.flatnonzero(self.known).tolist(), key=lambda root: nodes[root]):
             look_at_clock()
@@ -170,7 +143,9 @@ class Classes:
                     root, [dstate for dstate in self._fitting(root) if dstate != root], forced=True
                 )
                 if ranked and _is_ahead(ranked, evidence):
-                    self.make(ranked[0][1], root)
+                    self.merge(ranked[0][1], root, forced=True)
+                    has_merged = True
+        return has_merged
 
     def _fitting(self, root: int) -> list[int]:
         """List the known dstates that are apart from no step of a root's class."""

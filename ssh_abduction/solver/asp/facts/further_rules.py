@@ -39,35 +39,24 @@ def rests_on(axiom: str, t: int, other: str) -> str:
     return f":- {active(axiom, t)}, violation({other},T)."
 
 
-def doubt(number: int, part: int, condition: str | None, *, one: bool) -> str:
-    """Return the rules of a program part for a doubt whether two things, such as steps, are one.
+def one_in_doubt(number: int, condition: str | None) -> str:
+    """Return the rule that two things are one if this body of a rule holds; never if None."""
+    one = f"one_in_doubt({number})"
+    return f"{one} :- {condition}." if condition else f"#external {one}."
 
-    If the doubt is open and true in an answer, `some_doubt` is true. `condition` is the body of a
-    rule that holds if the two things are one; None if they never are. The doubt is that they are
-    one or, if `one` is False, that they are not.
+
+def some_doubt(question: int, doubts: Iterable[tuple[int, bool]]) -> str:
+    """Return the rule that some doubt holds while `asked(question)` is true.
+
+    A doubt has the number of two things, and says that they are one (True) or that they are not.
     """
-    rules = [f"#external {open_doubt(number)}."]
-    rules += (
-        [f"one_in_doubt({number}) :- {condition}."]
-        if condition
-        else [f"#external one_in_doubt({number})."]
-    )
-    return "\n".join(
-        [
-            *rules,
-            f"{some_doubt(part)} :- {open_doubt(number)}, "
-            f"{'' if one else 'not '}one_in_doubt({number}).",
-        ]
-    )
+    none = ", ".join(f"{'not ' if one else ''}one_in_doubt({n})" for n, one in doubts)
+    return f"#external {asked(question)}.\n:- {asked(question)}, {none}."
 
 
-def doubts_before(part: int) -> str:
-    """Return the rule that derives `some_doubt` of a part from `some_doubt` of the part before."""
-    return (
-        f"{some_doubt(part)} :- {some_doubt(part - 1)}."
-        if part > 1
-        else f"#external {some_doubt(0)}."
-    )
+def asked(question: int) -> Symbol:
+    """Return the external atom that is true while this question about doubts is asked."""
+    return Function("asked", number_symbols(question))
 
 
 def steps_are_one(sort: str, i: int, j: int) -> str:
@@ -82,16 +71,6 @@ def steps_are_one(sort: str, i: int, j: int) -> str:
         "paths": f"along({i},H,_), along({j},H,_)",
         "courses": f"same_course({i},{j})",
     }[sort]
-
-
-def open_doubt(number: int) -> Symbol:
-    """Return the external atom that says that a doubt is open: an answer may make it true."""
-    return Function("open_doubt", number_symbols(number))
-
-
-def some_doubt(part: int) -> Symbol:
-    """Return the atom that says that an open doubt of this program part or an earlier one holds."""
-    return Function("some_doubt", number_symbols(part))
 
 
 def exactly(number: int, count: Count) -> str:
