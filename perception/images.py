@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from perception.errors import PerceptionError
 from ssh_abduction.data.trace import Trace
 
-# Limit in bytes of an unpacked file, since a small archive may unpack to more than the
-# memory.
+# Limit in bytes of an unpacked file, since a small archive may unpack to more than the memory.
 LARGEST = 4 * 2**30
 
 

@@ -129,8 +129,7 @@ class ImageLikelihood:
     def labels(self, images: ArrayLike, unmapped: float = UNMAPPED) -> list[Any]:
         """Find the most probable place of each image, with equal priors for all known places.
 
-        It is one of `classes`, or None if an unknown place, with its prior `unmapped`, is
-        likelier.
+        It is one of `classes`, or None if an unknown place, with its prior `unmapped`, is likelier.
         """
         found = []
         for ratios in self.ratios(images):

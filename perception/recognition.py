@@ -85,8 +85,7 @@ class PlaceRecogniser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
     def distances(self, X: ArrayLike) -> NDArray[np.float64]:
         """Measure how far the nearest learnt image of each class is from each image.
 
-        Images are (n, d), finite. Distances are (n, c), Euclidean, a column for each of
-        `classes_`.
+        Images are (n, d), finite. Distances are (n, c), Euclidean, a column for each of `classes_`.
         """
         remembered, labels = self.remembered()
         found = cdist(self._images(X), remembered)

@@ -92,8 +92,7 @@ def read_occupancy(path: Path) -> tuple[str, NDArray[np.float64]]:
     if not occupied.any():
         raise SimulatorError(
             f"{named(path)}: expected walls, got a map without occupied cells ({between:,} of "
-            f"{cells.size:,} are in between, 1 to 99); "
-            f"check occupied_thresh, negate and mode"
+            f"{cells.size:,} are in between, 1 to 99); check occupied_thresh, negate and mode"
         )
     if between:
         warnings.warn(
@@ -168,8 +167,7 @@ class _MapFileReader:
         if strange := sorted(set(self.fields) - FIELDS):
             warnings.warn(
                 f"{named(self.path)}: expected the fields {', '.join(sorted(FIELDS))}, got others, "
-                "which are not read: "
-                f"{brief(', '.join(strange))}; check their spelling",
+                f"which are not read: {brief(', '.join(strange))}; check their spelling",
                 SimulatorWarning,
                 stacklevel=5,
             )

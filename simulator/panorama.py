@@ -243,7 +243,6 @@ class Camera:
         """Take a panorama.
 
         Args:
-            world: The world.
             pose: Pose of the robot: x and y in metres, heading in radians.
             rng: Source of noise.
             hour: Hour of the day, from 0 to 24.

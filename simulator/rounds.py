@@ -50,7 +50,6 @@ class Rooms:
     """Plans routes in a building: through free space in each room, and straight through doors.
 
     Args:
-        building: The building.
         radius: Radius of the robot in metres.
 
     Attributes:

@@ -64,9 +64,8 @@ class WallPositions:
     def offset(self, reach: float) -> float | None:
         """Measure how many metres the robot is to the left of the line that it should follow.
 
-        The line is the midline between two walls, or is `reach`, half the width of a
-        corridor, away from the only wall. Negative to the right. None without a wall on
-        either side.
+        The line is the midline between two walls, or is `reach`, half the width of a corridor, away
+        from the only wall. Negative to the right. None without a wall on either side.
         """
         near = 1.5 * reach
         left = self.left if self.left is not None and self.left < near else None

@@ -203,8 +203,7 @@ class Place:
     def of(cls, ranges: Array, reach: float, farthest: float) -> Place:
         """Find the place in a panorama, (360,) metres at each degree, or NaN.
 
-        `reach` is half the width of a street. The range `farthest` means that nothing was
-        seen.
+        `reach` is half the width of a street. The range `farthest` means that nothing was seen.
         """
         points, beams = points_of(np.nan_to_num(ranges, nan=farthest), AROUND, farthest)
         if not len(points):

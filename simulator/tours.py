@@ -50,7 +50,6 @@ def simulate(
     of hill-climbing.
 
     Args:
-        world: The world.
         tours: Number of tours.
         seed: Seed of all noise.
         laser: The scanner.

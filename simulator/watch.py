@@ -62,8 +62,7 @@ class DriveWatch:
     def action(self, number: int, name: str) -> Iterator[None]:
         """Watch one action, by its number in all tours, and check its end.
 
-        Raises SimulatorError if it ends at a wrong place, or a tour does not end at its
-        start.
+        Raises SimulatorError if it ends at a wrong place, or a tour does not end at its start.
         """
         before = self.driver.robot.pose
         self._home = self._home or before
@@ -80,9 +79,8 @@ class DriveWatch:
             at = self.world.places[expected]
             raise SimulatorError(
                 f"{self.world.name}: {where}: expected the robot to come to {_at(expected, at)}, "
-                f"got it {_at('', after)}, "
-                f"{math.dist(at, after[:2]):.1f} m off; so it drives another "
-                f"route{self._because(before)}"
+                f"got it {_at('', after)}, {math.dist(at, after[:2]):.1f} m off; so it drives "
+                f"another route{self._because(before)}"
             )
         if place == len(self.world.route) - 1:
             self._ended(tour, after)

@@ -171,8 +171,7 @@ def describe_cuts(log: RobotLog, track: Track, turned: list[tuple[int, float]]) 
         notes.append(
             f"The scans show nothing of what was seen before, {_times(len(track.breaks))}: from "
             f"scan {track.breaks[0]} ({_where(log, track.breaks[0])}) on. The robot may have been "
-            "carried "
-            "there. The rest is mapped as a separate drive."
+            "carried there. The rest is mapped as a separate drive."
         )
     if gaps := _gaps(log, track):
         first = gaps[0]
@@ -187,9 +186,8 @@ def describe_cuts(log: RobotLog, track: Track, turned: list[tuple[int, float]]) 
         first, angle = turned[0]
         notes.append(
             f"Scans turn differently from the odometry, {_times(len(turned))}: at scan {first} "
-            f"({_where(log, first)}) by {abs(math.degrees(angle)):.0f} degrees. The track "
-            "follows the scans. If the robot was carried there, cut the log there, and map each "
-            "part."
+            f"({_where(log, first)}) by {abs(math.degrees(angle)):.0f} degrees. The track follows "
+            "the scans. If the robot was carried there, cut the log there, and map each part."
         )
     return notes
 

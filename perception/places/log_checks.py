@@ -190,9 +190,8 @@ def judged(log: RobotLog, track: Track, explained: bool) -> tuple[Track, list[st
         notes.append(
             f"The track is unreliable: scan matching fails in {100 * failing:.0f} % of the scans, "
             f"and contradicts the odometry in {100 * overriding:.0f} % of the steps, where good "
-            "logs have 2 % at most. It is "
-            f"{track.way[-1]:.0f} m long. The map may be wrong."
-            f"{'' if explained and not _has_few_beams(log) else f' Do this: {advice(log)}.'}"
+            f"logs have 2 % at most. It is {track.way[-1]:.0f} m long. The map may be "
+            f"wrong.{'' if explained and not _has_few_beams(log) else f' Do this: {advice(log)}.'}"
         )
     elif contradictions := _contradictions(log, track):
         notes.append(

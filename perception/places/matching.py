@@ -130,9 +130,8 @@ class Scene:
     def agreement(self, points: Array) -> tuple[Array, Array]:
         """Compute how well points, relative to the middle, agree with the walls of this scene.
 
-        They are (n, 2, m) x and y in metres of m points in n poses. For each pose, return
-        the sum of the agreements, (n,), and the number of points whose cells this scene
-        observed, (n,).
+        They are (n, 2, m) x and y in metres of m points in n poses. For each pose, return the sum
+        of the agreements, (n,), and the number of points whose cells this scene observed, (n,).
         """
         cells = self.cells(points)
         return self._sharp.ravel()[cells].sum(axis=1), self._observed.ravel()[cells].sum(axis=1)

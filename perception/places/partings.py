@@ -57,9 +57,8 @@ def with_partings(
 ) -> tuple[tuple[Visit, ...], list[VisitMatch]]:
     """Add a visit for each pass of a place where stretches of a drive diverge.
 
-    Visits whose middles are nearly the same get the same middle. An added visit has the local
-    map of the nearest other one. Return all visits, in order, and the closures between their
-    middles.
+    Visits whose middles are nearly the same get the same middle. An added visit has the local map
+    of the nearest other one. Return all visits, in order, and the closures between their middles.
     """
     drive = _DrivePoints(track, visits)
     relations = [*_closed(drive, closings), *_tracked(drive)]  # no middle of a visit changes them

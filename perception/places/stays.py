@@ -83,8 +83,7 @@ class Stays:
     def add(self, visits: Sequence[Visit], horizon: int | None) -> Iterator[Visit]:
         """Add the next visits, in the order of their scans, and yield those that are final.
 
-        No visit will come that begins before the scan `horizon`; None at the end of the
-        drive.
+        No visit will come that begins before the scan `horizon`; None at the end of the drive.
         """
         for visit in visits:
             self._pass(visit)

@@ -53,9 +53,8 @@ Frames = dict[str, dict[str, FrameTransform]]
 def transforms_of(bag: Bag, seen: set[str], damaged: list[Damage]) -> Frames:
     """Read the transforms to each frame of a bag, by the name of the parent frame.
 
-    Transforms over time are kept only for the frames of scans (`seen`) and their ancestors.
-    Those of the many joints of a robot are not needed. `damaged` receives messages that cannot
-    be read.
+    Transforms over time are kept only for the frames of scans (`seen`) and their ancestors. Those
+    of the many joints of a robot are not needed. `damaged` receives messages that cannot be read.
     """
     frames: Frames = {}
     topics = set(bag.topics(*TRANSFORMS))

@@ -63,9 +63,8 @@ class Bag:
     def messages(self, topics: set[str]) -> Iterator[tuple[Any, int, float, Any]]:
         """Read the messages of some topics.
 
-        Yield for each its connection, its number within the topic (from 1), the time of
-        recording in seconds, and the message. Damage takes the place of a message that
-        cannot be read.
+        Yield for each its connection, its number within the topic (from 1), the time of recording
+        in seconds, and the message. Damage takes the place of a message that cannot be read.
         """
         from rosbags.serde import SerdeError
 

@@ -251,9 +251,8 @@ def _survey(scans: Sequence[Scan], options: LaserOptions) -> tuple[Meaning, list
         )
         notes.append(
             f"Ranges of {reach:.4g} m repeat in {_percent(share)} of the beams, and hardly any are "
-            f"longer{but}. "
-            "They are taken to mean that nothing came back. If they are walls, "
-            "say how far the laser reaches: --set no_return=METRES."
+            f"longer{but}. They are taken to mean that nothing came back. If they are walls, say "
+            "how far the laser reaches: --set no_return=METRES."
         )
     if not math.isfinite(reach):
         # The largest range itself was measured, so the reach lies just above it.
@@ -265,8 +264,7 @@ def _survey(scans: Sequence[Scan], options: LaserOptions) -> tuple[Meaning, list
         if most > 0:
             notes.append(
                 "The log does not say how far the laser reaches. By its largest range it is "
-                f"{most:.4g} m. "
-                "If it reaches farther, or less far, say so: --set no_return=METRES."
+                f"{most:.4g} m. If it reaches farther, or less far, say so: --set no_return=METRES."
             )
     if options.zero_is is not None:
         return Meaning(reach, options.free), notes

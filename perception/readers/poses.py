@@ -201,8 +201,7 @@ def sources_of(track: RecordedTrack) -> list[NDArray[np.intp]]:
     """Separate the poses of sources that alternate, such as two programs with the same transform.
 
     Each pose is given to the source whose last pose is nearest. If no source is near, the pose
-    starts a new source. The largest comes first. If poses do not alternate, all are of one
-    source.
+    starts a new source. The largest comes first. If poses do not alternate, all are of one source.
     """
     poses = track.table()[:, 2:]
     if len(poses) < 10:

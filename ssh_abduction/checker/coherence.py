@@ -11,8 +11,8 @@ from ssh_abduction.checker.moves import course_of, heading_of
 from ssh_abduction.checker.reading import Check, Found, Reading
 from ssh_abduction.checker.sides import is_pair
 from ssh_abduction.checker.stars import slot_changes
+from ssh_abduction.data.groups import firsts
 from ssh_abduction.data.maps import Fault
-from ssh_abduction.data.trace import View
 
 
 def labels_are_dstates(m: Reading) -> Found:
@@ -81,9 +81,7 @@ def dstates_look_as_seen(m: Reading) -> Found:
     Unknown views, and views that the map treats as wrong, do not count. The axiom functional_view
     covers the views of later steps.
     """
-    shown: dict[int, tuple[View | None, int]] = {}
-    for (label, view), i in m.views.items():
-        shown.setdefault(label, (view, i))
+    shown = firsts((label, (view, i)) for (label, view), i in m.views.items())
     for first, s in m.visited:
         view, i = shown.get(s.id, (None, first))
         if s.view != view:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ssh_abduction.checker.reading import Found, Reading
-from ssh_abduction.data.reach import parts
+from ssh_abduction.data.groups import parts
 
 _LIFTS = ("lift", "stairs")
 

@@ -19,8 +19,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from ssh_abduction.data.drives import drives_of, named_steps
+from ssh_abduction.data.groups import NodeClasses
 from ssh_abduction.data.maps import SSHMap, check_of_trace, checked_map
-from ssh_abduction.data.reach import NodeClasses
 from ssh_abduction.data.trace import Action, Trace, checked_trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.theory.theory import Theory, checked_theory

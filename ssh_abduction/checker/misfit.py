@@ -3,10 +3,9 @@
 The solver looks for poses of dstates. This module looks for errors of the displacements instead, so
 the two share no method. The unknowns z are the errors of all displacements and closures, the scale
 and the drift, each in standard deviations. A map demands that its loops close, and that the two
-steps of each closure lie as the closure says: c(z) = 0. The misfit is the least sum of z² with
-c(z) = 0. It is found by Gauss-Newton: the next z is the smallest solution w of J w = J z - c(z),
-where J holds the derivatives of c. This is the update of an iterated Kalman filter for all loops at
-once.
+steps of each closure lie as the closure says: c(z) = 0. The misfit is the least sum of z² with c(z)
+= 0. It is found by Gauss-Newton: the next z is the smallest solution w of J w = J z - c(z), where J
+holds the derivatives of c. This is the update of an iterated Kalman filter for all loops at once.
 
 A displacement is missing where a drive starts, or where it was not logged. Between two gaps lies a
 *stretch* of steps, whose poses by dead reckoning have a frame of their own. If two stretches have a

@@ -39,12 +39,11 @@ def check_bound(trace: Trace, certificate: Any) -> ProvenBound:
     """Return the lower bound on dstates that a certificate proves, and the certificate's faults.
 
     A certificate has a clique: steps that are pairwise at different dstates. Two steps are at
-    different dstates if the same actions lead from them to different views, because a dstate
-    has one view and actions are deterministic. So for each pair of the clique, the check
-    follows a word (a list of actions) from both steps along the trace and compares the views at
-    the end. The certificate lists the words of pairs. If it has no words at all, the word of a
-    pair is the actions that the trace has after both steps. Raises MapError if the certificate
-    is malformed.
+    different dstates if the same actions lead from them to different views, because a dstate has
+    one view and actions are deterministic. So for each pair of the clique, the check follows a word
+    (a list of actions) from both steps along the trace and compares the views at the end. The
+    certificate lists the words of pairs. If it has no words at all, the word of a pair is the
+    actions that the trace has after both steps. Raises MapError if the certificate is malformed.
     """
     if not isinstance(certificate, Mapping):
         raise MapError(

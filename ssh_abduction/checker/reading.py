@@ -10,8 +10,8 @@ from typing import Any, TypeAlias, TypeVar
 
 from ssh_abduction.checker.moves import Course, MapLink, course_of
 from ssh_abduction.data.drives import drives_of, named_steps
+from ssh_abduction.data.groups import firsts, reached
 from ssh_abduction.data.maps import DState, SSHMap
-from ssh_abduction.data.reach import reached
 from ssh_abduction.data.star import Openings
 from ssh_abduction.data.trace import Trace, View
 from ssh_abduction.theory.theory import Theory
@@ -150,9 +150,7 @@ class Reading:
             self.along_travels if "travel_orders" in self.axioms else ()
         ):
             edges[path].setdefault((p, q) if direction == 1 else (q, p), move)
-        listed: dict[int, tuple[int, ...]] = {}
-        for h in self.map.paths:
-            listed.setdefault(h.id, h.order)
+        listed = firsts((h.id, h.order) for h in self.map.paths)
         return {h: Order(listed.get(h, ()), edges[h], self.axioms) for h in listed | self.along}
 
     @cached_property

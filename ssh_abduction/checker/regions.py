@@ -12,7 +12,7 @@ from typing import TypeAlias
 from ssh_abduction.checker.moves import Course, along, course_of, opposite
 from ssh_abduction.checker.reading import Check, Found, Reading
 from ssh_abduction.checker.sides import RightBranch, branches_right_of
-from ssh_abduction.data.reach import reached
+from ssh_abduction.data.groups import reached
 from ssh_abduction.data.regions import Region, list_in_words
 
 _Places: TypeAlias = frozenset[int]

@@ -6,7 +6,7 @@ from collections import defaultdict
 
 from ssh_abduction.checker.moves import Course, along, course_of, going, opposite
 from ssh_abduction.checker.reading import Check, Found, Reading
-from ssh_abduction.data.reach import reached
+from ssh_abduction.data.groups import reached
 
 
 def one_place(m: Reading) -> Found:

@@ -108,10 +108,9 @@ def parser() -> Parser:
         prog="ssh-abduction",
         description="Find the topological maps that explain what a robot saw and did.",
         epilog=(
-            f"Words: {WORDS}\n\n"
-            "Exit codes: 0 success, or a map that is proven minimal; 1 error; 2 wrong usage; 10 a "
-            "map that is not proven minimal; 20 no map exists, or a map breaks an axiom; 30 no "
-            "map in time; 130 interrupted; 143 ended by SIGTERM."
+            f"Words: {WORDS}\n\nExit codes: 0 success, or a map that is proven minimal; 1 error; 2 "
+            "wrong usage; 10 a map that is not proven minimal; 20 no map exists, or a map breaks "
+            "an axiom; 30 no map in time; 130 interrupted; 143 ended by SIGTERM."
         ),
     )
     top.add_argument("--version", action="version", version=f"%(prog)s {version('ssh-abduction')}")

@@ -48,8 +48,7 @@ def answers_on_cluster(
     if not re.search(r"^inproc:|:\d+$", address):
         raise AbductionError(
             "--scheduler: expected an address with a port, such as tcp://host:8786, got "
-            f"{brief(address)}"
-            "; take the one that dask scheduler prints"
+            f"{brief(address)}; take the one that dask scheduler prints"
         )
     # The answers report errors. The warning about large graphs does not apply: each file is sent
     # to one worker, once.

@@ -39,9 +39,8 @@ def run(options: argparse.Namespace) -> int:
     ]
     if changed:
         raise AbductionError(
-            f"{named(changed[0])}: expected no file, or the example of this name, got another "
-            "one; nothing was copied: "
-            "move it away, or take another folder (-o FOLDER)"
+            f"{named(changed[0])}: expected no file, or the example of this name, got another one; "
+            "nothing was copied: move it away, or take another folder (-o FOLDER)"
         )
     folder.mkdir(parents=True, exist_ok=True)
     for path, data in examples.items():

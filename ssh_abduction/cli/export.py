@@ -22,9 +22,8 @@ def add_parser(verbs: Verbs) -> None:
         "Write a map in the format of another program: a route graph for Nav2 (GeoJSON), a "
         "topological map for LCAS's topological_navigation (tmap2, YAML), GraphML, Graphviz "
         "DOT, SVG, or JSON for networkx.",
-        "Positions are in metres from the first dstate if the map has poses. Otherwise they "
-        "come from a layout, and a warning says so. docs/reference/formats.md describes each "
-        "format.",
+        "Positions are in metres from the first dstate if the map has poses. Otherwise they come "
+        "from a layout, and a warning says so. docs/reference/formats.md describes each format.",
     )
     add_maps(parser)
     parser.add("--to", "the format to write", required=True, choices=FORMATS)

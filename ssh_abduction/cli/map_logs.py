@@ -14,11 +14,10 @@ def add_parser(verbs: Verbs) -> None:
         "map",
         run,
         "map a building from a robot's log",
-        "Find the minimal maps of a building from a robot's log. Writes trace.jsonl, "
-        "maps.json, page.html, report.html and run.json into a folder. With several logs, "
-        "each gets its own folder, and its result is one line. Logs that are already mapped with "
-        "the same settings are skipped. With --together, the logs are drives through one building, "
-        "and get one map.",
+        "Find the minimal maps of a building from a robot's log. Writes trace.jsonl, maps.json, "
+        "page.html, report.html and run.json into a folder. With several logs, each gets its own "
+        "folder, and its result is one line. Logs that are already mapped with the same settings "
+        "are skipped. With --together, the logs are drives through one building, and get one map.",
     )
     parser.add(
         "logs",

@@ -345,8 +345,7 @@ def theory_of(options: argparse.Namespace, found: Theory | None = None) -> Theor
     """Return the theory that the options name, or `found`, with the fields that the user changed.
 
     If `found` is None, the default theory takes its place. Raises TheoryError if a field has a
-    wrong value or contradicts another one, and MapError if the file of --theory holds no
-    theory.
+    wrong value or contradicts another one, and MapError if the file of --theory holds no theory.
     """
     chosen = choices_of(options)
     named_theory: str | None = options.theory

@@ -100,7 +100,6 @@ def _seeds(text: str) -> list[int]:
     except (ValueError, OverflowError):
         raise AbductionError(
             f"--seeds: expected numbers as 0-19 or 1,5,7, at most {MOST_SEEDS:,} and below "
-            f"{2**32:,}, got {brief(text)}"
-            "; write fewer"
+            f"{2**32:,}, got {brief(text)}; write fewer"
         ) from None
     return found

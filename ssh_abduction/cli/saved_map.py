@@ -125,18 +125,16 @@ class SavedMap:
     def gateway(self, text: str) -> tuple[tuple[str, float], ...]:
         """Return the steps at which the robot faced a gateway, each with degrees clockwise.
 
-        Degrees count from ahead. The text is a place and a direction on the drawn map, such
-        as "p4 north"; or a step and a direction from the robot, such as "monday:12 left" or
-        "monday:12 135". Raises MapError if the map has no such place or step, or no
-        headings there.
+        Degrees count from ahead. The text is a place and a direction on the drawn map, such as "p4
+        north"; or a step and a direction from the robot, such as "monday:12 left" or "monday:12
+        135". Raises MapError if the map has no such place or step, or no headings there.
         """
         where, _, way = text.strip().rpartition(" ")
         kind, step = self.thing(where.strip()) if where else ("", "")
         if kind != "place":
             raise MapError(
-                f"gateway: expected a place and a direction such as 'p4 north' or "
-                f"'monday:12 left', got {brief(text)}"
-                "; write both"
+                "gateway: expected a place and a direction such as 'p4 north' or 'monday:12 left', "
+                f"got {brief(text)}; write both"
             )
         label = self.map.dstate_at[step_of(self.drives, step)]
         if way not in COMPASS:

@@ -146,7 +146,6 @@ class Corrections:
         """Name the place, path or region of a step. An earlier name for this step is replaced.
 
         Args:
-            name: The name.
             kind: "place", "path" or "region".
             step: The step, such as "monday:12".
 
@@ -314,7 +313,6 @@ class Corrections:
         If two names are of one place of this map, the first one counts.
 
         Args:
-            ssh_map: The map.
             drives: The drives of its trace.
         """
         checked_map(ssh_map)

@@ -2,10 +2,9 @@
 
 A star is all gateways (ways out of a place) seen at a step, each with a bearing. A sight is a
 dstate (distinctive state: a place and a heading) with a star that is seen there. A sight numbers
-its gateways; the numbers are its slots. The sights at a place see the same gateways, but a
-bearing may be off, and some gateways are not observed. So `frames_that_fit` searches, at each
-place, for a frame (which gateways exist) and a shift of the slots for each sight, such that all
-axioms hold.
+its gateways; the numbers are its slots. The sights at a place see the same gateways, but a bearing
+may be off, and some gateways are not observed. So `frames_that_fit` searches, at each place, for a
+frame (which gateways exist) and a shift of the slots for each sight, such that all axioms hold.
 """
 
 from __future__ import annotations
@@ -17,6 +16,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
 
+from ssh_abduction.data.groups import grouped
 from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.rotations import leads, middle, rotations, turns_so, ways
 from ssh_abduction.data.star import CLOSED, MOST_CLOSED, Frame, Star
@@ -232,11 +232,9 @@ def are_opposite(seen_a: Turned, seen_b: Turned) -> bool:
 
 def by_place(sights: Sequence[Sight]) -> dict[int, list[Sight]]:
     """Group sights by place: return a dict from places to lists of sights."""
-    there: dict[int, list[Sight]] = {}
-    for sight in sights:
-        if sight.dstate.place is not None:
-            there.setdefault(sight.dstate.place, []).append(sight)
-    return there
+    return grouped(
+        (sight.dstate.place, sight) for sight in sights if sight.dstate.place is not None
+    )
 
 
 def frames_that_fit(

@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 from ssh_abduction.data.checks import a_whole_number, all_instances, an_instance, one_of
 from ssh_abduction.data.errors import MapError, brief, is_whole, named
 from ssh_abduction.data.files import json_line
+from ssh_abduction.data.groups import firsts, grouped, parts
 from ssh_abduction.data.map_file import (
     MAP_FORMAT,
     SOLUTION_FORMAT,
@@ -37,7 +38,6 @@ from ssh_abduction.data.map_file import (
 )
 from ssh_abduction.data.map_parts import FAULTS, NAMED, DState, Fault, Fit, MapPath, Name, Pose
 from ssh_abduction.data.notebook import in_output
-from ssh_abduction.data.reach import parts
 from ssh_abduction.data.regions import Region, renumbered, right_of
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted
@@ -244,10 +244,7 @@ class SSHMap:
         Travels, turns and common places connect the dstates of a floor. If two drives, or two
         visits by different lifts, share no place of a floor, the map has two floors for it.
         """
-        found: dict[int, list[int]] = {}
-        for s in self.dstates:
-            if s.floor is not None:
-                found.setdefault(s.floor, []).append(s.id)
+        found = grouped((s.floor, s.id) for s in self.dstates if s.floor is not None)
         return tuple(tuple(found[floor]) for floor in sorted(found))
 
     def without_headings(self) -> SSHMap:
@@ -266,9 +263,8 @@ class SSHMap:
         place = _numbered([*(s.place for s in visited), *self.places])
         path = _numbered([*(s.path for s in visited), *(p.id for p in self.paths)])
         floor = _numbered(s.floor for s in visited)
-        faced: dict[int | None, int | None] = {}  # the direction in which each path was first faced
-        for s in visited:
-            faced.setdefault(s.path, s.direction)
+        # the direction in which each path was first faced
+        faced = firsts((s.path, s.direction) for s in visited)
         # Direction +1 becomes the one first faced. The order of the path is reversed accordingly.
         dstates = tuple(
             DState(

@@ -74,8 +74,7 @@ def of_members(members: Mapping[Reason, Collection[int]]) -> tuple[Region, ...]:
     """Make a region of each different set of places, and find which regions contain which.
 
     The largest comes first. `members` has, for each reason to make a region, the places of the
-    region. An empty set makes no region.
-    All directed paths that bound a set are its bounds.
+    region. An empty set makes no region. All directed paths that bound a set are its bounds.
     """
     right: dict[tuple[int, int], set[int]] = {}
     doors: dict[frozenset[int], int] = {}

@@ -112,9 +112,8 @@ class UnderWay:
 def rungs(trace: Trace, theory: Theory, stars: bool = True) -> Iterator[tuple[str, Theory]]:
     """List the theories of the ladder. Each one adds a kind of evidence that the trace has.
 
-    Yield the name and the theory of each rung. The stars, displacements and planarity of the
-    first theory are replaced. `stars` says whether there is a rung for stars, if the trace has
-    some.
+    Yield the name and the theory of each rung. The stars, displacements and planarity of the first
+    theory are replaced. `stars` says whether there is a rung for stars, if the trace has some.
     """
     jumped = theory.jumped
     theory = theory.replace(star="none", displacement="none", planar=False, jumped=0)
@@ -146,7 +145,6 @@ def ladder(
     """Solve a trace with one theory after the other, each with one more kind of evidence.
 
     Args:
-        trace: The trace.
         theory: The theory to start from; Theory.topological() by default. The ladder replaces its
             stars, displacements and planarity.
         time_limit: Seconds for each rung; None for no limit.

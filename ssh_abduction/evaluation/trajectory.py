@@ -224,8 +224,7 @@ def checked_time(value: Any, where: str) -> float | None:
 def checked_pose(value: Any, where: str) -> Pose:
     """Read from JSON the pose of a dstate in the frame of the robot that saw it.
 
-    None says that the dstate is at the pose of the robot. Raises TraceError, which names the
-    step.
+    None says that the dstate is at the pose of the robot. Raises TraceError, which names the step.
     """
     return (0.0, 0.0, 0.0) if value is None else three_numbers(value, f"{where}: seen")
 

@@ -396,9 +396,8 @@ class Axioms:
     def smallest_clash(self, assumed: Sequence[Assumption] = ()) -> list[tuple[str, int]]:
         """Find a minimal set of pairs (axiom, step) that no map with these assumptions satisfies.
 
-        There are many minimal sets. To get a short one, whole axioms are dropped before
-        single steps, once in the order of the axioms and once in reverse. The smaller
-        result is returned.
+        There are many minimal sets. To get a short one, whole axioms are dropped before single
+        steps, once in the order of the axioms and once in reverse. The smaller result is returned.
         """
         found = [
             self._shrunk(list(order), assumed) for order in (self._pairs, reversed(self._pairs))

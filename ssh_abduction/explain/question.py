@@ -35,7 +35,6 @@ class LimitedQuestion(ABC, Generic[_Answer]):
     `answer` may be called once. `known` may be called from any thread while `answer` runs.
 
     Args:
-        trace: The trace.
         theory: The theory; Theory.topological() if None.
         time_limit: Seconds; None for no limit.
         memory_limit: MiB; None for no limit.

@@ -110,9 +110,8 @@ class Traces:
     ) -> Traces:
         """Copy these traces with a view, (n,), and its confidence, (n,), if any, at each step.
 
-        `images` has the vector of each image, (n, d). A step without a view (noise, -1)
-        gets the view whose centre is nearest to its image. `second` has the runner-up's
-        views, if any.
+        `images` has the vector of each image, (n, d). A step without a view (noise, -1) gets the
+        view whose centre is nearest to its image. `second` has the runner-up's views, if any.
         """
         of_steps = np.ones(len(images)) if sure is None else sure.round(4)
         parts = zip(

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from ssh_abduction.data.action import STANDARD_ACTIONS
+from ssh_abduction.data.groups import grouped
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.star import SPREAD
 from ssh_abduction.data.trace import Action, Trace, View
@@ -52,7 +53,6 @@ class Moves:
     """Where the moves of a robot lead from each of the N dstates of a map.
 
     Args:
-        ssh_map: The map.
         trace: The trace that was mapped, to estimate probabilities by counting; None takes all
             links from the map.
     """
@@ -155,9 +155,10 @@ def view_ratios(ssh_map: SSHMap, trace: Trace | None) -> dict[View, Observation]
     visits = Counter[int]()
     for (x, _), n in counts.items():
         visits[x] += n
-    shown: dict[View, list[tuple[int, float]]] = {}
-    for (x, view), n in sorted(counts.items(), key=lambda item: item[0][0]):
-        shown.setdefault(view, []).append((x, n / visits[x]))
+    shown = grouped(
+        (view, (x, n / visits[x]))
+        for (x, view), n in sorted(counts.items(), key=lambda item: item[0][0])
+    )
     number = len(ssh_map.dstates)
     ratios: dict[View, Observation] = {}
     for view, pairs in shown.items():
@@ -171,9 +172,8 @@ def view_ratios(ssh_map: SSHMap, trace: Trace | None) -> dict[View, Observation]
 def transitions(ssh_map: SSHMap, trace: Trace | None) -> dict[str, Links]:
     """Find where each action leads, by its name.
 
-    The trace that was mapped serves to estimate probabilities by counting (equation 3). The
-    links of the map say where an action leads if the trace lacks it there, or is None (equation
-    4).
+    The trace that was mapped serves to estimate probabilities by counting (equation 3). The links
+    of the map say where an action leads if the trace lacks it there, or is None (equation 4).
     """
     # Count how often each action led from one dstate to another.
     counts = Counter[tuple[int, str, int]]()
@@ -186,9 +186,7 @@ def transitions(ssh_map: SSHMap, trace: Trace | None) -> dict[str, Links]:
         )
     tried = {(x, action) for x, action, _ in counts}
     counts.update({link for link in ssh_map.links if link[:2] not in tried})
-    entries: dict[str, list[tuple[int, int, int]]] = {}
-    for (x, action, y), n in counts.items():
-        entries.setdefault(action, []).append((x, y, n))
+    entries = grouped((action, (x, y, n)) for (x, action, y), n in counts.items())
     links: dict[str, Links] = {}
     for action, listed in entries.items():
         sources, targets, tries = np.array(listed).T

@@ -15,10 +15,9 @@ and when the number of maps has changed. It takes the first of these that exists
 3. An untried action for which the minimal maps predict different outcomes.
 4. Actions that distinguish the map from a map without one of its returns (`return_doubts.py`).
 
-When it is done
----------------
-1. *Unique.* All minimal maps have the same dstates and the same places. They may differ in paths.
-2. *Closed.* At each dstate that the robot can reach, each action that it can do there was tried, or
+When it is done --------------- 1. *Unique.* All minimal maps have the same dstates and the same
+places. They may differ in paths. 2. *Closed.* At each dstate that the robot can reach, each action
+that it can do there was tried, or
    the axioms imply where the action leads.
 3. *Beyond doubt.* A minimal map may still have too few dstates, as it merges all that can be
    merged. So the explorer doubts each return of the map. It looks for the best map in which the two
@@ -100,19 +99,17 @@ class Exploration:
 
     Attributes:
         steps: Number of actions that the robot did.
-        ending: Why the exploration ended.
-            "done": one map is left, nothing in it is untried, and no return is in doubt.
-            "inseparable": nothing that the robot can do distinguishes the remaining minimal maps,
-            or the minimal map from `rival`.
-            "steps": the robot did the largest number of actions that was allowed.
-            "time": there was no time to prove which maps are minimal, or to weigh a doubt.
-            "contradicted": no map explains what was seen.
+        ending: Why the exploration ended. "done": one map is left, nothing in it is untried, and no
+            return is in doubt. "inseparable": nothing that the robot can do distinguishes the
+            remaining minimal maps, or the minimal map from `rival`. "steps": the robot did the
+            largest number of actions that was allowed. "time": there was no time to prove which
+            maps are minimal, or to weigh a doubt. "contradicted": no map explains what was seen.
         is_unique: Whether all minimal maps have the same dstates and the same places.
         is_true: Whether the minimal map is unique and its dstates and places are the true ones, as
             far as the robot drove; None if what the robot saw came without the truth.
         solution: The minimal maps of all that was seen, or the best map found in time.
-        rival: A map with more dstates that also explains everything, and that nothing the robot
-            can do distinguishes from the minimal map; None if none was found.
+        rival: A map with more dstates that also explains everything, and that nothing the robot can
+            do distinguishes from the minimal map; None if none was found.
     """
 
     steps: int

@@ -35,7 +35,6 @@ class MoveGraph:
     links; for routes by places also moves that paths imply.
 
     Args:
-        ssh_map: The map.
         by: What the shortest route minimises: "actions", "places" or "metres".
 
     Raises:

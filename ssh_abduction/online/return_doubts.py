@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TypeAlias
 
+from ssh_abduction.data.groups import firsts
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver import solve
@@ -54,9 +55,7 @@ class ReturnDoubts:
             if not ssh_map.places or action.kind == "travel"
         ]
         comes = [0, *moves]
-        first: dict[int | None, int] = {}
-        for t in comes:
-            first.setdefault(at[t], t)
+        first = firsts((at[t], t) for t in comes)
         enough = len(ssh_map.dstates) + self._margin
         for t in reversed(comes):
             doubt = (first[at[t]], t)

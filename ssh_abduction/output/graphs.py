@@ -27,24 +27,21 @@ def to_networkx(
     """Convert a map to a graph of networkx.
 
     Args:
-        ssh_map: The map.
-        level: The kind of graph.
-            "causal" is a MultiDiGraph. Each dstate (distinctive state: a place and a heading) is
-            a node with the attributes view, place, path, direction, heading, floor, place_name and
-            path_name. Each link is an edge with the attribute action. Unknown attributes are left
-            out. If the map lists regions, nodes have their ids as the attribute regions, and
-            `graph["regions"]` has the regions as dicts. The other kinds have these, too.
-            "topological" is a bipartite Graph with the nodes ("place", p) and ("path", h). Each
-            place on a path gives an edge with the attribute index, its position in the order of
-            the path.
-            "places" is a MultiGraph. Each place is a node with the attributes pos (x to the right,
-            y up) and dstates. Each two neighbours on a path give an edge with the path's id as its
-            key. Its attributes are path; order, the index of the first neighbour; travelled,
-            whether the robot went from one to the other; and metres, if the map has poses. Places
-            and paths that a person named have the attribute name. The attribute
-            `graph["metric"]` says whether positions are metres.
-        turns: How actions turn, as in `to_svg`. It decides the positions of "places" if the map
-            has no poses.
+        level: The kind of graph. "causal" is a MultiDiGraph. Each dstate (distinctive state: a
+            place and a heading) is a node with the attributes view, place, path, direction,
+            heading, floor, place_name and path_name. Each link is an edge with the attribute
+            action. Unknown attributes are left out. If the map lists regions, nodes have their ids
+            as the attribute regions, and `graph["regions"]` has the regions as dicts. The other
+            kinds have these, too. "topological" is a bipartite Graph with the nodes ("place", p)
+            and ("path", h). Each place on a path gives an edge with the attribute index, its
+            position in the order of the path. "places" is a MultiGraph. Each place is a node with
+            the attributes pos (x to the right, y up) and dstates. Each two neighbours on a path
+            give an edge with the path's id as its key. Its attributes are path; order, the index of
+            the first neighbour; travelled, whether the robot went from one to the other; and
+            metres, if the map has poses. Places and paths that a person named have the attribute
+            name. The attribute `graph["metric"]` says whether positions are metres.
+        turns: How actions turn, as in `to_svg`. It decides the positions of "places" if the map has
+            no poses.
 
     Raises:
         MapError: `ssh_map` is not a map, `level` is none of these, or `turns` has a value that is

@@ -19,6 +19,7 @@ from scipy.sparse import coo_array
 
 from ssh_abduction.data.checks import an_object
 from ssh_abduction.data.errors import MapError, brief, is_finite
+from ssh_abduction.data.groups import grouped
 from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.trace import Trace
 
@@ -69,10 +70,9 @@ def turns_between(
     dstates = ssh_map.dstates
     in_slots = max((s.heading or 0 for s in dstates), default=0) < 4
     unit = 90 if in_slots else 1
-    members: dict[int, list[DState]] = {}
-    for s in dstates:
-        if s.place is not None and s.heading is not None:
-            members.setdefault(s.place, []).append(s)
+    members = grouped(
+        (s.place, s) for s in dstates if s.place is not None and s.heading is not None
+    )
     for facing in members.values():
         for a, b in pairwise(facing):
             yield Turn(a, b, -math.radians(((b.heading or 0) - (a.heading or 0)) * unit), SURE)

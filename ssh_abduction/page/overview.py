@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from statistics import fmean
 from typing import Any, TypeAlias
 
+from ssh_abduction.data.groups import grouped
 from ssh_abduction.data.maps import SSHMap
 
 Steps: TypeAlias = tuple[int, ...]
@@ -47,9 +48,8 @@ class _Counts:
                 self.along[steps, of_path[h]] += count
         for steps in of_place.values():
             self.places[steps] += count
-        # Only streets that the robot travelled count: it went between two places along one path,
-        # or in a map without paths. The order of other places on a path is one of many possible
-        # ones.
+        # Only streets that the robot travelled count: it went between two places along one path, or
+        # in a map without paths. The order of other places on a path is one of many possible ones.
         streets: dict[Pair, int | None] = {}
         for s, _, x in ssh_map.links:
             a, b = ssh_map.dstates[s], ssh_map.dstates[x]
@@ -116,10 +116,7 @@ def overview(maps: Sequence[SSHMap], spots: Sequence[Spot]) -> dict[str, Any]:
 
 def _members(names: Sequence[int | None]) -> dict[int | None, Steps]:
     """For each number, list the steps that have it. Steps with None are left out."""
-    found: dict[int | None, list[int]] = {}
-    for t, name in enumerate(names):
-        if name is not None:
-            found.setdefault(name, []).append(t)
+    found = grouped((name, t) for t, name in enumerate(names) if name is not None)
     return {name: tuple(steps) for name, steps in found.items()}
 
 

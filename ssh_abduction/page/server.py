@@ -49,7 +49,6 @@ class PageServer(ThreadingHTTPServer):
 
     Args:
         listing: The maps.
-        trace: Their trace.
         theory: Their theory; None for the topological theory.
         run: A run that the page replays with beliefs; None for none.
         called: File names and flags for the commands that the page shows; None takes the file that
@@ -107,11 +106,10 @@ class PageServer(ThreadingHTTPServer):
     def answer(self, question: str, data: Mapping[str, Any], watch: Watch) -> dict[str, Any]:
         """Answer "explain", why two steps are one dstate or not, or "solve", to find maps.
 
-        `data` has `pair`, the two steps to explain; and `same` and `different`, lists of
-        pairs of steps that are assumed to be one dstate, or different ones. The answer has
-        `text`; and `assuming`, the cost of each assumption, or `content`, the new content
-        of the page. Raises AbductionError for a malformed question or one without an
-        answer, and LimitError.
+        `data` has `pair`, the two steps to explain; and `same` and `different`, lists of pairs of
+        steps that are assumed to be one dstate, or different ones. The answer has `text`; and
+        `assuming`, the cost of each assumption, or `content`, the new content of the page. Raises
+        AbductionError for a malformed question or one without an answer, and LimitError.
         """
         if question not in ("explain", "solve"):
             raise MapError(f"expected explain or solve, got {brief(question)}; ask one of the two")

@@ -77,7 +77,6 @@ class Consequences:
     """The predictions of one map.
 
     Args:
-        ssh_map: The map.
         links: For each dstate, a dict from each action tried there to the dstate it leads to.
         looks: The view and star of each dstate.
         theory: The theory, whose axioms may imply where actions lead; None to use all axioms.

@@ -23,6 +23,7 @@ import networkx as nx
 from ssh_abduction.data.checks import a_list, a_text, all_instances
 from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.errors import MapError, brief, printable
+from ssh_abduction.data.groups import firsts, grouped
 from ssh_abduction.data.maps import Fault, SSHMap, checked_map
 from ssh_abduction.data.words import attributes_of
 from ssh_abduction.rivals.sides import Beside, only_in
@@ -271,18 +272,13 @@ def _groups(classes: Sequence[int], ones: Sequence[int]) -> list[list[int]]:
 
     Classes without a place, path or course in the map are left out.
     """
-    groups: dict[int, list[int]] = {}
-    for c in classes:
-        if ones[c] != NONE:
-            groups.setdefault(ones[c], []).append(c)
+    groups = grouped((ones[c], c) for c in classes if ones[c] != NONE)
     return list(groups.values())
 
 
 def _named_links(ssh_map: SSHMap, steps: Sequence[int]) -> set[Link]:
     """Return the links of a map. Each dstate is named by its first step."""
-    first: dict[int, int] = {}
-    for t, label in zip(steps, ssh_map.dstate_at, strict=True):
-        first.setdefault(label, t)
+    first = firsts((label, t) for t, label in zip(steps, ssh_map.dstate_at, strict=True))
     return {
         (first[s], action, first[x]) for s, action, x in ssh_map.links if s in first and x in first
     }
@@ -292,9 +288,7 @@ def _unmoved(first: SSHMap, other: SSHMap) -> set[int]:
     """Find the dstates that have the same steps in both maps, each named by its first step."""
     sets: list[set[Steps]] = []
     for ssh_map in (first, other):
-        steps: dict[int, list[int]] = {}
-        for t, label in enumerate(ssh_map.dstate_at):
-            steps.setdefault(label, []).append(t)
+        steps = grouped((label, t) for t, label in enumerate(ssh_map.dstate_at))
         sets.append({tuple(some) for some in steps.values()})
     return {some[0] for some in sets[0] & sets[1]}
 

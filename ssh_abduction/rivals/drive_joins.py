@@ -20,6 +20,7 @@ from typing import Any, TypeAlias
 from ssh_abduction.data.checks import an_instance
 from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.errors import MapError
+from ssh_abduction.data.groups import firsts, grouped
 from ssh_abduction.data.words import counted
 from ssh_abduction.rivals.listing import Listing
 from ssh_abduction.solver import probability_in_words
@@ -183,12 +184,8 @@ def _visits(drive: Drive, placings: Sequence[_Placing]) -> list[list[int]]:
 
     Of several steps that every map has at one place, list only the first.
     """
-    first: dict[tuple[int, ...], int] = {}
-    for t in range(drive.first, drive.stop):
-        first.setdefault(tuple(at[t] for at in placings), t)
-    by_place: dict[int, list[int]] = {}
-    for names, t in first.items():
-        by_place.setdefault(names[0], []).append(t)
+    first = firsts((tuple(at[t] for at in placings), t) for t in range(drive.first, drive.stop))
+    by_place = grouped((names[0], t) for names, t in first.items())
     return list(by_place.values())
 
 

@@ -299,8 +299,7 @@ class Listing:
             if here != there:
                 raise MapError(
                     f"{other.source}: expected the view {brief(here)} at step {t}, as the maps of "
-                    f"{self.source} have, "
-                    f"got {brief(there)}; compare maps of one trace"
+                    f"{self.source} have, got {brief(there)}; compare maps of one trace"
                 )
 
     def number(self, name: str) -> int:
@@ -339,8 +338,7 @@ class Listing:
         step = next(t for t, (a, b) in enumerate(zip(first, seen, strict=True)) if a != b)
         raise MapError(
             f"{self._name(i)}: expected the view {brief(first[step])} at step {step}, as "
-            f"{self._name(0)} has, got {brief(seen[step])}; "
-            "compare maps of one trace"
+            f"{self._name(0)} has, got {brief(seen[step])}; compare maps of one trace"
         )
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssh_abduction.data.errors import MapError, brief
+from ssh_abduction.data.groups import firsts
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Trace, View
@@ -199,10 +200,7 @@ def _sound(ssh_map: SSHMap) -> list[tuple[int, int]]:
 
 def _first_steps(ssh_map: SSHMap) -> dict[int, int]:
     """For each dstate, find the first step whose observation the map does not treat as wrong."""
-    first: dict[int, int] = {}
-    for t, label in _sound(ssh_map):
-        first.setdefault(label, t)
-    return first
+    return firsts((label, t) for t, label in _sound(ssh_map))
 
 
 def _classes(trace: Trace, steps: Sequence[int]) -> dict[int, int]:
@@ -248,9 +246,8 @@ def leads_of(ssh_map: SSHMap, number: int) -> dict[int, dict[str, int]]:
         if found[source].setdefault(action, target) != target:
             raise MapError(
                 f"maps[{number}]: links: expected one dstate that {brief(action)} leads to from "
-                f"dstate {source}, "
-                f"got {found[source][action]} and {target}; take a theory with the axiom "
-                "deterministic"
+                f"dstate {source}, got {found[source][action]} and {target}; take a theory with "
+                "the axiom deterministic"
             )
     return found
 

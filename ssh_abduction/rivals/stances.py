@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
+from ssh_abduction.data.groups import firsts, grouped
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.star import Frame, Star
-from ssh_abduction.data.trace import Action, Step, Trace
+from ssh_abduction.data.trace import Action, Trace
 from ssh_abduction.rivals.consequences import OF_FRAMES, QUARTERS, is_possible
 from ssh_abduction.rivals.machines import Can, Seen, leads_of
 from ssh_abduction.theory.theory import Theory
@@ -56,7 +57,6 @@ class Stances:
     others: turns lead there from dstates.
 
     Args:
-        ssh_map: The map.
         trace: The trace of the map.
         theory: The theory of the map.
         actions: Actions that the robot can do, in addition to those of the trace.
@@ -77,9 +77,7 @@ class Stances:
         self._actions = {action.name: action for action in known if not action.starts}
         self._can = can
         self._implies = theory.star == "frame" and theory.hard >= OF_FRAMES
-        first: dict[int, Step] = {}
-        for label, step in zip(ssh_map.dstate_at, trace.steps, strict=True):
-            first.setdefault(label, step)
+        first = firsts(zip(ssh_map.dstate_at, trace.steps, strict=True))
         self._looks = [first[s.id] for s in ssh_map.dstates]
         self._stars = [
             Star.of(step.star) if step.star is not None and theory.star != "none" else None
@@ -92,9 +90,8 @@ class Stances:
         ]
         if not self._implies or any(s.heading is None for s in ssh_map.dstates):
             self._at = self._rooms()
-        self._in: dict[int, list[int]] = {}  # the stances in each room
-        for n, (room, _) in enumerate(self._at):
-            self._in.setdefault(room, []).append(n)
+        # the stances in each room
+        self._in = grouped((room, n) for n, (room, _) in enumerate(self._at))
         self._back: dict[int, int] = {}  # where a travel from a stance leads if it leads back
 
     def moves(self) -> list[StanceMove]:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from perception.places.importing import Imported
 from perception.readers.scans import Pose, RobotLog
 from ssh_abduction.data.drives import Drive, drives_of
+from ssh_abduction.data.groups import firsts
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import displacement_between, moved
 from ssh_abduction.output.drawing import ALARM, COLOURS, escaped, page, svg_text, titled
@@ -189,9 +190,9 @@ def _map_marks(sheet: _Sheet, imported: Imported, solution: Solution) -> Iterato
             visits[place].append(visit)
     # A place is drawn at the mean of its visits.
     middles = {p: np.mean([sheet.spots[v] for v in seen], axis=0) for p, seen in visits.items()}
-    doubts: dict[int | None, float] = {}
-    for _, second, probability in doubtful_joins(solution):
-        doubts.setdefault(places[second], probability)
+    doubts = firsts(
+        (places[second], probability) for _, second, probability in doubtful_joins(solution)
+    )
     hidden = undecided_places(ssh_map) - doubts.keys()
     shown = {place: middle for place, middle in middles.items() if place not in hidden}
     path_of = {state.id: state.path for state in ssh_map.dstates}

@@ -35,8 +35,7 @@ class Axiom:
         sentence: What the axiom says.
         source: The publication that it is from; may be empty.
         level: The name of its encoding.
-        subject: Conditions for a theory to have what the axiom is about, such as stars
-            (`% @when`).
+        subject: Conditions for a theory to have what the axiom is about, such as stars (`% @when`).
         conditions: All conditions for a theory to have the axiom: `subject`, and those after `if`
             in the comment of the axiom.
     """

@@ -212,9 +212,8 @@ def _check_numbers(theory: Theory) -> None:
         price = getattr(theory, name)
         if not is_finite(price) or not (price == 0 or 0.1 <= price <= DEAREST):
             raise TheoryError(
-                f"{name}: expected a number of dstates from 0.1 to {DEAREST:g}, or 0 for no "
-                f"such faults, got {brief(price)}"
-                "; take one in this range"
+                f"{name}: expected a number of dstates from 0.1 to {DEAREST:g}, or 0 for no such "
+                f"faults, got {brief(price)}; take one in this range"
             )
         object.__setattr__(theory, name, round(float(price), 1))
     if not is_finite(theory.reject) or not 0 < theory.reject < 1:

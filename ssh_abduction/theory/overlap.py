@@ -24,7 +24,6 @@ class Overlap:
         """Find the drives that closures join.
 
         Args:
-            trace: The trace.
             theory: The theory, which has the price.
         """
         starts = starts_of(trace)

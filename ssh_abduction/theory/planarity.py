@@ -21,7 +21,7 @@ from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import TypeAlias, TypeVar
 
-from ssh_abduction.data.reach import parts
+from ssh_abduction.data.groups import parts
 from ssh_abduction.runtime.clock import each_looking, look_at_clock
 
 Ends: TypeAlias = tuple[int, ...]

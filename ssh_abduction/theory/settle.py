@@ -70,10 +70,9 @@ def settle(trace: Trace, theory: Theory | None = None, known: Problem | None = N
     """Replace each "auto" in a theory, and check that the trace has what the axioms need.
 
     Return the trace, the theory, and the evidence. A step whose view is unknown may be at any
-    dstate. If a problem with the same trace, or with its first steps, is `known`, the results
-    of its evidence are reused. Raises TraceError if all views, the kind of an action, or a star
-    is missing, and TheoryError if the trace lacks the stars or displacements that the theory
-    needs.
+    dstate. If a problem with the same trace, or with its first steps, is `known`, the results of
+    its evidence are reused. Raises TraceError if all views, the kind of an action, or a star is
+    missing, and TheoryError if the trace lacks the stars or displacements that the theory needs.
     """
     checked_trace(trace)
     theory = checked_theory(theory)

@@ -180,8 +180,7 @@ class Theory:
         if unknown:
             raise TheoryError(
                 f"theory: expected fields out of {', '.join(f.name for f in fields(self))}, got "
-                f"{brief(min(unknown))}"
-                "; take some of these"
+                f"{brief(min(unknown))}; take some of these"
             )
         return replace(self, **choices)
 
@@ -236,7 +235,6 @@ class Theory:
         Args:
             kind: misread (the view is wrong), misseen (the star), slipped (the action done there),
                 jumped (the displacement that led there), or changed (one gateway).
-            step: The step.
         """
         one_of("kind", kind, FAULTS, TheoryError)
         _checked_step(step)
@@ -326,7 +324,6 @@ class Theory:
         """Check that a step has what the axioms need. `star` must not be auto.
 
         Args:
-            step: The step.
             where: The name of the step in messages.
 
         Raises:
@@ -359,8 +356,7 @@ class Theory:
             if step.gateways and (near := step.gateways.too_near):
                 raise TraceError(
                     f"{where}: star: expected gateways that their spreads tell apart, got "
-                    f"{near[0]:g} and {near[1]:g} degrees; "
-                    f"give smaller spreads, or merge the two"
+                    f"{near[0]:g} and {near[1]:g} degrees; give smaller spreads, or merge the two"
                 )
             return
         try:
@@ -381,8 +377,7 @@ class Theory:
                     flag = f"--{name.replace('_', '-')}"
                     raise TheoryError(
                         f"{name} ({flag}): expected steps from 0 to {len(trace) - 1}, got "
-                        f"{pair[0]},{pair[1]}"
-                        "; take two steps of the trace"
+                        f"{pair[0]},{pair[1]}; take two steps of the trace"
                     )
 
     def of_steps(self, first: int, length: int) -> Theory:

@@ -319,8 +319,7 @@ def draw_outcomes(
 ) -> None:
     """Draw k, U, the map and the recognition rate over the notch and the spread of poses.
 
-    Results as in the paper get a frame. A cross marks the notch and the scale of the
-    experiment.
+    Results as in the paper get a frame. A cross marks the notch and the scale of the experiment.
     """
     notches = sorted({o.notch for o in outcomes})
     scales = sorted({o.scale for o in outcomes})

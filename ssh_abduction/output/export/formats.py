@@ -50,11 +50,9 @@ def export_map(
     """Export a map as the text of a file for another program.
 
     If the map has poses, positions are metres relative to the first dstate (distinctive state: a
-    place and a heading). Otherwise positions are computed by a layout; nav2 and tmap2 files say
-    so.
+    place and a heading). Otherwise positions are computed by a layout; nav2 and tmap2 files say so.
 
     Args:
-        ssh_map: The map.
         to: The format: "nav2", a route graph of Nav2 (GeoJSON); "tmap2", a topological map of
             LCAS's topological_navigation (YAML); "graphml"; "dot", for Graphviz; "svg", a picture;
             or "networkx-json", which networkx.node_link_graph reads.

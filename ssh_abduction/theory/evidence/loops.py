@@ -93,8 +93,7 @@ class Loops:
     def of(trace: Trace, bend: float = 0.0, drift: float | None = None) -> Loops:
         """Make the loops of a trace, without a steady drift of heading in radians per metre.
 
-        `drift` is the standard deviation of the remaining drift; that of the odometry by
-        default.
+        `drift` is the standard deviation of the remaining drift; that of the odometry by default.
         """
         odometry = trace.odometry or Odometry()
         sums = _sums(trace, 0, len(trace), np.array([bend]), np.zeros((1, COLUMNS)))[0]
@@ -129,9 +128,8 @@ class Loops:
     ) -> Array:
         """Return the covariances, m x 3 x 3, between the closings of m loops and of m other loops.
 
-        Loops are given by the steps at which they begin, and those at which they end.
-        Covariances come from displacements in both loops, and from errors that all
-        displacements share.
+        Loops are given by the steps at which they begin, and those at which they end. Covariances
+        come from displacements in both loops, and from errors that all displacements share.
         """
         (i, j), (k, m) = (
             tuple(np.asarray(steps, dtype=int) for steps in pair) for pair in (loops, others)

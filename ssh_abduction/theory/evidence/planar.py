@@ -27,8 +27,8 @@ from functools import cache
 from itertools import combinations, pairwise, product
 from typing import TYPE_CHECKING, ClassVar, TypeAlias, TypeVar
 
+from ssh_abduction.data.groups import NodeClasses, grouped
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.reach import NodeClasses
 from ssh_abduction.data.star import Openings
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
@@ -424,9 +424,8 @@ def description(
     for step in steps:
         if first.setdefault(labels[step], step) != step:
             yield Equality(first[labels[step]], step)
-    visits: dict[int, list[int]] = {}  # for each place, the first step of each of its dstates
-    for step in first.values():
-        visits.setdefault(at[step], []).append(step)
+    # for each place, the first step of each of its dstates
+    visits = grouped((at[step], step) for step in first.values())
     for here in visits.values():
         yield from (Equality(here[0], step, "place") for step in here[1:])
         yield from (Equality(i, j, holds=False) for i, j in combinations(here, 2) if distinct)

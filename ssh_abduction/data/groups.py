@@ -1,4 +1,8 @@
-"""Follow links from node to node, and merge nodes."""
+"""Group values by their keys, and nodes by the links between them.
+
+>>> grouped([("a", 1), ("b", 2), ("a", 3)]), firsts([("a", 1), ("b", 2), ("a", 3)])
+({'a': [1, 3], 'b': [2]}, {'a': 1, 'b': 2})
+"""
 
 from __future__ import annotations
 
@@ -6,6 +10,24 @@ from collections.abc import Callable, Collection, Hashable, Iterable
 from typing import Generic, TypeVar
 
 Node = TypeVar("Node", bound=Hashable)
+Key = TypeVar("Key", bound=Hashable)
+Value = TypeVar("Value")
+
+
+def grouped(pairs: Iterable[tuple[Key, Value]]) -> dict[Key, list[Value]]:
+    """Return the values of each key, in the order of the pairs."""
+    found: dict[Key, list[Value]] = {}
+    for key, value in pairs:
+        found.setdefault(key, []).append(value)
+    return found
+
+
+def firsts(pairs: Iterable[tuple[Key, Value]]) -> dict[Key, Value]:
+    """Return the first value of each key."""
+    found: dict[Key, Value] = {}
+    for key, value in pairs:
+        found.setdefault(key, value)
+    return found
 
 
 def reached(starts: Iterable[Node], beside: Callable[[Node], Iterable[Node]]) -> dict[Node, None]:
