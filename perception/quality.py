@@ -113,7 +113,10 @@ def cluster_quality(X: ArrayLike, labels: ArrayLike, tree: SpanningTree | None =
     clusters = _numbered(labels, len(images))
     if clusters.max() == 0:
         return math.nan
-    between = _separation(images, clusters) if tree is None else tree.separation(clusters)
+    if tree is not None:
+        between = tree.separation(clusters)
+    else:  # one round of Borůvka's algorithm, with clusters as components
+        between = math.sqrt(float(_Cells(images).shortest_leaving(clusters)[0].min()))
     if between == 0:
         return 0.0
     within = cluster_spread(images, clusters)
@@ -251,14 +254,6 @@ def cluster_spread(X: ArrayLike, labels: ArrayLike) -> float:
     for m in members:
         best = max(best, _wider(images[m], best))
     return best
-
-
-def _separation(images: Floats, clusters: Integers) -> float:
-    """The smallest distance between two clusters.
-
-    One round of Borůvka's algorithm, with clusters as components, finds it.
-    """
-    return math.sqrt(float(_Cells(images).shortest_leaving(clusters)[0].min()))
 
 
 class _Cells:

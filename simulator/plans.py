@@ -217,11 +217,7 @@ def _with_opposites(found: Sequence[RoomGateway]) -> tuple[RoomGateway, ...]:
         k: other
         for k in range(len(found))
         if k == nearest(other := nearest(k))
-        and _bend(found, k, other) <= STRAIGHT
+        and _apart(found[k].bearing, found[other].bearing + 180) <= STRAIGHT
         and found[k].to != found[other].to
     }
     return tuple(replace(gateway, opposite=pairs.get(k)) for k, gateway in enumerate(found))
-
-
-def _bend(found: Sequence[RoomGateway], one: int, other: int) -> float:
-    return _apart(found[one].bearing, found[other].bearing + 180)

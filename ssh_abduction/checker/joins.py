@@ -194,15 +194,12 @@ class _JoinCollector:
         """Whether it is known that two steps are one dstate. In the map, they must be one."""
         if second in self.asserted:
             return True
-        if self.map.dstates[self.map.dstate_at[second]].place is None:
+        here = self.map.dstates[self.map.dstate_at[second]]
+        if here.place is None:
             return False
         # The map has both steps at one dstate, so their headings and courses are equal in it. If
         # headings, or courses, are known relative to each other, they are equal in all maps.
+        by_course = self.by_course and here.path is not None
         return self.places.are_one(first, second) and (
-            self.by_heading or (self.by_course and self._along_one_path(first, second))
+            self.by_heading or (by_course and self.courses.are_one(first, second))
         )
-
-    def _along_one_path(self, first: int, second: int) -> bool:
-        """Whether two steps are known to be along one path."""
-        on_path = self.map.dstates[self.map.dstate_at[second]].path is not None
-        return on_path and self.courses.are_one(first, second)

@@ -92,7 +92,13 @@ class Edges:
                     if not (distinct and k in faced.values())
                 ]
                 headings = [
-                    faced for faced in headings if all(_is_turned(faced, turn) for turn in turns)
+                    faced
+                    for faced in headings
+                    if all(
+                        (faced[s] + q - faced[x]) % 4 == 0
+                        for s, q, x in turns
+                        if {s, x} <= faced.keys()
+                    )
                 ]
             # headings that differ by a rotation of the place are one option
             found: dict[tuple[int, ...], Option] = {}
@@ -247,12 +253,6 @@ class Edges:
         return len(set(gateways)) == len(gateways) and is_planar(
             {place: tuple(end for _, end in sorted(here)) for place, here in around.items()}
         )
-
-
-def _is_turned(faced: Mapping[int, int], turn: tuple[int, int, int]) -> bool:
-    """Tell whether headings fit a turn. They do if one of its two headings is not chosen yet."""
-    s, quarters, t = turn
-    return s not in faced or t not in faced or (faced[s] + quarters - faced[t]) % 4 == 0
 
 
 def _goes_round(order: Sequence[Arm], sequence: Sequence[Arm]) -> bool:

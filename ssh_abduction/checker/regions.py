@@ -108,12 +108,6 @@ def _places(nodes: Iterable[_Node]) -> _Places:
     return frozenset(node[1] for node in nodes if node[0] == "place")
 
 
-def _bounds(m: Reading, places: _Places) -> set[Course]:
-    """Find the courses that have all these places on their right."""
-    sides = m.once(known_sides)
-    return {course for course, beside in sides.items() if places <= beside.keys()}
-
-
 def _missing(m: Reading, expected: Mapping[_Places, str]) -> Found:
     """Yield the regions that an axiom derives and the map does not list."""
     there = {frozenset(region.places) for region in m.map.regions or ()}
@@ -125,7 +119,8 @@ def _missing(m: Reading, expected: Mapping[_Places, str]) -> Found:
 def _wrong(m: Reading, region: Region) -> Iterator[str]:
     """Yield a sentence for each field of a region that is wrong."""
     places = frozenset(region.places)
-    if set(region.bounds) != _bounds(m, places):
+    sides = m.once(known_sides).items()
+    if {*region.bounds} != {course for course, beside in sides if places <= beside.keys()}:
         yield "is not right of exactly the directed paths that it lists"
     if not {places} & {*m.once(_beside), *m.once(_between), *m.once(_behind)}:
         yield "follows from no axiom"

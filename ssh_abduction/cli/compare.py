@@ -65,7 +65,8 @@ def run(options: argparse.Namespace) -> int:
         if not options.json:
             print("\n".join(_runs(record["runs"], options.maps, options.other)))
         # Maps of different traces have nothing else to compare.
-        if not of_one_trace(options.maps, options.other):
+        runs = (options.maps, options.other)
+        if len({(Path(run) / "trace.jsonl").read_bytes() for run in runs}) > 1:
             if options.json:
                 print(json_line(record))
             return 0
@@ -126,11 +127,6 @@ def _runs(differing: dict[str, tuple[Any, Any]], first: str, other: str) -> Iter
     )
     if not differing:
         yield "the two runs have the same settings, and found the same"
-
-
-def of_one_trace(first: str, other: str) -> bool:
-    """Whether the traces in the folders of two runs are the same."""
-    return (Path(first) / "trace.jsonl").read_bytes() == (Path(other) / "trace.jsonl").read_bytes()
 
 
 def _flat(value: Any, name: str = "") -> dict[str, Any]:

@@ -87,19 +87,14 @@ def headline(solution: Solution, count: int, explanation: Explanation | None) ->
         counted(least, "minimal maps")
         if weighed is None
         else f"{counted(least, 'maps')} of least cost"
-    ) + _levels_above(solution)
+    )
+    for level in solution.levels[1:]:
+        parts = (counted(v, k) for k, v in level.cost.to_dict().items())
+        found += f"; {level.count} with {', '.join(parts)}"
     beyond = f" that cost up to {solution.within} more" if solution.minimal_listed else ""
     return (
         f"optimal: {counts}; "
         f"{found}{'' if solution.complete else f', and there may be more{beyond}{why}'}; {seconds}"
-    )
-
-
-def _levels_above(solution: Solution) -> str:
-    """For each cost above the minimum, write how many maps have it, and their counts."""
-    return "".join(
-        f"; {level.count} with {', '.join(counted(v, k) for k, v in level.cost.to_dict().items())}"
-        for level in solution.levels[1:]
     )
 
 
@@ -165,7 +160,7 @@ def describe(ssh_map: SSHMap) -> str:
             s.id,
             s.shown,
             "" if s.place is None else ssh_map.numbered("place", s.place),
-            course(s.path, s.direction),
+            s.course,
             ", ".join(leads.get(s.id, [])),
         ]
         for s in ssh_map.dstates
@@ -235,7 +230,8 @@ def compared(found: Comparison) -> Iterator[str]:
                 if option.answers[choice.questions.index(question)]
                 for i in option.maps
             ]
-            shown = _numbered(sorted(yes), len(found.ids))
+            maps = f"{'map' if len(yes) == 1 else 'maps'} {stretches(sorted(yes))}"
+            shown = f"{maps} ({len(yes)} of {len(found.ids)})"
             yield f"    question {number[question]}: {question}: in {shown}"
         if len(asked) > SHOWN_QUESTIONS:
             yield (
@@ -281,12 +277,6 @@ def depending(differing: Mapping[Matter, Sequence[int]]) -> str:
     return "; ".join(
         f"the {NOUNS[sort][len(steps) > 1]} of {steps_in_words(steps)}"
         for sort, steps in shown.items()
-    )
-
-
-def _numbered(numbers: Sequence[int], count: int) -> str:
-    return (
-        f"{'map' if len(numbers) == 1 else 'maps'} {stretches(numbers)} ({len(numbers)} of {count})"
     )
 
 

@@ -43,6 +43,11 @@ class DState:
         """The view to show to people; "?" if it is unknown."""
         return "?" if self.view is None else self.view
 
+    @property
+    def course(self) -> str:
+        """The path with the sign of the direction, such as "2+"; "" without a path."""
+        return "" if self.path is None else f"{self.path}{'+' if self.direction == 1 else '-'}"
+
 
 @dataclass(frozen=True, slots=True)
 class MapPath:

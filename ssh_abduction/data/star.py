@@ -324,7 +324,7 @@ def parse_star(value: Any, where: str) -> tuple[Entry, ...]:
         x is None or x in (0, 1) for x in given if not isinstance(x, Mapping | Gateway)
     )
     star = tuple(_entry(x, len(given), four, f"{where}[{i}]") for i, x in enumerate(given))
-    seen = [entry for entry in star if _is_seen(entry)]
+    seen = [e for e in star if (e.open if isinstance(e, Gateway) else e is not None)]
     bearings = {(e.bearing if isinstance(e, Gateway) else float(e or 0)) % 360 for e in seen}
     if not is_four(star) and len(bearings) < len(seen):
         raise TraceError(
@@ -344,10 +344,6 @@ def parse_star(value: Any, where: str) -> tuple[Entry, ...]:
 def star_to_json(star: Sequence[Entry]) -> list[Any]:
     """Return a star as a list, as a trace file has it."""
     return [entry.to_json() if isinstance(entry, Gateway) else entry for entry in star]
-
-
-def _is_seen(entry: Entry) -> bool:
-    return bool(entry.open) if isinstance(entry, Gateway) else entry is not None
 
 
 def _entry(value: Any, count: int, four: bool, where: str) -> Entry:

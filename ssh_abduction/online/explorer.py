@@ -51,7 +51,6 @@ from ssh_abduction.data.words import counted
 from ssh_abduction.evaluation import evaluate
 from ssh_abduction.online.mapper import OnlineMapper
 from ssh_abduction.online.return_doubts import ReturnDoubts
-from ssh_abduction.rivals.experiment import Experiment
 from ssh_abduction.rivals.explore import next_experiment
 from ssh_abduction.rivals.machines import Seen
 from ssh_abduction.rivals.tour import next_tour
@@ -354,16 +353,16 @@ class Explorer:
     def _next_plan(self) -> tuple[str, ...]:
         """Find the actions of the next experiment; empty if nothing is left to find out."""
         maps = list(self.solution.maps)
-        found = self._experiment(maps)
+        found = next_experiment(maps, implied=True, **self._known)
         # No known links distinguish the maps: try what is untried.
-        if not found.plan.branches and (tour := self._tour(maps[0])):
+        if not found.plan.branches and (tour := next_tour(maps[0], margin=DOUBTED, **self._known)):
             return tour
         # Nothing is left to do, but there may be more minimal maps: look for them longer.
         is_proven = self.solution.status is Status.OPTIMAL and self.solution.complete
         if not found.actions and not is_proven:
             self._longer = self._solve_longer()
             if self._longer.maps:
-                found = self._experiment(list(self._longer.maps))
+                found = next_experiment(self._longer.maps, implied=True, **self._known)
         if found.actions or not self.solution.maps:
             return found.actions
         return self._doubting_plan(self.solution.maps[0])
@@ -389,7 +388,7 @@ class Explorer:
             rival = self._doubts.rival(doubt, trace, theory, dstates)
             if rival is None:
                 continue
-            experiment = self._experiment([best, rival])
+            experiment = next_experiment([best, rival], implied=True, **self._known)
             if experiment.actions:
                 return experiment.actions
             # Two groups: the maps differ, but nothing distinguishes them. One group: both are the
@@ -399,27 +398,12 @@ class Explorer:
             self._doubts.dispel(doubt, dstates)
         return ()
 
-    def _experiment(self, maps: list[SSHMap]) -> Experiment:
-        """Find an experiment that distinguishes maps, or that tries an untried action."""
-        return next_experiment(
-            maps,
-            self.mapper.trace,
-            theory=self.mapper.theory,
-            actions=self._abilities.ever.values(),
-            can=self._abilities.names,
-            implied=True,
-        )
-
-    def _tour(self, ssh_map: SSHMap) -> tuple[str, ...]:
-        """Find the shortest tour through all untried actions of a map; empty if none is left."""
-        return next_tour(
-            ssh_map,
-            self.mapper.trace,
-            theory=self.mapper.theory,
-            actions=self._abilities.ever.values(),
-            can=self._abilities.names,
-            margin=DOUBTED,
-        )
+    @property
+    def _known(self) -> dict[str, Any]:
+        """What plans need to know besides maps."""
+        trace, theory = self.mapper.trace, self.mapper.theory
+        can = self._abilities
+        return {"trace": trace, "theory": theory, "actions": can.ever.values(), "can": can.names}
 
 
 def _is_unique(solution: Solution) -> bool:

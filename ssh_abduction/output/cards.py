@@ -13,7 +13,7 @@ from html import escape
 
 from ssh_abduction.data.errors import printable
 from ssh_abduction.data.groups import grouped
-from ssh_abduction.data.maps import DState, SSHMap
+from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.star import star_to_json
 from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.data.words import counted
@@ -43,11 +43,15 @@ def map_card(ssh_map: SSHMap) -> str:
     # A map without places has fewer columns.
     topological = bool(ssh_map.places)
     head = ("dstate", "view", *(("place", "path") if topological else ()), "links")
+
+    def number(place: int | None) -> str:
+        return "" if place is None else ssh_map.numbered("place", place)
+
     rows = [
         (
             s.id,
             s.shown,
-            *(_where(s, ssh_map) if topological else ()),
+            *((number(s.place), s.course) if topological else ()),
             ", ".join(leads.get(s.id, ())),
         )
         for s in ssh_map.dstates
@@ -122,9 +126,3 @@ def _image(step: Step) -> object:
     if isinstance(step.image, tuple):
         return counted(len(step.image), "numbers")
     return "" if step.image is None else step.image
-
-
-def _where(s: DState, ssh_map: SSHMap) -> tuple[object, object]:
-    """The place of a dstate, and its path with the sign of the direction; "" if unknown."""
-    course = "" if s.path is None else f"{s.path}{'+' if s.direction == 1 else '-'}"
-    return "" if s.place is None else ssh_map.numbered("place", s.place), course

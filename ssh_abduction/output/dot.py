@@ -46,19 +46,15 @@ def _clusters(ssh_map: SSHMap, places: set[int], after: int, indent: str = "  ")
             left -= {*region.places}
     for p in (p for p in ssh_map.places if p in left):
         inside = " ".join(_node(s, ssh_map) for s in ssh_map.dstates if s.place == p)
-        label = _quoted(ssh_map.called("place", p) + _beside(ssh_map, p))
+        bounds = {c for r in ssh_map.regions or () if p in r.places for c in r.bounds}
+        beside = f"\nright of {list_in_words(map(course_named, sorted(bounds)))}" if bounds else ""
+        label = _quoted(ssh_map.called("place", p) + beside)
         lines.append(f"{indent}subgraph cluster_{p} {{ label={label}; {inside} }}")
     return lines
 
 
-def _beside(ssh_map: SSHMap, place: int) -> str:
-    """Say which directed paths a place is known to lie right of."""
-    bounds = {c for r in ssh_map.regions or () if place in r.places for c in r.bounds}
-    return f"\nright of {list_in_words(map(course_named, sorted(bounds)))}" if bounds else ""
-
-
 def _node(s: DState, ssh_map: SSHMap) -> str:
-    course = "" if s.path is None else f"\npath {s.path}{'+' if s.direction == 1 else '-'}"
+    course = f"\npath {s.course}" if s.course else ""
     name = ssh_map.name_of("path", s.path)
     course += "" if name is None else f" ({name})"
     return f"{s.id} [label={_quoted(f'{s.id}: {s.shown}{course}')}];"

@@ -130,7 +130,8 @@ def _moves_of(
 ) -> list[Point]:
     """Find how far to move each dstate, so that each floor or piece is below the one before."""
     moves = [(0.0, 0.0)] * len(at)
-    boxes = [_box([at[s] for s in part]) for part in parts]
+    corners = [[*zip(*(at[s] for s in part), strict=True)] for part in parts]
+    boxes = [(min(xs), min(ys), max(xs), max(ys)) for xs, ys in corners]
     extent = max((max(x1 - x0, y1 - y0) for x0, y0, x1, y1 in boxes), default=0.0)
     gap = max(STOREY * extent, least)
     below = None  # the least y of the part above, where it is drawn
@@ -140,12 +141,6 @@ def _moves_of(
         for s in part:
             moves[s] = move
     return moves
-
-
-def _box(points: Sequence[Point]) -> tuple[float, float, float, float]:
-    """The least x and y, and the greatest x and y, of some points."""
-    xs, ys = zip(*points, strict=True)
-    return min(xs), min(ys), max(xs), max(ys)
 
 
 def _floor_by_floor(ssh_map: SSHMap, found: Layout) -> Layout:

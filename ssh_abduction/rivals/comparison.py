@@ -31,7 +31,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssh_abduction.data.errors import MapError, printable
-from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.words import attributes_of, counted
 from ssh_abduction.rivals.differences import Difference, difference
 from ssh_abduction.rivals.factors import deciding, independent, options_of
@@ -196,17 +195,12 @@ class Comparison:
             text += f", and {more} larger ones"
         if count == 1 and not more and (not is_partial or self.minimal is None):
             return text
-        text += f": {self._differences}"
+        faults = self.variants.get("faults", 0)
+        text += f": their faults differ ({faults} ways); " if faults > 1 else ": "
+        text += self.shared.sentence
         if is_partial and not self.shared.proven:
             text += ", as far as is known: other maps may differ in more"
         return text
-
-    @property
-    def _differences(self) -> str:
-        faults = self.variants.get("faults", 0) > 1
-        return (
-            f"their faults differ ({self.variants['faults']} ways); " if faults else ""
-        ) + self.shared.sentence
 
     @property
     def product(self) -> str:
@@ -291,6 +285,9 @@ def compare(maps: Maps, other: Maps | None = None) -> Comparison:
     options = [options_of([a.column for a in choice], len(table)) for choice in choices]
     of_choice, together = _depending(asked, options, table)
     fits = [ssh_map.fit.chi2 for ssh_map in listing.maps if ssh_map.fit]
+    sizes = Counter((len(m.dstates), len(m.places), len(m.paths)) for m in listing.maps)
+    faults = {m.faults for m in listing.maps}
+    variants: dict[Matter, int] = {"faults": len(faults)} if any(faults) else {}
     return Comparison(
         ids=tuple(ssh_map.id for ssh_map in listing.maps),
         steps=listing.steps,
@@ -299,11 +296,11 @@ def compare(maps: Maps, other: Maps | None = None) -> Comparison:
         stopped=listing.stopped if listing.complete is False else None,
         shared=shared,
         listed=listed,
-        variants=_variants(table, listing.maps),
+        variants=variants | {sort: table.variants(sort) for sort in table.ones},
         choices=tuple(_choice(*parts) for parts in zip(choices, options, of_choice, strict=True)),
         together=together,
         deciding=tuple(asked[i].question for i in order),
-        sizes=_sizes(listing.maps),
+        sizes=tuple(sorted(sizes.items())),
         fits=(min(fits), max(fits)) if fits else None,
         others=_others(listing, listing_there) if listing_there else None,
         by_cost=listing.weighed is not None,
@@ -350,22 +347,6 @@ def _choice(
         for maps in members.values()
     ]
     return Choice(tuple(a.question for a in asked), tuple(options), differing)
-
-
-def _variants(table: Table, maps: Sequence[SSHMap]) -> dict[Matter, int]:
-    """For each sort, count the different groupings of the steps by maps."""
-    faults: dict[Matter, int] = (
-        {"faults": len({m.faults for m in maps})} if any(m.faults for m in maps) else {}
-    )
-    return faults | {sort: table.variants(sort) for sort in table.ones}
-
-
-def _sizes(maps: Sequence[SSHMap]) -> tuple[tuple[tuple[int, int, int], int], ...]:
-    """Count the maps of each size, for `Comparison.sizes`."""
-    counts = Counter(
-        (len(ssh_map.dstates), len(ssh_map.places), len(ssh_map.paths)) for ssh_map in maps
-    )
-    return tuple(sorted(counts.items()))
 
 
 def _others(here: Listing, there: Listing) -> Others:

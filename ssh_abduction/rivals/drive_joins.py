@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from itertools import combinations
+from itertools import combinations, product
 from typing import Any, TypeAlias
 
 from ssh_abduction.data.checks import an_instance
@@ -164,7 +164,15 @@ def _pair(
     excluded = 0
     for here in _visits(one, placings):
         for there in _visits(other, placings):
-            join = _surest(here, there, placings, weights)
+            joins = (
+                DriveJoin(
+                    i,
+                    j,
+                    math.fsum(w for w, at in zip(weights, placings, strict=True) if at[i] == at[j]),
+                )
+                for i, j in product(here, there)
+            )
+            join = max(joins, key=lambda join: join.share)
             if join.share == 0:
                 excluded += 1
                 continue
@@ -185,22 +193,4 @@ def _visits(drive: Drive, placings: Sequence[_Placing]) -> list[list[int]]:
     Of several steps that every map has at one place, list only the first.
     """
     first = firsts((tuple(at[t] for at in placings), t) for t in range(drive.first, drive.stop))
-    by_place = grouped((names[0], t) for names, t in first.items())
-    return list(by_place.values())
-
-
-def _surest(
-    here: Sequence[int],
-    there: Sequence[int],
-    placings: Sequence[_Placing],
-    weights: Sequence[float],
-) -> DriveJoin:
-    """Find the pair of steps, one of each list, that is most probably at one place."""
-    joins = (
-        DriveJoin(
-            i, j, math.fsum(w for w, at in zip(weights, placings, strict=True) if at[i] == at[j])
-        )
-        for i in here
-        for j in there
-    )
-    return max(joins, key=lambda join: join.share)
+    return list(grouped((names[0], t) for names, t in first.items()).values())

@@ -116,20 +116,16 @@ class Observations:
         self._numbers: dict[object, int] = {}
         self.seen: list[Seen] = []
         reading = _reading(maps, trace, theory)
-        self.of = [
-            self._of(ssh_map, None if reading is None else trace, reading) for ssh_map in maps
-        ]
+        self.of: list[list[int]] = []
+        for ssh_map in maps:
+            stars = _first_steps(ssh_map) if reading is not None else {}
+            self.of.append(
+                [self._number(s.view, stars.get(s.id), reading) for s in ssh_map.dstates]
+            )
 
-    def _of(self, ssh_map: SSHMap, trace: Trace | None, reading: _StarReader | None) -> list[int]:
-        """Return the number of the observation at each dstate of a map."""
-        stars = _first_steps(ssh_map) if trace is not None and reading is not None else {}
-        return [self._number(s.view, stars.get(s.id), trace, reading) for s in ssh_map.dstates]
-
-    def _number(
-        self, view: View | None, step: int | None, trace: Trace | None, reading: _StarReader | None
-    ) -> int:
+    def _number(self, view: View | None, step: int | None, reading: _StarReader | None) -> int:
         """Return the number of an observation, from a view and the step that shows the star."""
-        if step is None or trace is None or reading is None:
+        if step is None or reading is None:
             return self._add((view, None), Seen(view))
         key, star = reading(step)
         return self._add((view, key), Seen(view, star))

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
+from ssh_abduction.checker.moves import course_of
 from ssh_abduction.data.checks import an_instance
 from ssh_abduction.data.drives import named_steps
 from ssh_abduction.data.errors import MapError
@@ -158,7 +159,7 @@ def _sides(
     courses: dict[tuple[tuple[int, int] | None, ...], int] = {}
     for t in steps:
         places.setdefault(tuple(of[t].place for of in states), t)
-        here = tuple(_course(of[t].path, of[t].direction) for of in states)
+        here = tuple(course_of(of[t]) for of in states)
         back = tuple(course and (course[0], -course[1]) for course in here)
         if back not in courses:
             courses.setdefault(here, t)
@@ -172,11 +173,6 @@ def _sides(
             if any(sides):
                 found[i, j] = sides
     return found
-
-
-def _course(path: int | None, direction: int | None) -> tuple[int, int] | None:
-    """Return a path with a direction along it; None if one of the two is None."""
-    return None if path is None or direction is None else (path, direction)
 
 
 def _side(

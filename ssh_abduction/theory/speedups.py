@@ -153,18 +153,9 @@ def _any_theory(theory: Theory) -> bool:
     return True
 
 
-def _knows_views(theory: Theory) -> bool:
-    """Whether the observation of each step is known, and no gateway may change."""
-    return not theory.unknown_views and not theory.changed
-
-
 def _keeps_headings(theory: Theory) -> bool:
     """Whether each dstate has at most one heading, if places have frames."""
     return theory.star != "frame" or "one_heading" in theory.hard
-
-
-def _is_causal(theory: Theory) -> bool:
-    return theory.level == "causal" and theory.prefer == ("dstates",) and not theory.has_faults
 
 
 def _has_paths(theory: Theory) -> bool:
@@ -176,14 +167,6 @@ def _has_frames(theory: Theory) -> bool:
         theory.star == "frame"
         and theory.priorities[:1] == ("dstates",)
         and theory.path_order == "total"
-    )
-
-
-def _has_bare_places(theory: Theory) -> bool:
-    return (
-        theory.level == "topological"
-        and theory.star in ("none", "alike")
-        and theory.priorities[:1] == ("dstates",)
     )
 
 
@@ -293,7 +276,9 @@ TABLE = (
         "named dstates",
         "names",
         "Causal theory: make some names. Clingo chooses one of them for each node.",
-        _is_causal,
+        lambda theory: (
+            theory.level == "causal" and theory.prefer == ("dstates",) and not theory.has_faults
+        ),
         CAUSAL,
         _kept_by("names", and_also=(*PAIRS_OF_STEPS, *OF_TRACES)),
     ),
@@ -356,7 +341,11 @@ TABLE = (
         "ways",
         "Places without stars: if clingo takes long, first find the dstates, with names. Then find "
         "places and paths.",
-        _has_bare_places,
+        lambda theory: (
+            theory.level == "topological"
+            and theory.star in ("none", "alike")
+            and theory.priorities[:1] == ("dstates",)
+        ),
         PLACES,
         _kept_by(
             "names", "sides_frameless", "paths_frameless", and_also=(*PAIRS_OF_STEPS, *OF_TRACES)
@@ -366,7 +355,7 @@ TABLE = (
         "clique",
         "clique",
         "Find steps that are pairwise distinct, or such segments of paths. Give each its own name.",
-        _knows_views,
+        lambda theory: not theory.unknown_views and not theory.changed,
         CAUSAL,
         EVERY,
     ),
