@@ -148,10 +148,7 @@ def _neighbours(
 
 
 def _permuted(images: Floats, second: NDArray[np.bool_], seed: int) -> Floats:
-    """Compute how much of the margin is lost if each feature is shuffled, (d,).
-
-    The recogniser learns half of the images. The margin is measured on the other half.
-    """
+    """Compute how much of the margin on one half of the images is lost if a feature is shuffled."""
     order = np.argsort(second, kind="stable")
     known, asked = order[::2], order[1::2]
     model = KNeighborsClassifier(1, algorithm="brute").fit(images[known], second[known])
@@ -185,10 +182,7 @@ def _margin(model: Any, images: Floats, second: NDArray[np.bool_]) -> float:
 
 
 def _linear(images: Floats, second: NDArray[np.bool_]) -> Floats:
-    """Compute what each feature adds to the difference of the mean scores of two dstates, (d,).
-
-    The scores are those of a logistic regression that separates the dstates.
-    """
+    """Compute what each feature adds to how a logistic regression separates two dstates, (d,)."""
     model = LogisticRegression(max_iter=1000).fit(images - images.mean(axis=0), second)
     return np.asarray(model.coef_[0] * (images[second].mean(axis=0) - images[~second].mean(axis=0)))
 

@@ -138,10 +138,7 @@ class ImageLikelihood:
         return found
 
     def _features(self, images: ArrayLike) -> NDArray[np.float64]:
-        """Compute the features, (n, d), that the last estimator of the pipeline compares.
-
-        Raises PerceptionError if the images are not a finite table or have another length.
-        """
+        """Compute what the last estimator compares, (n, d). Raises PerceptionError."""
         try:
             table = np.asarray(equal_length(images), np.float64)
         except PerceptionError:

@@ -379,10 +379,7 @@ def _halves(images: Floats, members: Integers) -> Iterator[Integers]:
 
 
 def _two_sweeps(images: Floats) -> float:
-    """A lower bound of the largest distance between two images, often close to that distance.
-
-    The bound is the largest distance from the image that is farthest from the centre.
-    """
+    """A lower bound of the largest distance: from the image that is farthest from the centre."""
     start = images[_squares(images - images.mean(axis=0)).argmax()]
     return math.sqrt(_squares(images - start).max())
 
@@ -434,18 +431,12 @@ def _squares(differences: Floats) -> Floats:
 
 
 def _rounding(beams: int, dtype: type[np.floating[Any]], reach: float) -> float:
-    """A bound of the rounding error of |a|² + |b|² - 2ab for vectors with |a| + |b| <= reach.
-
-    The bound covers the dot product and the rounding of the vectors to `dtype`.
-    """
+    """A bound of the rounding error of |a|² + |b|² - 2ab for vectors with |a| + |b| <= reach."""
     return float((beams + 16) * np.finfo(dtype).eps * reach**2)
 
 
 def _numbered(labels: ArrayLike, count: int | None = None) -> Integers:
-    """Number the labels 0, 1, ….
-
-    Raises PerceptionError unless the labels are a row, of length `count` if that is given.
-    """
+    """Number the labels 0, 1, …. Raises PerceptionError unless they are a row of this length."""
     of = np.asarray(labels)
     if of.ndim != 1 or not len(of) or (count is not None and len(of) != count):
         raise PerceptionError(

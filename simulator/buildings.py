@@ -133,10 +133,7 @@ def _opening(plan: Plan, door: Door) -> Opening:
 
 
 def _span(flat: Opening, walls: Array) -> tuple[float, float]:
-    """Find where the wall with a door begins and ends, in metres along the wall from the door.
-
-    An outline may have corners within a straight wall, so connected stretches are joined.
-    """
+    """Find where a straight wall with a door begins and ends, in metres from the door."""
     # (n, 2 ends, along and across)
     ends = np.stack([flat.frame(walls[:, :2]), flat.frame(walls[:, 2:])], axis=1)
     way = ends[:, 1] - ends[:, 0]

@@ -207,10 +207,7 @@ class FreeRectangle:
 
 
 def _clearance(occupied: Mask) -> Array:
-    """The distance from each cell to the nearest occupied cell, in metres.
-
-    Cells outside the grid count as occupied.
-    """
+    """The distance from each cell to the nearest cell that is occupied or outside, in metres."""
     clearance: Array = (
         distance_transform_edt(np.pad(~occupied, 1, constant_values=False))[1:-1, 1:-1] * CELL
     )

@@ -259,10 +259,7 @@ class _MapFileReader:
 
 
 def _cells(fields: MapFile, path: Path) -> Cells:
-    """Read the image of a map as cells: 100 is occupied, 0 free, -1 unknown, others between.
-
-    The top row is first. Raises SimulatorError, with both files, if the image cannot be read.
-    """
+    """Read the image as cells, top row first: 100 occupied, 0 free, -1 unknown, or between."""
     from PIL import Image, UnidentifiedImageError  # Imported here because it loads slowly.
 
     where = f"{named(path)}: image: {named(fields.image)}"

@@ -146,10 +146,7 @@ class Odometer:
 
 
 def _motions(poses: Array) -> tuple[Array, Array, Array]:
-    """The motion from each pose to the next: metres ahead, metres to the left, radians turned.
-
-    Each is an array, (n - 1,).
-    """
+    """The motion from each pose to the next: metres ahead and left, radians, (n - 1,)."""
     steps = np.diff(poses, axis=0)
     cos, sin = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
     turned = np.remainder(steps[:, 2] + np.pi, 2 * np.pi) - np.pi

@@ -188,10 +188,7 @@ class _PlanReader:
 
 
 def _matched(here: Sequence[Point], there: Sequence[Point]) -> Iterator[Point]:
-    """Match the doors that two rooms list. A door may be drawn on one or both sides of the wall.
-
-    Yields the mean of two matched positions, or a position without a match.
-    """
+    """Match the doors that two rooms list: yield the mean of both positions, or the only one."""
     distances = np.array([[math.dist(a, b) for b in there] for a in here]).reshape(
         len(here), len(there)
     )

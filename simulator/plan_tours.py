@@ -223,10 +223,7 @@ def _heading(plan: Plan, stand: Stand) -> float:
 
 
 def _bearings(plan: Plan, stand: Stand) -> tuple[float, ...]:
-    """The bearing of each gateway of the room, in degrees clockwise from straight ahead.
-
-    The order is that of the gateways. It reveals the heading, so stars must be sorted.
-    """
+    """The bearings of the room's gateways, in its order, in degrees clockwise from ahead."""
     heading = _heading(plan, stand)
     return tuple(
         round((gateway.bearing - heading) % 360, DIGITS) % 360

@@ -129,10 +129,7 @@ class Rooms:
 
 
 def _sides(building: Building, number: int) -> dict[int, Point]:
-    """The points at which the robot begins and ends to drive through a door, by room.
-
-    Empty if it is unclear which room is on which side.
-    """
+    """Where the robot begins and ends to drive through a door, by room; empty if unclear."""
     opening, door = building.openings[number], building.plan.doors[number]
     sides = [opening.point(0.0, side * (opening.depth / 2 + APPROACH)) for side in (-1, 1)]
     here, there = (building.plan.rooms[room] for room in door.rooms)
@@ -212,10 +209,7 @@ class Round:
 
 
 def _legs(rooms: Rooms, home: int, metres: float, chance: np.random.Generator) -> Iterator[Within]:
-    """Draw the legs of a round at random: a room, and the doors of entry and leaving.
-
-    None instead of a door means the middle of the room.
-    """
+    """Draw the legs of a round: a room, and the doors in and out; None is the room's middle."""
     passed: Counter[int] = Counter()
     room, came, done = home, None, 0.0
     while True:

@@ -109,10 +109,7 @@ def _turned(points: Array, angle: float) -> Array:
 
 
 def _axis(points: Array) -> float:
-    """The direction of the walls between -45 and 45 degrees, in radians.
-
-    It is the mean direction, modulo a right angle, of the lines between points close together.
-    """
+    """The mean direction of the walls between -45 and 45 degrees, in radians."""
     chords = points[8:] - points[:-8]
     length = np.hypot(chords[:, 0], chords[:, 1])
     good = (length > 0.08) & (length < 1.5)
@@ -129,10 +126,7 @@ def _axis(points: Array) -> float:
 
 
 def _finer(points: Array, reach: float) -> float:
-    """The remaining angle between walls and axes, in radians.
-
-    It is the mean slope of the walls ahead, behind, left and right, weighted by their length.
-    """
+    """The remaining angle between walls and axes in radians, weighted by the walls' lengths."""
     slopes, weights = [], []
     for u, v in ((0, 1), (1, 0)):
         values, spacing = points[:, v], _spacing(points[:, u])
@@ -165,10 +159,7 @@ def _spacing(values: Array) -> Array:
 
 
 def _line(values: Array, weights: Array, chosen: NDArray[np.bool_]) -> float | None:
-    """The coordinate of the longest wall across an axis; None if no wall is LONG enough.
-
-    Points have weights in metres of wall. Those that are not `chosen` are not searched.
-    """
+    """The coordinate of the longest wall across an axis; None if no wall is LONG enough."""
     picked, length = values[chosen], weights[chosen]
     if len(picked) < 5:
         return None

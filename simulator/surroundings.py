@@ -123,11 +123,7 @@ def streets_of(
 
 
 def _straight(points: NDArray[np.complex128]) -> Iterator[Wall]:
-    """Split points into walls by the algorithm of Douglas and Peucker.
-
-    Points that do not lie on one line are split at the point farthest from the line between their
-    ends.
-    """
+    """Split points into walls by the algorithm of Douglas and Peucker."""
     if len(points) < 5:
         return
     way = points[-1] - points[0]
@@ -141,10 +137,7 @@ def _straight(points: NDArray[np.complex128]) -> Iterator[Wall]:
 
 
 def _fitted(points: NDArray[np.complex128]) -> Wall:
-    """The wall on the least-squares line through points.
-
-    Its direction is half the angle of the second moment of the points.
-    """
+    """The wall on the least-squares line through points."""
     middle = points.mean()
     direction = np.sqrt(((points - middle) ** 2).sum())
     direction /= abs(direction)
@@ -156,10 +149,7 @@ def _fitted(points: NDArray[np.complex128]) -> Wall:
 def _between(
     walls: Sequence[Wall], points: NDArray[np.complex128], reach: float, farther: float
 ) -> Iterator[Street]:
-    """The streets between any two walls, one on the right of the street and one on the left.
-
-    Arguments are those of `streets_of`.
-    """
+    """The streets between any two walls, one on the right of the street and one on the left."""
     # Rotate both walls so that the street points along the real axis.
     for right, left in permutations(walls, 2):
         if radians_between(cmath.phase(right.way), cmath.phase(-left.way)) > PARALLEL:
@@ -253,10 +243,7 @@ class Place:
 
 
 def _meeting(streets: Sequence[Street]) -> complex | None:
-    """The point with the least sum of squared distances to all midlines.
-
-    None if two streets are one that goes straight on.
-    """
+    """The point nearest to all midlines; None if two streets are one that goes straight on."""
     if (
         len(streets) == 2
         and radians_between(streets[0].bearing, streets[1].bearing + math.pi) <= STRAIGHT
@@ -270,10 +257,7 @@ def _meeting(streets: Sequence[Street]) -> complex | None:
 
 
 def _end(streets: Sequence[Street], points: NDArray[np.complex128], reach: float) -> complex | None:
-    """The fixed point of a dead end: on the midline of the only street, `reach` before the wall.
-
-    None if there is no wall.
-    """
+    """The point of a dead end: on the midline, `reach` before the wall; None without a wall."""
     for street in streets:
         along = cmath.rect(1, street.bearing)
         seen = (points - street.middle) / along

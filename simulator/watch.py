@@ -86,10 +86,7 @@ class DriveWatch:
             self._ended(tour, after)
 
     def _ended(self, tour: int, pose: Pose) -> None:
-        """Check that a tour ended where the first one began.
-
-        Warn if it did not, or raise SimulatorError if other tours would follow.
-        """
+        """Warn if a tour did not end where the first began; an error if others follow."""
         assert self._home is not None
         if (
             math.dist(pose[:2], self._home[:2]) <= self._near
@@ -207,10 +204,7 @@ class DriveWatch:
 
 
 def _off_axis(world: World) -> float:
-    """The smallest angle between the start heading and walls, in radians.
-
-    Walls are assumed to be parallel or at right angles to the longest one.
-    """
+    """The smallest angle between the start heading and right-angled walls, in radians."""
     ways = world.segments[:, 2:] - world.segments[:, :2]
     longest = ways[int(np.hypot(*ways.T).argmax())]
     return abs(math.remainder(world.start[2] - math.atan2(longest[1], longest[0]), math.pi / 2))

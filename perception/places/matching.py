@@ -228,10 +228,7 @@ def match(first: Scene, second: Turned) -> Match | None:
 
 
 def _scores(first: _Spectra, second: _Spectra, least: float) -> Array:
-    """The coarse score of each rotation and shift, (n, shifts, shifts).
-
-    The spectra of the first place are conjugated. The score is divided by at least `least` points.
-    """
+    """Score each rotation and shift, (n, shifts, shifts), divided by at least `least` points."""
     walls, blurred, observed = first
     points, soft, seen = second
     agree, count = (

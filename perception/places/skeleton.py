@@ -216,11 +216,7 @@ def junctions_merged(graph: Graph, distance: Array) -> list[Fork]:
 def _are_one(
     edge: Edge, heads: tuple[int, int], nodes: Mapping[int, Node], distance: Array
 ) -> bool:
-    """Check whether the junctions at the ends of an edge are in one open space.
-
-    Each end may be merged with other junctions already. `heads` has the largest junction of each
-    end's group.
-    """
+    """Whether the junctions at the ends of an edge, merged into `heads`, are in one open space."""
     first, second = (nodes[node] for node in heads)
     rows, columns = np.rint(edge.cells).astype(int).T
     narrowest = distance[rows, columns].min()
@@ -259,11 +255,7 @@ def bends(graph: Graph, distance: Array, out: float) -> Iterator[Bend]:
 
 
 def _bends_of(edge: Edge, first: float, last: float, distance: Array, out: float) -> Iterator[Bend]:
-    """Find the bends of one line, the sharpest first. See `bends`.
-
-    The line is within the disc of its first node for a length of `first` cells, and within that of
-    its last node for a length of `last` cells.
-    """
+    """Find the bends of one line outside the discs of its ends, the sharpest first."""
     cells = edge.cells
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(cells, axis=0).T))])
     rows, columns = np.rint(cells).astype(int).T

@@ -189,10 +189,7 @@ def _in_order(cells: Sequence[int], steps: Sequence[int]) -> list[int]:
 def _add_line(
     graph: Graph, line: NDArray[np.int64], touched: Sequence[list[int]], distance: Array
 ) -> None:
-    """Add a line, (n, 2), to a graph, with a node at each of its ends that is at no junction.
-
-    `touched` has the junctions that touch its first and its last cell.
-    """
+    """Add a line, (n, 2), with a node at each end that touches no junction (`touched`)."""
     if len(line) == 1:  # Both ends are at one cell.
         touched = [touched[0][:1], touched[0][1:2]]
     ends = []

@@ -178,10 +178,7 @@ def _course(track: Track, first: Visit, last: Visit, heading: float) -> list[lis
 
 
 def _star(visit: Visit, heading: float) -> tuple[Gateway, ...]:
-    """Make the star of a place as seen with a heading: its ways out, clockwise from the back.
-
-    A way that is not sure becomes a gateway that was not observed.
-    """
+    """Make the star of a place as seen with a heading, clockwise from the back."""
     seen = [(-math.degrees(wrapped(way.bearing - heading)), way.sure) for way in visit.ways]
     return tuple(
         Gateway(round(bearing, 1), SPREAD, open=True if sure else None)
@@ -234,10 +231,7 @@ def _with_turns(steps: list[Step], visits: Sequence[Visit]) -> list[Step]:
 
 
 def _turn(clockwise: float, visit: Visit) -> Action:
-    """The action of a turn at a visit by an angle in degrees.
-
-    If the robot leaves by the way by which it came, the action is "around".
-    """
+    """The action of a turn at a visit by an angle in degrees."""
     if visit.arrived == visit.left:
         return Action.of("around")
     degrees = round(clockwise % 360, 1)

@@ -66,11 +66,7 @@ def units_of(log: RobotLog) -> tuple[Units, list[str]]:
 
 
 def _length(log: RobotLog) -> tuple[float, list[str]]:
-    """Recognise how many units make a metre, 1 if no unit fits, with a note.
-
-    It is recognised on a stretch of the log: in the right unit, the odometry there agrees with scan
-    matching.
-    """
+    """Recognise on a stretch of the log how many units make a metre, with a note."""
     usual = jumps.usual_step(log)
     if usual <= SPARSE:
         return 1.0, []

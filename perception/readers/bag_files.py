@@ -89,10 +89,7 @@ def files_opened(path: Path, format: str) -> Iterator[Files]:
 
 
 def _of_folder(path: Path, folder: Path, stack: ExitStack) -> Files:
-    """Open a folder by its metadata.yaml. Without a usable one, open all files in it.
-
-    Raises LogError if no file can be opened, or they are of several drives.
-    """
+    """Open a folder by its metadata.yaml, or else all files in it. Raises LogError."""
     parts = sorted(
         (part for part in path.iterdir() if NAMES.search(part.name) and part.is_file()), key=_number
     )

@@ -121,10 +121,7 @@ def _scan_topics(bag: Bag, named: Sequence[str]) -> list[str]:
 
 
 def _chosen(bag: Bag, kinds: Sequence[str], name: str | None, option: str) -> str | None:
-    """Choose a topic: the named one, or the only one with messages of some kinds, if any.
-
-    Raises LogError if the named topic does not exist, or several exist and none is named.
-    """
+    """Choose the named topic, or the only one of some kinds, if any. Raises LogError."""
     counts = {topic: count for topic, count in bag.topics(*kinds).items() if count}
     short = kinds[0].rpartition("/")[2]
     listed = (
@@ -312,10 +309,7 @@ def _scans(
 def _measured(
     message: Any, mount: Pose, is_flipped: bool
 ) -> tuple[NDArray[np.float64], LaserScanner]:
-    """Read the ranges of a message, and describe its laser. Raises Damaged.
-
-    The beams of a flipped laser, which hangs upside down, turn clockwise.
-    """
+    """Read ranges and laser of a message. The beams of a flipped laser turn clockwise."""
     first, step, nearest, reach = (
         float(v)
         for v in (message.angle_min, message.angle_increment, message.range_min, message.range_max)

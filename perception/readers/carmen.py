@@ -157,10 +157,7 @@ def read(
 def _scans(
     file: IO[bytes], source: str, odometer: _OdometerPoses, kind: str, mount: Pose, reach: float
 ) -> Iterator[Scan | Damage]:
-    """Yield the scans, and damage for lines that cannot be read.
-
-    `reach` is that of the laser in metres, if the lines do not give it.
-    """
+    """Yield the scans, and damage for lines that cannot be read."""
     # Scans without poses wait here for the next ODOM line.
     waiting: list[Scan | Damage] = []
     # The field of view may be given in degrees. Without one, or with an invalid one, it is pi.
@@ -316,10 +313,7 @@ class _OdometerPoses:
 def _measured(
     line: ScanLine, mount: Pose, reach: float, fov: float
 ) -> tuple[NDArray[np.float64], LaserScanner]:
-    """The ranges of a scan in metres, and its laser.
-
-    `reach`, in metres, and `fov`, in radians, hold if the line does not give them.
-    """
+    """The ranges of a scan and its laser; `reach` and `fov` hold if the line does not give them."""
     beams = len(line.ranges)
     if line.shape is None:
         # FLASER lines do not give the geometry. The first beam is on the right. If the number of

@@ -107,11 +107,7 @@ class PoseGraph:
         return VertexPoses(tuple(poses), tuple(gaps))
 
     def _motion(self, start: int, end: int) -> Pose | None:
-        """Find the motion from one vertex to another; None if it is unknown.
-
-        It is that of the edge between the two. If there is none, the motions along the vertices
-        whose numbers lie between theirs are added up.
-        """
+        """Find the motion between vertices by an edge or a chain of edges; None without."""
         if (motion := self.edges.get((start, end))) is not None:
             return motion
         if (back := self.edges.get((end, start))) is not None:
@@ -262,10 +258,7 @@ def meaning_of(
 def _meaning_beside_graph(
     graph: PoseGraph, survey: Survey, kind: str, source: str, notes: list[str]
 ) -> Meaning:
-    """Find out what the poses of the scans mean if the log has vertices.
-
-    Raises LogError if they are those of vertices, and there are no edges.
-    """
+    """Find out what the poses of scans mean if the log has vertices. Raises LogError."""
     if graph.share_at_vertices(survey.poses) < MOST_SCANS:
         notes.append(
             f"The poses in {kind} and in VERTEX2 differ: those in {kind} are used as odometry, "
@@ -394,10 +387,7 @@ def _count_restart(
     pose: Pose,
     time: float | None,
 ) -> None:
-    """Count whether the ODOM line after a scan repeats the pose of the scan.
-
-    `before` has the pose and time, in seconds, of the ODOM line before the scan.
-    """
+    """Count whether the ODOM line after a scan repeats the pose of the scan."""
     if line.second is None or before is None or before[0] == line.second:
         return
     survey.moves += 1

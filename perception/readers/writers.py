@@ -203,10 +203,7 @@ def _write_bag(path: Path, scans: Iterable[Scan], covariances: NDArray[np.float6
 def _messages(
     store: Any, scans: Iterable[Scan], covariances: NDArray[np.float64] | None, is_ros1: bool
 ) -> Iterator[tuple[str, int, Any]]:
-    """Yield topic, time in nanoseconds and message of all scans, or raise LogError.
-
-    Errors are: no scan, a negative time, or a laser whose mount changes.
-    """
+    """Yield topic, time in nanoseconds and message of all scans, or raise LogError."""
     types = store.types
     mounted: set[Pose] = set()
     for number, (scan, seconds) in enumerate(zip(*_numbered(scans), strict=True)):
@@ -253,10 +250,7 @@ def _messages(
 
 
 class _Maker:
-    """Makes messages with one time.
-
-    For ROS 1, `numbering` has the sequence number of the header.
-    """
+    """Makes messages with one time. ROS 1 also numbers headers."""
 
     def __init__(self, types: Any, stamp: Any, numbering: dict[str, int]) -> None:
         self.types, self.stamp, self.numbering = types, stamp, numbering

@@ -61,10 +61,7 @@ def contradictions(
 
 
 class _Claims:
-    """The claims of an answer. Each method yields a sentence for each false claim.
-
-    Parameters as in `false_claims`.
-    """
+    """The claims of an answer. Each method yields a sentence for each false claim."""
 
     def __init__(
         self,

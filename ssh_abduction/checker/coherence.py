@@ -52,10 +52,7 @@ def numbered_by_first_visit(m: Reading) -> Found:
 
 
 def _numbered(what: str, ids: Sequence[int], visits: Iterable[tuple[int, int | None]]) -> Found:
-    """Check that ids are 0, 1, 2, … by first visit, and that each is visited.
-
-    `visits` has a step and the id visited there (None for no id), by step.
-    """
+    """Check that ids are 0, 1, 2, … by first visit. `visits` has the id, or None, by step."""
     if list(ids) != list(range(len(ids))):
         yield [], f"The ids of the {what} are not 0, 1, 2, … in this order."
     used = {x: i for i, x in reversed(list(visits)) if x is not None}

@@ -118,10 +118,7 @@ def closure(m: Reading) -> Found:
 
 
 def _p_value(match: Closure, odometry: Odometry, freedom: int) -> float:
-    """Compute the probability of a closure at least this far from zero if both poses are equal.
-
-    `freedom` is 2 to compare positions, 3 to compare poses.
-    """
+    """Compute how probable a closure so far from zero is if poses, or positions, are equal."""
     import numpy as np
     from scipy.special import chdtrc  # scipy.stats has the same, and loads for half a second
 

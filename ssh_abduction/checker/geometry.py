@@ -123,10 +123,7 @@ def refused_returns(trace: Trace, ssh_map: SSHMap, theory: Theory) -> Iterator[R
 
 
 def _refused(trace: Trace, ssh_map: SSHMap, theory: Theory, drifts: Drifts) -> Iterator[_Found]:
-    """Find rejected returns for `refused_returns`.
-
-    Single returns come first: they are found fast, and a caller may need no more.
-    """
+    """Find rejected returns for `refused_returns`, the single ones first: they are found fast."""
     yield from _refused_alone(list(_returns(trace, ssh_map, theory, drifts)), drifts, theory)
     if theory.joint > 1:
         yield from _refused_together(
@@ -304,10 +301,7 @@ class _EachReturn:
 def _unsafe(
     filtered: ErrorFilter, rows: Steps, alone: _EachReturn, end: int, most: float
 ) -> tuple[Steps, Steps]:
-    """Find the pairs that need a test, among the pairs whose later return ends at step `end`.
-
-    Arguments are those of `_sets`. Returns the indices of the earlier and of the later returns.
-    """
+    """Find the pairs that need a test among those whose later return ends at step `end`."""
     later = np.arange(*np.searchsorted(rows[:, 1], [end, end + 1]))
     earlier = np.arange(
         np.searchsorted(rows[:, 1], rows[later, 0].min(), side="right"), later[-1] + 1
@@ -335,19 +329,13 @@ def _unsafe(
 
 
 def _common_ends(rows: Steps, here: Steps, others: Steps) -> Steps:
-    """Count the ends that the loops of the returns `here` and `others` (indices) have in common.
-
-    Both returns share the error by which the robot is off its dstate at such an end.
-    """
+    """Count the common ends of the loops of the returns `here` and `others` (indices)."""
     same: Steps = (rows[here, :2] == rows[others, :2]).sum(-1)
     return same
 
 
 def _is_safe(share: Array, squares: Array, most: float) -> NDArray[np.bool_]:
-    """For each pair of returns, tell whether the bound shows that it is not rejected.
-
-    `squares` are the sums of the chi-squares of both returns.
-    """
+    """Tell for each pair of returns whether the bound shows that it is not rejected."""
     left = 1 - squares / most
     safe: NDArray[np.bool_] = (left > 0) & (share + MARGIN <= left**2)
     return safe

@@ -245,10 +245,7 @@ class _Errors:
         return np.array(off), np.concatenate(rows) if rows else np.zeros((0, self._size))
 
     def _row(self, pose: Array, own: Array, first: int, last: int) -> Array:
-        """Compute the derivatives of the pose at `last` minus that at `first`, (3, unknowns).
-
-        `own` has the derivatives of each movement by its own unknowns, (steps, 3, 5).
-        """
+        """Compute how the pose at `last` minus that at `first` changes with all unknowns."""
         along = slice(first + 1, last + 1)
         rest = pose[last, :2] - pose[along, :2]
         # An error of the heading turns the rest of the way.

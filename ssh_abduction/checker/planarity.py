@@ -211,10 +211,7 @@ class Edges:
         return one
 
     def _some_option_draws(self, options: list[list[Option]]) -> bool:
-        """Tell whether one option can be chosen for each place so that they make a drawing.
-
-        Options are chosen place by place. A partial choice that makes no drawing is not extended.
-        """
+        """Choose an option place by place, and tell whether some choice makes a drawing."""
         settled = {arm: k for some in options if len(some) == 1 for arm, k in some[0].items()}
         others = sorted((some for some in options if len(some) != 1), key=len)
         if not self._is_drawing(settled):
@@ -256,10 +253,7 @@ class Edges:
 
 
 def _goes_round(order: Sequence[Arm], sequence: Sequence[Arm]) -> bool:
-    """Whether a sequence has distinct gateways that `order` has in the same cyclic order.
-
-    Gateways that are not in `order` yet do not count.
-    """
+    """Whether gateways, all different, have the cyclic order of those that `order` has."""
     there = [order.index(gateway) for gateway in sequence if gateway in order]
     return (
         len(set(sequence)) == len(sequence)

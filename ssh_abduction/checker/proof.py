@@ -107,10 +107,7 @@ def _look_different(here: Step, there: Step) -> bool:
 
 
 def _common_actions(trace: Trace, i: int, j: int) -> list[str]:
-    """List the actions done after both steps, until the views or actions differ.
-
-    This is the word of a pair if a certificate has no words.
-    """
+    """List the actions done after both steps, until the views or actions differ."""
     word: list[str] = []
     for here, there in zip(trace.steps[i:], trace.steps[j:], strict=False):
         if (

@@ -304,10 +304,7 @@ class Order:
         return self.listed[i + 1 :] if direction == 1 else self.listed[:i]
 
     def _follows(self, p: int, direction: int) -> list[int]:
-        """Find the places that travels or the list put after p.
-
-        The list is used only if the order is total. If a travel contradicts it, the travel decides.
-        """
+        """Find the places that travels, or else the list of a total order, put after p."""
         travelled = self._next[direction].get(p, {})
         later = self._later(p, direction) if self._total else ()
         return [

@@ -54,10 +54,7 @@ def _beside(m: Reading) -> dict[_Places, str]:
 
 
 def _between(m: Reading) -> dict[_Places, str]:
-    """Find the region of each place right of courses: all places right of the same courses.
-
-    Each region comes with a sentence.
-    """
+    """Find the region of each place right of courses: all places right of the same courses."""
     sides = m.once(known_sides)
     found = {}
     for p in {p for places in sides.values() for p in places}:

@@ -163,10 +163,7 @@ class SolveQuestion(FileQuestion):
         maps: list[Given],
         given_up: Callable[[], bool],
     ) -> contextlib.AbstractContextManager[object]:
-        """Make a guard that ends a worker process at its limits.
-
-        In any other process, return a context manager that does nothing.
-        """
+        """Make a guard that ends a worker process at its limits; nothing in other processes."""
 
         def last_words(why: Stop) -> tuple[SolveAnswer, int]:
             # Nobody reads the exit code of this process.
@@ -296,10 +293,7 @@ def _forget_memory() -> None:
 
 @contextlib.contextmanager
 def _progress(total: int) -> Iterator[tuple[Callable[[str], None], Callable[[], None]]]:
-    """Show a progress bar on stderr, if it is a terminal.
-
-    Yield two functions: one prints a line, the other advances the bar by one.
-    """
+    """Show a progress bar on a terminal. Yield functions that print a line, and that advance it."""
     if not sys.stderr.isatty():
         yield partial(print, flush=True), lambda: None
         return

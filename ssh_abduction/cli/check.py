@@ -153,10 +153,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _refuse_bound(resolved: Theory, solved: Theory | None) -> None:
-    """Raise MapError if a clique of steps proves no bound by one of these theories.
-
-    `resolved` is the theory to check by, `solved` that of the file of maps, if known.
-    """
+    """Raise MapError if a clique proves no bound by the theory to check by, or by the file's."""
     if resolved.has_faults or (solved is not None and solved.has_faults):
         raise MapError(
             "bound: expected a theory without faults (misread, slipped), as a clique of steps "
@@ -291,10 +288,7 @@ def _false_of_maps(data: Mapping[str, Any], maps: Sequence[SSHMap], trace: Trace
 
 
 def _false_of_all(data: Mapping[str, Any], trace: Trace) -> Iterator[str]:
-    """Yield a sentence for each false claim of the file about all maps: what they share.
-
-    Call it only if all other claims hold.
-    """
+    """Yield a sentence for each false claim of the file about what all maps share."""
     try:
         solution = Solution.from_dict(data, "the file", trace)
     except MapError as error:

@@ -59,10 +59,7 @@ def _all_actions(parser: argparse.ArgumentParser) -> list[argparse.Action]:
 
 
 def _file_kind(action: argparse.Action) -> str | None:
-    """Find out from its metavar whether an argument names a "file", a "folder", or neither (None).
-
-    A positional argument names a file, unless it is a number or has choices.
-    """
+    """Find out whether an argument names a "file", a "folder", or neither (None)."""
     if action.nargs == 0 or action.choices is not None:
         return None
     if not action.option_strings:

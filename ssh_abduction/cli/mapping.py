@@ -431,10 +431,7 @@ def _say(answer: MapAnswer, folder: Path) -> None:
 
 
 def _theory(options: argparse.Namespace) -> tuple[Theory | None, dict[str, Any]]:
-    """Find the theory that the options ask for, and the fields that the user set.
-
-    The theory is None, as it depends on the log, unless the user names one. Then the dict is empty.
-    """
+    """Find the theory that the user names, if any, or else the fields that the user set."""
     asked = theory_of(options)
     choices = {name: getattr(asked, name) for name in choices_of(options)}
     return (asked, {}) if options.theory or asked.level == "causal" else (None, choices)

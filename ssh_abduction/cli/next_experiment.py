@@ -152,10 +152,7 @@ def _tree(plan: ExperimentPlan, indent: str) -> Iterator[str]:
 
 
 def _untried(plan: ExperimentPlan) -> str:
-    """Say which untried action to try if known links cannot distinguish the remaining rivals.
-
-    The text continues a line. It is empty if one rival remains or the plan goes on.
-    """
+    """Say which untried action to try if known links cannot distinguish the rivals."""
     if len(plan.rivals) == 1 or plan.branches:
         return ""
     if plan.untried is None:

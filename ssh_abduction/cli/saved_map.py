@@ -151,10 +151,7 @@ class SavedMap:
         return self._seen_from(best, self._rounded(drawn[best] - COMPASS[way], text))
 
     def _seen_from(self, label: int, way: float) -> tuple[tuple[str, float], ...]:
-        """List the steps at the place of a dstate, with the direction of a gateway in degrees.
-
-        Without headings, only the steps at the dstate itself are listed.
-        """
+        """List the steps at a dstate's place with degrees of a gateway, by their headings."""
         here = self.map.dstates[label]
         unit = 90 if self.in_quarters else 1
         ways = {

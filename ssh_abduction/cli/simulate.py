@@ -288,10 +288,7 @@ def _camera(options: argparse.Namespace) -> Camera | None:
 
 
 def _with_table(trace: Trace, target: str) -> Trace:
-    """Write the panoramas of a trace to an .npz file beside it.
-
-    Its images are then indices into it.
-    """
+    """Move the panoramas of a trace to an .npz file beside it. Images are then indices into it."""
     import io
     from dataclasses import replace
     from pathlib import Path

@@ -239,10 +239,7 @@ def _joint(paths: Sequence[str]) -> Trace:
 
 
 class _Text:
-    """Prints the result of a search for people.
-
-    `kept` has the first maps; others are only counted.
-    """
+    """Prints the result of a search for people. `kept` has the first maps."""
 
     def __init__(self, search: Search, obeying: Obeying) -> None:
         self.kept: list[SSHMap] = []

@@ -94,10 +94,7 @@ def pair(text: str) -> tuple[int, int]:
 
 
 def _labelled(options: argparse.Namespace) -> tuple[Any, Any, Any]:
-    """Return the images, (n, d), of the n labelled steps, their labels, (n,), and a recogniser.
-
-    The recogniser is untrained.
-    """
+    """Return the images, (n, d), of the labelled steps, their labels, and a new recogniser."""
     from perception.recognition import recogniser
 
     images, labels, _, features = _mapped(options)
@@ -105,10 +102,7 @@ def _labelled(options: argparse.Namespace) -> tuple[Any, Any, Any]:
 
 
 def _mapped(options: argparse.Namespace) -> tuple[Any, Any, SSHMap, Any]:
-    """Return images, (n, d), their labels, (n,), the map, and a transformer of the images.
-
-    Only the n steps with a label count. The labels are ids of dstates in the map.
-    """
+    """Return the images of labelled steps, their dstates, the map, and a transformer of images."""
     from perception.appearance import features_of
     from perception.images import images_of
     from ssh_abduction.learning.learner import labels_of

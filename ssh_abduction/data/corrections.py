@@ -343,10 +343,7 @@ class Corrections:
         )
 
     def _check_names(self) -> None:
-        """Raise MapError if two sentences give one name, or name one thing twice.
-
-        A name that reads as a number is wrong, too.
-        """
+        """Raise MapError if a name is a number or given twice, or a thing is named twice."""
         where = self.source or "corrections"
         first: dict[tuple[str, ...], int] = {}
         for i, naming in enumerate(self.names):

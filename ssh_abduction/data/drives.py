@@ -338,10 +338,7 @@ def _warn_of_repeats(traces: Sequence[Trace]) -> None:
 
 
 def _warn_of_other_names(traces: Sequence[Trace]) -> None:
-    """Warn if traces have different names for actions that are alike in all else.
-
-    Lifts are left out, as those to different floors have different names.
-    """
+    """Warn if traces have different names for travels or turns that are alike in all else."""
     known: dict[Action, tuple[int, set[str]]] = {}
     for i, trace in enumerate(traces):
         named: dict[Action, set[str]] = {}

@@ -326,10 +326,7 @@ def _fitted(
 
 @lru_cache(maxsize=2**12)
 def _frames(star: Star, most: int) -> tuple[Frame, ...]:
-    """The frames of a star, also those with up to `most` gateways that are closed on its drive.
-
-    Each of these is open on another drive, and so counts as a change.
-    """
+    """The frames of a star, also with up to `most` gateways that are open on other drives only."""
     if not most:
         return star.frames
     every = (wider for frame in star.frames for wider in frame.with_closed)
@@ -344,10 +341,7 @@ def _closed(read: Turned) -> frozenset[int]:
 
 
 def _changes(closed: Mapping[int, frozenset[int]]) -> float:
-    """Count the gateways that change from each drive at a place to the next; inf if too many.
-
-    `closed` has the gateways that are closed, for each drive.
-    """
+    """Count how often gateways open or close from each drive to the next; inf if too often."""
     in_order = [closed[drive] for drive in sorted(closed)]
     counts = [len(a ^ b) for a, b in pairwise(in_order)]
     return sum(counts) if max(counts, default=0) <= MOST_CLOSED else math.inf
@@ -408,10 +402,7 @@ def _allowed(
     axioms: Collection[str],
     as_shown: bool,
 ) -> bool:
-    """Whether the axioms allow these frames and shifts for two sights at one place.
-
-    The sight `a` is not later than `b`. With `as_shown`, the headings of the dstates must fit, too.
-    """
+    """Whether the axioms allow frames and shifts for two sights at one place, the earlier first."""
     (first, back), (then, on) = seen_a, seen_b
     shift = (on - back) % max(first.slots, 1)
     found = rotations(first, then, shift)

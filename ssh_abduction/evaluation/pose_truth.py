@@ -259,10 +259,7 @@ def told_poses(trace: Trace) -> list[Pose | None]:
 
 
 class _PoseTruth:
-    """The truth by the poses of a trace.
-
-    `told` says for each step whether its pose is known, (n,).
-    """
+    """The truth by poses. `told` says for each step whether its pose is known, (n,)."""
 
     name = "poses"
 
@@ -288,10 +285,7 @@ class _PoseTruth:
 
 
 class _Related:
-    """The truth by relations.
-
-    `told` says whether the time of each step is near related times, (n,).
-    """
+    """The truth by relations. `told` says whether related times are near each step, (n,)."""
 
     name = "relations"
 

@@ -183,10 +183,7 @@ class Argument:
         assumed: Sequence[Assumption],
         known: frozenset[clingo.Symbol],
     ) -> tuple[tuple[str, int], ...] | None:
-        """Find the first link of `left` that gives a new conclusion or a contradiction.
-
-        Return it as a tuple of one link; None if no single link gives anything new.
-        """
+        """Find the first link of `left` that alone gives a new conclusion or a contradiction."""
         for link in left:
             active = _active([*placed, link])
             if assumed and not self._axioms.consistent(active, assumed):
@@ -198,10 +195,7 @@ class Argument:
     def _add(
         self, group: tuple[tuple[str, int], ...], known: frozenset[clingo.Symbol], supposed: bool
     ) -> None:
-        """Add a line if some known conclusions are new.
-
-        If `supposed`, they need the supposition.
-        """
+        """Add a line if some known conclusions are new, perhaps under the supposition."""
         new = known - self._born.keys()
         if new:
             self._born.update(dict.fromkeys(new, len(self._lines)))
@@ -394,10 +388,7 @@ class Argument:
             )
 
     def _map_without(self, link: tuple[str, int]) -> SSHMap:
-        """Find a map that satisfies the supposition and all links of the argument but this one.
-
-        Axioms in SHOWN also hold at other steps, at as many as possible.
-        """
+        """Find a map with the supposition and all links but this one, and most of SHOWN."""
         supposed = [self._supposed]
         active = _active(other for other in self._links if other != link)
         for axiom in SHOWN:

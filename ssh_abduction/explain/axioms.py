@@ -333,10 +333,7 @@ class Axioms:
     def _refused_together(
         self, displacement: Displacement, answer: _ModelMap, step: int
     ) -> Refusal | None:
-        """Find two returns, the later one to `step`, that displacements reject together.
-
-        A return is two steps at one dstate or at one place.
-        """
+        """Find two returns, the later one to `step`, that displacements reject together."""
         if displacement.joint == 1:
             return None
         return displacement.returns_of(self._trace).refused_at(answer.labels, answer.places, step)
@@ -410,10 +407,7 @@ class Axioms:
     def _shrunk(
         self, kept: list[clingo.Symbol], assumed: Sequence[Assumption]
     ) -> list[clingo.Symbol]:
-        """Drop unneeded pairs (axiom, step) in their order, whole axioms first.
-
-        Return the atoms left.
-        """
+        """Drop unneeded pairs (axiom, step) in order, whole axioms first; return the others."""
         # the last unsat core: as long as all of it is kept, there is no map
         core: set[clingo.Symbol] | None = None
 

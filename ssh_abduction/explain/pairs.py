@@ -270,10 +270,7 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
     def _keep(
         self, ssh_map: SSHMap, cost: Cost | None, nats: float | None, *, proven: bool = False
     ) -> None:
-        """Keep the cost of a map if no better map of its side is known.
-
-        `proven` says that no map of the side costs less.
-        """
+        """Keep the cost of a map, perhaps `proven` to be its side's least, if it is the best."""
         one = ssh_map.dstate_at[self.first] == ssh_map.dstate_at[self.second]
         before = self._sides[one]
         side = replace(before, possible=True, cost=cost, nats=nats, proven=proven)
@@ -353,10 +350,7 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
     # The whole trace
 
     def _list_minimal_maps(self, settled: bool) -> None:
-        """List minimal maps, and count those of each side.
-
-        If the verdict is already `settled`, look for a single minimal map only.
-        """
+        """List minimal maps, only one if the verdict is `settled`, and count each side's."""
         left = self._watch.left()
         seconds = (
             min(left, max(CONFIRMING, 0.0 if self.limit is None else self.limit / 10))

@@ -242,10 +242,7 @@ def _path_side(readings: list[Reading], place: int, path: int) -> PathSide:
 
 
 def _side_of(m: Reading, place: int, course: Course) -> tuple[_Side, RightBranch | None]:
-    """Find the side of a course on which a place lies, and the branch that shows it.
-
-    Both are None if the side is unknown. The branch is None if the place is on the path.
-    """
+    """Find the side of a course on which a place lies, and the branch that shows it; or None."""
     if place in m.along.get(course[0], ()):
         return "on", None
     sides = m.once(known_sides)

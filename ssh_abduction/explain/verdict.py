@@ -266,10 +266,7 @@ def _effect(nats: float) -> str:
 
 
 def _difference(lost: Cost, won: Cost, theory: Theory) -> str:
-    """Compare in words the cost `lost` of a map with the cost `won` of a better map.
-
-    The text names the first preferred count in which the two differ, and the equal counts before.
-    """
+    """Compare costs in words by the first count that differs, and the equal ones before."""
     same: list[str] = []
     for (name, one), (_, other) in zip(
         _counts(lost, theory.priorities), _counts(won, theory.priorities), strict=True

@@ -211,9 +211,6 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
         return ViewClusterer(random_state=0, isolated=ISOLATED if theory.misread else None)
 
     def _followed(self, traces: Traces, looks: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Follow traces on the map, by the dstate that each image looks like, (m,).
-
-        Unknown ones are -1.
-        """
+        """Give each image of the traces the dstate that it looks like, (m,); -1 if unknown."""
         views = self.clusterer_.predict(self.features_.transform(traces.images))
         return labels_on(self.map_, traces, views, looks)

@@ -122,10 +122,7 @@ def _has_turns_of_its_own(ssh_map: SSHMap) -> bool:
 def _links_of(
     sources: NDArray[np.intp], targets: NDArray[np.intp], weights: NDArray[np.float64], number: int
 ) -> Links:
-    """Make the links of one action from weights of pairs of dstates, (n,).
-
-    A weight says how likely a pair is, relative to other pairs with the same source.
-    """
+    """Make the links of one action from relative weights of pairs of dstates, (n,)."""
     totals = np.bincount(sources, weights, number)
     missing = np.where(totals > 0, 0.0, 1.0)
     return Links(

@@ -233,10 +233,7 @@ class MoveGraph:
         return move + (self._travel_cost if travels else 0.0)
 
     def _only_action(self, *, onward: bool) -> str | None:
-        """Return the action that leads along paths or, if not `onward`, turns around on them.
-
-        None if the map has no such action, or several.
-        """
+        """The only action along paths or, if not `onward`, around on them; None if not one."""
         dstates, names = self.map.dstates, set()
         for source, action, target in self.map.links:
             s, x = dstates[source], dstates[target]
@@ -246,10 +243,7 @@ class MoveGraph:
         return names.pop() if len(names) == 1 else None
 
     def _dstates_at(self, place: int, field: str) -> set[Node]:
-        """Find the dstates at a place.
-
-        Raise MapError, naming `field`, if the map has no such place.
-        """
+        """Find the dstates at a place. Raise MapError, naming `field`, if there is none."""
         members = self._dstates_in({place})
         if not members:
             known = sorted({s.place for s in self.map.dstates if s.place is not None})

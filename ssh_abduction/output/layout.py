@@ -296,10 +296,7 @@ class _Drawing:
         return kept
 
     def _packed(self, at: Mapping[int, Point]) -> dict[int, Point]:
-        """Move parts of the map that no street connects side by side.
-
-        The first spot is at (0, 0).
-        """
+        """Move parts that no street connects side by side. The first spot is at (0, 0)."""
         graph: nx.Graph[Any] = nx.Graph()
         graph.add_nodes_from(self.spots)
         graph.add_edges_from(pair for path in self.map.paths for pair in pairwise(path.order))

@@ -392,10 +392,7 @@ def _colour(s: DState) -> str:
 
 
 def _spots(ssh_map: SSHMap, poses: Sequence[Pose]) -> list[Point]:
-    """Find the positions of places, in metres.
-
-    If the map has no places, find those of dstates. Of several near each other, take the first.
-    """
+    """Find the positions of places, or else of dstates that are not near an earlier one."""
     spots = [
         (poses[members[0].id].x, poses[members[0].id].y) for members in _sites(ssh_map).values()
     ]

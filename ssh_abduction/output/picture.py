@@ -135,10 +135,7 @@ def _path_name(ssh_map: SSHMap, path: MapPath, spots: dict[int, Point]) -> list[
 
 
 def _dstates(ssh_map: SSHMap, place: int, spot: Point, found: Layout) -> list[str]:
-    """Draw the dstates at a place, each on the side of the place that it faces.
-
-    A dstate with an unknown heading is drawn where there is most room.
-    """
+    """Draw each dstate on the side of its place that it faces, or where there is most room."""
     x, y = spot
     taken: list[float] = []
     marks = []
@@ -174,10 +171,7 @@ def _freest(taken: list[float]) -> float:
 
 
 def _causal(ssh_map: SSHMap, found: Layout) -> tuple[list[str], list[Point]]:
-    """Draw a map without places: dstates, and links as arrows.
-
-    Return marks and points to include.
-    """
+    """Draw dstates, and links as arrows; return the marks, and points to include."""
     spots = [_on_page(x, y) for x, y, _ in found.dstates]
     faults = faults_in_words(ssh_map)
     marks = []

@@ -156,10 +156,7 @@ class StreetProgram:
         return at, float(answer.fun) + CROSSING * len(self._near(at))
 
     def _ways_apart(self, e: int, f: int) -> Iterator[list[_Condition]]:
-        """Yield the ways to separate the streets e and f, each as a list of inequalities.
-
-        One street is on a side of the other or, if both are parallel, ahead of it or behind it.
-        """
+        """Yield inequalities that put one of two streets beside, ahead of or behind the other."""
         parallel = abs(float(self.across[e] @ self.along[f])) < PARALLEL
         for normal in (self.across[e], self.along[e] if parallel else self.across[f]):
             for sign in (1.0, -1.0):

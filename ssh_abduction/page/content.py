@@ -159,10 +159,7 @@ def _joins(listing: Listing) -> list[tuple[int, int, str | None]]:
 
 
 def _drives(listing: Listing) -> dict[str, Any]:
-    """The drives of a joint trace, which of them the first map joins, and the joins between them.
-
-    Each join is two steps and its probability, or the share of the maps that have it.
-    """
+    """The drives of a joint trace, which the first map joins, and their joins with shares."""
     first = {drive.name: drive.first for drive in listing.drives}
     return {
         "drives": [asdict(drive) for drive in listing.drives] if len(listing.drives) > 1 else [],
@@ -204,11 +201,7 @@ class _Pool:
 
 
 def _choice(data: dict[str, Any]) -> dict[str, Any]:
-    """Reduce the dict of a choice to the sentences of its questions and to its options.
-
-    A choice is a set of questions that maps answer differently. An option is one way to answer
-    them.
-    """
+    """Reduce the dict of a choice to the sentences of its questions and to its options."""
     return {
         "questions": [question["sentence"] for question in data["questions"]],
         "options": [
@@ -278,10 +271,7 @@ def _layouts(
 
 
 def _unit(found: Layout) -> float:
-    """Compute the median distance of a place from the nearest other one, for at most 200 places.
-
-    If there are no places, take dstates. The distance is |dx| + |dy|.
-    """
+    """Compute the median |dx| + |dy| from a place, or dstate, to the nearest; for at most 200."""
     points = list(found.places.values()) or [(x, y) for x, y, _ in found.dstates]
     nearest = [
         min((abs(x - u) + abs(y - v) for u, v in points if (u, v) != (x, y)), default=0.0)

@@ -111,10 +111,7 @@ def _step(step: Step, view: str) -> dict[str, Any]:
 
 
 def _steps_of_map(first: SSHMap) -> list[dict[str, Any]]:
-    """Reconstruct the views and actions of the trace from a map.
-
-    An action is None if several actions join the two dstates.
-    """
+    """Reconstruct views and actions of the trace from a map; None for several actions."""
     actions = grouped(((s, x), action) for s, action, x in first.links)
     done = [actions.get(pair, []) for pair in pairwise(first.dstate_at)]
     names = [some[0] if len(some) == 1 else None for some in done]
@@ -255,10 +252,7 @@ def _text(shares: NDArray[np.float64]) -> str:
 def _panoramas(
     held: Sequence[NDArray[np.float64] | None], shape: Any, each: int
 ) -> dict[str, Any] | None:
-    """Encode panoramas, with rows and columns left out so that each has few characters.
-
-    None if the images do not have the shape, or are too many.
-    """
+    """Encode panoramas, thinned to few characters; None for a wrong shape or too many."""
     if (
         not isinstance(shape, list)
         or len(shape) != 3

@@ -337,10 +337,7 @@ def _choice(
     option: NDArray[np.intp],
     differing: dict[Matter, tuple[int, ...]],
 ) -> Choice:
-    """Make the choice that consists of the questions `asked`.
-
-    `option` has the number of the option of each map. `differing` is that of the choice.
-    """
+    """Make a choice of the questions `asked`, with the number of each map's `option`."""
     members = members_of(option.tolist())
     options = [
         Option(tuple(bool(a.column[maps[0]]) for a in asked), tuple(i + 1 for i in maps))
@@ -388,11 +385,7 @@ def _check_backbone(shared: Backbone, listed: Backbone, listing: Listing) -> Non
 
 
 def _contradiction(claimed: Shared, seen: Shared, in_one: Sequence[int]) -> tuple[int, int] | None:
-    """Find two steps that are one by the backbone but not in a listed map, or vice versa.
-
-    Two steps are *one* if they are at one dstate (or one place, along one path or one course,
-    depending on the sort).
-    """
+    """Find two steps that are one by the backbone but not in a listed map, or vice versa."""
     first_of: dict[int, int] = {}
     for t, number in enumerate(claimed.always):
         first = first_of.setdefault(number, t)

@@ -268,10 +268,7 @@ def _changes(table: Table, sort: Sort) -> Iterable[Change]:
 
 
 def _groups(classes: Sequence[int], ones: Sequence[int]) -> list[list[int]]:
-    """Group classes as a map does. `ones` is the row of the map in `Table.ones`.
-
-    Classes without a place, path or course in the map are left out.
-    """
+    """Group classes as the row of a map in `Table.ones` does, without those that are nowhere."""
     groups = grouped((ones[c], c) for c in classes if ones[c] != NONE)
     return list(groups.values())
 

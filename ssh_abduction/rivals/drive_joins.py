@@ -188,9 +188,6 @@ def _pair(
 
 
 def _visits(drive: Drive, placings: Sequence[_Placing]) -> list[list[int]]:
-    """List the steps of a drive at each place of the first map.
-
-    Of several steps that every map has at one place, list only the first.
-    """
+    """List the first steps of a drive's visits to each place of the first map."""
     first = firsts((tuple(at[t] for at in placings), t) for t in range(drive.first, drive.stop))
     return list(grouped((names[0], t) for names, t in first.items()).values())

@@ -298,10 +298,7 @@ class Laboratory:
         return [*walk.way(best[1]), best[2]], parts
 
     def _untried(self, machines: Sequence[int], start: Row) -> Untried | None:
-        """Find the most informative action that at least one of the machines has no link for.
-
-        The way to the action uses links that all machines have. None if there is no such action.
-        """
+        """Find the most informative action that some machine has no link for; or None."""
         walk = Walk(self._table, machines, start, self._watch)
         best: tuple[tuple[int, int], int, int, dict[Consequence, list[int]]] | None = None
         for layer in walk.layers():

@@ -142,10 +142,7 @@ def only_in(
 def _sides(
     maps: Sequence[SSHMap], steps: Sequence[int]
 ) -> dict[tuple[int, int], list[_Side | None]]:
-    """Find the side of a path in each map, by the first steps at a place and along a path.
-
-    It is None if the map does not know it. Pairs that no map knows are left out.
-    """
+    """Find the side of a path in each map, by first steps at a place and along a path, if known."""
     beside = [
         {
             (path.id, d): {*right_of(m.regions or (), path.id, d)}

@@ -143,10 +143,7 @@ class Stances:
         return [at[n] for n in sorted(at)]
 
     def _possible(self, n: int) -> list[Action]:
-        """List the actions that the robot can do in stance n.
-
-        In a stance that was never seen, these are the actions that the turned star allows.
-        """
+        """List the actions possible in stance n, by the turned star if it was never seen."""
         if n < len(self._looks):
             step = self._looks[n]
             seen = Seen(step.view, step.star if self._stars[n] else None)

@@ -138,10 +138,7 @@ class Table:
 
 
 def _common_classes(labelings: Sequence[Ints]) -> Ints:
-    """Find the class of each step, (steps,), numbered from 0 by first step.
-
-    Steps are in one class if they have equal labels in each labeling.
-    """
+    """Number the steps, (steps,): those with equal labels in all labelings share one."""
     classes = labelings[0].astype(np.int64)
     for labels in labelings[1:]:
         _, classes = np.unique(classes * (int(labels.max()) + 1) + labels, return_inverse=True)

@@ -378,10 +378,7 @@ def _spots(poses: Sequence[Pose], imported: Imported) -> list[Pose]:
 def _next(
     drives: Sequence[Drive], ssh_map: SSHMap | None, laid: Sequence[int]
 ) -> tuple[int, list[tuple[int, int]]]:
-    """Choose the drive to move next: the one that shares most places with the moved drives, `laid`.
-
-    Return its index, and pairs of a step of a moved drive and a step of this drive at one place.
-    """
+    """Choose the drive that shares most places with the `laid` ones, with pairs of common steps."""
     known: dict[object, list[int]] = defaultdict(list)
     for k in laid:
         for t in range(drives[k].first, drives[k].stop):
@@ -408,10 +405,7 @@ def _station(ssh_map: SSHMap | None, step: int) -> object:
 def _fitted(
     spots: Sequence[Pose], pairs: Sequence[tuple[int, int]], ssh_map: SSHMap | None
 ) -> Pose:
-    """Find the motion that brings the second step of each pair to the first, by least squares.
-
-    Each pose counts as two points: itself, and a point one metre ahead. So one pair is enough.
-    """
+    """Find the motion that brings each second step, and a point ahead of it, best to the first."""
     here, there = [], []
     for first, second in pairs:
         x, y, heading = spots[first]

@@ -23,11 +23,7 @@ def one_thread(user_api: str | None = None) -> AbstractContextManager[Any]:
 
 @cache
 def _controller(user_api: str | None) -> Any:
-    """Find the libraries that this process has loaded. Do this once, as it takes milliseconds.
-
-    Each value of `user_api` has its own controller, as libraries of other kinds may be loaded
-    later.
-    """
+    """Find the libraries that are loaded, once for each kind, as it takes milliseconds."""
     from threadpoolctl import ThreadpoolController
 
     return ThreadpoolController()

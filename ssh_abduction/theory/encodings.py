@@ -139,10 +139,7 @@ def axioms_in(text: str, level: str) -> list[Axiom]:
 
 
 def _unwrapped(text: str) -> list[str]:
-    """Return the lines of an encoding, with each `% @axiom` comment on one line.
-
-    A line that continues such a comment starts with `%` and at least three spaces.
-    """
+    """Return the lines of an encoding, with each `% @axiom` comment on one line."""
     lines: list[str] = []
     for line in text.splitlines():
         if lines and lines[-1].startswith("% @axiom(") and line.startswith("%   "):

@@ -86,10 +86,7 @@ def can_be_drawn(
 
 
 def _on_rings(place_of: Sequence[Place]) -> set[int]:
-    """Return the edges that are not in dead ends.
-
-    Edges in dead ends can be added to any drawing of the others.
-    """
+    """Return the edges that are in no dead end, as dead ends fit into any drawing."""
     ends_at: dict[Place, set[int]] = {}
     for end, place in enumerate(place_of):
         ends_at.setdefault(place, set()).add(end)

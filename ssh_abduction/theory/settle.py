@@ -155,10 +155,7 @@ def _weigh_of(theory: Theory, displacement: str) -> Literal["cost", "count"]:
 
 
 def _star_of(trace: Trace, theory: Theory) -> Star:
-    """Return the value of `star` that fits the trace, or raise TheoryError.
-
-    It says how to read stars (the openings seen at a place).
-    """
+    """Return how to read the stars of a trace, or raise TheoryError."""
     star = theory.star
     if star == "auto":
         star = "frame" if trace.has_stars else "none"

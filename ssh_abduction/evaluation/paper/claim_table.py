@@ -174,10 +174,7 @@ def _triple(found: FoundMaps) -> str:
 
 
 def _trend(run: SeedRun) -> float:
-    """How much the largest offset grows over the whole run, as a share of its mean.
-
-    The growth is that of a straight line through the offsets of the tours.
-    """
+    """How much the largest offset grows over a run, by a straight line, as a share of its mean."""
     largest = np.array([max(row[:2]) for row in run.spread])
     slope = np.polyfit(np.arange(len(largest)), largest, 1)[0]
     return float(slope * len(largest) / largest.mean())

@@ -292,10 +292,7 @@ def _contrast(e: PaperExperiment, seed: int, trace: Trace, alone: NDArray[Any], 
 
 
 def _step(trace: Trace) -> float:
-    """The spacing of images, in metres, that gives about one image for each step of a trace.
-
-    The length of the route is its |dx| + |dy| summed.
-    """
+    """The |dx| + |dy| of the route for each step of a trace, to space images evenly, in metres."""
     poses = np.array([step.truth["pose"][:2] for step in trace.steps])
     return round(float(np.abs(np.diff(poses, axis=0)).sum() / len(poses)), 2)
 

@@ -135,10 +135,7 @@ def _each(work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], jobs: int)
 def _done(
     number: int, work: Callable[..., Any], task: tuple[Any, ...], _: Callable[[], bool]
 ) -> tuple[int, Any]:
-    """Call `work` in a worker process.
-
-    Return the task's number, and the result or the exception.
-    """
+    """Do a task in a worker process. Return its number, and the result or the exception."""
     try:
         return number, work(*task)
     except Exception as error:

@@ -108,10 +108,7 @@ def _roads(ssh_map: SSHMap, level: str, turns: Trace | Turns | None, hide_undeci
 
 
 def _graph_of_places(ssh_map: SSHMap, to: str, turns: Trace | Turns | None) -> nx.Graph[Any]:
-    """Make the graph of places, with attributes that are numbers or texts, as in files.
-
-    Raises MapError if the map has no places, or the format is DOT.
-    """
+    """Make the graph of places with numbers or texts. Raises MapError without places."""
     if not ssh_map.places:
         raise MapError(
             "level: expected dstates, got places: the map has no places; export its dstates"

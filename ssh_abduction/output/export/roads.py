@@ -233,10 +233,7 @@ def _regions_at(ssh_map: SSHMap, place: int | None) -> tuple[tuple[int, ...], tu
 
 
 def _streets(ssh_map: SSHMap) -> dict[tuple[int, int], Way]:
-    """Find the action, path and direction of the travels between two places, in each direction.
-
-    The action is None if the robot travelled only from the end to the start.
-    """
+    """Find action, path and direction of travels between places, both ways; no action against."""
     ends: dict[tuple[int, int], Way] = {}
     for path in ssh_map.paths:
         index = {place: i for i, place in enumerate(path.order)}

@@ -73,10 +73,7 @@ def are_alike(one: Star, other: Star) -> bool:
 
 
 def _pairable(one: Star, other: Star) -> bool:
-    """Whether all gateways seen in one star can match different gateways of the other star.
-
-    Two gateways match if their bearings differ by at most the sum of their spreads.
-    """
+    """Whether all gateways seen in one star match different gateways of the other, by bearing."""
     partner: dict[int, int] = {}  # gateways of `one`, by their partner in `other`
 
     def pair(k: int, tried: set[int]) -> bool:

@@ -109,10 +109,7 @@ class Planar(Evidence):
         at: Mapping[int, int],
         distinct: bool,
     ) -> bool:
-        """Whether travels and turns that begin at `moves` cannot be drawn without a crossing.
-
-        With `distinct`, different dstates at a place face different slots.
-        """
+        """Whether travels and turns that begin at `moves` cannot be drawn without a crossing."""
         shown = _Shown(trace, moves, labels, at, stars=self.stars)
         return not (
             _can_draw_framed(shown, self.turns, distinct)
@@ -227,10 +224,7 @@ def _slots_of(
 
 
 def _is_drawing(edges: Iterable[tuple[End, End]], slots: Mapping[End, int]) -> bool:
-    """Whether the edges whose slots are known can be drawn without a crossing.
-
-    Also, each gateway must be the end of only one of them.
-    """
+    """Whether edges with known slots, one a gateway, can be drawn without a crossing."""
     joined = {
         frozenset((end[0], slots[end]) for end in edge)
         for edge in edges

@@ -111,10 +111,7 @@ class Returns:
         }
 
     def _loops_within(self, groups: Sequence[Sequence[int]], since: int = 0) -> tuple[Steps, Steps]:
-        """The first and last steps of loops, from `since` on, between steps of one sorted group.
-
-        Loops are left out if a displacement is missing on the way, or if the heading is lost.
-        """
+        """The first and last steps of loops within each sorted group, ended since a step."""
         import numpy as np
 
         begins = self.reckoning.begins
@@ -404,10 +401,7 @@ class Returns:
         )
 
     def _begin_of_visit(self, step: int) -> int:
-        """The first step of the visit that a step belongs to.
-
-        If turns may leave places, the step itself.
-        """
+        """The first step of a step's visit; the step itself if turns may leave places."""
         return self.arrivals[bisect(self.arrivals, step) - 1] if self.evidence.turns_stay else step
 
     def _together(self, rows: Steps, before: Together | None = None) -> Together:

@@ -291,10 +291,7 @@ def joint_squares(loops: Loops, these: Steps, others: Steps) -> Array:
 
 
 def _common_ends(these: Steps, others: Steps) -> Steps:
-    """Count the ends that the loops of two returns share: the beginning, the end, or both.
-
-    There the robot is off its dstate by one error, which is in both loops.
-    """
+    """Count the ends, with their common errors, that the loops of two returns share."""
     return np.asarray((these[..., :2] == others[..., :2]).sum(-1))
 
 
@@ -308,10 +305,7 @@ def _alone(closing: Array, covariance: Array, repeated: Array, one_dstate: Steps
 
 
 def _cut_off_headings(closing: Array, covariance: Array, one_dstate: Steps) -> None:
-    """Ignore the heading in returns to places: set its error to 0 and its covariances to 0.
-
-    The arrays are changed. The variance becomes 1, so that the matrix can be inverted.
-    """
+    """Set the headings' errors and covariances of returns to places to 0, their variances to 1."""
     places = one_dstate == 0
     closing[places, 2] = 0.0
     covariance[places, 2, :] = covariance[places, :, 2] = 0.0
