@@ -38,11 +38,12 @@ from instances import HEADINGS, doors_of, maze
 from together import joined
 from truth import NOISE, Known, is_true, with_truth
 
-from simulator.motion import displacement_between, reported
+from simulator.odometer import reported
 from simulator.plan_tours import Floor, Stand
 from simulator.plans import Plan
 from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.data import Action, Odometry, Step
+from ssh_abduction.data.odometry import displacement_between
 from ssh_abduction.data.star import Gateway as Sighted
 from ssh_abduction.solver.guesses.beam import Beam
 from ssh_abduction.solver.guesses.joint_maps import Joining

@@ -25,13 +25,13 @@ from changes import cheapest
 from truth import NOISE, Known, is_true, with_truth, worlds
 
 from simulator.errors import SimulatorWarning
-from simulator.motion import displacement_between
 from simulator.robot import Body
 from simulator.tours import simulate
 from simulator.world import TrueDState, World
 from ssh_abduction import SSHMap, Theory, solve
 from ssh_abduction.data import Action
 from ssh_abduction.data.floors import with_floors
+from ssh_abduction.data.odometry import displacement_between
 from ssh_abduction.output import to_svg
 
 TURNS = {"right": -1, "left": 1, "around": 2}  # in quarters, counterclockwise

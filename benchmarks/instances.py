@@ -15,9 +15,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from simulator.motion import Pose, displacement_between, reported
+from simulator.odometer import reported
 from ssh_abduction import Trace
 from ssh_abduction.data import Odometry
+from ssh_abduction.data.odometry import Pose, displacement_between
 
 HEADINGS = ((0, 1), (1, 0), (0, -1), (-1, 0))  # north, east, south, west
 TURNS = {"right": 1, "around": 2, "left": 3}

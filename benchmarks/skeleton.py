@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_opening, distance_transform_edt, label
 
 from perception.readers.scans import Pose, RobotLog
-from simulator.motion import moved
+from ssh_abduction.data.odometry import moved
 
 Array = NDArray[np.float64]
 CELL = 0.1  # side of a cell

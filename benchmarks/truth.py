@@ -30,14 +30,13 @@ from pathlib import Path
 
 from instances import displaced, maze
 
-from simulator.motion import Pose
 from simulator.plan_tours import tour
 from simulator.plans import Plan
 from simulator.robot import Body
 from ssh_abduction import Solution, Theory, Trace, solve
 from ssh_abduction.data import Odometry
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.odometry import NUMBERS
+from ssh_abduction.data.odometry import NUMBERS, Pose
 from ssh_abduction.solver import Status, find_backbone
 
 ROOT = Path(__file__).parent.parent

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from simulator.errors import SimulatorError
 from simulator.laser import Laser
-from simulator.motion import Pose, displacement_between, moved
 from simulator.odometer import Odometer
 from simulator.world import World
 from ssh_abduction.data.errors import brief, is_finite
+from ssh_abduction.data.odometry import Pose, displacement_between, moved
 
 Array = NDArray[np.float64]
 # Speed of driving in metres per second, and of turning in radians per second.

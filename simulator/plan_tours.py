@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from simulator.errors import SimulatorError
-from simulator.motion import Pose, displacement_between, reported
+from simulator.odometer import reported
 from simulator.plans import APART, Plan
 from ssh_abduction.data.checks import a_number, a_whole_number, an_instance
-from ssh_abduction.data.odometry import Odometry
+from ssh_abduction.data.odometry import Odometry, Pose, displacement_between
 from ssh_abduction.data.star import Gateway as Sighted
 from ssh_abduction.data.trace import Action, Step, Trace
 

@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulator.errors import SimulatorError
-from simulator.motion import Pose, displacement_between
 from ssh_abduction.data.errors import brief, is_finite
-from ssh_abduction.data.odometry import Displacement
+from ssh_abduction.data.odometry import Displacement, Pose, displacement_between
 
 # Largest errors of odometry, as a share and in radians per metre. With larger ones, the robot does
 # not notice that it left a place.

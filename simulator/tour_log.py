@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulator.driver import Driver, Tolerance
-from simulator.motion import DIGITS
+from simulator.odometer import DIGITS
 from simulator.panorama import Camera
 from simulator.robot import Body, Report, SimulatedRobot
 from simulator.world import World

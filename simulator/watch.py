@@ -18,9 +18,9 @@ import numpy as np
 from simulator.driver import TURNS, Driver
 from simulator.errors import SimulatorError, SimulatorWarning
 from simulator.laser import meetings
-from simulator.motion import Pose, displacement_between
 from simulator.world import World
 from simulator.world_files import ACTIONS, are_square
+from ssh_abduction.data.odometry import Pose, displacement_between
 
 # Largest distance from the expected place in metres (`reach` if that is larger), and largest
 # difference of heading in radians.

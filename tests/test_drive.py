@@ -21,7 +21,6 @@ from simulator.driver import Driver
 from simulator.errors import SimulatorError, SimulatorWarning
 from simulator.freespace import FreeSpace
 from simulator.laser import Laser
-from simulator.motion import displacement_between
 from simulator.odometer import Odometer
 from simulator.plans import Plan
 from simulator.robot import Body, SimulatedRobot
@@ -29,6 +28,7 @@ from simulator.rounds import Rooms, Round, holds, record_plan
 from simulator.tours import record, simulate
 from simulator.world import World
 from ssh_abduction.cli import main
+from ssh_abduction.data.odometry import displacement_between
 
 RECTANGLE, HALL = World.named("notched-rectangle"), World.named("taylor-hall")
 

@@ -22,7 +22,7 @@ from ssh_abduction.explain.pairs import explain_pair
 from ssh_abduction.explain.piece import Piece
 from ssh_abduction.explain.verdict import PairExplanation, Verdict
 from ssh_abduction.rivals import Listing
-from ssh_abduction.rivals.pair_in_map import PairInMap
+from ssh_abduction.rivals.listing import PairInMap
 from ssh_abduction.solver import Search, Start, Status
 from ssh_abduction.solver.asp.facts import derivation_lp, further_rules
 from ssh_abduction.theory.encodings import axioms

@@ -19,7 +19,6 @@ from simulator.driver import Driver
 from simulator.errors import SimulatorError
 from simulator.junctions import Pilot
 from simulator.laser import BEARINGS, Laser
-from simulator.motion import displacement_between
 from simulator.robot import Body, SimulatedRobot
 from simulator.surroundings import Panorama, Place, compass
 from simulator.tours import simulate
@@ -27,6 +26,7 @@ from simulator.world import World
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main
+from ssh_abduction.data.odometry import displacement_between
 from ssh_abduction.evaluation import evaluate
 from ssh_abduction.solver import Status
 

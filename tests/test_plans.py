@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from simulator.errors import SimulatorError
-from simulator.motion import moved
 from simulator.plan_tours import tour
 from simulator.plans import APART, STRAIGHT, Plan
 from ssh_abduction import Theory, Trace, evaluate, solve
@@ -19,6 +18,7 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.data import Odometry
 from ssh_abduction.data.gateways import with_allowed_headings
 from ssh_abduction.data.maps import DState, MapPath, SSHMap
+from ssh_abduction.data.odometry import moved
 from ssh_abduction.data.trace import Step
 
 PLANS = Path(__file__).parent.parent.parent / "shared" / "data" / "plans"

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from simulator.driver import Driver, act, climb
 from simulator.errors import SimulatorError
 from simulator.laser import BEARINGS, Laser
-from simulator.motion import displacement_between, moved, reported
+from simulator.odometer import reported
 from simulator.robot import Body, SimulatedRobot
 from simulator.sight import LONG, sight
 from simulator.tour_log import noise_model
@@ -24,6 +24,7 @@ from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction import Trace
 from ssh_abduction.data import Odometry
+from ssh_abduction.data.odometry import displacement_between, moved
 
 RECTANGLE = World.named("notched-rectangle")
 HALL = World.named("taylor-hall")

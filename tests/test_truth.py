@@ -13,9 +13,9 @@ import reject
 import truth
 from instances import CELL, maze
 
-from simulator.motion import moved
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.data import Odometry
+from ssh_abduction.data.odometry import moved
 
 EXACT = Odometry(0, 0, 0, 0, 0, 0, 0, 0)
 NOISE = Odometry(**truth.NOISE)

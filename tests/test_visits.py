@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from simulator.motion import Pose, displacement_between
 from ssh_abduction import SSHMap, Trace
 from ssh_abduction.cli import main
 from ssh_abduction.data import DState, TraceError
+from ssh_abduction.data.odometry import Pose, displacement_between
 from ssh_abduction.evaluation import evaluate_visits
 from ssh_abduction.evaluation.relations import Relation, Relations
 

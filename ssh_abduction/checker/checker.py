@@ -14,8 +14,8 @@
 
 The checker shares nothing with the encodings or the solver, so it catches their mistakes. The
 axioms are those of docs/explanation/theory.md, after Kuipers & Beeson (AAAI 2002) and Remolina &
-Kuipers (AIJ 2004). `AXIOMS` maps the name of each axiom to its check. The checks are in `causal`,
-`topological`, `sides`, `stars`, `clashes`, `floors` and `evidence`; `coherence` checks that the map
+Kuipers (AIJ 2004). `AXIOMS` maps the name of each axiom to its check. The checks are in
+`topological`, `sides`, `stars`, `clashes` and `evidence`; `coherence` checks that the map
 fits the trace. `regions` checks the regions of a map that lists them.
 
 A map lists one place, one course (path and direction) and one heading for each dstate, even if the
@@ -30,7 +30,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from ssh_abduction.checker import (
-    causal,
     clashes,
     coherence,
     evidence,
@@ -50,7 +49,6 @@ from ssh_abduction.theory.theory import Theory
 COHERENCE = "map_explains_trace"
 
 AXIOMS: dict[str, Check] = {
-    **causal.AXIOMS,
     **topological.AXIOMS,
     **sides.AXIOMS,
     **stars.AXIOMS,

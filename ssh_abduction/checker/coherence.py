@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 from ssh_abduction.checker import clashes
-from ssh_abduction.checker.floors import floors_are_listed
+from ssh_abduction.checker.evidence import floors_are_listed
 from ssh_abduction.checker.moves import course_of, heading_of
 from ssh_abduction.checker.reading import Check, Found, Reading
 from ssh_abduction.checker.sides import is_pair

@@ -40,8 +40,7 @@ from ssh_abduction.solver import Stop
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
-    from ssh_abduction.rivals.listing import Listing
-    from ssh_abduction.rivals.pair_in_map import PairInMap
+    from ssh_abduction.rivals.listing import Listing, PairInMap
 
 EXIT_NO_MAP, EXIT_UNKNOWN = 20, 30
 SECONDS = 60.0  # the default time limit: joint maps with changes may need hours for a proof
@@ -126,7 +125,7 @@ def run(options: argparse.Namespace) -> int:
     elif options.steps:
         first, second = (step_named(trace, step) for step in options.steps)
         if listing is not None:
-            from ssh_abduction.rivals.pair_in_map import PairInMap  # loads numpy
+            from ssh_abduction.rivals.listing import PairInMap  # loads numpy
 
             pair = PairInMap.of(listing, first, second)
         question = PairQuestion(

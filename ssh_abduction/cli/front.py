@@ -12,6 +12,7 @@ from ssh_abduction.cli.text import counted, table
 from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.data.words import attributes_of
 from ssh_abduction.runtime import program
 from ssh_abduction.solver import Front, fault_front
 from ssh_abduction.theory.theory import Theory
@@ -74,17 +75,5 @@ def _as_text(front: Front, most: int) -> str:
 
 def _as_data(front: Front) -> dict[str, object]:
     """Convert a front to a dict for JSON."""
-    points = [
-        {
-            "faults": p.faults,
-            "dstates": p.dstates,
-            "proven": p.proven,
-            "map": None if p.map is None else p.map.to_dict(),
-        }
-        for p in front.points
-    ]
-    return {
-        "knee": front.knee,
-        "prices": None if front.prices is None else list(front.prices),
-        "front": points,
-    }
+    points = [attributes_of(p, "faults", "dstates", "proven", "map") for p in front.points]
+    return attributes_of(front, "knee", "prices") | {"front": points}

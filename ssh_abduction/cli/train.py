@@ -24,6 +24,7 @@ from ssh_abduction.data.errors import MapError, named
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.maps import SSHMap, maps_of
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.data.words import attributes_of
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -151,17 +152,7 @@ def run_learning_curve(options: argparse.Namespace) -> int:
         images, labels, sizes, folds=options.folds, random_state=options.seed, estimator=recogniser
     )
     if options.json:
-        print(
-            json.dumps(
-                {
-                    "sizes": curve.sizes,
-                    "mean": curve.mean,
-                    "lowest": curve.lowest,
-                    "highest": curve.highest,
-                    "folds": curve.folds,
-                }
-            )
-        )
+        print(json.dumps(attributes_of(curve, "sizes", "mean", "lowest", "highest", "folds")))
     else:
         rows = [
             [s, f"{m:.3f}", f"{a:.3f}", f"{b:.3f}"]

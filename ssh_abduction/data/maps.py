@@ -17,14 +17,15 @@ import hashlib
 import json
 import os
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 from ssh_abduction.data.checks import a_whole_number, all_instances, an_instance, one_of
-from ssh_abduction.data.errors import MapError, brief, is_whole, named
+from ssh_abduction.data.drives import Drive, pieces_in_words
+from ssh_abduction.data.errors import MapError, brief, checked_index, is_whole, named
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.groups import firsts, grouped, parts
 from ssh_abduction.data.map_file import (
@@ -37,10 +38,9 @@ from ssh_abduction.data.map_file import (
     write_map,
 )
 from ssh_abduction.data.map_parts import FAULTS, NAMED, DState, Fault, Fit, MapPath, Name, Pose
-from ssh_abduction.data.notebook import in_output
 from ssh_abduction.data.regions import Region, renumbered, right_of
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.data.words import counted
+from ssh_abduction.data.words import counted, in_output
 
 __all__ = [
     "FAULTS",
@@ -304,16 +304,9 @@ class SSHMap:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the map as plain data, as `solve --json` prints it (docs/reference/formats.md)."""
+        names, optional = DState.__slots__, ("heading", "floor")
         dstates = [
-            {
-                "id": s.id,
-                "view": s.view,
-                "place": s.place,
-                "path": s.path,
-                "direction": s.direction,
-                **({} if s.heading is None else {"heading": s.heading}),
-                **({} if s.floor is None else {"floor": s.floor}),
-            }
+            {n: x for n in names if (x := getattr(s, n)) is not None or n not in optional}
             for s in self.dstates
         ]
         data: dict[str, Any] = {
@@ -444,3 +437,45 @@ def check_of_trace(maps: Iterable[SSHMap], trace: Trace, where: str, *, views: b
                     f"{where}: maps[{i}]: expected view {brief(seen)} at step {t}, as the trace "
                     f"has it, got {brief(there)}; the maps are of another trace"
                 )
+
+
+class MapSequence:
+    """A sequence of maps, for a class with the attributes `maps` and `drives`."""
+
+    __slots__ = ()
+    maps: tuple[SSHMap, ...]
+
+    @property
+    def drives(self) -> tuple[Drive, ...]:
+        """The drives of the trace; empty if they are unknown."""
+        raise NotImplementedError
+
+    @property
+    def joined(self) -> str:
+        """Which drives the first map joins, in words; empty for one drive or without a map."""
+        return pieces_in_words(self.drives, self.maps[0]) if self.maps else ""
+
+    def __len__(self) -> int:
+        """The number of maps."""
+        return len(self.maps)
+
+    def __bool__(self) -> bool:
+        """True, even without a map. Ask `len` or `status` whether there are maps."""
+        return True
+
+    def __iter__(self) -> Iterator[SSHMap]:
+        return iter(self.maps)
+
+    @overload
+    def __getitem__(self, index: int) -> SSHMap: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> tuple[SSHMap, ...]: ...
+
+    def __getitem__(self, index: int | slice) -> SSHMap | tuple[SSHMap, ...]:
+        """The map at a position, or a tuple of maps for a slice. Raises RangeError."""
+        return (
+            self.maps[index]
+            if isinstance(index, slice)
+            else self.maps[checked_index(index, len(self.maps), "maps")]
+        )

@@ -25,13 +25,12 @@ from ssh_abduction.data.checks import a_list, a_path, a_text, a_whole_number, an
 from ssh_abduction.data.closure import Closure, checked_closures, closures_among
 from ssh_abduction.data.errors import RangeError, TraceError, brief, checked_index, named
 from ssh_abduction.data.files import json_line, save_file
-from ssh_abduction.data.notebook import in_output
 from ssh_abduction.data.observation import View, checked_probability, view_or_unknown
 from ssh_abduction.data.odometry import Covariance, Odometry
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.step import Step, as_list, of_actions
 from ssh_abduction.data.trace_file import FORMAT, VERSION, read_trace
-from ssh_abduction.data.words import counted
+from ssh_abduction.data.words import counted, in_output
 
 __all__ = [
     "STANDARD_ACTIONS",

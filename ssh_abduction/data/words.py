@@ -6,8 +6,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import MISSING, fields
+from importlib import import_module
 from typing import Any
 
 from ssh_abduction.data.errors import brief
@@ -51,3 +52,12 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: _plain(part) for key, part in value.items()}
     return [_plain(part) for part in value] if isinstance(value, tuple | list) else value
+
+
+def in_output(name: str) -> Callable[..., Any]:
+    """Load and return the function with this name in `ssh_abduction.output`.
+
+    Values make HTML for notebooks by it. `ssh_abduction.output` imports this package.
+    """
+    function: Callable[..., Any] = getattr(import_module("ssh_abduction.output"), name)
+    return function

@@ -34,10 +34,10 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from simulator.motion import Pose, displacement_between, moved
 from ssh_abduction.data.checks import an_instance
 from ssh_abduction.data.errors import TraceError, brief, is_finite, named
 from ssh_abduction.data.maps import SSHMap, checked_maps
+from ssh_abduction.data.odometry import Pose, displacement_between, moved
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.data.words import attributes_of, counted
 from ssh_abduction.evaluation.named_truth import map_of_trace

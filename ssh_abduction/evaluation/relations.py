@@ -30,10 +30,9 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
-from simulator.motion import Pose, displacement_between, moved
 from ssh_abduction.data.errors import TraceError, brief, named
 from ssh_abduction.data.files import read_at_most
-from ssh_abduction.data.odometry import Displacement
+from ssh_abduction.data.odometry import Displacement, Pose, displacement_between, moved
 from ssh_abduction.evaluation.trajectory import is_trajectory
 
 # Files of more bytes than this are rejected.

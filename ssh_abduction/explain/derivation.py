@@ -56,8 +56,7 @@ class Inference:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the line as plain data, as `explain --json` prints it."""
-        own = attributes_of(self, "says", "because", "premises", "supposed")
-        return own | {"links": [{"axiom": a.axiom, "steps": list(a.steps)} for a in self.links]}
+        return attributes_of(self, "says", "because", "premises", "supposed", "links")
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,15 +107,7 @@ class Derivation:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the argument as plain data, without the maps of the links."""
-        return {
-            "steps": list(self.steps),
-            "clashes": [
-                {"axiom": clash.axiom, "steps": list(clash.steps)} for clash in self.clashes
-            ],
-            "supposition": self.supposition,
-            "inferences": [inference.to_dict() for inference in self.inferences],
-            "summary": self.summary,
-        }
+        return attributes_of(self, "steps", "clashes", "supposition", "inferences", "summary")
 
 
 def clashes_of(links: Iterable[tuple[str, int]]) -> tuple[ClashingAxiom, ...]:

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 from ssh_abduction.data.errors import TheoryError, TraceError, brief, is_whole
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.data.words import attributes_of
 from ssh_abduction.explain.axioms import Axioms
 from ssh_abduction.explain.piece import Piece
 from ssh_abduction.solver import check_rules
@@ -40,6 +41,10 @@ class ClashingAxiom:
 
     axiom: str
     steps: tuple[int, ...]
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the axiom and its steps as plain data."""
+        return attributes_of(self, "axiom", "steps")
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,12 +83,7 @@ class Explanation:
 
     def to_dict(self) -> dict[str, object]:
         """Return the explanation as plain data, as `solve --json` prints it."""
-        return {
-            "first": self.first,
-            "last": self.last,
-            "clashes": [{"axiom": c.axiom, "steps": list(c.steps)} for c in self.clashes],
-            "sentences": list(self.sentences),
-        }
+        return attributes_of(self, "first", "last", "clashes", "sentences")
 
 
 def explain(

@@ -41,7 +41,7 @@ from ssh_abduction.data.errors import MapError, brief, printable
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.regions import Region, course_named, named_by_number, right_of
 from ssh_abduction.data.trace import View
-from ssh_abduction.data.words import counted
+from ssh_abduction.data.words import attributes_of, counted
 from ssh_abduction.online.move_graph import MoveGraph, Node
 from ssh_abduction.rivals.listing import Listing, Maps
 
@@ -171,21 +171,12 @@ class Route:
         """
         length = self.metres
         return {
-            "map": self.map,
-            "by": self.by,
-            "from": self.start,
-            "to": self.goal,
-            "summary": self.sentence,
-            "actions": list(self.actions),
-            "views": list(self.views),
-            "dstates": list(self.dstates),
-            "places": list(self.places),
+            **attributes_of(self, "map", "by"),
+            **{"from": self.start, "to": self.goal, "summary": self.sentence},
+            **attributes_of(self, "actions", "views", "dstates", "places"),
             **({} if length is None else {"metres": round(length, 4)}),
             "known": self.is_known,
-            "moves": [move.to_dict() for move in self.moves],
-            **({"legs": [leg.to_dict() for leg in self.legs]} if self.legs else {}),
-            "agree": list(self.agree),
-            "maps": self.maps,
+            **attributes_of(self, "moves", *(["legs"] if self.legs else []), "agree", "maps"),
         }
 
 

@@ -11,19 +11,17 @@ if TYPE_CHECKING:
     from ssh_abduction.output.cards import map_card, trace_card
     from ssh_abduction.output.dot import to_dot
     from ssh_abduction.output.export import export_map
-    from ssh_abduction.output.graphs import to_graphml, to_networkx
+    from ssh_abduction.output.graphs import to_graphml, to_networkx, to_pandas
     from ssh_abduction.output.picture import to_svg
     from ssh_abduction.output.plotting import plot
-    from ssh_abduction.output.tables import to_pandas
 
 _HOMES = {  # module: the names that this package exports from it
     "cards": ("map_card", "trace_card"),
     "dot": ("to_dot",),
     "export": ("export_map",),
-    "graphs": ("to_graphml", "to_networkx"),
+    "graphs": ("to_graphml", "to_networkx", "to_pandas"),
     "picture": ("to_svg",),
     "plotting": ("plot",),
-    "tables": ("to_pandas",),
 }
 __all__ = [
     "export_map",

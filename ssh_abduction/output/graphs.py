@@ -1,11 +1,11 @@
-"""Convert a map to a graph of networkx, or to GraphML text."""
+"""Convert a map to a graph of networkx, to GraphML text, or to a table of pandas."""
 
 from __future__ import annotations
 
 import json
 import math
 from itertools import pairwise
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import networkx as nx
 
@@ -15,6 +15,9 @@ from ssh_abduction.data.maps import SSHMap, checked_map
 from ssh_abduction.data.regions import ids_at
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.output.headings import Turns, degrees_of
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 LEVELS = ("causal", "topological", "places")
 
@@ -113,15 +116,8 @@ def _causal(ssh_map: SSHMap) -> nx.MultiDiGraph[Any]:
     """Make the graph of dstates and links. Attributes that are None are left out."""
     graph: nx.MultiDiGraph[Any] = nx.MultiDiGraph()
     for s in ssh_map.dstates:
-        facts = {
-            "view": s.view,
-            "place": s.place,
-            "path": s.path,
-            "direction": s.direction,
-            "heading": s.heading,
-            "floor": s.floor,
-            "place_name": ssh_map.name_of("place", s.place),
-            "path_name": ssh_map.name_of("path", s.path),
+        facts = {name: getattr(s, name) for name in s.__slots__[1:]} | {
+            f"{kind}_name": ssh_map.name_of(kind, getattr(s, kind)) for kind in ("place", "path")
         }
         graph.add_node(s.id, **{k: v for k, v in facts.items() if v is not None})
     for source, action, target in ssh_map.links:
@@ -173,3 +169,35 @@ def _named(ssh_map: SSHMap, kind: str, number: int) -> dict[str, str]:
     """Return the attribute `name` of a place or path; empty if a person gave it none."""
     name = ssh_map.name_of(kind, number)
     return {} if name is None else {"name": xml_text(name)}
+
+
+def to_pandas(ssh_map: SSHMap) -> pd.DataFrame:
+    """Make a table with a row for each step of the trace that was mapped.
+
+    Returns:
+        A table with the columns dstate, view, place, path, direction and heading. If the map has
+        poses, also x and y (metres) and pose_heading (radians). If it has names, also place_name.
+        The index is named step.
+
+    Raises:
+        MapError: `ssh_map` is not a map, or pandas is not installed.
+    """
+    checked_map(ssh_map)
+    try:
+        import pandas as pd
+    except ImportError:
+        raise MapError(
+            "to_pandas: expected pandas, got none; install it with pip install pandas"
+        ) from None
+    rows = []
+    for s in (ssh_map.dstates[label] for label in ssh_map.dstate_at):
+        row = {"dstate": s.id} | {name: getattr(s, name) for name in s.__slots__[1:]}
+        if ssh_map.names:
+            row["place_name"] = ssh_map.name_of("place", s.place)
+        if ssh_map.fit and ssh_map.fit.poses:
+            pose = ssh_map.fit.poses[s.id]
+            row |= {"x": pose.x, "y": pose.y, "pose_heading": pose.heading}
+        rows.append(row)
+    table = pd.DataFrame(rows, index=pd.RangeIndex(len(rows), name="step"))
+    whole = ["place", "path", "direction", "heading", "floor"]
+    return table.astype(dict.fromkeys(whole, "Int64"))  # integers that may be missing

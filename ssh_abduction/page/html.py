@@ -69,7 +69,6 @@ class Page:
         Raises:
             MapError: The package anywidget is not installed.
         """
-        from ssh_abduction.page.widget import widget_of
 
         return widget_of(self.html)
 
@@ -145,3 +144,30 @@ def _file(name: str) -> str:
 def _digest(text: str) -> str:
     """Compute the digest by which a content security policy allows a script or style."""
     return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+
+
+SHOW = """
+export default { render({ model, el }) {
+  const frame = document.createElement("iframe");
+  frame.sandbox = "allow-scripts";
+  frame.style.cssText =
+    "display:block;box-sizing:border-box;width:100%;height:680px;border:1px solid #8888";
+  frame.title = "Maps";
+  frame.srcdoc = model.get("html");
+  el.append(frame);
+} };
+"""
+
+
+def widget_of(html: str) -> Any:
+    """Make a notebook widget that shows a page in an iframe. Raises MapError without anywidget."""
+    try:
+        import anywidget
+        import traitlets
+    except ImportError:
+        raise MapError(
+            "widget: expected anywidget, got none; "
+            "install it with pip install 'ssh-abduction[notebook]'"
+        ) from None
+    members = {"_esm": SHOW, "html": traitlets.Unicode(html).tag(sync=True)}
+    return type("PageWidget", (anywidget.AnyWidget,), members)()

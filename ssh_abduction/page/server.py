@@ -30,8 +30,7 @@ from ssh_abduction.page import answers
 from ssh_abduction.page.content import Called, content_of
 from ssh_abduction.page.html import html_of
 from ssh_abduction.page.replays import Run
-from ssh_abduction.rivals.listing import Listing
-from ssh_abduction.rivals.pair_in_map import PairInMap
+from ssh_abduction.rivals.listing import Listing, PairInMap
 from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import LimitError, Watch, in_process
 from ssh_abduction.theory.theory import Theory

@@ -152,20 +152,10 @@ class Difference:
             dict(zip(("dstates", "places", "paths", "links"), size, strict=True))
             for size in self.sizes
         ]
-        data: dict[str, Any] = {
-            "ids": list(self.ids),
-            "same": self.same,
-            "sizes": sizes,
-            "changes": [change.to_dict() for change in self.changes],
-            "links": [[list(link) for link in links] for links in self.links],
-            "has_places": list(self.has_places),
-            "sides": [[beside.to_dict() for beside in sides] for sides in self.sides],
-            "faults": [[fault.to_dict() for fault in faults] for faults in self.faults],
-            "words": list(self.lines),
-        }
-        if self.chi2:
-            data["chi2"] = list(self.chi2)
-        return data
+        data = attributes_of(self, "ids", "same") | {"sizes": sizes}
+        data |= attributes_of(self, "changes", "links", "has_places", "sides", "faults")
+        data["words"] = list(self.lines)
+        return data | (attributes_of(self, "chi2") if self.chi2 else {})
 
 
 def difference(

@@ -1,5 +1,0 @@
-import sys
-
-from ssh_abduction.cli import main
-
-sys.exit(main())
