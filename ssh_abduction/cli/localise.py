@@ -22,7 +22,7 @@ from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import steps_in_words, table
 from ssh_abduction.data.errors import LocaliserError, MapError, named
 from ssh_abduction.data.files import json_line
-from ssh_abduction.data.groups import grouped
+from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.trace import Trace
 
 if TYPE_CHECKING:
@@ -138,7 +138,7 @@ def _localiser(options: argparse.Namespace) -> Localiser:
 
 def _headline(beliefs: Sequence[Mapping[str, Any]]) -> str:
     """List the steps with each verdict, such as "located", and those where the belief collapsed."""
-    steps = grouped((belief["verdict"], step) for step, belief in enumerate(beliefs))
+    steps = gathered((belief["verdict"], step) for step, belief in enumerate(beliefs))
     parts = [f"{verdict} at {steps_in_words(some)}" for verdict, some in steps.items()]
     if collapses := [step for step, belief in enumerate(beliefs) if belief["collapsed"]]:
         parts.append(f"the belief collapsed at {steps_in_words(collapses)}")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from ssh_abduction.data.drives import drives_of, named_steps
 from ssh_abduction.data.errors import printable
-from ssh_abduction.data.groups import grouped
+from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted as counted  # noqa: PLC0414 - the verbs have it from here
@@ -154,7 +154,7 @@ def describe(ssh_map: SSHMap) -> str:
         parts += [
             f"  side_of_branch is not applied to paths {h} and {g}" for h, g in ssh_map.excused
         ]
-    leads = grouped((source, f"{action} → {target}") for source, action, target in ssh_map.links)
+    leads = gathered((source, f"{action} → {target}") for source, action, target in ssh_map.links)
     rows = [
         [
             s.id,

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
 
-from ssh_abduction.data.groups import grouped
+from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.rotations import leads, middle, rotations, turns_so, ways
 from ssh_abduction.data.star import CLOSED, MOST_CLOSED, Frame, Star
@@ -232,7 +232,7 @@ def are_opposite(seen_a: Turned, seen_b: Turned) -> bool:
 
 def by_place(sights: Sequence[Sight]) -> dict[int, list[Sight]]:
     """Group sights by place: return a dict from places to lists of sights."""
-    return grouped(
+    return gathered(
         (sight.dstate.place, sight) for sight in sights if sight.dstate.place is not None
     )
 

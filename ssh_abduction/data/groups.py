@@ -1,6 +1,6 @@
 """Group values by their keys, and nodes by the links between them.
 
->>> grouped([("a", 1), ("b", 2), ("a", 3)]), firsts([("a", 1), ("b", 2), ("a", 3)])
+>>> gathered([("a", 1), ("b", 2), ("a", 3)]), firsts([("a", 1), ("b", 2), ("a", 3)])
 ({'a': [1, 3], 'b': [2]}, {'a': 1, 'b': 2})
 """
 
@@ -14,7 +14,7 @@ Key = TypeVar("Key", bound=Hashable)
 Value = TypeVar("Value")
 
 
-def grouped(pairs: Iterable[tuple[Key, Value]]) -> dict[Key, list[Value]]:
+def gathered(pairs: Iterable[tuple[Key, Value]]) -> dict[Key, list[Value]]:
     """Return the values of each key, in the order of the pairs."""
     found: dict[Key, list[Value]] = {}
     for key, value in pairs:

@@ -27,7 +27,7 @@ from ssh_abduction.data.checks import a_whole_number, all_instances, an_instance
 from ssh_abduction.data.drives import Drive, pieces_in_words
 from ssh_abduction.data.errors import MapError, brief, checked_index, is_whole, named
 from ssh_abduction.data.files import json_line
-from ssh_abduction.data.groups import firsts, grouped, parts
+from ssh_abduction.data.groups import firsts, gathered, parts
 from ssh_abduction.data.map_file import (
     MAP_FORMAT,
     SOLUTION_FORMAT,
@@ -244,7 +244,7 @@ class SSHMap:
         Travels, turns and common places connect the dstates of a floor. If two drives, or two
         visits by different lifts, share no place of a floor, the map has two floors for it.
         """
-        found = grouped((s.floor, s.id) for s in self.dstates if s.floor is not None)
+        found = gathered((s.floor, s.id) for s in self.dstates if s.floor is not None)
         return tuple(tuple(found[floor]) for floor in sorted(found))
 
     def without_headings(self) -> SSHMap:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ssh_abduction.checker.checker import Violation
-from ssh_abduction.data.groups import grouped
+from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.words import attributes_of
 from ssh_abduction.explain.no_map import ClashingAxiom
@@ -112,7 +112,7 @@ class Derivation:
 
 def clashes_of(links: Iterable[tuple[str, int]]) -> tuple[ClashingAxiom, ...]:
     """Group links (pairs of an axiom and a step) by axiom, in the order of first links."""
-    steps = grouped(links)
+    steps = gathered(links)
     return tuple(ClashingAxiom(axiom, tuple(sorted({*some}))) for axiom, some in steps.items())
 
 

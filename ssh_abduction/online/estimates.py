@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from ssh_abduction.data.action import STANDARD_ACTIONS
-from ssh_abduction.data.groups import grouped
+from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.star import SPREAD
 from ssh_abduction.data.trace import Action, Trace, View
@@ -152,7 +152,7 @@ def view_ratios(ssh_map: SSHMap, trace: Trace | None) -> dict[View, Observation]
     visits = Counter[int]()
     for (x, _), n in counts.items():
         visits[x] += n
-    shown = grouped(
+    shown = gathered(
         (view, (x, n / visits[x]))
         for (x, view), n in sorted(counts.items(), key=lambda item: item[0][0])
     )
@@ -183,7 +183,7 @@ def transitions(ssh_map: SSHMap, trace: Trace | None) -> dict[str, Links]:
         )
     tried = {(x, action) for x, action, _ in counts}
     counts.update({link for link in ssh_map.links if link[:2] not in tried})
-    entries = grouped((action, (x, y, n)) for (x, action, y), n in counts.items())
+    entries = gathered((action, (x, y, n)) for (x, action, y), n in counts.items())
     links: dict[str, Links] = {}
     for action, listed in entries.items():
         sources, targets, tries = np.array(listed).T

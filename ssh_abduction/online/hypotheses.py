@@ -30,7 +30,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from ssh_abduction.data.groups import grouped
+from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.maps import DState, Fault, SSHMap
 from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.solver import Cost, observation
@@ -131,7 +131,7 @@ class ExtendedMap:
         the same dstate, up to renaming. The past does not count. For dstates that cannot be
         reached from here, only their number counts.
         """
-        ends = grouped((s, (action, x)) for (s, action), x in self.links.items())
+        ends = gathered((s, (action, x)) for (s, action), x in self.links.items())
         # Number the dstates in the order in which a breadth-first search from here reaches them.
         number, reached = {self.here: 0}, [self.here]
         links = []

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 from html import escape
 
 from ssh_abduction.data.errors import printable
-from ssh_abduction.data.groups import grouped
+from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.star import star_to_json
 from ssh_abduction.data.trace import Step, Trace
@@ -39,7 +39,7 @@ def map_card(ssh_map: SSHMap) -> str:
     if fit := ssh_map.fit:
         freedom = f"{fit.dof} degrees of freedom (p = {fit.p:.2g})"
         parts.append(paragraph(f"chi-square {fit.chi2:.1f} for {freedom}"))
-    leads = grouped((source, f"{action} → {target}") for source, action, target in ssh_map.links)
+    leads = gathered((source, f"{action} → {target}") for source, action, target in ssh_map.links)
     # A map without places has fewer columns.
     topological = bool(ssh_map.places)
     head = ("dstate", "view", *(("place", "path") if topological else ()), "links")

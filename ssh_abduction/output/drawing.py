@@ -10,7 +10,7 @@ from html import escape
 from typing import TypeAlias
 
 from ssh_abduction.data.errors import xml_text
-from ssh_abduction.data.groups import grouped
+from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.maps import SSHMap
 
 Point: TypeAlias = tuple[float, float]
@@ -101,13 +101,13 @@ def fault_mark(x: float, y: float, title: str, size: float = 1.0) -> str:
 
 def faults_in_words(ssh_map: SSHMap) -> dict[int, str]:
     """For each dstate with a fault of the map at one of its steps, say the faults in words."""
-    faults = grouped((ssh_map.dstate_at[fault.step], str(fault)) for fault in ssh_map.faults)
+    faults = gathered((ssh_map.dstate_at[fault.step], str(fault)) for fault in ssh_map.faults)
     return {s: "; ".join(said) for s, said in faults.items()}
 
 
 def link_names(ssh_map: SSHMap) -> dict[tuple[int, int], str]:
     """Join the names of actions from one dstate to another by commas, by (start, end)."""
-    actions = grouped(
+    actions = gathered(
         ((source, target), action) for source, action, target in ssh_map.links if source != target
     )
     return {ends: ", ".join(names) for ends, names in actions.items()}

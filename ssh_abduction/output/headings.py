@@ -19,7 +19,7 @@ from scipy.sparse import coo_array
 
 from ssh_abduction.data.checks import an_object
 from ssh_abduction.data.errors import MapError, brief, is_finite
-from ssh_abduction.data.groups import grouped
+from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.trace import Trace
 
@@ -70,7 +70,7 @@ def turns_between(
     dstates = ssh_map.dstates
     in_slots = max((s.heading or 0 for s in dstates), default=0) < 4
     unit = 90 if in_slots else 1
-    members = grouped(
+    members = gathered(
         (s.place, s) for s in dstates if s.place is not None and s.heading is not None
     )
     for facing in members.values():

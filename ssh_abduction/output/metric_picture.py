@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from statistics import median
 
-from ssh_abduction.data.groups import grouped
+from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.maps import DState, Pose, SSHMap
 from ssh_abduction.output.drawing import (
     COLOURS,
@@ -382,7 +382,7 @@ def _site(s: DState) -> int:
 
 
 def _sites(ssh_map: SSHMap) -> dict[int, list[DState]]:
-    return grouped((_site(s), s) for s in ssh_map.dstates)
+    return gathered((_site(s), s) for s in ssh_map.dstates)
 
 
 def _colour(s: DState) -> str:

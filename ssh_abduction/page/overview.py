@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from statistics import fmean
 from typing import Any, TypeAlias
 
-from ssh_abduction.data.groups import grouped
+from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.maps import SSHMap
 
 Steps: TypeAlias = tuple[int, ...]
@@ -116,7 +116,7 @@ def overview(maps: Sequence[SSHMap], spots: Sequence[Spot]) -> dict[str, Any]:
 
 def _members(names: Sequence[int | None]) -> dict[int | None, Steps]:
     """For each number, list the steps that have it. Steps with None are left out."""
-    found = grouped((name, t) for t, name in enumerate(names) if name is not None)
+    found = gathered((name, t) for t, name in enumerate(names) if name is not None)
     return {name: tuple(steps) for name, steps in found.items()}
 
 

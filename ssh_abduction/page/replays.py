@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from perception.errors import PerceptionError
 from perception.images import images_held
 from ssh_abduction.data.errors import MapError, TraceError, brief, is_finite, named
-from ssh_abduction.data.groups import grouped
+from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Step, Trace
 
@@ -112,7 +112,7 @@ def _step(step: Step, view: str) -> dict[str, Any]:
 
 def _steps_of_map(first: SSHMap) -> list[dict[str, Any]]:
     """Reconstruct views and actions of the trace from a map; None for several actions."""
-    actions = grouped(((s, x), action) for s, action, x in first.links)
+    actions = gathered(((s, x), action) for s, action, x in first.links)
     done = [actions.get(pair, []) for pair in pairwise(first.dstate_at)]
     names = [some[0] if len(some) == 1 else None for some in done]
     views: list[Any] = [first.dstates[label].shown for label in first.dstate_at]

@@ -23,7 +23,7 @@ import networkx as nx
 from ssh_abduction.data.checks import a_list, a_text, all_instances
 from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.errors import MapError, brief, printable
-from ssh_abduction.data.groups import firsts, grouped
+from ssh_abduction.data.groups import firsts, gathered
 from ssh_abduction.data.maps import Fault, SSHMap, checked_map
 from ssh_abduction.data.words import attributes_of
 from ssh_abduction.rivals.sides import Beside, only_in
@@ -48,7 +48,7 @@ class Change:
     """Steps that two maps group differently, by dstate, place, path or course.
 
     Attributes:
-        sort: What the steps are grouped by: "dstates", "places", "paths" or "courses".
+        sort: What the steps are gathered by: "dstates", "places", "paths" or "courses".
         first: The groups of steps in the first map, sorted by first step.
         other: The groups of the same steps in the other map.
         first_none: The steps that are at no place, or along no path, in the first map.
@@ -259,7 +259,7 @@ def _changes(table: Table, sort: Sort) -> Iterable[Change]:
 
 def _groups(classes: Sequence[int], ones: Sequence[int]) -> list[list[int]]:
     """Group classes as the row of a map in `Table.ones` does, without those that are nowhere."""
-    groups = grouped((ones[c], c) for c in classes if ones[c] != NONE)
+    groups = gathered((ones[c], c) for c in classes if ones[c] != NONE)
     return list(groups.values())
 
 
@@ -275,7 +275,7 @@ def _unmoved(first: SSHMap, other: SSHMap) -> set[int]:
     """Find the dstates that have the same steps in both maps, each named by its first step."""
     sets: list[set[Steps]] = []
     for ssh_map in (first, other):
-        steps = grouped((label, t) for t, label in enumerate(ssh_map.dstate_at))
+        steps = gathered((label, t) for t, label in enumerate(ssh_map.dstate_at))
         sets.append({tuple(some) for some in steps.values()})
     return {some[0] for some in sets[0] & sets[1]}
 
@@ -287,9 +287,9 @@ def _size(ssh_map: SSHMap) -> tuple[int, int, int, int]:
 
 def _groups_in_words(groups: Sequence[Steps], none: Steps) -> str:
     """Put into words how one map groups steps: "groups steps 0–1 | 2 and leaves out step 5"."""
-    grouped = f"groups {_steps(sum(map(len, groups)))} {' | '.join(map(stretches, groups))}"
+    gathered = f"groups {_steps(sum(map(len, groups)))} {' | '.join(map(stretches, groups))}"
     left = f"leaves out {_steps(len(none))} {stretches(none)}"
-    return " and ".join(([grouped] if groups else []) + ([left] if none else []))
+    return " and ".join(([gathered] if groups else []) + ([left] if none else []))
 
 
 def _steps(count: int) -> str:

@@ -20,7 +20,7 @@ from typing import Any, TypeAlias
 from ssh_abduction.data.checks import an_instance
 from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.errors import MapError
-from ssh_abduction.data.groups import firsts, grouped
+from ssh_abduction.data.groups import firsts, gathered
 from ssh_abduction.data.words import counted
 from ssh_abduction.rivals.listing import Listing
 from ssh_abduction.solver import probability_in_words
@@ -190,4 +190,4 @@ def _pair(
 def _visits(drive: Drive, placings: Sequence[_Placing]) -> list[list[int]]:
     """List the first steps of a drive's visits to each place of the first map."""
     first = firsts((tuple(at[t] for at in placings), t) for t in range(drive.first, drive.stop))
-    return list(grouped((names[0], t) for names, t in first.items()).values())
+    return list(gathered((names[0], t) for names, t in first.items()).values())

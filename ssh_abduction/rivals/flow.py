@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import coo_array
 
-from ssh_abduction.data.groups import grouped, reached
+from ssh_abduction.data.groups import gathered, reached
 from ssh_abduction.rivals.stances import StanceMove
 
 T = TypeVar("T")
@@ -172,7 +172,7 @@ def nearest_of(
 
     Parameters as in `shortest_walk`. Return the names of the actions; empty if there is no way.
     """
-    after = grouped(
+    after = gathered(
         (move.source, k)
         for k, move in sorted(enumerate(moves), key=lambda pair: pair[0] not in due)
     )
@@ -197,5 +197,5 @@ def reached_from(moves: Iterable[StanceMove], start: int) -> set[int]:
 
 def followed_from(links: Iterable[tuple[T, T]], start: T) -> set[T]:
     """Find all nodes that links (pairs of source and target) reach, including `start`."""
-    after = grouped(links)
+    after = gathered(links)
     return set(reached([start], lambda n: after.get(n, ())))

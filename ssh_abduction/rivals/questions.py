@@ -15,7 +15,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from ssh_abduction.data.errors import printable
-from ssh_abduction.data.groups import grouped
+from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.maps import Fault, SSHMap
 from ssh_abduction.data.words import attributes_of
 from ssh_abduction.rivals.table import Bools, Table
@@ -174,7 +174,7 @@ def _key(column: Bools) -> bytes:
 
 def members_of(numbers: Sequence[int]) -> dict[int, list[int]]:
     """Return a dict from each number to the list of its positions, from 0."""
-    return grouped((number, i) for i, number in enumerate(numbers))
+    return gathered((number, i) for i, number in enumerate(numbers))
 
 
 def _steps(steps: Sequence[int]) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
-from ssh_abduction.data.groups import firsts, grouped
+from ssh_abduction.data.groups import firsts, gathered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.star import Frame, Star
 from ssh_abduction.data.trace import Action, Trace
@@ -91,7 +91,7 @@ class Stances:
         if not self._implies or any(s.heading is None for s in ssh_map.dstates):
             self._at = self._rooms()
         # the stances in each room
-        self._in = grouped((room, n) for n, (room, _) in enumerate(self._at))
+        self._in = gathered((room, n) for n, (room, _) in enumerate(self._at))
         self._back: dict[int, int] = {}  # where a travel from a stance leads if it leads back
 
     def moves(self) -> list[StanceMove]:

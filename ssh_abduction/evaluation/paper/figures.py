@@ -111,38 +111,19 @@ def draw_beliefs(path: str | Path, beliefs: Sequence[Mapping[str, Any]]) -> None
     )
     # Shade the steps at which the robot was lost or nowhere, behind both curves.
     steps = np.arange(len(beliefs))
+    edges = np.repeat(steps, 2) + np.tile([-0.5, 0.5], len(steps))
     for verdict, colour in (("lost", ORANGE), ("nowhere", GREY)):
         shaded = np.array([belief["verdict"] == verdict for belief in beliefs])
+        label = verdict if shaded.any() else None
+        style = {"color": colour, "alpha": 0.25, "linewidth": 0, "label": label}
         for axes in (upper, lower):
-            axes.fill_between(
-                np.repeat(steps, 2) + np.tile([-0.5, 0.5], len(steps)),
-                0,
-                1,
-                where=np.repeat(shaded, 2),
-                color=colour,
-                alpha=0.25,
-                linewidth=0,
-                transform=axes.get_xaxis_transform(),
-                label=verdict if shaded.any() else None,
-            )
-    upper.plot(
-        steps,
-        [belief["entropy"] for belief in beliefs],
-        "o-",
-        color=BLUE,
-        markersize=3,
-        label="entropy",
-    )
-    collapses = [step for step, belief in enumerate(beliefs) if belief["collapsed"]]
-    if collapses:
-        upper.plot(
-            collapses,
-            [beliefs[step]["entropy"] for step in collapses],
-            "x",
-            color="black",
-            markersize=7,
-            label="the belief collapsed",
-        )
+            style |= {"where": np.repeat(shaded, 2), "transform": axes.get_xaxis_transform()}
+            axes.fill_between(edges, 0, 1, **style)
+    entropy = np.array([belief["entropy"] for belief in beliefs])
+    upper.plot(steps, entropy, "o-", color=BLUE, markersize=3, label="entropy")
+    if any(collapsed := [belief["collapsed"] for belief in beliefs]):
+        at, label = np.flatnonzero(collapsed), "the belief collapsed"
+        upper.plot(at, entropy[at], "x", color="black", markersize=7, label=label)
     upper.set(ylabel="entropy, bits", ylim=(0, None))
     upper.legend(frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4)
     lower.plot(steps, [belief["nowhere"] for belief in beliefs], color=BLUE)
@@ -165,20 +146,11 @@ def draw_world(path: str | Path, world: World, poses: Sequence[Sequence[float]])
     size = 0.05 * max(world.bounds[2] - world.bounds[0], world.bounds[3] - world.bounds[1])
     for s in world.dstates:
         x, y, heading = s.pose
-        axes.annotate(
-            "",
-            (x + size * math.cos(heading), y + size * math.sin(heading)),
-            (x, y),
-            arrowprops={"arrowstyle": "->", "color": GREEN},
-        )
+        dx, dy = size * math.cos(heading), size * math.sin(heading)
+        arrow = {"arrowstyle": "->", "color": GREEN}
+        axes.annotate("", (x + dx, y + dy), (x, y), arrowprops=arrow)
         if len(world.dstates) <= 8:
-            axes.text(
-                x + 1.35 * size * math.cos(heading),
-                y + 1.35 * size * math.sin(heading),
-                s.name,
-                ha="center",
-                va="center",
-            )
+            axes.text(x + 1.35 * dx, y + 1.35 * dy, s.name, ha="center", va="center")
     if len(world.dstates) > 8:
         for place in sorted({s.place for s in world.dstates}):
             x, y, _ = next(s.pose for s in world.dstates if s.place == place)
@@ -206,13 +178,7 @@ def draw_views(
     far = min(8.4, 1.05 * float(np.percentile(images, 98)))
     for axes, name in zip(grid.flat, names, strict=False):
         for image in images[views == name][:60]:
-            axes.plot(
-                -image * np.sin(BEARINGS),
-                image * np.cos(BEARINGS),
-                color=BLUE,
-                linewidth=0.4,
-                alpha=0.3,
-            )
+            axes.plot(*_ends(image, BEARINGS), color=BLUE, linewidth=0.4, alpha=0.3)
         axes.plot(0, 0, "^", color=ORANGE, markersize=5)
         axes.set(aspect="equal", xlim=(-far, far), ylim=(-0.06 * far, far))
         dstates = sorted(set(truth[views == name].tolist()))
@@ -248,23 +214,11 @@ def draw_telling(
         far = 1.05 * min(8.0, max(float(np.max(scan)) for scan in scans))
         for axes, (method, shares) in zip(row, telling.methods.items(), strict=True):
             for scan, colour, dashes in zip(scans, (BLUE, GREEN), ("-", "--"), strict=True):
-                axes.plot(
-                    -scan * np.sin(bearings),
-                    scan * np.cos(bearings),
-                    dashes,
-                    color=colour,
-                    linewidth=0.8,
-                )
+                axes.plot(*_ends(scan, bearings), dashes, color=colour, linewidth=0.8)
             at = np.flatnonzero(shares > 0)
-            x, y = -scans[0][at] * np.sin(bearings[at]), scans[0][at] * np.cos(bearings[at])
-            axes.scatter(
-                x,
-                y,
-                s=300 * shares[at] / max(shares.max(), 0.01) * 0.5,
-                color=ORANGE,
-                alpha=0.6,
-                linewidths=0,
-            )
+            sizes = 300 * shares[at] / max(shares.max(), 0.01) * 0.5
+            dots = _ends(scans[0][at], bearings[at])
+            axes.scatter(*dots, s=sizes, color=ORANGE, alpha=0.6, linewidths=0)
             axes.plot(0, 0, "^", color="black", markersize=5)
             axes.set(aspect="equal", xlim=(-far, far), ylim=(-0.08 * far, far))
             axes.set_title(f"{a} or {b}: {method}", fontsize=8)
@@ -289,25 +243,12 @@ def draw_spread(path: str | Path, spread: Sequence[Sequence[float]]) -> None:
     """
     # Positions on the left axis, headings on the right one.
     table = np.array(spread)
+    tours, largest = np.arange(1, len(table) + 1), 1000 * table[:, :2].max(1)
     figure, axes = _pyplot().subplots(figsize=(5.5, 2.8))
-    axes.plot(
-        np.arange(1, len(table) + 1),
-        1000 * table[:, :2].max(1),
-        "o-",
-        color=BLUE,
-        markersize=3,
-        label="position",
-    )
+    axes.plot(tours, largest, "o-", color=BLUE, markersize=3, label="position")
     axes.set(xlabel="tour", ylabel="largest offset, mm", ylim=(0, None))
     right = axes.twinx()
-    right.plot(
-        np.arange(1, len(table) + 1),
-        np.degrees(table[:, 2]),
-        "s--",
-        color=ORANGE,
-        markersize=3,
-        label="heading",
-    )
+    right.plot(tours, np.degrees(table[:, 2]), "s--", color=ORANGE, markersize=3, label="heading")
     right.set(ylabel="largest offset, degrees", ylim=(0, None))
     right.spines["right"].set_visible(True)
     figure.legend(frameon=False, loc="upper right", ncols=2)
@@ -333,12 +274,7 @@ def draw_outcomes(
         ("map right", lambda o: float(o.right), "Greens"),
         ("recognition rate (true labels)", lambda o: o.rate, "viridis"),
     ]
-    lowest = {
-        "map right": 0.0,
-        "U at that k": 0.7,
-        "recognition rate (true labels)": 0.4,
-        "k chosen by M": 2,
-    }
+    lowest = dict(zip((title for title, _, _ in panels), (2, 0.7, 0.0, 0.4), strict=True))
     # One panel for each value. Each cell of a panel is one notch and spread.
     for axes, (title, value, colours) in zip(grid.flat, panels, strict=True):
         table = np.round([[value(cell[n, t]) for t in scales] for n in notches], 3)
@@ -355,26 +291,12 @@ def draw_outcomes(
                     if colours == "viridis"
                     else table[i, j] > middle
                 )
-                axes.text(
-                    j,
-                    i,
-                    text,
-                    ha="center",
-                    va="center",
-                    fontsize=8,
-                    color="white" if dark else "black",
-                )
-                if as_in_paper(o):
-                    axes.add_patch(
-                        pyplot.Rectangle(
-                            (j - 0.47, i - 0.47),
-                            0.94,
-                            0.94,
-                            fill=False,
-                            edgecolor=ORANGE,
-                            linewidth=2,
-                        )
-                    )
+                ink = "white" if dark else "black"
+                axes.text(j, i, text, ha="center", va="center", fontsize=8, color=ink)
+                # As in the paper: four views, U = 1, the right map, and full recognition.
+                if o.k == 4 and o.uncertainty > 1 - 1e-9 and o.right and o.rate > 0.999:
+                    frame = {"fill": False, "edgecolor": ORANGE, "linewidth": 2}
+                    axes.add_patch(pyplot.Rectangle((j - 0.47, i - 0.47), 0.94, 0.94, **frame))
         x, y = (
             np.interp(here[1], scales, range(len(scales))),
             np.interp(here[0], notches, range(len(notches))),
@@ -389,6 +311,6 @@ def draw_outcomes(
     _save(figure, path)
 
 
-def as_in_paper(o: NotchOutcome) -> bool:
-    """Tell whether an outcome has four views, U = 1, the right map, and full recognition."""
-    return o.k == 4 and o.uncertainty > 1 - 1e-9 and o.right and o.rate > 0.999
+def _ends(ranges: NDArray[np.float64], bearings: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Compute where beams end on a page on which the robot faces up: x and y in metres."""
+    return [-ranges * np.sin(bearings), ranges * np.cos(bearings)]

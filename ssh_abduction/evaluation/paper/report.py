@@ -212,6 +212,15 @@ DIFFERENCES = {
     ),
 }
 
+VIEWS = (
+    "views.png",
+    "Ours: the views. Images of each cluster on top of each other, the robot at the triangle, "
+    "facing up.",
+)
+SPREAD = (
+    "spread.png",
+    "Ours: errors do not add up. The largest offset from a dstate's mean pose, tour by tour.",
+)
 FIGURES = {
     "notched-rectangle": [
         (
@@ -219,22 +228,14 @@ FIGURES = {
             "Figure 2: the notched rectangle. Walls, true dstates (arrows) and where images were "
             "taken.",
         ),
-        (
-            "views.png",
-            "Ours: the views. Images of each cluster on top of each other, the robot at the "
-            "triangle, facing up.",
-        ),
+        VIEWS,
         ("quality.png", "Figure 3: M and U against the number of clusters."),
         ("map.svg", "Ours: the minimal map, from the views alone."),
         (
             "learning.png",
             "Figure 4: recognition rate on the map's labels, mean and range over ten folds.",
         ),
-        (
-            "spread.png",
-            "Ours: errors do not add up. The largest offset from a dstate's mean pose, tour by "
-            "tour.",
-        ),
+        SPREAD,
         (
             "outcomes.png",
             "Ours: where the method works. Frames: all as in the paper (4 views, U = 1, right map, "
@@ -247,11 +248,7 @@ FIGURES = {
             "Figure 5: the hallway. Walls, clutter (orange), true dstates (arrows) and where "
             "images were taken.",
         ),
-        (
-            "views.png",
-            "Ours: the views. Images of each cluster on top of each other, the robot at the "
-            "triangle, facing up.",
-        ),
+        VIEWS,
         ("quality.png", "Figure 6, left: M and U against the number of clusters."),
         ("map.svg", "Ours: the minimal map, from the views alone."),
         (
@@ -263,11 +260,7 @@ FIGURES = {
             "learning.png",
             "Figure 6, right: recognition rate on the map's labels, mean and range over ten folds.",
         ),
-        (
-            "spread.png",
-            "Ours: errors do not add up. The largest offset from a dstate's mean pose, tour by "
-            "tour.",
-        ),
+        SPREAD,
     ],
 }
 

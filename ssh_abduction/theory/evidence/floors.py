@@ -14,7 +14,7 @@ from itertools import product
 from typing import TYPE_CHECKING, ClassVar
 
 from ssh_abduction.data.floors import stretches_of
-from ssh_abduction.data.groups import grouped
+from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory.evidence.protocol import Equality, Evidence
@@ -59,7 +59,7 @@ def _lifted(trace: Trace) -> tuple[int, ...]:
 @lru_cache(maxsize=8)
 def _pairs(stretches: tuple[int, ...], lifted: tuple[int, ...]) -> Pairs:
     """Pair each step on the stretch before a lift with each step on the stretch behind it."""
-    steps = grouped((stretch, t) for t, stretch in enumerate(stretches))
+    steps = gathered((stretch, t) for t, stretch in enumerate(stretches))
     return Pairs.of(
         elsewhere=[
             pair for t in lifted for pair in product(steps[stretches[t - 1]], steps[stretches[t]])

@@ -27,7 +27,7 @@ from functools import cache
 from itertools import combinations, pairwise, product
 from typing import TYPE_CHECKING, ClassVar, TypeAlias, TypeVar
 
-from ssh_abduction.data.groups import NodeClasses, grouped
+from ssh_abduction.data.groups import NodeClasses, gathered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.star import Openings
 from ssh_abduction.data.trace import Trace
@@ -419,7 +419,7 @@ def description(
         if first.setdefault(labels[step], step) != step:
             yield Equality(first[labels[step]], step)
     # for each place, the first step of each of its dstates
-    visits = grouped((at[step], step) for step in first.values())
+    visits = gathered((at[step], step) for step in first.values())
     for here in visits.values():
         yield from (Equality(here[0], step, "place") for step in here[1:])
         yield from (Equality(i, j, holds=False) for i, j in combinations(here, 2) if distinct)
