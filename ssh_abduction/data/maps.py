@@ -17,15 +17,14 @@ import hashlib
 import json
 import os
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.data.checks import a_whole_number, all_instances, an_instance, one_of
-from ssh_abduction.data.drives import Drive, pieces_in_words
-from ssh_abduction.data.errors import MapError, brief, checked_index, is_whole, named
+from ssh_abduction.data.errors import MapError, brief, is_whole, named
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.groups import firsts, gathered, parts
 from ssh_abduction.data.map_file import (
@@ -437,45 +436,3 @@ def check_of_trace(maps: Iterable[SSHMap], trace: Trace, where: str, *, views: b
                     f"{where}: maps[{i}]: expected view {brief(seen)} at step {t}, as the trace "
                     f"has it, got {brief(there)}; the maps are of another trace"
                 )
-
-
-class MapSequence:
-    """A sequence of maps, for a class with the attributes `maps` and `drives`."""
-
-    __slots__ = ()
-    maps: tuple[SSHMap, ...]
-
-    @property
-    def drives(self) -> tuple[Drive, ...]:
-        """The drives of the trace; empty if they are unknown."""
-        raise NotImplementedError
-
-    @property
-    def joined(self) -> str:
-        """Which drives the first map joins, in words; empty for one drive or without a map."""
-        return pieces_in_words(self.drives, self.maps[0]) if self.maps else ""
-
-    def __len__(self) -> int:
-        """The number of maps."""
-        return len(self.maps)
-
-    def __bool__(self) -> bool:
-        """True, even without a map. Ask `len` or `status` whether there are maps."""
-        return True
-
-    def __iter__(self) -> Iterator[SSHMap]:
-        return iter(self.maps)
-
-    @overload
-    def __getitem__(self, index: int) -> SSHMap: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> tuple[SSHMap, ...]: ...
-
-    def __getitem__(self, index: int | slice) -> SSHMap | tuple[SSHMap, ...]:
-        """The map at a position, or a tuple of maps for a slice. Raises RangeError."""
-        return (
-            self.maps[index]
-            if isinstance(index, slice)
-            else self.maps[checked_index(index, len(self.maps), "maps")]
-        )

@@ -19,7 +19,8 @@ from ssh_abduction.data.errors import MapError, SolverError, brief, named
 from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.map_file import SOLUTION_FORMAT, check_format, read_json, write_map
-from ssh_abduction.data.maps import MapSequence, SSHMap, check_of_trace, maps_of
+from ssh_abduction.data.map_sequence import MapSequence
+from ssh_abduction.data.maps import SSHMap, check_of_trace, maps_of
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.output import cards
