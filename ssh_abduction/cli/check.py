@@ -241,23 +241,14 @@ def _bound(
             f"{doubt}"
         )
     elif bound.refuted:
-        sizes = (
-            f"{bound.refuted[0]} to {total - 1}"
-            if len(bound.refuted) > 1
-            else str(bound.refuted[0])
-        )
-        said.append(
-            f"at least {counted(total, 'dstates')}, if clingo is right that no map has {sizes}"
-        )
-    if fewest is not None:
-        beyond = (
-            "fewer than that, so this bound or a map is wrong"
-            if fewest < total
-            else f"{fewest - total} more than proven"
-        )
-        said.append(
-            f"the maps have {fewest}" + (": no map has fewer" if fewest == total else f", {beyond}")
-        )
+        sizes = str(bound.refuted[0]) + f" to {total - 1}" * (len(bound.refuted) > 1)
+        least = counted(total, "dstates")
+        said.append(f"at least {least}, if clingo is right that no map has {sizes}")
+    if fewest is not None and fewest < total:
+        said.append(f"the maps have {fewest}, fewer than that, so this bound or a map is wrong")
+    elif fewest is not None:
+        more = f", {fewest - total} more than proven" if fewest > total else ": no map has fewer"
+        said.append(f"the maps have {fewest}{more}")
     return not false and (fewest is None or fewest >= total)
 
 
@@ -297,9 +288,7 @@ def _false_of_all(data: Mapping[str, Any], trace: Trace) -> Iterator[str]:
     backbone = solution.backbone
     if backbone and backbone.proven and solution.minimal_listed:
         sharing = Sharing()
-        for ssh_map in (
-            solution.maps[: solution.levels[0].count] if solution.levels else solution.maps
-        ):
+        for ssh_map in solution.minimal_maps or solution.maps:
             sharing.absorb(ssh_map)
         right = sharing.backbone(proven=True)
         if backbone.to_dict() != right.to_dict():

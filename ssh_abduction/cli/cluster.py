@@ -6,6 +6,7 @@ import argparse
 import math
 import os
 import sys
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -76,12 +77,8 @@ def run(options: argparse.Namespace) -> int:
             f"{options.trace}: images: {error}; log more images, or different ones"
         ) from None
     truth = true_dstate_names(trace)
-    uncertainty: dict[int, float] = {}
-    if truth is not None:
-        uncertainty = {
-            k: uncertainty_coefficient(labels, truth)
-            for k, labels in clusterer.labels_by_k_.items()
-        }
+    by_k = {} if truth is None else clusterer.labels_by_k_
+    uncertainty = {k: uncertainty_coefficient(labels, truth or ()) for k, labels in by_k.items()}
     beside = trace.images and os.path.relpath(
         Path(trace.source or ".").parent / trace.images, Path(options.output).parent
     )
@@ -91,24 +88,20 @@ def run(options: argparse.Namespace) -> int:
         images=beside,
     )
     clustered = with_runner_up(clustered, None if other is None else other.tolist())
+    columns = {"M": clusterer.quality_, "trimmed": clusterer.trimmed_}
+    columns |= {"U": uncertainty} if uncertainty else {}
+    words = {clusterer.k_: "chosen", clusterer.runner_up_: "runner-up"}
     rows = [
         [
             k,
-            *(
-                "–" if math.isnan(m) else f"{m:.3f}"
-                for m in (clusterer.quality_[k], clusterer.trimmed_[k])
-            ),
-            *([f"{uncertainty[k]:.3f}"] if uncertainty else []),
-            {clusterer.k_: "chosen", clusterer.runner_up_: "runner-up"}.get(k, ""),
+            *("–" if math.isnan(m := column[k]) else f"{m:.3f}" for column in columns.values()),
+            words.get(k, ""),
         ]
         for k in clusterer.quality_
     ]
-    chosen = table(["k", "M", "trimmed", *(["U"] if uncertainty else []), ""], rows)
-    write(
-        clustered,
-        options.output,
-        f"{chosen}\n{counted(clusterer.k_, 'views')} of {counted(len(images), 'images')}",
-    )
+    chosen = table(["k", *columns, ""], rows)
+    said = f"{counted(clusterer.k_, 'views')} of {counted(len(images), 'images')}"
+    write(clustered, options.output, f"{chosen}\n{said}")
     warn_of_doubts(clusterer.labels_, clusterer.confidence_, clusterer.quality_[clusterer.k_])
     warn(runner_up_doubts(clustered))
     if options.plot:
@@ -128,14 +121,10 @@ def runner_up_doubts(trace: Trace) -> list[str]:
     theory = (
         Theory.topological() if all(action.kind for action in trace.actions) else Theory.causal()
     )
-    try:
-        found = (
-            second_map(trace, solve(trace, theory, time_limit=SECONDS).maps, theory)
-            if runner_up(trace)
-            else None
-        )
-    except AbductionError:  # the trace lacks what the theory needs; `solve` will report that
-        return []
+    found = None
+    with suppress(AbductionError):  # the trace lacks what the theory needs; `solve` reports that
+        if runner_up(trace):
+            found = second_map(trace, solve(trace, theory, time_limit=SECONDS).maps, theory)
     return [found.sentence] if found else []
 
 

@@ -20,19 +20,8 @@ UNKNOWN = "–"
 # If poses and relations agree on less than this share of the pairs of visits, they belong to
 # different logs, or one of them is wrong.
 ALIKE = 0.9
-PAIRS = (
-    "map",
-    "places",
-    "joined",
-    "right",
-    "precision",
-    "recall",
-    "dstates",
-    "joined",
-    "right",
-    "precision",
-    "recall",
-)
+OF_PAIRS = ("joined", "right", "precision", "recall")
+PAIRS = ("map", "places", *OF_PAIRS, "dstates", *OF_PAIRS)
 HEAD = (
     "map",
     "isomorphic",
@@ -118,13 +107,9 @@ def run(options: argparse.Namespace) -> int:
         if not visits.places.judged:
             warn([_nothing_judged(visits)])
         if visits.by_both is not None and visits.by_both[1] < ALIKE * visits.by_both[0]:
-            warn(
-                [
-                    "relations and the poses of the trace agree on "
-                    f"{visits.by_both[1]} of {counted(visits.by_both[0], 'pairs')} of visits only: "
-                    f"are {named(options.relations)} relations of this log?"
-                ]
-            )
+            agree = f"{visits.by_both[1]} of {counted(visits.by_both[0], 'pairs')} of visits only"
+            ask = f"are {named(options.relations)} relations of this log?"
+            warn([f"relations and the poses of the trace agree on {agree}: {ask}"])
     if options.json:
         record = {"count": len(maps)} if found is None else found.to_dict()
         print(json_line({**record, **{visits.judge: visits.to_dict() for visits in judged}}))
@@ -136,15 +121,8 @@ def run(options: argparse.Namespace) -> int:
         print(table(HEAD, [_row(i, one) for i, one in enumerate(found.maps, 1)]))
     for visits in judged:
         print(_visits_in_words(visits))
-        print(
-            table(
-                PAIRS,
-                [
-                    [i, *_pairs(one.places), *_pairs(one.dstates)]
-                    for i, one in enumerate(visits.maps, 1)
-                ],
-            )
-        )
+        rows = enumerate(visits.maps, 1)
+        print(table(PAIRS, [[i, *_pairs(one.places), *_pairs(one.dstates)] for i, one in rows]))
     return 0
 
 
@@ -170,21 +148,17 @@ def _nothing_judged(found: VisitsEvaluation) -> str:
 def _visits_in_words(found: VisitsEvaluation) -> str:
     """Say how many pairs of visits and of steps were judged, and how many were left out."""
     places, dstates = found.places, found.dstates
-    left_out = [
-        counted(places.stayed, "pairs")
-        + " within this distance, as the robot made no visit farther away in between"
-        if places.stayed
-        else "",
-        counted(places.unknown, "pairs") + f", as {found.judge} do not tell how far apart they are"
-        if places.unknown
-        else "",
-    ]
+    stayed = "within this distance, as the robot made no visit farther away in between"
+    left_out = [f"{counted(places.stayed, 'pairs')} {stayed}"] if places.stayed else []
+    if places.unknown:
+        unknown = counted(places.unknown, "pairs")
+        left_out.append(f"{unknown}, as {found.judge} do not tell how far apart they are")
     return (
         f"judged by {found.judge}: {places.returns} of {counted(places.judged, 'pairs')} of visits "
         f"are returns to one place (within {found.near:g} m, and the robot was farther away in "
         f"between); {dstates.returns} of {counted(dstates.judged, 'pairs')} of steps are returns "
         f"to one dstate (headings also differ by at most {found.turned:g} degrees)"
-        + "".join(f"\nleft out: {text}" for text in left_out if text)
+        + "".join(f"\nleft out: {text}" for text in left_out)
         + (
             f"\nposes and relations agree on {found.by_both[1]} of "
             f"{counted(found.by_both[0], 'pairs')} of visits"
@@ -213,40 +187,28 @@ def _headline(found: Evaluation, may_be_more: bool) -> str:
 
 def _truth(found: Evaluation, steps: int) -> str:
     """Describe the truth of a trace with this number of steps: where it is known, and counts."""
-    named_counts = (
-        (found.true_dstates, "dstates"),
-        (found.true_places, "places"),
-        (found.true_paths, "paths"),
-    )
-    counts = ", ".join(
-        counted(number, things) for number, things in named_counts if number is not None
-    )
-    ambiguity = (
-        ""
-        if found.ambiguity is None
-        else f"; {100 * found.ambiguity:.0f} % of the pairs of dstates share a view"
-    )
+    known = {things: getattr(found, f"true_{things}") for things in ("dstates", "places", "paths")}
+    counts = ", ".join(counted(n, things) for things, n in known.items() if n is not None)
+    ambiguity = ""
+    if found.ambiguity is not None:
+        ambiguity = f"; {100 * found.ambiguity:.0f} % of the pairs of dstates share a view"
     return f"the truth, known at {found.steps} of {counted(steps, 'steps')}: {counts}{ambiguity}"
 
 
 def _row(number: int, one: MapEvaluation) -> list[object]:
     """Make the row of a map, which has this number, in the table."""
-    return [
-        number,
-        _word(one.isomorphic, "yes", "no"),
-        *(
-            UNKNOWN if count is None else f"{count} {_word(right, 'right', 'wrong')}"
-            for count, right in (
-                (one.dstates, one.dstates_right),
-                (one.places, one.places_right),
-                (one.paths, one.paths_right),
-            )
-        ),
-        _share(one.accuracy),
-        f"{_share(one.place_precision)} {_share(one.place_recall)}",
-        f"{_share(one.edge_precision)} {_share(one.edge_recall)}",
-        f"{_share(one.link_precision)} {_share(one.link_recall)}",
+    counts = [
+        UNKNOWN
+        if (count := getattr(one, kind)) is None
+        else f"{count} {_word(getattr(one, f'{kind}_right'), 'right', 'wrong')}"
+        for kind in ("dstates", "places", "paths")
     ]
+    shares = [
+        " ".join(_share(getattr(one, f"{kind}_{what}")) for what in ("precision", "recall"))
+        for kind in ("place", "edge", "link")
+    ]
+    isomorphic = _word(one.isomorphic, "yes", "no")
+    return [number, isomorphic, *counts, _share(one.accuracy), *shares]
 
 
 def _word(value: bool | None, yes: str, no: str) -> str:

@@ -109,10 +109,7 @@ def run(options: argparse.Namespace) -> int:
     number_steps(options, trace)
     maps, found, data = _maps_of(options)
     trace, theory = as_corrected(trace, theory_of(options, found), maps, options.corrections)
-    limits: dict[str, Any] = {
-        "time_limit": options.time_limit,
-        "memory_limit": options.memory_limit,
-    }
+    limits: dict[str, Any] = {n: getattr(options, n) for n in ("time_limit", "memory_limit")}
     listing = _listing_of(maps, data, len(trace)) if found and options.steps else None
     if listing is not None:
         limits["known"] = listing.maps
@@ -193,13 +190,9 @@ def _exit_code(explanation: Answer) -> int:
     if isinstance(explanation, PlaceExplanation):
         if explanation.stopped == "interrupted":
             return interrupted_code()
-        return (
-            0
-            if explanation.maps
-            else EXIT_NO_MAP
-            if explanation.possible is False
-            else EXIT_UNKNOWN
-        )
+        if explanation.maps:
+            return 0
+        return EXIT_NO_MAP if explanation.possible is False else EXIT_UNKNOWN
     if isinstance(explanation, PairExplanation):
         no_map, known = explanation.verdict is Verdict.NO_MAP, explanation.proven
     else:

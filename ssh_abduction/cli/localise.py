@@ -88,15 +88,10 @@ def run(options: argparse.Namespace) -> int:
     trace = Trace.load(options.other)
     beliefs = [belief.to_dict() for belief in localiser.beliefs(trace)]
     if options.json:
-        head = {
-            "map": options.map or 1,
-            "dstates": len(localiser.ssh_map.dstates),
-            "chances": asdict(localiser.chances),
-        }
-        lines = ",\n".join(
-            json_line({"step": step, **belief}) for step, belief in enumerate(beliefs)
-        )
-        print(f'{json_line(head)[:-1]}, "beliefs": [\n{lines}\n]}}')
+        head = {"map": options.map or 1, "dstates": len(localiser.ssh_map.dstates)}
+        head["chances"] = asdict(localiser.chances)
+        lines = [json_line({"step": step, **belief}) for step, belief in enumerate(beliefs)]
+        print(json_line(head)[:-1] + ', "beliefs": [\n' + ",\n".join(lines) + "\n]}")
     else:
         print(_headline(beliefs))
         print(table(HEAD, [_row(step, belief, trace) for step, belief in enumerate(beliefs)]))

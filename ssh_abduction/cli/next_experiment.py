@@ -74,19 +74,14 @@ def run(options: argparse.Namespace) -> int:
     if found is None and options.theory is None and theory == Theory.topological():
         theory = None  # a saved map does not contain its theory
     watch = Watch(options.time_limit, options.memory_limit)
+    complete = not (isinstance(data, dict) and data.get("complete") is False)
 
     def interrupt() -> None:
         watch.interrupted = True
 
     try:
         with on_ctrl_c(interrupt), Guard(interrupt, lambda _: ("", interrupted_code()), None, None):
-            experiment = next_experiment(
-                maps,
-                trace,
-                theory=theory,
-                complete=not (isinstance(data, dict) and data.get("complete") is False),
-                watch=watch,
-            )
+            experiment = next_experiment(maps, trace, theory=theory, complete=complete, watch=watch)
     except MapError as error:
         raise MapError(f"{named(options.maps)}: {error}") from None
     if options.json:
@@ -99,13 +94,9 @@ def run(options: argparse.Namespace) -> int:
         warn([experiment.warning])
     if experiment.stopped == "interrupted":
         return interrupted_code()
-    return (
-        0
-        if not experiment.stopped
-        else EXIT_CUT_SHORT
-        if experiment.plan.branches
-        else EXIT_NOTHING
-    )
+    if not experiment.stopped:
+        return 0
+    return EXIT_CUT_SHORT if experiment.plan.branches else EXIT_NOTHING
 
 
 def _lines(experiment: Experiment) -> Iterator[str]:
@@ -118,16 +109,11 @@ def _lines(experiment: Experiment) -> Iterator[str]:
         rows = [
             [action, *(said.seen[i] for said in shown)] for i, action in enumerate(plan.actions)
         ]
-        yield table(
-            [
-                "action",
-                *(
-                    f"{_rivals_in_words(said.rivals)} predict{'s' * (len(said.rivals) == 1)}"
-                    for said in shown
-                ),
-            ],
-            rows,
-        )
+        head = [
+            f"{_rivals_in_words(said.rivals)} predict{'s' * (len(said.rivals) == 1)}"
+            for said in shown
+        ]
+        yield table(["action", *head], rows)
         if more:
             yield f"  and {more} more predictions (--json has all)"
         lines = list(_tree(plan, "  "))

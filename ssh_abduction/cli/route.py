@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Collection
+from typing import Any
 
 from ssh_abduction.cli.options import add_map, add_maps
 from ssh_abduction.cli.parsing import Verbs
@@ -56,15 +57,10 @@ def run(options: argparse.Namespace) -> int:
 
     listing = Listing.load(options.maps)
     given = {name.text for ssh_map in listing.maps for name in ssh_map.names}
+    avoid = _names(options.avoid, given)
     try:
-        found = route(
-            listing,
-            options.start,
-            options.goal,
-            by=options.by,
-            avoid=_names(options.avoid, given),
-            map=options.map,
-        )
+        how: dict[str, Any] = {"by": options.by, "map": options.map}
+        found = route(listing, options.start, options.goal, avoid=avoid, **how)
     except MapError as error:
         if str(error).startswith(f"{listing.source}:"):
             raise

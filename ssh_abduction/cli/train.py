@@ -184,15 +184,8 @@ def run_recognise(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps(labels))
     else:
-        print(
-            table(
-                ["step", "dstate"],
-                [
-                    (step, "nowhere" if label is None else label)
-                    for step, label in enumerate(labels)
-                ],
-            )
-        )
+        shown = ["nowhere" if label is None else label for label in labels]
+        print(table(["step", "dstate"], [*enumerate(shown)]))
     return 0
 
 
@@ -221,33 +214,18 @@ def run_tell_apart(options: argparse.Namespace) -> int:
     found = {p: telling_features(images, labels, *p) for p in pairs}
     if options.json:
         records = [
-            {
-                "dstates": p,
-                "recognised": f.recognised,
-                **{k: v.tolist() for k, v in f.methods.items()},
-            }
+            {"dstates": p, "recognised": f.recognised}
+            | {method: shares.tolist() for method, shares in f.methods.items()}
             for p, f in found.items()
         ]
         print(json.dumps(records))
     else:
         rows = [
-            [
-                f"{a}, {b}",
-                f"{f.recognised:.3f}",
-                *(strongest(shares) for shares in f.methods.values()),
-            ]
+            [f"{a}, {b}", f"{f.recognised:.3f}", *map(strongest, f.methods.values())]
             for (a, b), f in found.items()
         ]
-        print(
-            table(
-                [
-                    "dstates",
-                    "recognised",
-                    *(f"beams by {method}" for method in next(iter(found.values())).methods),
-                ],
-                rows,
-            )
-        )
+        beams = [f"beams by {method}" for method in next(iter(found.values())).methods]
+        print(table(["dstates", "recognised", *beams], rows))
     if options.plot:
         sys.stdout.flush()  # print first, in case drawing fails
         from ssh_abduction.evaluation.paper.figures import draw_telling

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import shlex
 import tempfile
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -140,17 +141,10 @@ def _assuming(listing: Listing, trace: Trace, theory: Theory) -> dict[str, Any]:
         known = assumptions(listing, trace, theory, ASSUMING)
     except AbductionError:  # the theory of the file does not suit this trace
         known = {}
-    texts = list(
-        dict.fromkeys(
-            text for costs in known.values() for text in (costs["same"], costs["different"])
-        )
-    )
-    number = {text: k for k, text in enumerate(texts)}
-    pairs = {
-        f"{i},{j}": [number[costs["same"]], number[costs["different"]]]
-        for (i, j), costs in known.items()
-    }
-    return {"texts": texts, "pairs": pairs}
+    both = {f"{i},{j}": (c["same"], c["different"]) for (i, j), c in known.items()}
+    number = {text: k for k, text in enumerate(dict.fromkeys(chain(*both.values())))}
+    pairs = {pair: [number[text] for text in texts] for pair, texts in both.items()}
+    return {"texts": list(number), "pairs": pairs}
 
 
 def _run(options: argparse.Namespace, trace: Trace | None, data: Any) -> Run | None:
@@ -233,15 +227,8 @@ def _serve(
     from ssh_abduction.solver import end_all
 
     try:
-        server = PageServer(
-            listing,
-            trace,
-            theory,
-            run=localised,
-            called=called,
-            port=options.port,
-            time_limit=options.time_limit,
-        )
+        where: dict[str, Any] = {"port": options.port, "time_limit": options.time_limit}
+        server = PageServer(listing, trace, theory, run=localised, called=called, **where)
     except OSError as error:
         raise AbductionError(
             f"port: expected a free port, got {options.port}: {error.strerror}; name another one"
