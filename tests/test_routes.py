@@ -106,7 +106,7 @@ def test_what_is_avoided_is_gone_round() -> None:
         match="avoid: expected a way around what is avoided, got none to dstate 3; avoid less",
     ):
         route(ssh_map, 0, 3, avoid=[1])
-    with pytest.raises(MapError, match="those of to"):
+    with pytest.raises(MapError, match="of 'to' that is not avoided"):
         route(ssh_map, 0, 3, avoid=["p3"])
     detour = SSHMap(
         ssh_map.labels, dstates, (*links, (2, "d", 3)), (0, 1, 2, 3), (MapPath(0, (0, 1)),)

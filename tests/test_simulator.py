@@ -617,7 +617,7 @@ def test_docstrings_run() -> None:
     import doctest
     import importlib
 
-    for name in ("freespace", "motion", "odometer", "panorama", "plan_tours", "world"):
+    for name in ("freespace", "odometer", "panorama", "plan_tours", "world"):
         result = doctest.testmod(importlib.import_module(f"simulator.{name}"))
         assert result.failed == 0
         assert result.attempted > 0
