@@ -360,17 +360,10 @@ class Forcing:
         known: dict[tuple[int, int], float],
         branches: int,
     ) -> bool:
-        """Add joins that every map of a cost below `most` has.
+        """Add joins that every map of a cost below `most` has. Tell whether there is no such map.
 
-        Args:
-            visits: The visits.
-            joins: The joins to begin with.
-            most: A cost.
-            known: Prices of maps that lack joins. More are added.
-            branches: How many joins may be assumed to be lacking at a time.
-
-        Returns:
-            Whether no map costs less than `most`.
+        `joins` has those to begin with. `known` has prices of maps that lack joins, and gets more.
+        Up to `branches` joins at a time are assumed to be lacking.
         """
         while True:
             joins, low, worth = self._grown(visits, joins, most, known)
@@ -391,15 +384,9 @@ class Forcing:
     ) -> tuple[Ints, float, list[tuple[tuple[int, int], float]]]:
         """Add all joins that every map of a cost below `most` has, without branches.
 
-        Args:
-            visits: The visits.
-            joins: The joins so far: the class of each visit.
-            most: A cost.
-            known: Prices of maps that lack joins. More are added.
-
-        Returns:
-            The joins, a lower bound on the cost of maps that have them, and the other joins of the
-            best map, each with a lower bound on the cost of maps without it. The highest is first.
+        Returns the class of each visit, a lower bound on the cost of maps with these joins, and the
+        other joins of the best map, each with a lower bound on the cost of maps without it, the
+        highest first. `known` has prices of maps that lack joins, and gets more.
         """
         while True:
             look_at_clock()

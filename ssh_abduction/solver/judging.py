@@ -59,15 +59,7 @@ class Judging:
         return refusal[1] if refusal else None
 
     def refusal(self, ssh_map: SSHMap) -> tuple[str, frozenset[Equality]] | None:
-        """Find the first kind of evidence that rejects a map.
-
-        Args:
-            ssh_map: A map of the trace or of a prefix.
-
-        Returns:
-            The name of the evidence, and a set of equalities that contradicts it; None if no
-            evidence rejects the map.
-        """
+        """Name the first evidence that rejects a map, with equalities that contradict it."""
         for evidence in self._evidence:
             if found := evidence.refuse(self._trace, ssh_map):
                 return evidence.name, found
@@ -105,13 +97,8 @@ class Judging:
     def pass_map(self, ssh_map: SSHMap, prefix: int, elapsed: float) -> None:
         """Check a map of the whole trace before it is given, as far as there is time.
 
-        Args:
-            ssh_map: The map.
-            prefix: The number of first steps that clingo was given.
-            elapsed: The seconds that the search took so far.
-
-        Raises:
-            InternalError: The map breaks an axiom.
+        Clingo was given the first `prefix` steps, and the search took `elapsed` seconds so far.
+        Raises InternalError if the map breaks an axiom.
         """
         if not self._shown or ssh_map == self._accepted:
             return

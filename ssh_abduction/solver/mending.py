@@ -97,16 +97,11 @@ class Mending:
         yield from self._by_rare_dstates()
 
     def minimal_maps(self, most: int) -> tuple[tuple[SSHMap, ...], bool] | None:
-        """List the minimal maps, if it is proven which mended traces have them.
+        """List the minimal maps, and say whether these are all; None if nothing is proven.
 
-        Call this after the iteration over `maps` has ended.
-
-        Args:
-            most: The number of maps to list for each mended trace; 0 for all.
-
-        Returns:
-            Minimal maps, and whether these are all. None if there is no such proof: the best map
-            costs more than the bound, or not all mended traces were solved.
+        At most this many maps (0: all) are listed for each mended trace. Call this after the
+        iteration over `maps` has ended. There is no proof if the best map costs more than the
+        bound, or if not all mended traces were solved.
         """
         if self._best is None or self._best.cost[0] != self.bound or not self._cheapest:
             return None

@@ -58,11 +58,8 @@ class Ranking:
     ) -> Iterator[SSHMap]:
         """Yield the same maps with their fit, the one with the least chi-square first.
 
-        Args:
-            maps: The maps as they are found. Only the first RANKED of them are sorted.
-            over: Returns whether a limit is reached. From then on, maps get no fit and keep their
-                order. Only the fit of the first map may take longer.
-            overtime: Returns how many seconds the fit of the first map may take from then on.
+        Only the first RANKED maps are sorted. Once `over` says that a limit is reached, maps get no
+        fit and keep their order. Only the fit of the first map may then take `overtime` seconds.
         """
         late: Watch | None = None
 

@@ -21,10 +21,7 @@ if TYPE_CHECKING:
 def summary_of(solution: Solution, count: int, backbone: Backbone | None) -> str:
     """Say in one sentence how many minimal maps there are, and in which steps they differ.
 
-    Args:
-        solution: The solution.
-        count: The number of maps that were found. They need not be in the solution.
-        backbone: What the known minimal maps share; None if no minimal map is known.
+    `count` maps were found. They need not be in the solution.
     """
     if solution.status is Status.UNSATISFIABLE:
         return "no map satisfies the axioms"
@@ -53,13 +50,7 @@ def summary_of(solution: Solution, count: int, backbone: Backbone | None) -> str
 
 
 def opening(theory: Theory, steps: int, within: int) -> dict[str, Any]:
-    """Return the fields of a solution's JSON that come before the maps.
-
-    Args:
-        theory: The theory.
-        steps: The number of steps of the trace.
-        within: The number of dstates above the minimum that a listed map may have.
-    """
+    """Return the fields of a solution's JSON that come before the maps."""
     head = {
         "format": SOLUTION_FORMAT,
         "version": VERSION,
@@ -70,12 +61,7 @@ def opening(theory: Theory, steps: int, within: int) -> dict[str, Any]:
 
 
 def written_map(ssh_map: SSHMap, cost: Cost | None = None) -> dict[str, Any]:
-    """Return a map as plain data, as it is in a solution's JSON.
-
-    Args:
-        ssh_map: The map.
-        cost: The cost to write with the map; None for no cost.
-    """
+    """Return a map as plain data, as it is in a solution's JSON, perhaps with a cost."""
     return ssh_map.to_dict() | ({"cost": cost.to_dict()} if cost else {})
 
 
@@ -89,10 +75,7 @@ def written_trace(trace: Trace) -> dict[str, Any]:
 def ending(solution: Solution, count: int, backbone: Backbone | None) -> dict[str, Any]:
     """Return the fields of a solution's JSON that come after the maps.
 
-    Args:
-        solution: The solution.
-        count: The number of maps that were written. The solution need not hold the maps.
-        backbone: What the known minimal maps share; None if no minimal map is known.
+    `count` maps were written. The solution need not hold them.
     """
     end: dict[str, Any] = {
         "status": solution.status.value,

@@ -82,13 +82,9 @@ class Watch:
         on_tick: Callable[[], None] = lambda: None,
         clock: Callable[[], float] | None = None,
     ) -> None:
-        """Set the limits. The clock stands still until `start`.
+        """Set the limits in seconds and MiB. The clock, `now` by default, stands until `start`.
 
-        Args:
-            limit: Seconds; None for no limit.
-            memory: MiB that the process may use at its peak; None for no limit.
-            on_tick: Called by `check` every TICK seconds, to report progress.
-            clock: Returns the time in seconds; None for `now`.
+        `check` calls `on_tick` every TICK seconds, to report progress.
         """
         self._on_tick, self._clock = on_tick, clock or now
         self._next_tick = TICK
@@ -154,15 +150,10 @@ class Watch:
         return self._spent + (0 if self._started is None else self._clock() - self._started)
 
     def check(self, ahead: float = 0.0, mebibytes: float = 0.0) -> None:
-        """Raise if a limit is reached, or would be reached during the next work.
+        """Raise LimitError if a limit is reached, or would be reached during the next work.
 
-        Args:
-            ahead: Seconds that the next work takes; it cannot be interrupted.
-            mebibytes: MiB of memory that the next work takes.
-
-        Raises:
-            LimitError: A limit is reached, or the search was interrupted.
-            StageTimeError: The time of the present stage is over.
+        That work takes `ahead` seconds and some memory, and cannot be interrupted. Raises
+        StageTimeError if the time of the present stage is over.
         """
         if self.interrupted:
             raise LimitError("interrupted")

@@ -35,21 +35,14 @@ _under_way: set[subprocess.Popen[bytes]] = set()
 
 
 class Lost(NamedTuple):
-    """Stands for a missing answer, as the process of a task ended or was killed for being late.
-
-    `number` is the number of the task. `late` says whether it took too long.
-    """
+    """Stands for a missing answer, as the process of a task ended, or was killed for being late."""
 
     number: int
     late: bool
 
 
 class Worker:
-    """A process that does one task at a time, until `end` is called.
-
-    Attributes:
-        deadline: The time of the monotonic clock at which the process is late; None for no limit.
-    """
+    """A process that does one task at a time, until `end` is called; late after `deadline`."""
 
     def __init__(self, folder: str) -> None:
         """Start a process that makes its temporary files in a folder."""

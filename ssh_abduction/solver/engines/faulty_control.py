@@ -56,13 +56,7 @@ class FaultyAnswer:
 
 @dataclass
 class _Given:
-    """A record of everything that the present control was given.
-
-    Attributes:
-        names: The number of names of each view.
-        full: The steps that may be at any dstate.
-        steps: The given steps, in the order in which clingo got them.
-    """
+    """A record of everything that the present control was given."""
 
     names: dict[int, int] = field(default_factory=dict)
     full: set[int] = field(default_factory=set)

@@ -66,14 +66,10 @@ STRAINED = 1.0
 
 @dataclass(frozen=True, slots=True)
 class _Extension:
-    """A way to extend a hypothesis by a step.
+    """A way to extend a hypothesis by a step: to a known place and dstate, or to new ones (None).
 
-    Attributes:
-        nats: The cost of the extended hypothesis.
-        place: The known place at which the new step is; None for a new place.
-        dstate: The known dstate at which the new step is; None for a new dstate.
-        of: The hypothesis to extend. In it the robot has moved already: the last three entries of
-            its mean vector are the pose at the new step.
+    In the hypothesis `of`, the robot has moved already: the last three entries of its mean vector
+    are the pose at the new step.
     """
 
     nats: float

@@ -122,14 +122,7 @@ class Sketch:
 
     @classmethod
     def beyond(cls, ssh_map: SSHMap, trace: Trace, theory: Theory, homing: bool = True) -> Self:
-        """Make a sketch that begins with a map of a trace.
-
-        Args:
-            ssh_map: The map. It has to satisfy all axioms.
-            trace: The trace of the map.
-            theory: The theory.
-            homing: Whether a travel may lead back to the place that the robot came from.
-        """
+        """Make a sketch that begins with a map of a trace, which has to satisfy all axioms."""
         sketch = cls(trace.steps[0], theory, homing)
         sketch._map, sketch._tree, sketch.labels = ssh_map, False, list(ssh_map.dstate_at)
         sketch._links = {(s, action): x for s, action, x in ssh_map.links}
@@ -164,11 +157,9 @@ class Sketch:
         return sketch
 
     def extend(self, action: Action, step: Step) -> bool:
-        """Add an action and the step after it.
+        """Add an action and the step after it. If they contradict the sketch, return False.
 
-        Returns:
-            True if the sketch has grown. False if the action or the step contradicts it; then the
-            sketch cannot be used any more.
+        Then the sketch cannot be used any more.
         """
         here = self.labels[-1]
         there = self._links.get((here, action.name))
