@@ -576,32 +576,6 @@ def places(walk: Walk, chart: FramedChart) -> list[object]:
     return list(place.values())
 
 
-@settings(max_examples=50)
-@given(st.lists(st.tuples(st.integers(0, 2), st.integers(0, 3)), min_size=2, max_size=7), st.data())
-def test_what_fails_to_be_transitive_is_among_the_scattered(
-    states: list[tuple[int, int]], data: st.DataObject
-) -> None:
-    """Visits at places, with some pairs left out, rotated or added."""
-    every = {
-        (i, j): (t - s) % 4
-        for j, (q, t) in enumerate(states)
-        for i, (p, s) in enumerate(states[:j])
-        if p == q
-    }
-    two = st.tuples(st.integers(0, len(states) - 2), st.integers(1, len(states) - 1)).filter(
-        lambda pair: pair[0] < pair[1]
-    )
-    every |= data.draw(st.dictionaries(two, st.integers(-1, 3), max_size=2), label="changed")
-    pairs = [(*pair, turn) for pair, turn in every.items() if turn >= 0]
-    turned: dict[int, dict[int, int]] = {}
-    for pair in pairs:
-        transitive.take(turned, pair)
-    failing = {pair for pair in pairs if transitive.apart_yet_joined(pair, turned)}
-    scattered = set(transitive.scattered(pairs, len(states)))
-    assert failing <= scattered
-    assert bool(failing) == bool(scattered)
-
-
 def test_annealing_finds_the_places_of_a_maze() -> None:
     walk = maze(4, 4, steps=800, seed=0, stars=True)
     chart = Chart.framed(walk.trace, Log(walk.trace, Theory(star="frame")))

@@ -108,7 +108,7 @@ def test_a_mapper_without_time_still_has_a_small_map() -> None:
 
 def test_a_stage_limit_raises_once() -> None:
     watch = started(60)
-    watch.end_stage_after(-1)
+    watch.stage_ends = -1
     with pytest.raises(StageTimeError):
         watch.check()
     watch.check()

@@ -81,7 +81,7 @@ class Beams:
         may_have_map = self._search_widths(time, clashes)
         if may_have_map:
             self._search_without_axioms(time)
-        watch.end_stage_after(math.inf)
+        watch.stage_ends = math.inf
         return may_have_map
 
     def _search_widths(self, time: _Time, clashes: Callable[[], bool]) -> bool:
@@ -91,7 +91,7 @@ class Beams:
         several = parts.task.theory.several_drives or parts.task.theory.lifts
         widths = [width for width in WIDTHS if width <= BROAD or not several]
         if several:
-            watch.end_stage_after(time.end(JOINING))
+            watch.stage_ends = time.end(JOINING)
             with suppress(StageTimeError):
                 for ssh_map in parts.candidates.joined():
                     self._add(ssh_map)
@@ -103,7 +103,7 @@ class Beams:
             last, first = widths[-1], self._took[0] if self._took else math.inf
             if width < last and began + last * first < time.end(WIDTHS[last]):
                 continue  # there is time for the last one, so leave this one out
-            watch.end_stage_after(time.end(WIDTHS[width]))
+            watch.stage_ends = time.end(WIDTHS[width])
             if (beam := parts.candidates.beam(width)) is None:
                 break
             if not self._ends(beam, width) and not self._ended:
@@ -117,7 +117,7 @@ class Beams:
 
     def _search_without_axioms(self, time: _Time) -> None:
         """Find how many nats broken axioms save, if unknown, by the widest beam that ended."""
-        self._parts.watch.end_stage_after(time.end(BREAKING))
+        self._parts.watch.stage_ends = time.end(BREAKING)
         is_open = self._best[1] < math.inf and math.isinf(self.broken)
         with suppress(StageTimeError):
             if is_open and (beam := self._parts.candidates.beam(self._ended)):

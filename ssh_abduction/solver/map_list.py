@@ -35,7 +35,7 @@ def listed(parts: Parts, found: Iterator[Priced], *, keeps_time: bool) -> Iterat
         _log.info("minimal maps cost %s; they are listed", _cost_in_words(parts))
         ends = watch.reserve_begins if keeps_time else math.inf
         ends = ends if ends > watch.elapsed() else math.inf
-        watch.end_stage_after(ends)
+        watch.stage_ends = ends
         for ssh_map, cost in found:
             if most and known.count == most:
                 known.stopped = "maps limit"
@@ -51,7 +51,7 @@ def listed(parts: Parts, found: Iterator[Priced], *, keeps_time: bool) -> Iterat
             watch.start()
             if known.count == most:
                 spent = watch.elapsed()
-                watch.end_stage_after(min(ends, spent + max(ONE_MORE, ONE_MORE_SHARE * spent)))
+                watch.stage_ends = min(ends, spent + max(ONE_MORE, ONE_MORE_SHARE * spent))
     known.complete = True
 
 
@@ -72,7 +72,7 @@ def by_count(
         raise StageTimeError
     parts.rivals.listed = True  # so the backbone needs no further search
     if not limits.most or known.count < limits.most:
-        parts.watch.end_stage_after(math.inf)
+        parts.watch.stage_ends = math.inf
     if limits.within and counted_first(parts.task.theory):
         engine = parts.prefixes.engine
         parts.near = NearMinimal(parts.task, parts.judging, limits.most, parts.report, engine.asker)

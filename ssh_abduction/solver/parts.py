@@ -99,7 +99,7 @@ class Parts:
 
     def end_clingo(self) -> None:
         """Stop clingo and the clock, and take over the bound that clingo proved."""
-        self.watch.end_stage_after(math.inf)
+        self.watch.stage_ends = math.inf
         self.watch.stop()
         engine = self.prefixes.engine
         self.known.raise_bound(engine.bound)

@@ -334,10 +334,10 @@ class Search:
                 self._parts.known.status = Status.UNSATISFIABLE
                 return
         if watch.left() < math.inf:
-            watch.end_stage_after(watch.elapsed() + COUNTING_SHARE * watch.left())
+            watch.stage_ends = watch.elapsed() + COUNTING_SHARE * watch.left()
         with suppress(StageTimeError):
             self._stages.find_minimum()
-        watch.end_stage_after(math.inf)
+        watch.stage_ends = math.inf
         if self._parts.known.status is not Status.UNSATISFIABLE:
             most = self.limits.most
             weighing.search(lambda trace, theory, s: self._solve_mended(trace, theory, most, s))
@@ -373,10 +373,10 @@ class Search:
         watch.start()
         spent = watch.elapsed()
         is_unlimited = watch.left() == math.inf
-        watch.end_stage_after(spent + max(REASONING, spent) if is_unlimited else math.inf)
+        watch.stage_ends = spent + max(REASONING, spent) if is_unlimited else math.inf
         with heeding(watch.check):
             self._parts.rivals.reason()
-        watch.end_stage_after(math.inf)
+        watch.stage_ends = math.inf
         watch.stop()
 
     def interrupt(self) -> None:

@@ -120,14 +120,14 @@ class Stages:
         parts, watch = self._parts, self._parts.watch
         whole = watch.stage_ends
         ends = watch.elapsed() + min(seconds, choosing.STEPWISE_SHARE * watch.left())
-        watch.end_stage_after(min(ends, whole))
+        watch.stage_ends = min(ends, whole)
         try:
             parts.prefixes.find_minimum()
         except StageTimeError:
             parts.prefixes.start = max(parts.prefixes.start, parts.engine.size)
             return False
         finally:
-            watch.end_stage_after(whole)
+            watch.stage_ends = whole
         return True
 
     def _settle_dstates_first(self) -> None:

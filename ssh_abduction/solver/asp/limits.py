@@ -93,7 +93,8 @@ class Watch:
         self._memory = memory
         self._started: float | None = None
         self._spent = 0.0
-        self._stage_ends = math.inf
+        # `check` raises StageTimeError once, when the clock shows more seconds than this.
+        self.stage_ends = math.inf
         self.interrupted = False
 
     def start(self, since: float | None = None) -> None:
@@ -136,15 +137,6 @@ class Watch:
         """Lower the time limit to this many seconds since the start, without a reserve."""
         self._limit = self._allowed = seconds if self._limit is None else min(seconds, self._limit)
 
-    @property
-    def stage_ends(self) -> float:
-        """The seconds on the clock at which the present stage ends; infinity for no end."""
-        return self._stage_ends
-
-    def end_stage_after(self, seconds: float) -> None:
-        """Let `check` raise StageTimeError once, as soon as the clock shows this many seconds."""
-        self._stage_ends = seconds
-
     def elapsed(self) -> float:
         """Return the seconds on the clock."""
         return self._spent + (0 if self._started is None else self._clock() - self._started)
@@ -164,8 +156,8 @@ class Watch:
             raise LimitError("time limit")
         if self._memory is not None and peak_memory() + mebibytes > self._memory:
             raise LimitError("memory limit")
-        if self.elapsed() > self._stage_ends:
-            self._stage_ends = math.inf
+        if self.elapsed() > self.stage_ends:
+            self.stage_ends = math.inf
             raise StageTimeError
 
     def later(self, seconds: float) -> Callable[[], None]:

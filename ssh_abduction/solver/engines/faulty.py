@@ -100,7 +100,7 @@ class FaultyEngine:
         if self.size >= GUESSED or not self._guesses():
             return
         began, left = watch.elapsed(), watch.left()
-        watch.end_stage_after(min(ends, began + min(ASKED_FIRST, ASKED_FIRST_SHARE * left)))
+        watch.stage_ends = min(ends, began + min(ASKED_FIRST, ASKED_FIRST_SHARE * left))
         try:
             yield from self._asked()
         except StageTimeError:
@@ -108,7 +108,7 @@ class FaultyEngine:
             if watch.elapsed() > ends:
                 raise
         finally:
-            watch.end_stage_after(ends)
+            watch.stage_ends = ends
 
     def _guessed(self) -> Iterator[Found]:
         """Yield guessed maps of the whole trace, each cheaper than the one before.

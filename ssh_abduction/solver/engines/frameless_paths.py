@@ -77,24 +77,6 @@ class _Far:
         return cls(tuple(pairs), tuple((step, labels[step]) for step in steps))
 
 
-@dataclass(frozen=True)
-class _Members:
-    """A set of links and of constraints `_Far`, to find out whether places and paths fit them."""
-
-    links: list[Link]
-    far: list[_Far]
-
-    @classmethod
-    def of(cls, members: Iterable[Link | _Far]) -> _Members:
-        links, far = list[Link](), list[_Far]()
-        for member in members:
-            if isinstance(member, _Far):
-                far.append(member)
-            else:
-                links.append(member)
-        return cls(links, far)
-
-
 class PlacesAndPaths:
     """Finds the best places and paths for labels, or the reason why none fit.
 
@@ -234,19 +216,21 @@ class PlacesAndPaths:
             self._give_axioms(new)
             return
         far = self._far_away(labels)
-        members = _Members.of(minimal_part(self._clash, [*links, *far]))
-        placed = {at for apart in members.far for at in apart.placed}
+        members: list[Link | _Far] = minimal_part(self._clash, [*links, *far])
+        placed = {at for member in members if isinstance(member, _Far) for at in member.placed}
         self.named.program.add_links_at({step for step, _ in placed})
         self._forbidden += 1
         self.named.program.add_rules(
-            f"forbidden_{self._forbidden}", names_lp.forbidden_links(members.links, placed)
+            f"forbidden_{self._forbidden}",
+            names_lp.forbidden_links([x for x in members if not isinstance(x, _Far)], placed),
         )
 
     def _clash(self, members: list[Link | _Far]) -> bool:
         """Whether no places and paths exist for these members."""
-        some = _Members.of(members)
+        links = [member for member in members if not isinstance(member, _Far)]
+        far = [member for member in members if isinstance(member, _Far)]
         return not any(
-            self._has_paths(self._control_for(some.links, far=some.far, single=single))
+            self._has_paths(self._control_for(links, far=far, single=single))
             for single in (True, False)
         )
 

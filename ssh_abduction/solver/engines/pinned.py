@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ssh_abduction.solver.engines.base import AT_ONCE
-from ssh_abduction.solver.steps.apart import Matrix
 from ssh_abduction.solver.steps.chart import Chart
 from ssh_abduction.solver.steps.log import Log
 
@@ -34,15 +33,10 @@ class Pinned:
         """
         chart = Chart.of_steps(log, steps)
         clique = chart.continuations.clique() if largest else [0]
-        columns = [chart.continuations.apart_from(step) for step in clique]
-        return cls(chart, clique, _not_apart(np.stack(columns, axis=1)))
+        apart = np.stack([chart.continuations.apart_from(step) for step in clique], axis=1)
+        return cls(chart, clique, [(~row).nonzero()[0].tolist() for row in apart])
 
     @property
     def is_long(self) -> bool:
         """Whether there are too many nodes to compare them in pairs."""
         return len(self.chart.seen) > AT_ONCE
-
-
-def _not_apart(apart: Matrix) -> list[list[int]]:
-    """For each row of a matrix of flags, list the columns whose flag is False."""
-    return [(~row).nonzero()[0].tolist() for row in apart]

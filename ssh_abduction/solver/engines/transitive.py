@@ -11,7 +11,6 @@ from collections.abc import Sequence, Set
 from typing import TypeAlias
 
 import clingo
-import numpy as np
 
 from ssh_abduction.solver.asp.facts import visits_lp
 from ssh_abduction.solver.steps.chart import FramedChart
@@ -39,9 +38,7 @@ def intransitive(pairs: Sequence[Pair], fits: Set[Pair], chart: FramedChart) -> 
     found: dict[Three, None] = {}
     turned: Turned = {}
     leaves = chart.leaves
-    work = scattered(pairs, len(chart.stars))
-    if not work:
-        return []
+    work = list(pairs)
     for pair in pairs:
         take(turned, pair)
     for i, j, r in work:
@@ -70,27 +67,6 @@ class PairOf(dict[clingo.Symbol, Pair]):
     def __missing__(self, symbol: clingo.Symbol) -> Pair:
         pair = self[symbol] = visits_lp.read_same(symbol)
         return pair
-
-
-def scattered(pairs: Sequence[Pair], visits: int) -> list[Pair]:
-    """List the pairs whose group of visits is not consistent.
-
-    A group is all visits that pairs connect to each other. It is consistent if each two of its
-    visits are a pair, and the slots of all pairs agree.
-    """
-    first, second, turns = np.array(pairs, dtype=int).reshape(-1, 3).T
-    group = np.arange(visits)  # for each visit, the first visit that it is paired with
-    np.minimum.at(group, second, first)
-    turned = np.zeros(visits, dtype=int)  # the slot that is slot 0 of that first visit
-    at_first = group[second] == first
-    turned[second[at_first]] = turns[at_first]
-    members = np.bincount(group, minlength=visits)
-    joined = np.bincount(group[first], minlength=visits)
-    wrong = (group[first] != group[second]) | ((turned[second] - turned[first]) % 4 != turns)
-    bad = joined != members * (members - 1) // 2
-    bad[group[first[wrong]]] = bad[group[second[wrong]]] = True
-    found = bad[group[first]] | bad[group[second]]
-    return [pair for pair, is_bad in zip(pairs, found, strict=True) if is_bad]
 
 
 def take(turned: Turned, pair: Pair) -> None:
