@@ -32,9 +32,10 @@ class Tried:
 
     Attributes:
         k: The chosen number of views.
-        quality: M for each k that was tried (`perception.quality.cluster_quality`).
-        trimmed: Trimmed M for each k that was tried (`perception.quality.trimmed_quality`).
-        labels: The view of each image for each k that was tried, (n,).
+        quality: For each number of views k that was tried, M: the gap between clusters divided by
+            their width (`perception.quality.cluster_quality`).
+        trimmed: The same, but with quantiles instead of extremes (`trimmed_quality`).
+        labels: For each k that was tried, the view of each image, (n,).
     """
 
     k: int

@@ -208,7 +208,8 @@ def uncertainty_coefficient(views: ArrayLike, truth: ArrayLike) -> float:
     seen, true = _numbered(views), _numbered(truth)
     if len(seen) != len(true):
         raise PerceptionError(
-            f"truth: expected {len(seen)} states, one per view, got {len(true)}; give each view one"
+            f"truth: expected {len(seen)} states, one for each entry of views, got {len(true)}; "
+            "give a true state for each"
         )
     return min(1.0, max(0.0, float(homogeneity_score(seen, true))))
 

@@ -206,7 +206,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
 
     @property
     def quality_(self) -> dict[int, float]:
-        """M for each k that was tried, without noise.
+        """For each number of views k that was tried, M (`cluster_quality`), without noise.
 
         It has one entry if k is given or if the clusterer finds k itself.
         """
@@ -214,12 +214,15 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
 
     @property
     def trimmed_(self) -> dict[int, float]:
-        """Trimmed M for each k that was tried (`perception.quality.trimmed_quality`)."""
+        """For each number of views k that was tried, M computed with medians (`trimmed_quality`).
+
+        M is the gap between clusters divided by their width. Larger is better.
+        """
         return self.tried_.trimmed
 
     @property
     def labels_by_k_(self) -> dict[int, NDArray[np.intp]]:
-        """The view of each image for each k that was tried, (n,)."""
+        """For each number of views k that was tried, the view of each image, (n,)."""
         return self.tried_.labels
 
     @property

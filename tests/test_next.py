@@ -394,7 +394,7 @@ def test_limits_leave_a_plan_that_says_so() -> None:
         ([SSHMap((0,), (DState(0, "w"),), ())], r"maps\[0\]: dstates\[0\].view: expected 'v'"),
         (
             [SSHMap((0,), (DState(0, "v"), DState(1, "v")), ((0, "a", 0), (0, "a", 1)))],
-            r"links: expected one dstate that 'a' leads to",
+            r"links: expected that 'a' leads from dstate",
         ),
     ],
 )

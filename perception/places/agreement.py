@@ -193,7 +193,8 @@ def disagreement(log: RobotLog, track: Track) -> str | None:
 def laser_direction(log: RobotLog) -> float | None:
     """Estimate the direction of the laser, in degrees to the left of straight ahead.
 
-    Returns None if the log is right, the scans do not show it, or there are several lasers.
+    Returns None if the direction given in the log is correct, if the scans do not show the
+    direction, or if there are several lasers.
     """
     angles = {scan.laser.mount[2] for scan in log.scans}
     apart = _apart(log, np.radians(TURNS)) if len(angles) == 1 else None
@@ -206,7 +207,10 @@ def laser_direction(log: RobotLog) -> float | None:
 
 
 def field_of_view(log: RobotLog) -> float | None:
-    """Estimate the field of view in degrees; None if the log is right or scans do not show it."""
+    """Estimate the field of view of the laser in degrees.
+
+    Returns None if the field of view given in the log is correct, or if the scans do not show it.
+    """
     fov = _fov(log.scans[0])
     tried = [_apart(log, np.zeros(1), float(degrees) / fov) for degrees in FIELDS]
     now = _apart(log, np.zeros(1))

@@ -110,9 +110,9 @@ class _Gate:
     """The relative poses that the track allows for two visits.
 
     Attributes:
-        poses: (d, 3) x, y and rotation of the later visit, by the axes of the earlier one, for each
-            drift of the heading.
-        covariance: (3, 3) covariance by the track, times INFLATED.
+        poses: (d, 3) x, y and rotation of the later visit in the frame of the earlier one, for each
+            of the d drifts of the heading that are tried.
+        covariance: (3, 3) covariance of these poses by the track, times INFLATED.
     """
 
     poses: Array

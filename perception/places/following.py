@@ -147,8 +147,8 @@ def poses_of_scans(
 ) -> Iterator[Followed]:
     """Compute the pose of each scan from the scans before it, and yield it before the next is read.
 
-    `doubt_of` takes the index of a scan and the motion to it by odometry. It says how far the
-    odometry of this step can be trusted. `trust` has the standard deviations of its errors.
+    `doubt_of` takes the index of a scan and the motion from the previous scan by odometry. It says
+    how far this motion can be trusted. `trust` has the standard deviations of errors of odometry.
     """
     recent: deque[tuple[Array, Array]] = deque(maxlen=RECENT)
     last: Followed | None = None

@@ -257,8 +257,8 @@ def _units_of(log: RobotLog, tell: Teller) -> Units:
     log_checks.refuse_shuffled(log)
     if jumps.keep_one_source(log)[1]:
         raise LogError(
-            f"{named(log.source)}: expected odometry of one source, got poses of several that "
-            "alternate; stop the other source, or import the log from a file"
+            f"{named(log.source)}: expected odometry of one source, got poses of several sources "
+            "in turn; let only one source publish odometry, or import the log from a file"
         )
     units, notes = units_of(log)
     tell(notes)

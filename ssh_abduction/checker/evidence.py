@@ -1,4 +1,7 @@
-"""Checks of the axioms about stars (gateways seen), asserted pairs, poses and planar drawings."""
+"""Checks of the axioms about stars, pairs of steps, poses and planar drawings.
+
+A star is the gateways seen at a step. Users may assert that two steps are the same or different.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Check the returns of a map against the displacements of its trace (axiom `one_pose`).
 
-A return is a pair of steps that the map has at one dstate or at one place. Its loop is the way
-between these steps. The module `dead_reckoning` computes the error with which a loop closes, and
+A return is two steps that the map has at one place or dstate. Its loop is the way between these
+steps. The module `dead_reckoning` computes the error with which a loop closes, and
 the covariance of this error.
 
 Returns are tested alone and in pairs by their chi-square. Most pairs need no test, because a bound
@@ -70,8 +70,8 @@ class LoopGap:
 class Refused:
     """One return, or a pair of returns, that the displacements reject.
 
-    A return is a pair of steps that the map has at one dstate or at one place. Its loop is the way
-    between these steps.
+    A return is two steps that the map has at one place or dstate. Its loop is the way between these
+    steps.
 
     Attributes:
         returns: For each return, its two steps and its degrees of freedom (2 for a place, 3 for a
@@ -111,9 +111,9 @@ class Refused:
 def refused_returns(trace: Trace, ssh_map: SSHMap, theory: Theory) -> Iterator[Refused]:
     """Find the single returns and the pair of returns that displacements reject most clearly.
 
-    A return is a pair of steps that the map has at one dstate or at one place. At most one
-    return to a place is yielded, one return to a dstate, and then one pair. The theory is
-    resolved for the trace, so that it has the number of tests.
+    A return is two steps that the map has at one place or dstate. Yields at most one return to a
+    place, one return to a dstate, and then one pair of returns. The theory is resolved for the
+    trace, so that it has the number of tests.
     """
     if not trace.has_displacements:
         return

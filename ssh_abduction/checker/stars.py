@@ -108,7 +108,7 @@ def _rotated(star: Openings, quarters: int) -> Openings:
 
 
 def _one_star(seen: Iterable[tuple[DState, Openings, int]], how: str) -> Found:
-    """Check that the stars at each place, which are rotated to be comparable, are equal."""
+    """Check that the stars at each place are equal. The caller rotated them to a common frame."""
     known: dict[int, tuple[Openings, int]] = {}
     for s, star, i in seen:
         if s.place is not None:

@@ -66,14 +66,15 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.add(
         "trace",
-        "trace file (JSON Lines), or - for standard input; or a file of maps that solve -o "
-        "wrote, or a folder that `map` wrote, for its trace and the theory of its maps",
+        "trace file (JSON Lines), or - for standard input. Or a file of maps that solve -o wrote, "
+        "or a folder that the command 'map' wrote: then the trace and theory of these maps are "
+        "used",
     )
     parser.add(
         "steps",
-        "the numbers of two steps, from 0, or DRIVE:STEP in a joint trace; leave them out to "
-        "learn why there is no map. Or a place and a path of the first minimal map: p7 path2; "
-        "or a place alone, for all paths and regions",
+        "the numbers of two steps, from 0, or DRIVE:STEP in a joint trace. Leave them out to "
+        "learn why there is no map. Or a place and a path of the first minimal map, such as p7 "
+        "path2, or a place alone, to learn on which side of each path and in which regions it is",
         nargs="*",
         default=(),
         metavar="step",
@@ -89,8 +90,8 @@ def add_parser(verbs: Verbs) -> None:
     add_limits(parser, "what is known", SECONDS)
     parser.add(
         "--corrections FILE",
-        "obey the corrections in this file; for a folder, in its corrections.yaml (default: "
-        "corrections.yaml beside the file of --theory, if both exist)",
+        "obey the corrections in this file, or in corrections.yaml of this folder (default: "
+        "corrections.yaml in the folder of the file that --theory names, if there is one)",
     )
     add_theory(parser)
 

@@ -46,7 +46,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.add(
         "other",
         "trace of a robot in the mapped world that uses the same names of views and actions; "
-        "- for standard input; or a folder that `map` wrote",
+        "- for standard input; or a folder that the command 'map' wrote",
         type=trace_path,
     )
     parser.add("--map I", "the number of the map, from 1 (default: 1)", type=int)
@@ -61,8 +61,8 @@ def add_parser(verbs: Verbs) -> None:
         "recogniser that train wrote for this map, to use images instead of views",
     )
     said = {
-        "misread": "at each step, the view or star does not fit the dstate where the robot is "
-        "(default: 0.01)",
+        "misread": "at a step, the view or the star (the gateways seen) does not fit the dstate "
+        "where the robot is (default: 0.01)",
         "slipped": "an action fails, or the robot is kidnapped during it (default: 0.01)",
         "unmapped": "the robot is outside the map at the start, after a slip, or after an action "
         "for which the map has no link (default: 0.1)",

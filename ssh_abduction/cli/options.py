@@ -55,7 +55,8 @@ def add_theory(parser: Parser, default: str = "topological") -> None:
     parser.add(
         "--theory PRESET|FILE",
         f"a preset: {', '.join(PRESETS)}; or a .toml file with fields of a theory; or a file "
-        f"of maps, or a folder that `map` wrote, to use their theory (default: {default})",
+        f"of maps or a folder that the command 'map' wrote, to use the theory of its maps "
+        f"(default: {default})",
         to=group,
     )
     for name, text in (
@@ -75,7 +76,7 @@ def add_theory(parser: Parser, default: str = "topological") -> None:
             continue
         details: dict[str, Any] = {"metavar": "NAMES"}
         if field.name == "prices":
-            details = {"metavar": "D,P,H"}
+            details = {"metavar": "DSTATE,PLACE,PATH"}
         elif field.name == "rules":
             details = {"metavar": "FILE", "many": True}
         elif field.name in CHOICES:

@@ -181,7 +181,7 @@ def _digest_of(path: str) -> str | None:
 
 
 def _runs_in(folder: Path) -> dict[str, list[Path]]:
-    """Find the runs in `folder` and its subfolders. List their folders by the digest of the log."""
+    """Find the folders of runs in and below `folder`. Return them for each digest of a log."""
     found: dict[str, list[Path]] = {}
     with suppress(OSError):
         for place in (folder, *sorted(one for one in folder.iterdir() if one.is_dir())):

@@ -280,7 +280,8 @@ def with_gateway(star: Sequence[Entry], bearing: float, *, is_open: bool) -> tup
         quarter = near_quarter(bearing)
         if quarter is None:
             raise TraceError(
-                f"star: expected ahead, right, back or left, got {bearing:g} degrees; take one"
+                "star: expected a gateway at 0, 90, 180 or 270 degrees from ahead, as the star has "
+                f"four directions, got {bearing:g} degrees; name one of these"
             )
         return (*star[:quarter], int(is_open), *star[quarter + 1 :])
     entries = [e if isinstance(e, Gateway) else Gateway(float(e or 0)) for e in star]

@@ -350,9 +350,9 @@ class Axioms:
 
         `clash` is a set of pairs (axiom, step) that no map satisfies, as from `smallest_clash`.
         Without displacements the axioms of the clash have models. Each of these models has
-        a return (two steps at one dstate or at one place) that displacements reject. This
-        method describes the return that is rejected most clearly, forbids it, and repeats
-        this until no model is left.
+        a return (two steps at one place or dstate) that displacements reject. This method
+        describes the return that is rejected most clearly, forbids it, and repeats this until no
+        model is left.
         """
         displacement = displacement_of(self._problem)
         steps = [t for axiom, t in clash if displacement and axiom == displacement.axiom]

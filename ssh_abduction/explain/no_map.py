@@ -58,7 +58,7 @@ class Explanation:
         last: The last step of the stretch.
         clashes: The axioms that clash, each with its steps.
         sentences: If displacements take part in the clash (axiom `one_pose`), sentences about the
-            returns (two steps at one dstate or place) that displacements rule out. At most three
+            returns (two steps at one place or dstate) that displacements reject. At most three
             for each last step of a return, the clearest first. Otherwise empty.
     """
 

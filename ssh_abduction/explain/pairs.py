@@ -350,7 +350,7 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
     # The whole trace
 
     def _list_minimal_maps(self, settled: bool) -> None:
-        """List minimal maps, only one if the verdict is `settled`, and count each side's."""
+        """List minimal maps (one if `settled`). Count those in which the steps are one dstate."""
         left = self._watch.left()
         seconds = (
             min(left, max(CONFIRMING, 0.0 if self.limit is None else self.limit / 10))

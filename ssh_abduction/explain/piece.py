@@ -21,8 +21,9 @@ class Piece:
     the piece has no map, the whole trace has none.
 
     Attributes:
-        problem: A trace of these steps, numbered from 0, and the theory, with asserted pairs
-            renumbered. Where steps are left out, the action and the displacement are unknown.
+        problem: A trace of these steps, numbered from 0, and the theory. Where steps are left out,
+            the action and the displacement are unknown. The pairs of steps that a user asserted to
+            be the same or different are renumbered in the theory.
         steps: The steps by their numbers in the whole trace, ascending. In words, steps of several
             drives are named by their drives.
         facts: Clingo facts for the pairs of steps that displacements exclude from being at one
@@ -40,7 +41,7 @@ class Piece:
 
     @property
     def theory(self) -> Theory:
-        """The theory, with asserted pairs by the numbers of the piece."""
+        """The theory. Pairs of steps that a user asserted have the step numbers of the piece."""
         return self.problem.theory
 
     @staticmethod

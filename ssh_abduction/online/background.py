@@ -133,7 +133,7 @@ def _end(watch: Watch, thread: threading.Thread) -> None:
 
 
 class FaultSolver:
-    """Solves a growing trace with faults again each time that it has grown enough.
+    """Solves a growing trace, allowing faults, again after enough new steps.
 
     Args:
         options: The time limit and the other options of a step.
@@ -153,7 +153,7 @@ class FaultSolver:
         self._is_slow = False
 
     def is_due(self, trace: Trace) -> bool:
-        """Whether the trace has grown enough since the last search to be solved again."""
+        """Whether enough steps are new since the last search to solve the trace again."""
         return len(trace) >= self._next_search
 
     def make_due(self) -> None:

@@ -3,15 +3,15 @@
     see  ->  minimal maps of all that was seen  ->  next experiment  ->  do its actions  ->  see …
 
 A dstate (distinctive state) is a place and the direction that the robot faces there. A *return* is
-a pair of visits that a map has at one place. `OnlineMapper` keeps the minimal maps of the steps so
-far.
+two steps that a map has at one place or dstate. `OnlineMapper` keeps the minimal maps of the steps
+so far.
 
 The explorer looks for a new experiment when the last one is done, when clingo has searched again,
 and when the number of maps has changed. It takes the first of these that exists:
 
 1. Known links for which the minimal maps predict different views (`rivals/explore.py`).
 2. The shortest tour through all untried actions of the first map (`rivals/tour.py`). If the tour
-   comes back to a place later, the robot looks around there only then.
+   visits a place several times, the robot looks around there at the last visit.
 3. An untried action for which the minimal maps predict different outcomes.
 4. Actions that distinguish the map from a map without one of its returns (`return_doubts.py`).
 
@@ -150,8 +150,8 @@ class Explorer:
     Args:
         robot: The robot, with the methods `look`, `can` and `do`.
         theory: The axioms, and what to minimise; Theory.topological() by default.
-        margin: A return is two visits that the map has at one place. A return is in doubt while a
-            map without it has at most this many dstates more. 0 doubts nothing.
+        margin: A return (two steps that the map has at one place or dstate) is in doubt while a map
+            without it has at most this many dstates more. 0 doubts nothing.
         time_limit: Seconds for each step, and as many again for each doubt. A step may take a
             little longer. None waits for exact answers.
         max_maps: Keep at most this many maps; None keeps all.
@@ -380,8 +380,8 @@ class Explorer:
     def _doubting_plan(self, best: SSHMap) -> tuple[str, ...]:
         """Find actions that test whether one of the returns of the minimal map is wrong.
 
-        A return is a pair of visits that the map has at one place. The actions distinguish the map
-        from the best map without this return. They are empty if no doubt is left to test.
+        A return is two steps that the map has at one place or dstate. The actions distinguish the
+        map from the best map without this return. The result is empty if no doubt is left to test.
         """
         trace, theory, dstates = self.mapper.trace, self.mapper.theory, len(best.dstates)
         for doubt in self._doubts.in_doubt(best, trace):

@@ -90,8 +90,8 @@ class Difference:
         faults: For each map, the faults that the other map lacks.
         chi2: The chi-square of each map; None if one of them has no fit.
         has_places: For each map, whether it has places.
-        sides: For each map, the places beside paths that only this map knows; empty if a map has
-            no regions.
+        sides: For each map, its statements "this place lies right (left) of this path" that the
+            other map does not make; empty if a map has no regions.
     """
 
     ids: tuple[str, str]

@@ -241,9 +241,9 @@ def leads_of(ssh_map: SSHMap, number: int) -> dict[int, dict[str, int]]:
     for source, action, target in sorted(ssh_map.links):
         if found[source].setdefault(action, target) != target:
             raise MapError(
-                f"maps[{number}]: links: expected one dstate that {brief(action)} leads to from "
-                f"dstate {source}, got {found[source][action]} and {target}; take a theory with "
-                "the axiom deterministic"
+                f"maps[{number}]: links: expected that {brief(action)} leads from dstate {source} "
+                f"to one dstate, got dstates {found[source][action]} and {target}; solve the trace "
+                "with the axiom deterministic (do not leave it out by --set without)"
             )
     return found
 

@@ -125,18 +125,19 @@ def fault_front(
     check_limit("time_limit", "seconds", time_limit)
     if theory.jumped:
         raise TheoryError(
-            "jumped: expected no wrong displacements where faults are counted; leave it out "
-            "(--set jumped=0)"
+            "jumped: expected 0 to find the front (the fewest dstates for each number of faults), "
+            "which allows no wrong displacements; leave jumped out (--set jumped=0)"
         )
     if theory.level != "causal":
         raise TheoryError(
-            "front: expected a causal theory, got a topological one; take Theory.causal() "
-            "(--theory causal)"
+            "theory: expected a causal one, as the front (the fewest dstates for each number of "
+            "faults) has no places, got a topological one; take Theory.causal() (--theory causal)"
         )
     if theory.rules or theory.without or theory.prefer not in (("dstates",), ("auto",)):
         raise TheoryError(
-            "front: expected the causal axioms alone, fewest dstates first; leave out rules, "
-            "--set without and --set prefer"
+            "theory: expected the causal axioms alone, fewest dstates first, to find the front "
+            "(the fewest dstates for each number of faults); leave out rules, --set without and "
+            "--set prefer"
         )
     if not is_whole(most) or not 0 <= most <= 1000:
         raise TheoryError(

@@ -1,10 +1,10 @@
 """The misfit of a map to the displacements, and small sets of returns that cause a misfit.
 
-A *return* is a pair of steps that a map has at one dstate or one place. The misfit of a set of
-returns is the least chi-square of the displacements and closures, given that the two steps of each
-return have one pose, or one position (`solver/fit.py`). More returns leave less freedom. So a
-set never has a smaller misfit than a part of it, and a map never has a smaller misfit than a set of
-its returns.
+A *return* is two steps that a map has at one place or dstate. The misfit of a set of returns is the
+least chi-square of the displacements and closures, given that the two steps of each return have one
+pose (for a dstate) or one position (for a place, `solver/fit.py`). More returns leave less freedom.
+So a set of returns never has a smaller misfit than a part of the set, and a map never has a smaller
+misfit than a set of its returns.
 
 Laying drives on each other has a price (`theory/overlap.py`), and more returns never lower it. So
 twice this price is a part of the misfit.
@@ -34,7 +34,7 @@ _Groups: TypeAlias = tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]
 
 
 class Misfit:
-    """The misfits of sets of returns of one trace, each computed once.
+    """Computes the misfit of sets of returns of one trace, and keeps each result.
 
     Attributes:
         visit: For each step, the first step of its visit. Without places, each step is a visit.

@@ -345,21 +345,21 @@ def _read_shared(data: Any, of_step: Sequence[int] | None, steps: int, where: st
         or not all(is_whole(n) and n >= 0 for n in always)
     ):
         raise MapError(
-            f"{where}.always: expected {expected} numbers, got {brief(always)}; write it with "
-            "solve --json"
+            f"{where}.always: expected {expected} numbers, got {brief(always)}; write the file "
+            "with solve --json"
         )
     pairs, differing = data.get("sometimes"), data.get("differing", [])
     if not isinstance(pairs, list) or not all(
         isinstance(pair, list) and len(pair) == 2 and _are_steps(pair, steps) for pair in pairs
     ):
         raise MapError(
-            f"{where}.sometimes: expected pairs of steps, 0 to {steps - 1}, got {brief(pairs)}; "
-            "write it with solve --json"
+            f"{where}.sometimes: expected pairs of steps from 0 to {steps - 1}, got "
+            f"{brief(pairs)}; write the file with solve --json"
         )
     if not isinstance(differing, list) or not _are_steps(differing, steps):
         raise MapError(
-            f"{where}.differing: expected steps, 0 to {steps - 1}, got {brief(differing)}; write "
-            "it with solve --json"
+            f"{where}.differing: expected a list of steps from 0 to {steps - 1}, got "
+            f"{brief(differing)}; write the file with solve --json"
         )
     by_step = tuple(always if of_step is None else (always[number] for number in of_step))
     return Shared(by_step, tuple((i, j) for i, j in pairs), tuple(differing))

@@ -130,8 +130,8 @@ def settle(trace: Trace, theory: Theory | None = None, known: Problem | None = N
 def count_returns(problem: Problem) -> int:
     """Return the number of returns that may be true, rounded up to a power of two.
 
-    A return is a pair of visits at one place, or of steps at one dstate. The number is 0 if the
-    theory does not use displacements.
+    A return is two steps at one place or dstate. The number is 0 if the theory does not use
+    displacements.
     """
     displacement = displacement_of(problem)
     return displacement.count_returns(problem.trace) if displacement else 0

@@ -79,12 +79,12 @@ class Theory:
         displacement: Whether displacements are evidence; auto uses them if the trace has any.
         reject: Significance level: the largest probability of rejecting the true map because of
             its displacements.
-        joint: How many returns (visits that come back to a place) are tested together. 1: each
-            alone. 2: also pairs of them.
-        returns: Number of possible returns to a place or a dstate. Each is tested at the level
+        joint: How many returns (two steps that a map has at one place or dstate) are tested
+            together. 1: each return alone. 2: also pairs of returns.
+        returns: Number of possible returns. Each return is tested at the significance level
             `reject` divided by this number. 0 counts the possible returns of the trace.
-        misread: Cost in dstates, with one decimal, of treating a view or a star (the gateways seen
-            at a place) as wrong; 0 forbids it.
+        misread: Cost of treating a view or a star (the gateways seen at a place) as wrong, in
+            dstates, with one decimal: 1.5 costs as much as 1.5 dstates; 0 forbids it.
         slipped: Cost in dstates of an action that did not do what its name says; 0 forbids it.
         jumped: Cost in dstates of ignoring a displacement, for example because the robot was
             carried; 0 forbids it.
@@ -108,7 +108,8 @@ class Theory:
             their misfit to the displacements. auto: cost if displacements are used, dstates come
             first in `prefer`, and there are no excuses.
         prices: Three numbers: the prices of a dstate, a place and a path in nats (natural
-            logarithms of odds). Used only if maps are compared by cost.
+            logarithms of odds). A fault costs its cost in dstates times the price of a dstate. Used
+            only if maps are compared by cost.
     """
 
     level: Literal["causal", "topological"] = "topological"

@@ -73,10 +73,16 @@ def fewest_paths(segments: Segments) -> int:
 
 
 def _may_follow(pairs: list[tuple[int, int]], columns: list[int]) -> NDArray[np.bool_]:
-    """Return which fixed places may come after which on the path of a segment, (fixed, fixed).
+    """Find which fixed places may come after each other on the path of a segment.
 
-    `pairs` has where each travel of the segment begins and ends, and `columns` the numbers of the
-    fixed places. The result tells whether the place of the column may come after that of the row.
+    A segment is a set of steps known to be along one path.
+
+    Args:
+        pairs: For each travel of the segment, the places where it begins and ends.
+        columns: The numbers of the f fixed places.
+
+    Returns:
+        Whether fixed place j may come after fixed place i, at [i, j], (f, f).
     """
     members = sorted({place for pair in pairs for place in pair})
     number = {place: i for i, place in enumerate(members)}

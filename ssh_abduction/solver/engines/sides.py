@@ -33,7 +33,10 @@ class FramedSides:
         self._batch = -1
 
     def extend(self, batch: int) -> None:
-        """Extend the axioms of the paths added so far to the visits of a new batch."""
+        """Ground the axioms, for all paths added so far, for the visits of a new batch too.
+
+        A batch is the visits that clingo gets in one call.
+        """
         self._batch = batch
         if self._said:
             paths = [

@@ -71,7 +71,7 @@ def wrong_displacements(
 
 
 def _returns(sites: Sequence[int | None]) -> Iterator[tuple[int, int]]:
-    """Yield the returns: pairs of steps at one dstate or place, with only others in between."""
+    """Yield the returns: two steps at one place or dstate, with no step there in between."""
     last: dict[int, int] = {}
     for t, site in enumerate(sites):
         if site is None:

@@ -1,5 +1,6 @@
-"""Closures as evidence: they say how two steps lie relative to each other.
+"""Closures as evidence.
 
+A *closure* is the relative pose of two steps, measured by matching what the robot saw around them.
 If the local maps of two visits match with an offset that is far from zero, within the covariance of
 the match and of the middles of places, then the visits are not at one place. The axiom `closure`
 demands this for each closure alone. Closures together with displacements count in the misfit

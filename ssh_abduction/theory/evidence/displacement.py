@@ -1,8 +1,9 @@
 """Displacements as evidence: a dstate has one pose, and a place one position.
 
-A *return* is a pair of visits that a map has at one place, or a pair of steps that it has at one
-dstate. The displacements between the two steps make a loop. By these displacements, the end of the
-loop is some distance from its beginning, and the covariance says how likely that is (`loops.py`).
+A *return* is two steps that a map has at one place or dstate. For a place, they are the first steps
+of two visits. The displacements between the two steps make a loop. By these displacements, the end
+of the loop is some distance from its beginning, and the covariance says how likely that is
+(`loops.py`).
 The axiom `one_pose` demands that no set of at most `joint` returns is rejected.
 
 *One return* can be tested before the search. If it is rejected, its steps are at different places,

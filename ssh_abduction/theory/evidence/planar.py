@@ -224,7 +224,7 @@ def _slots_of(
 
 
 def _is_drawing(edges: Iterable[tuple[End, End]], slots: Mapping[End, int]) -> bool:
-    """Whether edges with known slots, one a gateway, can be drawn without a crossing."""
+    """Whether edges with known directions (slots) at both ends can be drawn without a crossing."""
     joined = {
         frozenset((end[0], slots[end]) for end in edge)
         for edge in edges

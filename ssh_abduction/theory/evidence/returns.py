@@ -1,7 +1,7 @@
 """Which returns of a trace the displacements allow.
 
-A return is a pair of visits at one place, or a pair of steps at one dstate. `displacement.py`
-explains how often a true one is rejected.
+A return is two steps at one place or dstate. `displacement.py` explains how often a true return is
+rejected.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ REMEMBERED = 64
 
 
 class Returns:
-    """The returns of a trace (pairs of visits at one place, or of steps at one dstate), and tests.
+    """The possible returns of a trace (two steps at one place or dstate), and tests of them.
 
     The tests reject returns that do not agree with the displacements.
     """

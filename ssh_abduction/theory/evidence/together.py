@@ -1,7 +1,7 @@
 """Find pairs of returns of a map that are rejected together, though neither is rejected alone.
 
-A return is a pair of steps that the map has at one place or dstate. Its loop is the way between
-them. Let the loops of two returns be off by o1 and o2, with covariances S1 and S2, and C between
+A return is two steps that the map has at one place or dstate. Its loop is the way between the two
+steps. Let the loops of two returns be off by o1 and o2, with covariances S1 and S2, and C between
 them. Their joint chi-square is
 
     (o1, o2)' (S1, C; C', S2)^-1 (o1, o2)
@@ -71,7 +71,7 @@ class _ReturnsAlone:
 class Together:
     """The returns of one map, and tests of pairs of them.
 
-    A return is a pair of steps that the map has at one place or dstate.
+    A return is two steps that the map has at one place or dstate.
 
     Attributes:
         rows: One row for each return, sorted by last step: its first step, its last step, and 1

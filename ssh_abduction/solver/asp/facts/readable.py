@@ -39,7 +39,10 @@ def theory_facts(theory: Theory, paths: int) -> str:
 
 
 def preferred(theory: Theory) -> list[str]:
-    """Return the facts for the counts that a theory minimises. The first has the highest level."""
+    """Return the clingo facts that say which counts to minimise.
+
+    The first count of `prefer` gets the highest priority.
+    """
     return [
         f"prefer({count},{len(theory.priorities) - i})."
         for i, count in enumerate(theory.priorities)
