@@ -1,12 +1,12 @@
 """Joins that every cheap map has, and a lower bound on the cost of all maps.
 
 A join is two visits that a map has at one place (without frames, two steps at one dstate). Let F be
-joins that every map of a cost below T has. At first F is empty. Each such map
-costs at least the misfit of F plus the prices of its dstates and places. Now take a further join. A
-map without it costs at least the misfit of F plus the prices of the dstates and places that are
-needed without it. If this sum is T or more, then every map of a cost below T has the join, and F
-gets it. Then the misfit of F is greater, and more dstates and places are needed without a further
-join. If the misfit of F plus the prices is T or more, then no map costs less than T.
+joins that every map of a cost below T has. At first F is empty. Each such map costs at least the
+misfit of F plus the prices of its dstates and places. Now take a further join. A map without it
+costs at least the misfit of F plus the prices of the dstates and places that are needed without it.
+If this sum is T or more, then every map of a cost below T has the join, and F gets it. Then the
+misfit of F is greater, and more dstates and places are needed without a further join. If the misfit
+of F plus the prices is T or more, then no map costs less than T.
 
 The joins are those of the best known map. If F gets no further join, assume that a map lacks a
 certain one, and find what all cheap maps without it have. If no map without it costs less than T, F

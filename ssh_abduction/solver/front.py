@@ -130,7 +130,7 @@ def fault_front(
         )
     if theory.level != "causal":
         raise TheoryError(
-            "theory: expected a causal one, as the front (the fewest dstates for each number of "
+            "theory: expected a causal theory, as the front (the fewest dstates for each number of "
             "faults) has no places, got a topological one; take Theory.causal() (--theory causal)"
         )
     if theory.rules or theory.without or theory.prefer not in (("dstates",), ("auto",)):
