@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from worlds import rectangle, written
 
-from ssh_abduction import SSHMap, Theory, Trace, route, solve
+from ssh_abduction import SSHMap, Theory, Trace, check, route, solve
 from ssh_abduction.cli import main
 from ssh_abduction.data import MapError
 from ssh_abduction.data.map_parts import Name
@@ -92,6 +92,26 @@ def test_a_route_by_places_leads_back_along_a_street_that_was_driven_one_way(
     assert by_places.moves[0].action is None
     assert (by_places.moves[1].action, by_places.moves[1].view) == ("travel", None)
     assert by_places.metres == pytest.approx(10, abs=0.1)
+
+
+def test_no_route_by_places_leads_from_one_piece_of_a_map_to_another() -> None:
+    """Fewer paths are preferred, so both streets are one path. Nothing observed joins them."""
+    drives = [
+        Trace.from_steps(views, ["travel"], name=name)
+        for views, name in (("ab", "monday"), ("xy", "far"))
+    ]
+    apart = tuple(product((0, 1), (2, 3)))
+    with pytest.warns(UserWarning, match="has no view in common"):
+        solution = solve(drives, Theory.topological().replace(elsewhere=apart), max_maps=None)
+    assert solution.trace is not None
+    for ssh_map in solution.maps:
+        assert len(ssh_map.pieces) == 2
+        assert len(ssh_map.paths) == 1
+        assert not check(solution.trace, ssh_map, solution.theory)
+        near, far = (f"p{ssh_map.place_of(t)}" for t in (1, 2))
+        assert len(route(ssh_map, 0, near, by="places").moves) == 1
+        with pytest.raises(MapError, match="to 2 dstates"):
+            route(ssh_map, 0, far, by="places")
 
 
 def test_what_is_avoided_is_gone_round() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from collections.abc import Set as AbstractSet
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -196,12 +196,12 @@ class MoveGraph:
                 at.setdefault(s.place, set()).add(s.id)
                 if s.path is not None and s.direction is not None:
                     facing.setdefault((s.place, s.path, s.direction), s.id)
-        for path in self.map.paths:
+        for path, order in self._stretches():
             ahead, back = (
-                [facing.get((place, path.id, way), (place, path.id, way)) for place in path.order]
+                [facing.get((place, path, way), (place, path, way)) for place in order]
                 for way in (1, -1)
             )
-            for place, *courses in zip(path.order, ahead, back, strict=True):
+            for place, *courses in zip(order, ahead, back, strict=True):
                 at.setdefault(place, set()).update(courses)
             for (here, there), (other, before) in zip(pairwise(ahead), pairwise(back), strict=True):
                 self._imply(here, there, travel)
@@ -210,6 +210,22 @@ class MoveGraph:
             for course in courses_here:
                 for other in courses_here - {course}:
                     self._imply(course, other, around if self._is_around(course, other) else None)
+
+    def _stretches(self) -> Iterator[tuple[int, tuple[int, ...]]]:
+        """Yield the id of each path and its places in order, those of each piece for themselves.
+
+        Pieces of a joint map may share a path, only because fewer paths are preferred.
+        """
+        piece_of = {
+            self.map.dstates[s].place: i for i, piece in enumerate(self.map.pieces) for s in piece
+        }
+        for path in self.map.paths:
+            pieces = [piece_of.get(place, 0) for place in path.order]
+            for piece in dict.fromkeys(pieces):
+                yield (
+                    path.id,
+                    tuple(p for p, i in zip(path.order, pieces, strict=True) if i == piece),
+                )
 
     def _imply(self, source: Node, target: Node, action: str | None) -> None:
         """Add an implied move, unless the map has a link for it or it leads to another floor."""
