@@ -69,7 +69,8 @@ class SpanningTree:
     """A minimum spanning tree of n images under Euclidean distance.
 
     Attributes:
-        edges: (n - 1, 2) indices of the two images that each edge joins, the shortest edge first.
+        edges: (n - 1, 2) indices of the two images at the ends of each edge, the shortest edge
+            first.
         lengths: (n - 1,) length of each edge, ascending; 0 between equal images.
     """
 
@@ -432,7 +433,7 @@ def _squares(differences: Floats) -> Floats:
 
 
 def _rounding(beams: int, dtype: type[np.floating[Any]], reach: float) -> float:
-    """A bound of the rounding error of |a|² + |b|² - 2ab for vectors with |a| + |b| <= reach."""
+    """A bound on the rounding error of |a|² + |b|² - 2ab for vectors with |a| + |b| <= reach."""
     return float((beams + 16) * np.finfo(dtype).eps * reach**2)
 
 

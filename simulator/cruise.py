@@ -34,7 +34,7 @@ PATIENCE = 100
 
 
 def drive_along(driver: Driver, space: FreeSpace, way: Array) -> Iterator[int]:
-    """Drive along a route, (n, 2) metres; yield the index of the point reached by each motion.
+    """Drive along a route, (n, 2) metres; yield the index of the point that each motion reached.
 
     `space` is the free space between known walls. Obstacles that the laser sees are marked in
     it. Raises SimulatorError if one blocks the route, or the robot is stuck or hits a wall.

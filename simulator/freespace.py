@@ -127,8 +127,8 @@ class FreeSpace:
     def way(self, start: Point, goal: Point, closed: Mask | None = None) -> Array | None:
         """Find the best route, (n, 2) metres, within the part of the grid around both ends.
 
-        `closed` is as in `part`. None if there is no route. `FreeRectangle.way` says which
-        one is best.
+        `closed` is as in `part`. None if there is no route. `FreeRectangle.way` says which route is
+        best.
         """
         return self.part(np.array([start, goal]), closed).way(start, goal)
 

@@ -209,7 +209,7 @@ class Round:
 
 
 def _legs(rooms: Rooms, home: int, metres: float, chance: np.random.Generator) -> Iterator[Within]:
-    """Draw the legs of a round: a room, and the doors in and out; None is the room's middle."""
+    """Draw the legs of a round: a room, and the doors in and out (None: the middle of the room)."""
     passed: Counter[int] = Counter()
     room, came, done = home, None, 0.0
     while True:

@@ -268,7 +268,7 @@ def _end(streets: Sequence[Street], points: NDArray[np.complex128], reach: float
 
 
 class Panorama:
-    """Ranges in all directions, one a degree, collected from images of a turning robot.
+    """Ranges in all directions, one per degree, collected from images of a turning robot.
 
     The panorama is in the frame of the robot at the first image.
 

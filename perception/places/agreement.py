@@ -234,7 +234,7 @@ def _apart(log: RobotLog, turns: Array, stretch: float = 1.0) -> Array | None:
     """How far the points of two scans lie apart, if the odometry moves one scan to the other.
 
     The laser is rotated by each of `turns` radians, and angles between beams are stretched. The
-    result is the mean distance in metres for each turn; None if there are too few pairs.
+    result is the mean distance in metres for each turn, (turns,); None if there are too few pairs.
     """
     apart = []
     for first, second in _pairs(log):

@@ -174,7 +174,7 @@ class _Gates:
 
 
 class _Corrected:
-    """The positions of visits by the track. Each closure corrects the later ones."""
+    """The positions of visits by the track. Each closure corrects the positions of later visits."""
 
     def __init__(self, visits: Sequence[Visit]) -> None:
         """Start without any correction."""
@@ -183,14 +183,14 @@ class _Corrected:
         self._turns = np.zeros(len(visits))
 
     def predict(self, visit: int) -> None:
-        """Place a visit by the track from the visit before it."""
+        """Compute the position of a visit from that of the visit before it and the track."""
         if visit:
             turn = self._turns[visit - 1]
             onward = points_turned(turn, self._middles[visit] - self._middles[visit - 1])
             self._places[visit], self._turns[visit] = self._places[visit - 1] + onward, turn
 
     def correct(self, closing: VisitMatch) -> None:
-        """Place the later visit of a closure by the earlier one."""
+        """Compute the position of the later visit of a closure from the earlier visit."""
         turn = self._turns[closing.first]
         onward = points_turned(turn, closing.match.shift)
         self._places[closing.last] = self._places[closing.first] + onward
@@ -214,7 +214,7 @@ def seen_from(first: Array, last: Array) -> Array:
 
 
 def errors_of(poses: Array, matches: Array) -> Array:
-    """Subtract poses by matches from poses by the track: (..., 3) metres and radians."""
+    """Subtract poses found by matching from poses of the track: (..., 3) metres and radians."""
     off = poses - matches
     off[..., 2] = (off[..., 2] + math.pi) % math.tau - math.pi
     return off
@@ -249,7 +249,7 @@ def uncertainty(track: Track, first: int, last: int, end: Array) -> Array:
         end: (x, y) of the point in metres, in the frame of the track.
 
     Returns:
-        (3, 3) in metres and radians, by the axes of the track.
+        (3, 3) in metres and radians, in the frame of the track.
     """
     # An error of an increment rotates and shifts all later poses. The point moves as the end of an
     # arm that begins there.

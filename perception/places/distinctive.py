@@ -208,7 +208,7 @@ class _Detector:
                 )
 
     def _near(self, scan: int, middle: Array) -> set[int]:
-        """The numbers of the milestones near a scan from which a middle can be seen."""
+        """The numbers of the milestones near a scan at which the middle of a place can be seen."""
         way = self._recent.way(scan)
         return {
             number
@@ -229,7 +229,7 @@ class _Sighting:
 
 @dataclass(eq=False)
 class _Chain:
-    """Sightings of one junction at successive milestones. Chains are numbered by their start."""
+    """Sightings of one junction at successive milestones. Chains are numbered in order of start."""
 
     number: int
     sightings: list[_Sighting]
@@ -253,7 +253,7 @@ def _middle(sightings: Sequence[_Sighting]) -> Array:
 
 
 def _distance(middle: Array, radius: float, junction: Junction) -> float | None:
-    """The distance of a junction from a chain's middle in metres; None if it is not one place."""
+    """The metres from a junction to the middle of a chain; None if they are two places."""
     far = math.dist(middle, junction.middle)
     return far if far < max(SAME, SHARE * min(radius, junction.radius)) else None
 

@@ -77,8 +77,8 @@ ALIKE = 0.03
 def follow(log: RobotLog, trust: Trust | None = None) -> Track:
     """Compute the trajectory of a robot from its log, by odometry and scan matching.
 
-    Corrected poses are not read. `trust` has the errors of the odometer; None means those of a
-    typical one.
+    Corrected poses are not read. `trust` has the standard deviations of errors of the odometer;
+    None for a typical odometer.
     """
     steps = unknown_steps(log)
     follower = _Follower(log, trust or Trust(), steps)

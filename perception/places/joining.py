@@ -39,7 +39,7 @@ TURNS = [k * TURN for k in range(round(math.tau / TURN))]
 
 
 def join_logs(logs: Sequence[RobotLog], parts: Sequence[Imported]) -> tuple[RobotLog, Imported]:
-    """Join logs, one per drive, by the result of `import_log` for each.
+    """Join the results of `import_log` for several logs, one per drive, to one trace.
 
     The views are made of the images of all drives. Visits and scans are numbered over all
     drives. In the steps of the trace, `visit` counts over all drives, and `scan` within the
@@ -110,7 +110,7 @@ def _named(names: Sequence[str | None], notes: Sequence[Sequence[str]]) -> tuple
 
 
 def _joint_track(tracks: Sequence[Track], begins: Sequence[int]) -> tuple[Track, list[Array]]:
-    """Join tracks to one, broken where a drive starts. Also return their shifts, (2,) metres."""
+    """Join tracks to one track, broken where each drive starts. Also return each shift, (2,) m."""
     poses = [tracks[0].poses]
     shifts = [np.zeros(2)]
     for track in tracks[1:]:
@@ -157,7 +157,7 @@ def scenes_of(part: Imported) -> list[Scene]:
 def closures_between(
     first: Imported, last: Imported, ours: Sequence[Scene], theirs: Sequence[Scene]
 ) -> list[VisitMatch]:
-    """Find the closures between the visits of two drives, by the scene of each visit.
+    """Find the closures between the visits of two drives, from the scene (local map) of each visit.
 
     They lead from visits of the earlier drive to visits of the later one. There are none if too
     few matches agree.

@@ -73,7 +73,7 @@ def keep_one_source(log: RobotLog) -> tuple[RobotLog, list[str]]:
 
 
 def seams_of(log: RobotLog) -> list[tuple[int, str]]:
-    """Find the first scans where a second drive seems to begin, and what changes there.
+    """Find the scans at which a second drive seems to begin, and say what changes there.
 
     The laser changes for good, or the clock is reset.
     """
@@ -114,7 +114,7 @@ def usual_step(log: RobotLog) -> float:
 
 
 def _of_source(scans: tuple[Scan, ...], members: NDArray[np.intp]) -> tuple[Scan, ...]:
-    """Replace the odometry of all scans by that of one source, inter- and extrapolated."""
+    """Replace the odometry of all scans by that of one source, interpolated or extrapolated."""
     from scipy.interpolate import interp1d
 
     poses = np.array([scans[number].odometry for number in members])

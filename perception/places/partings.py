@@ -178,7 +178,7 @@ class _DrivePoints:
 
 
 def _closed(drive: _DrivePoints, closings: Sequence[VisitMatch]) -> Iterator[_Alignment]:
-    """Yield how trajectories lie relative to each other by closures."""
+    """Yield the relative poses of trajectories that closures give."""
     for one in closings:
         first, last = drive.visits[one.first], drive.visits[one.last]
         first_way, last_way = float(drive.ways[one.first]), float(drive.ways[one.last])
@@ -187,7 +187,7 @@ def _closed(drive: _DrivePoints, closings: Sequence[VisitMatch]) -> Iterator[_Al
 
 
 def _tracked(drive: _DrivePoints) -> Iterator[_Alignment]:
-    """Yield how trajectories lie relative to each other by the track, for successive visits."""
+    """Yield the relative poses of trajectories that the track gives, for successive visits."""
     for way in drive.ways.tolist():
         first, last = np.searchsorted(drive.ways, (way, way + MOST))
         for other in drive.ways[first:last].tolist():
@@ -303,7 +303,7 @@ def lead_apart(far: Array) -> Iterator[tuple[int, int]]:
 
 
 def _ahead(far: Array) -> Iterator[tuple[int, int]]:
-    """Do what `lead_apart` does, but only in the direction of the first stretch."""
+    """Yield where they diverge, as `lead_apart` does, but only along the first stretch."""
     back, ahead = round(TOGETHER / PACE), round(AHEAD / PACE)
     ours, theirs = far.min(axis=1), far.min(axis=0)
     ends = np.flatnonzero((ours[:-1] <= BESIDE) & (ours[1:] > BESIDE))

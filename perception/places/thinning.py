@@ -83,7 +83,7 @@ class Graph:
     """The lines of a skeleton.
 
     Attributes:
-        nodes: Nodes by number.
+        nodes: A dict from numbers to nodes.
         edges: Edges in any order.
     """
 

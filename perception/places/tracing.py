@@ -208,7 +208,7 @@ def _image(patch: PackedPatch, middle: Array, heading: float) -> Array:
 
 
 def _covariance(track: Track, begin: int, end: int, first: Pose, last: Pose) -> Covariance:
-    """The covariance of the displacement between two steps, in the frame of the first."""
+    """The covariance of the displacement between two steps, in the frame of the first step."""
     total = uncertainty(track, begin, end, np.array(last[:2]))
     turned = np.eye(3)
     turned[:2, :2] = rotation(-first[2])

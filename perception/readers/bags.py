@@ -147,9 +147,9 @@ def _chosen(bag: Bag, kinds: Sequence[str], name: str | None, option: str) -> st
 
 
 def _survey(bag: Bag, topics: Sequence[str]) -> tuple[dict[str, NDArray[np.float64]], Counter[str]]:
-    """Count the scans of a bag by frame, with their times, (n, 2), by topic, or raise LogError.
+    """For each topic, list the times of its scans, (n, 2), and count the scans of each frame.
 
-    The times are in seconds: that in the header, and that of recording.
+    The times are in seconds: from the header, and of the recording. Raises LogError.
     """
     times: dict[str, list[tuple[float, float]]] = {}
     frames: Counter[str] = Counter()
@@ -168,7 +168,7 @@ def _survey(bag: Bag, topics: Sequence[str]) -> tuple[dict[str, NDArray[np.float
 def _odometer(
     bag: Bag, topic: str, damaged: list[Damage], notes: list[str]
 ) -> tuple[RecordedTrack, str, str]:
-    """Read the poses of the odometer, the name of their frame, and that of the frame of the robot.
+    """Read the poses of the odometer, the name of their frame, and the name of the robot's frame.
 
     `damaged` receives the messages that cannot be read, `notes` a note if several programs publish
     the topic. Raises LogError if no message can be read.

@@ -122,7 +122,7 @@ class PoseGraph:
         return motion
 
     def is_corrected(self, farthest: float) -> bool:
-        """Check whether a vertex is farther than some metres from its pose by odometry."""
+        """Check whether a vertex is more than some metres away from its pose by odometry."""
         first = self.vertices[0][1]
         return any(
             math.dist(displacement_between(first, pose)[:2], odometry[:2]) > farthest

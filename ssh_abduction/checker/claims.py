@@ -28,7 +28,7 @@ REASONS = ("time limit", "memory limit", "interrupted", "maps limit", "no proof"
 def false_claims(
     answer: Mapping[str, Any], maps: Sequence[SSHMap], steps: int, theory: Theory, proven: int
 ) -> tuple[str, ...]:
-    """Find the false claims of an answer of `solve --json`. None is accepted without a check.
+    """Find the false claims in the JSON that `solve --json` printed. Each claim is checked.
 
     `steps` is the number of steps of the trace. The theory has all defaults resolved. `proven`
     is the lower bound on dstates that the certificate of the answer proves. Numbers of dstates
@@ -114,7 +114,7 @@ class _Claims:
                 )
 
     def status(self) -> Iterator[str]:
-        """Check that `status`, `complete` and `stopped` fit each other and the maps."""
+        """Check that `status`, `complete` and `stopped` agree with each other and with the maps."""
         status, complete, stopped = (
             self.answer.get(name) for name in ("status", "complete", "stopped")
         )

@@ -78,7 +78,7 @@ def _clashes_of(m: Reading) -> list[Clash]:
 
 
 def _sights_of(m: Reading) -> tuple[list[Sight], Turns]:
-    """Return the sights of a map. If gateways may change, each drive has sights of its own."""
+    """Return the sights (dstate and star) of a map; of each drive, if gateways may change."""
     return sights_of(m.trace, m.map, m.onward, bool(m.theory.changed))
 
 

@@ -109,10 +109,10 @@ def false_costs(
 
 
 def _layings(trace: Trace, places: Sequence[int]) -> int:
-    """Count how often drives are laid on others to which no closure ties them.
+    """Count how often common places connect drives that no closures connect.
 
-    This is how many groups of drives that closures tie there are, less the groups of drives that
-    closures or places tie.
+    This is the number of groups of drives connected by closures, minus the number of groups
+    connected by closures or places.
     """
     drive = [0]
     for action in trace.actions:

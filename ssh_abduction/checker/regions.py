@@ -44,7 +44,7 @@ def known_sides(m: Reading) -> Mapping[Course, Mapping[int, RightBranch]]:
 
 
 def _beside(m: Reading) -> dict[_Places, str]:
-    """Find the regions right of one course each, and a sentence for each region."""
+    """For each course, find the region on its right, and a sentence that describes the region."""
     sides = m.once(known_sides)
     return {
         frozenset(places): f"They are what is known to lie right of {along(course)}."

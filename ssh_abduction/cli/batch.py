@@ -125,7 +125,7 @@ class SolveQuestion(FileQuestion):
     def _solved(
         self, number: int, path: str, trace: Trace, given_up: Callable[[], bool]
     ) -> SolveAnswer:
-        """Solve one trace as `answer` does, but let errors pass."""
+        """Solve one trace as `answer` does, but raise errors."""
         self.theory.check_steps(trace)
         if self.memory is not None:
             _forget_memory()

@@ -153,7 +153,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _refuse_bound(resolved: Theory, solved: Theory | None) -> None:
-    """Raise MapError if a clique proves no bound by the theory to check by, or by the file's."""
+    """Raise MapError if, by the theory to check or that of the file, a clique proves no bound."""
     if resolved.has_faults or (solved is not None and solved.has_faults):
         raise MapError(
             "bound: expected a theory without faults (misread, slipped), as a clique of steps "
@@ -303,7 +303,7 @@ def _false_of_all(data: Mapping[str, Any], trace: Trace) -> Iterator[str]:
 
 
 def _is_near(said: Any, right: Any) -> bool:
-    """Whether all numbers in two nested values are almost equal: machines round differently."""
+    """Whether all numbers in two nested values are almost equal, as machines round differently."""
     if isinstance(right, Mapping):
         return (
             isinstance(said, Mapping)

@@ -130,7 +130,7 @@ def _runs(differing: dict[str, tuple[Any, Any]], first: str, other: str) -> Iter
 
 
 def _flat(value: Any, name: str = "") -> dict[str, Any]:
-    """Flatten nested dicts: return each value by its keys, joined with dots."""
+    """Flatten nested dicts: return a dict from keys, joined with dots, to values."""
     if not isinstance(value, dict):
         return {name: value}
     return {

@@ -104,7 +104,7 @@ class Guard:
                 self._leave(program.interrupted_code())
 
     def _is_called(self) -> bool:
-        """Whether the search has to end: there was a signal, or the answer is not needed."""
+        """Whether the search has to end: a signal arrived, or nobody needs the answer any more."""
         numbers = self._signals.received()
         # The handler in the main thread may not have run yet, and may never run.
         program.heard.extend(numbers)

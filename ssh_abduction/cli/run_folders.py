@@ -212,6 +212,6 @@ def _key(folder: Path) -> str:
 
 
 def _cut(name: str) -> str:
-    """Cut a name, so that there is room to append a part of a digest."""
+    """Shorten a name, so that there is room to append a part of a digest."""
     room, encoded = LONGEST - DIGITS - 1, os.fsencode(name)
     return os.fsdecode(encoded[:room]) if len(encoded) > room else name

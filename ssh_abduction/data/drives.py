@@ -370,7 +370,7 @@ def _warn_of_other_units(traces: Sequence[Trace]) -> None:
 
 
 def _warn_of_other_views(traces: Sequence[Trace]) -> None:
-    """Warn if no view of a trace is seen in another one: no dstate of it can be one of theirs."""
+    """Warn if two traces have no view in common: then they can have no dstate in common."""
     seen = [set(trace.views) for trace in traces]
     if len(seen) < 2 or any(None in views for views in seen):  # unknown: it may be any view
         return

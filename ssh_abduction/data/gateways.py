@@ -83,7 +83,8 @@ def sights_of(
     onward: Callable[[DState], tuple[int, ...]],
     changes: bool = False,
 ) -> tuple[list[Sight], dict[tuple[Sight, Sight], set[Action]]]:
-    """List the sights of a map (dstates with stars), and the turns between sights at one place.
+    """List the sights of a map (dstates with stars), and the turns from sight to sight at one
+    place.
 
     The sights are sorted by first step. A dict has, for pairs of sights, the turns that lead
     from the first sight to the second. `onward` returns `Sight.onward` for a dstate. With
@@ -184,7 +185,8 @@ class Facing:
 def facing(
     trace: Trace, ssh_map: SSHMap, axioms: Collection[str], changes: bool = False
 ) -> Facing | None:
-    """Find how the dstates of a map face, by its stars. Paths of the map may still be merged.
+    """Find which way the dstates of a map face, from the stars (gateways seen). Paths of the map
+    may still be merged.
 
     None if no frame fits the stars of some place. The headings of the map are ignored. `axioms`
     and `changes` are as in `with_allowed_headings`.
@@ -271,7 +273,7 @@ def _fitted(
     axioms: frozenset[str],
     most: int,
 ) -> tuple[Turned, ...] | None:
-    """Do what `frames_that_fit` does, with a cache.
+    """Fit frames and shifts as `frames_that_fit` does, with a cache.
 
     Maps of growing prefixes have many places in common. Dstates that differ only in their heading
     are equal, so `headings` is an argument of its own.
@@ -375,7 +377,7 @@ def changes_in(trace: Trace, ssh_map: SSHMap, axioms: Collection[str]) -> Iterat
 def changes_of(
     sights: Sequence[Sight], turns: Turns, axioms: Collection[str]
 ) -> Iterator[GatewayChange]:
-    """Yield the gateways that change between drives, by a fit to the headings of the dstates."""
+    """Yield the gateways that change between drives, if the dstates have these headings."""
     for place, seen in by_place(sights).items():
         fitted = frames_that_fit(seen, turns, axioms) or []
         first_of = {s.drive: k for k, s in reversed([*enumerate(seen)])}

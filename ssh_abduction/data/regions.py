@@ -129,7 +129,7 @@ def ids_at(regions: Iterable[Region] | None, place: int | None) -> tuple[int, ..
 
 
 def region_of(regions: Iterable[Region] | None, place: int | None) -> int | None:
-    """Find the region that a person means by a place in it.
+    """Find the region that a person means by naming a place in it.
 
     It is the smallest region with the place and a door, or else the smallest with the place. None
     if no region has the place.

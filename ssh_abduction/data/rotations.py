@@ -91,9 +91,9 @@ def turns_so(action: Action, before: Frame, found: frozenset[int]) -> bool:
 def ways(first: Frame, then: Frame, shift: int, found: frozenset[int]) -> tuple[bool, bool]:
     """Return two flags: may the robot face the same way in both sights, and opposite ways?
 
-    The flags are true if no bearing speaks against a turn of 0, or 180, degrees (`found` says by
-    how many it may have turned). They are also true if gateways that are declared opposite match in
-    this way: they are on one path, which may bend. Gateway k of `then` is k + shift of `first`.
+    The flags are true if the robot may have turned by 0, or 180, degrees (`found` has all possible
+    turns). They are also true if gateways that are declared opposite match in this way: they are on
+    one path, which may bend. Gateway k of `then` is k + shift of `first`.
     """
     alike, opposite = (
         bool(found)

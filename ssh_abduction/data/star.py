@@ -127,7 +127,7 @@ class Frame:
 
     @property
     def with_closed(self) -> tuple[Frame, ...]:
-        """This frame, and the frames that add up to MOST_CLOSED closed gateways to it."""
+        """This frame, and the same with up to MOST_CLOSED additional closed gateways."""
         return _with_closed(self)
 
 

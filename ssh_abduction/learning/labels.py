@@ -102,7 +102,7 @@ def labels_of(
 def map_of(
     solution: Solution, vectors: NDArray[np.float64], choose: int | None = None
 ) -> tuple[SSHMap, NDArray[np.intp]]:
-    """Return the map to learn from, and the labels of its n steps, (n,), by `labels_of`.
+    """Return the map to learn from, and the labels of its n steps, (n,), as `labels_of` makes them.
 
     `vectors` has the vector of each image, (n, d). Views say little about how drives relate. So
     if there are several joint maps, only those that fit the images best are kept.

@@ -189,7 +189,7 @@ class FaultSolver:
         return self._background is not None
 
     def finished(self) -> Solved | None:
-        """Take the result of the search in the background; None if it is not done, or found none.
+        """Take the result of the search in the background; None if it is not done or has none.
 
         The result is about the trace as it was when the search began.
         """

@@ -292,7 +292,7 @@ class TheorySettler:
         self._theory = theory.replace(star=settled.star)
 
     def settled(self, trace: Trace, known: Problem | None = None) -> Problem:
-        """Choose each "auto" for the steps so far. What is known of fewer steps is reused."""
+        """Choose a value for each "auto", for the steps so far. Reuse results for fewer steps."""
         theory = self._theory
         if theory.displacement == "auto":
             theory = theory.replace(displacement="use" if trace.has_displacements else "none")

@@ -82,7 +82,7 @@ class Recovery:
         return Recovery(problem, self._options, before=self)
 
     def take(self, problem: Problem) -> None:
-        """Add the last step: extend all rivals by it, and record if it contradicts the best map."""
+        """Add the last step to all rivals, and record whether the step contradicts the best map."""
         trace = problem.trace
         self._trace, lead = trace, self._maps.lead
         if lead and self._confidence.known is None:

@@ -113,7 +113,8 @@ class MinimalMaps:
     ) -> None:
         """Take the result of a search. Keep the known minimal maps if the search listed fewer.
 
-        `complete` says whether these are all minimal maps. `cost` has the counts of one, if any.
+        `complete` says whether these are all minimal maps. `cost` has the counts of a minimal map,
+        if there is one.
         """
         maps, was_proven = list(found), self.status is Status.OPTIMAL
         self.status, self.complete, self.cost = status, complete, cost

@@ -271,7 +271,7 @@ def _layouts(
 
 
 def _unit(found: Layout) -> float:
-    """Compute the median |dx| + |dy| from a place, or dstate, to the nearest; for at most 200."""
+    """Compute the median |dx| + |dy| from each place, or dstate, to the nearest (200 at most)."""
     points = list(found.places.values()) or [(x, y) for x, y, _ in found.dstates]
     nearest = [
         min((abs(x - u) + abs(y - v) for u, v in points if (u, v) != (x, y)), default=0.0)

@@ -258,7 +258,7 @@ def _changes(table: Table, sort: Sort) -> Iterable[Change]:
 
 
 def _groups(classes: Sequence[int], ones: Sequence[int]) -> list[list[int]]:
-    """Group classes as the row of a map in `Table.ones` does, without those that are nowhere."""
+    """Group the classes that a map has as one, from its row in `Table.ones`. Skip those at NONE."""
     groups = gathered((ones[c], c) for c in classes if ones[c] != NONE)
     return list(groups.values())
 

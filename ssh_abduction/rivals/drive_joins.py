@@ -130,7 +130,7 @@ def joins_of_drives(listing: Listing) -> tuple[DrivePair, ...]:
 
 
 def _placings(listing: Listing) -> tuple[list[_Placing], list[float], bool]:
-    """The place of each step in each map, the maps' weights, and whether no map is missing."""
+    """For each map, the place of each step; the weights of the maps; and whether all are listed."""
     weighed = listing.weighed
     if weighed is not None:
         at: list[_Placing] = [rival.places or rival.dstates for rival in weighed.rivals]

@@ -352,7 +352,7 @@ def _has_one_view(theory: Theory) -> bool:
 
 
 def _seen(ssh_map: SSHMap) -> tuple[View | None, ...]:
-    """List the view seen at each step, by a map whose dstates have one view each."""
+    """List the view seen at each step, from a map in which each dstate has one view."""
     views = [s.view for s in ssh_map.dstates]
     seen = [views[label] for label in ssh_map.dstate_at]
     for fault in ssh_map.faults:

@@ -41,7 +41,7 @@ class Beside:
         step: The first step at the place.
         along: The first step along the path.
         side: The side of the path on which the place lies.
-        share: The share of the compared maps that know this, 0 to 1.
+        share: The share of the compared maps in which this is known, 0 to 1.
     """
 
     step: int
@@ -60,12 +60,12 @@ class Beside:
 
 @dataclass(frozen=True, slots=True)
 class SharedSides:
-    """The places beside paths that minimal maps know.
+    """The places known to lie beside paths in minimal maps.
 
     Attributes:
-        forced: The places beside paths that all of these maps know.
-        possible: The places beside paths that some of these maps know, but not all.
-        proven: Whether these are all minimal maps, and all of them list regions.
+        forced: The places known to lie beside a path in all of these maps.
+        possible: The places known to lie beside a path in some of these maps, but not in all.
+        proven: Whether all minimal maps were compared, and all of them list regions.
     """
 
     forced: tuple[Beside, ...]
@@ -90,7 +90,7 @@ class SharedSides:
 
 
 def shared_sides(listing: Listing) -> SharedSides | None:
-    """Find the places that minimal maps know to lie beside a path, in all of them or in some.
+    """Find the places known to lie beside a path in all minimal maps, or in some of them.
 
     Args:
         listing: The maps.
@@ -122,7 +122,7 @@ def shared_sides(listing: Listing) -> SharedSides | None:
 def only_in(
     first: SSHMap, other: SSHMap, steps: Sequence[int]
 ) -> tuple[tuple[Beside, ...], tuple[Beside, ...]]:
-    """Find the places beside paths that only the first map knows, and those only the other knows.
+    """Find places beside paths that only the first map has, and those that only the other has.
 
     Both are empty if a map has no regions. `steps` are the numbers of all steps.
     """

@@ -149,7 +149,7 @@ def _common_classes(labelings: Sequence[Ints]) -> Ints:
 
 
 def _firsts_of(names: Sequence[Hashable]) -> Ints:
-    """For each name, find the index at which it comes first; NONE if the name is None."""
+    """For each name, find the index of its first occurrence; NONE if the name is None."""
     first: dict[Hashable, int] = {}
     return np.array(
         [NONE if name is None else first.setdefault(name, i) for i, name in enumerate(names)],

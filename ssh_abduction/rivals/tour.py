@@ -137,7 +137,7 @@ def with_doubted_returns(ssh_map: SSHMap, trace: Trace, margin: int) -> SSHMap:
 
 
 def _copies(ssh_map: SSHMap, trace: Trace, believed: Collection[int]) -> list[Copy]:
-    """Find the place of each step if returns to places are doubted.
+    """Find the place of each step if we doubt that the robot returned to known places.
 
     A step that returns to an earlier place is then at a new copy of it. Returns at the steps
     `believed` are not doubted.

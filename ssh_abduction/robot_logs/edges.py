@@ -72,7 +72,7 @@ def grouped(travels: Iterable[tuple[Any, Any, Array]]) -> list[int]:
 
 
 def _apart(one: Array, other: Array, loop: bool) -> float:
-    """The distance of two courses in metres. That of loops does not depend on their directions."""
+    """The distance of two courses in metres. For loops it does not depend on their directions."""
     far = frechet(one, other)
     return min(far, frechet(one[::-1], other)) if loop else far
 

@@ -31,7 +31,7 @@ class _Time:
     seconds: float
 
     def end(self, share: float) -> float:
-        """Return what the clock will show, in seconds, when a share of the limit is used up."""
+        """Return the clock time in seconds at which a share of the limit is used up."""
         return self.begun + share * self.seconds
 
 
@@ -116,7 +116,7 @@ class Beams:
         return True
 
     def _search_without_axioms(self, time: _Time) -> None:
-        """Find how many nats broken axioms save, if unknown, by the widest beam that ended."""
+        """Find how many nats breaking axioms saves, with the widest beam that ended, if unknown."""
         self._parts.watch.stage_ends = time.end(BREAKING)
         is_open = self._best[1] < math.inf and math.isinf(self.broken)
         with suppress(StageTimeError):

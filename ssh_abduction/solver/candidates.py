@@ -50,8 +50,8 @@ class Candidates:
     """Makes maps of the whole trace, and keeps the best one that the checker accepts.
 
     Attributes:
-        contradicting: The steps that contradicted sketches, that of the most reliable sketch
-            first.
+        contradicting: The steps that contradicted sketches (maps made without a search). The step
+            of the most reliable sketch comes first.
     """
 
     def __init__(

@@ -40,7 +40,7 @@ def rivals_of(problem: Problem, misfit: Misfit, best: SSHMap, seconds: float) ->
     """Yield estimated rivals of a map of a trace that cost little more than it, each once.
 
     `seconds` is the time that this may take. `estimated` says what the rivals are. Drives that
-    closures tie to others do not overlap by chance, so they are not put apart.
+    closures connect to others do not overlap by chance. They stay connected.
     """
     dstate, place, _ = problem.theory.prices
     kept = nats_of(replace(Cost.of(best), dstates=0, places=0), problem.theory)
@@ -104,7 +104,7 @@ def estimated(
 
 
 def _apart(best: Rival, drive: Drive) -> Course:
-    """Return the dstates and places of a map after a drive gets dstates and places of its own."""
+    """Return the dstates and places of a map if a drive shares none with the other drives."""
     more = len(best.dstates)
     dstates, places = (
         tuple(numbered(name + more * (drive.first <= t < drive.stop) for t, name in enumerate(of)))

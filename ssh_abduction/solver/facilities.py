@@ -143,7 +143,7 @@ class Facilities:
     def _members(
         self, shares: Array, centres: Array, kinds: NDArray[np.int_]
     ) -> tuple[Array, NDArray[np.bool_], Array]:
-        """Find the points that pay less at each facility than their share.
+        """Find the points that pay less at each of m facilities than their share.
 
         Returns:
             The offsets of all points, (m, n, d), which points these are, and what all pay, (m, n).
@@ -153,7 +153,7 @@ class Facilities:
         return off, pays < shares - TINY, pays
 
     def _more(self, kinds: NDArray[np.int_]) -> Array:
-        """Return what each point pays more at m facilities because of their kinds, (m, n)."""
+        """Return what n points pay in addition at m facilities of another kind, (m, n)."""
         return np.where(kinds[:, None] == self.kinds, 0.0, self.fees)
 
     def _most_saved(self, shares: Array) -> tuple[float, Array, NDArray[np.int_]]:

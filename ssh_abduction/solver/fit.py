@@ -288,7 +288,7 @@ class Poses:
     def _predicted(self, unknown: Array) -> tuple[Array, Array, Array]:
         """Predict the displacements from the unknowns, in metres and radians, (n, 3).
 
-        Also return the cosine and the sine of the heading in the middle of each displacement.
+        Also return the cosine and sine of the heading halfway through each displacement.
         """
         at = unknown[: 2 * self._positions].reshape(-1, 2)
         heading = unknown[2 * self._positions : -2]

@@ -159,7 +159,7 @@ class Visits:
 
 
 class _Cliques:
-    """A clique in each part of the graph `apart`. All nodes of different parts are apart."""
+    """A clique in each part of the graph `apart`. Nodes of different parts are always apart."""
 
     def __init__(self, apart: Flags) -> None:
         self._apart, self._random = apart, np.random.default_rng(0)
@@ -266,7 +266,7 @@ class _Joined:
         )
 
     def _lack(self, a: int, b: int) -> list[tuple[int, int, int]]:
-        """Flag that two classes are not joined, and all that follows. Return the new flags."""
+        """Flag that two classes are not at one place, and what follows. Return the new flags."""
         added, waiting = [], [(0, a, b)]
         while waiting:
             r, a, b = waiting.pop()
@@ -324,7 +324,7 @@ class Forcing:
         return self.visits.returns(self.joins)
 
     def bounds(self, most: float) -> Iterator[float]:
-        """Yield rising lower bounds on the cost of every map, `most` at most. Keep `joins`."""
+        """Yield rising lower bounds, at most `most`, on the cost of every map. Keep `joins`."""
         low = self._bound(most)
         yield low
         while most - low > NEARLY * most:
@@ -337,7 +337,7 @@ class Forcing:
                 most = middle
 
     def _bound(self, most: float) -> float:
-        """Compute a lower bound on the cost of every map without branches, `most` at most."""
+        """Compute a lower bound, at most `most`, on the cost of every map, without branching."""
         low, joins, known = 0.0, self.joins, dict[tuple[int, int], float]()
         while low < most:
             joins, low, worth = self._grown(self.visits, joins, most, known)

@@ -143,7 +143,7 @@ def _done(
 
 
 def steps(name: str, seeds: Sequence[int], outcomes: bool) -> int:
-    """Count the calls of `on_done` by `reproduce` with these arguments, for a progress bar."""
+    """Count how often `reproduce` will call `on_done` with these arguments, for a progress bar."""
     has_outcomes = outcomes and name == "notched-rectangle"
     return len(seeds) + 1 + (len(NOTCHES) * len(SCALES) if has_outcomes else 0)
 

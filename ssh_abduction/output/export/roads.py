@@ -233,7 +233,7 @@ def _regions_at(ssh_map: SSHMap, place: int | None) -> tuple[tuple[int, ...], tu
 
 
 def _streets(ssh_map: SSHMap) -> dict[tuple[int, int], Way]:
-    """Find action, path and direction of travels between places, both ways; no action against."""
+    """Find action, path and direction of travels between places, both ways (no action back)."""
     ends: dict[tuple[int, int], Way] = {}
     for path in ssh_map.paths:
         index = {place: i for i, place in enumerate(path.order)}

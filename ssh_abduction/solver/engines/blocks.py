@@ -141,7 +141,7 @@ class Blocks:
         return high
 
     def _takes_fault(self, begin: int, end: int, most: int) -> bool:
-        """Whether a block needs a fault: more than `most` steps are pairwise different."""
+        """Whether a block of steps needs a fault: more than `most` of its steps differ pairwise."""
         self.watch.check()
         return (
             end - begin > most
@@ -179,7 +179,7 @@ class Blocks:
         return end, known
 
     def _refuted(self, begin: int, end: int, most: int, tenths: int) -> bool:
-        """Whether clingo proves that a block has no map within these limits."""
+        """Whether clingo proves that a block (consecutive steps) has no map within these limits."""
         proven = self._proven.get((begin, end))
         if proven is None or proven[0] < most or proven[1] < tenths:
             seen, actions = self.seen[begin:end], self.actions[begin : end - 1]

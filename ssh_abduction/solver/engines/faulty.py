@@ -219,8 +219,8 @@ class FaultyEngine:
     def _followed(self, answer: FaultyAnswer) -> tuple[list[int] | None, int]:
         """Follow the links of an answer through the steps that clingo was not given.
 
-        Returns the dstate of each step, and -1. If the links do not explain a step, or evidence
-        contradicts its dstate, returns None and the step to give to clingo next.
+        Returns the dstates of all steps, and -1. If the links do not explain a step, or evidence
+        contradicts the dstate of a step, returns None and the step to give to clingo next.
         """
         number, machine = self._machine(answer)
         labels: list[int] = []

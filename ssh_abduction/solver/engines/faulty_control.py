@@ -39,7 +39,7 @@ class FaultyAnswer:
         where: The name of the dstate of each given step that is not lost.
         slips: The given steps whose action slipped.
         lost: The given steps that are misread and at no dstate.
-        rests: The views, as integers, whose rest is used.
+        rests: The views, as integers, whose rest (dstates without a name) is used.
     """
 
     cost: int
@@ -50,7 +50,7 @@ class FaultyAnswer:
 
     @property
     def is_open(self) -> bool:
-        """Whether the answer is no map yet, as it uses a rest or loses a step."""
+        """Whether the answer is no map yet, as a dstate has no name or a step no dstate."""
         return bool(self.rests or self.lost)
 
 

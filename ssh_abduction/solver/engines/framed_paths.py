@@ -42,7 +42,7 @@ PREPARING = (1.6, 2.1)
 
 @dataclass(frozen=True)
 class NodeLabels:
-    """The dstates of the nodes of a chart, and a control for their paths; None to make one."""
+    """The dstates of the nodes of a chart, and a clingo control for paths; None to make one."""
 
     chart: FramedChart
     labels: Sequence[int]
@@ -177,7 +177,7 @@ class FramedPaths:
         return clashes or [self._clash(chart, labels)]
 
     def _clash(self, chart: FramedChart, labels: Sequence[int]) -> list[int]:
-        """Find one small clash by trial: leave out nodes while no paths fit the others."""
+        """Find a small clash (nodes that no paths fit): leave out nodes while none fit."""
 
         def clashes(nodes: list[int]) -> bool:
             control = self.control(chart, labels, nodes=nodes)

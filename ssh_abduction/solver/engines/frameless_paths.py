@@ -141,7 +141,7 @@ class PlacesAndPaths:
         return self._tightly(labels) is not None or self._has_paths(self._path_control(labels))
 
     def _tightly(self, labels: Sequence[int]) -> Found | None:
-        """Find a best map by the shortcut of `engines/homes.py`; None if it does not work."""
+        """Find a best map with no places but pairwise distinct ones (`homes.py`); None if none."""
         key = tuple(labels)
         if key in self._tight:
             return self._tight[key][1]
@@ -172,7 +172,8 @@ class PlacesAndPaths:
         return best
 
     def _best_at_home(self, labels: Sequence[int], control: Control, fewest: int) -> Found | None:
-        """Find the best map that merges each place with one of its homes (`engines/homes.py`).
+        """Find the best map that merges each place with one of its homes: the pairwise distinct
+        places that it may be (`engines/homes.py`).
 
         `fewest` is a lower bound on the number of paths. Returns None if the map is not proven to
         be the best of all maps with these dstates.

@@ -34,8 +34,8 @@ from ssh_abduction.solver.steps.apart import pairwise_distinct
 def homes_of(segments: Segments) -> Mapping[int, list[int]] | None:
     """Find the possible homes of each place, if a map has only as many places as fixed ones.
 
-    Homes of a place are the fixed places that it may be. Returns None if some place has none, or if
-    no places fit these dstates at all.
+    Fixed places are pairwise distinct. Homes of a place are the fixed places that it may be.
+    Returns None if some place has none, or if no places fit these dstates at all.
     """
     if any(c == p for c, p in segments.elsewhere):
         return None  # the segments contradict each other: no places fit these dstates

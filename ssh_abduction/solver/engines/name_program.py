@@ -229,7 +229,7 @@ class NameProgram:
         return not self.chart.excluded or self.chart.is_map(labels)
 
     def names(self) -> dict[tuple[int, int], int]:
-        """Return the names of dstates, without the rests, by keys.
+        """Return a dict from keys to the names of dstates, without the rests.
 
         A key is (-1, number) for a pinned node, and (view, number) for a spare name. Keys stay the
         same when names are added.
@@ -242,7 +242,7 @@ class NameProgram:
         }
 
     def rests(self, answer: dict[int, int]) -> set[int]:
-        """Return the views whose rest an answer uses. The answer has the name of each node."""
+        """Return the views whose rest (dstates without a name) an answer uses, from all names."""
         used = set(answer.values())
         return {view for view, spare in self._known.spare.items() if spare[-1] in used}
 
@@ -312,7 +312,7 @@ class NameProgram:
         ]
 
     def _not_given(self, trail: _Trail) -> Iterator[tuple[Link, None]]:
-        """Yield those links on a trail that clingo was not given yet, as keys for a dict."""
+        """Yield the links of a trail (connected links) that clingo lacks, as keys of a dict."""
         while trail is not None:
             link, trail = trail
             if link not in self._known.links:

@@ -79,7 +79,7 @@ class NameSearch:
                 raise
 
     def _searched(self) -> Iterator[list[int]]:
-        """Do the work of `improving`. End early if a known map has the fewest dstates."""
+        """Yield labels as `improving` does. End early if a known map has the fewest dstates."""
         labels = None
         while labels is None and (names := (yield from self._cheapest_answer())) is not None:
             labels = self._labels_by(names)
@@ -118,7 +118,7 @@ class NameSearch:
                 return answer, bool(end.value)
 
     def _labels_by(self, names: dict[int, int]) -> list[int] | None:
-        """Return labels by an answer. If it is no map, give clingo what it lacked; return None."""
+        """Return labels from an answer. If they are no map, give clingo the missing links."""
         program = self._program
         if views := program.rests(names):
             program.name_more(views)

@@ -238,7 +238,7 @@ class NamedLabels:
                 return
 
     def _needs_rest(self, spares: int) -> bool:
-        """Look for an answer of this cost that uses a rest. If there is one, add spare names."""
+        """Look for an answer of this cost with a dstate that has no name. If found, add names."""
         answers = self._asker.answers(
             names_lp.read_names,
             f"enum,{spares},{spares}",
@@ -252,6 +252,6 @@ class NamedLabels:
         return bool(views)
 
     def _answers_of(self, spares: int) -> Iterator[dict[int, int]]:
-        """Yield all answers that cost this many spare names and use no rest."""
+        """Yield all answers with this many dstates beyond the pinned ones, all with names."""
         resting, mode = self.program.resting(False), f"enum,{spares},0"
         return self._asker.answers(names_lp.read_names, mode, 0, assumptions=[resting], ahead=True)

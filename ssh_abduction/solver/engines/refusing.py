@@ -40,7 +40,7 @@ def all_accepted(
     key: Callable[[Answer], Hashable],
     known: set[Hashable],
 ) -> Generator[Answer, None, None]:
-    """Yield all accepted answers, each once, by `refuse` and `forbid` as in `first_accepted`.
+    """Yield all accepted answers, each once. See `first_accepted` for `refuse` and `forbid`.
 
     `key` is equal for answers that are the same. Answers with `known` keys are left out, and the
     keys of accepted answers are added to them.

@@ -65,7 +65,7 @@ class SmallMaps:
             steps = min(2 * steps, most)
 
     def guessed(self) -> Iterator[list[int]]:
-        """Yield the labels of a guessed map; none without `annealed`, or without a guess."""
+        """Yield the labels of a guessed map; none without speed-up annealed, or without a guess."""
         if self._task.speedups.annealed:
             near = self._map_of_guess(self._pinned)
             if near is not None:

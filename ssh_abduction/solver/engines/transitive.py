@@ -70,7 +70,7 @@ class PairOf(dict[clingo.Symbol, Pair]):
 
 
 def take(turned: Turned, pair: Pair) -> None:
-    """Record in `turned` that two visits are at one place."""
+    """Record in `turned` that two visits are at one place, with the rotation between them."""
     i, j, r = pair
     turned.setdefault(i, {})[j] = r
     turned.setdefault(j, {})[i] = -r % 4

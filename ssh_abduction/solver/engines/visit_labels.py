@@ -114,7 +114,7 @@ class VisitLabels:
             return True
 
     def _order_of_choice(self, chart: FramedChart) -> list[int]:
-        """Set `clique`, and return it and the other nodes, those that are apart from most first."""
+        """Set `clique`. Return it, and then the other nodes: first those apart from most nodes."""
         apart = chart.apart()
         self._asker.watch.check()
         self.clique = clique(apart, chart.seen) if self._task.speedups.clique else []
@@ -164,7 +164,7 @@ class VisitLabels:
         return list(self._found[0])
 
     def _first_labels(self, ask: Callable[[], list[Pair] | None]) -> tuple[int, ...] | None:
-        """Return the labels of all nodes by the first answer that is a map of the chart.
+        """Return the labels of all nodes from the first answer that is a map of the chart.
 
         After any other answer, clingo gets what it lacked: rules, or visits. `ask` returns the
         pairs of visits that are at one place in the next answer.

@@ -52,7 +52,8 @@ class VisitProgram:
 
     Attributes:
         batch: The number of the last batch of visits; -1 before the first.
-        least: A lower bound on the dstates: the number of nodes that are first in every answer.
+        least: A lower bound on the number of dstates: how many nodes are the first at their dstate
+            in every answer.
     """
 
     def __init__(self, task: Task, asker: Asker, chart: FramedChart, sides: FramedSides) -> None:

@@ -65,7 +65,7 @@ def evidence_of(theory: Theory, known: Iterable[Evidence] = ()) -> tuple[Evidenc
 def said_by(
     kinds: Iterable[Evidence], trace: Trace, refused: Mapping[str, int]
 ) -> dict[str, dict[str, int]]:
-    """Count by kind of evidence the pairs of steps and the sets of equalities that it excluded.
+    """For each kind of evidence, count the pairs of steps and sets of equalities that it excluded.
 
     For each name of a kind, "pairs" is the number of pairs of steps that are different dstates,
     and "refused" is the number of rejected sets, which is taken from `refused`.

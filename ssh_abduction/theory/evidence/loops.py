@@ -194,7 +194,7 @@ class Loops:
         return closing
 
     def _by_bend(self, i: Steps, j: Steps) -> Array:
-        """Return how far a drift of 1 radian a metre moves the end of each loop, m x 3."""
+        """Return how far a drift of 1 radian per metre moves the end of each loop, m x 3."""
         sums = self.ways[j] - self.ways[i]
         return np.hstack(
             [sums[:, :1] * _quarter_turned(self.poses[j, :2]) - sums[:, 1:], sums[:, :1]]

@@ -111,7 +111,7 @@ class Returns:
         }
 
     def _loops_within(self, groups: Sequence[Sequence[int]], since: int = 0) -> tuple[Steps, Steps]:
-        """The first and last steps of loops within each sorted group, ended since a step."""
+        """The first and last steps of loops within each sorted group that end since `since`."""
         import numpy as np
 
         begins = self.reckoning.begins
@@ -165,7 +165,8 @@ class Returns:
     def threshold(self, freedom: int, together: bool) -> float:
         """Return the chi-square above which a return, or a set of two (`together`), is rejected.
 
-        A return to a place has 2 degrees of freedom, one to a dstate 3, and a set the sum.
+        A return to a place has 2 degrees of freedom, and a return to a dstate has 3. A set has the
+        sum of its two returns.
         """
         from scipy.special import gammainccinv
 
@@ -223,7 +224,7 @@ class Returns:
     def _returns_among(
         self, labels: Sequence[int], places: Sequence[int | None], since: int = 0
     ) -> Steps:
-        """Do the same as `_returns_of`. Here `places` has the place of each step, not dstate."""
+        """List returns as `_returns_of`. Here `places` has the place of each step, not dstate."""
         import numpy as np
 
         at_dstate: dict[int, list[int]] = defaultdict(list)

@@ -305,7 +305,7 @@ def _alone(closing: Array, covariance: Array, repeated: Array, one_dstate: Steps
 
 
 def _cut_off_headings(closing: Array, covariance: Array, one_dstate: Steps) -> None:
-    """Set the headings' errors and covariances of returns to places to 0, their variances to 1."""
+    """For returns to places, set the heading's error and covariances to 0, its variance to 1."""
     places = one_dstate == 0
     closing[places, 2] = 0.0
     covariance[places, 2, :] = covariance[places, :, 2] = 0.0

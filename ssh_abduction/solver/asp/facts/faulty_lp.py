@@ -18,7 +18,8 @@ from ssh_abduction.theory.evidence import Equality, Pairs
 
 
 def faulty_names(names: Mapping[int, int]) -> Iterator[tuple[int, int]]:
-    """Yield all names, each with its view. The last one of each view is its rest.
+    """Yield all names, each with its view. The last name of each view is its rest: it stands for
+    all further dstates with that view.
 
     `names` has, for each view, the number of its names without the rest.
     """
@@ -107,7 +108,7 @@ def faulty_batch(
 
 
 def not_all_one(equalities: Collection[Equality]) -> str:
-    """Return the rule that some equalities do not all hold, of steps that clingo was given."""
+    """Return the rule that some equalities of steps (known to clingo) do not all hold."""
     body = (f"is({e.first},S{k}), is({e.second},S{k})" for k, e in enumerate(equalities))
     return f":- {', '.join(body)}."
 

@@ -48,7 +48,7 @@ def one_in_doubt(number: int, condition: str | None) -> str:
 def some_doubt(question: int, doubts: Iterable[tuple[int, bool]]) -> str:
     """Return the rule that some doubt holds while `asked(question)` is true.
 
-    A doubt has the number of two things, and says that they are one (True) or that they are not.
+    A doubt is the claim that two things, given by their numbers, are one (True) or are not.
     """
     none = ", ".join(f"{'not ' if one else ''}one_in_doubt({n})" for n, one in doubts)
     return f"#external {asked(question)}.\n:- {asked(question)}, {none}."

@@ -22,7 +22,7 @@ def name_facts(
     links: Iterable[tuple[int, int, int]],
     choices: Sequence[Sequence[int]],
 ) -> str:
-    """Return the facts that hold for all batches.
+    """Return the facts that hold for all batches (a batch is the nodes of one call).
 
     `names` are pairs of a name and its view. `spares` has the spare names of each view; the last
     one is the rest. `links` are triples of a node, an action, and the node that it leads to.
@@ -75,7 +75,7 @@ def batch_facts(
 
 
 def resting(batch: int) -> Symbol:
-    """Return the atom that says that some step of the batches up to this one is at a rest."""
+    """Return the atom "a step up to this batch is at a rest" (dstates of a view without a name)."""
     return Function("resting", number_symbols(batch))
 
 

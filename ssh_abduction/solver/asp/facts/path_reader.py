@@ -32,8 +32,8 @@ class PathAnswer:
     """The places and paths in an answer of paths_framed.lp or paths_frameless.lp.
 
     Attributes:
-        at: For each group of dstates that turns join: its place in the map, and the rotation from
-            the frame of this place to the frame of the group, in quarters clockwise.
+        at: For each group of dstates connected by turns: its place in the map, and the rotation
+            from the frame of this place to the frame of the group, in quarters clockwise.
         part: For each segment, its path, and its direction on the path (1 or -1).
         order: For each path, its places in order.
     """
@@ -177,7 +177,7 @@ class _Choices:
             self._among.setdefault(a, []).append((literal, (b, c)))
 
     def made_in(self, model: Model) -> dict[int, tuple[int, int]]:
-        """Return the other two arguments that an answer chooses, by the first argument."""
+        """Return a dict from the first argument to the other two that an answer chooses for it."""
         made = {}
         # Ask first about the atoms that the last answer had.
         for a, among in self._among.items():
@@ -189,7 +189,7 @@ class _Choices:
 
 
 def _literals(control: Control, name: str) -> dict[tuple[int, int, int], int]:
-    """Return the literal of each atom of a predicate, by the three arguments of the atom."""
+    """Return a dict from the three arguments of each atom of a predicate to its literal."""
     found = {}
     for atom in control.symbolic_atoms.by_signature(name, 3):
         a, b, c = read_atom(atom.symbol)[1]

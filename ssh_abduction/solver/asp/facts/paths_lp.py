@@ -88,8 +88,9 @@ def paths_frameless_facts(
 def read_contrary(model: Model) -> tuple[list[int], list[int]]:
     """Read the dstates that show that the labels have no places and paths.
 
-    Returns a dstate of each segment that shows it, the shortest segment first. Also returns the
-    dstates at which two paths cross, if these paths seem to meet again.
+    A segment is steps known to be along one path. Returns a dstate of each segment that contradicts
+    the axioms, the shortest segment first. Also returns the dstates at which two paths cross, if
+    these paths seem to meet again.
     """
     atoms = list(map(read_atom, model.symbols(shown=True)))
     contrary = sorted((args[1], args[0]) for name, args in atoms if name == "contrary")
@@ -188,7 +189,7 @@ def tight_facts(homes: Mapping[int, Iterable[int]]) -> str:
 
 
 def pinned_facts(segments: Iterable[int]) -> str:
-    """Return the facts for paths_framed.lp that name segments on pairwise different paths."""
+    """Return the facts for paths_framed.lp that name segments known to be on different paths."""
     return " ".join(f"pinned({segment})." for segment in segments)
 
 
@@ -198,7 +199,7 @@ def settled_labels(labels: Iterable[tuple[int, int]]) -> str:
 
 
 def open_labels(labels: Sequence[int]) -> str:
-    """Return the rules by which an answer is a set of labels of nodes that no paths fit."""
+    """Return rules whose answers are sets of labels of nodes that no paths fit."""
     return "\n".join(
         [
             *(f"{{ is({node},{label}) }}." for node, label in enumerate(labels)),

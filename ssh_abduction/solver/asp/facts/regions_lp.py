@@ -36,7 +36,7 @@ def region_facts(ssh_map: SSHMap, trace: Trace, axioms: Collection[str]) -> str:
 
 
 def members_in(control: Control) -> dict[Reason, set[int]]:
-    """Return the places of each region by its reason, from a control that grounded regions.lp."""
+    """Return a dict from the reason for a region to its places, from a control with regions.lp."""
     members: dict[Reason, set[int]] = {}
     reasons: dict[Symbol, Reason] = {}
     for atom in control.symbolic_atoms.by_signature("member", 2):
