@@ -111,7 +111,7 @@ def _sidecar(trace: Trace) -> NDArray[np.float64]:
     if len(shape) != 2 or not floats:
         raise PerceptionError(
             f"{path}: expected a table of images x ranges, got {table.dtype} of shape "
-            f"{shape}; store one image a row"
+            f"{shape}; store one image per row"
         )
     return table.astype(float)
 

@@ -92,7 +92,7 @@ class ImageLikelihood:
             images, labels = nearest.remembered()
         except NotFittedError:
             raise PerceptionError(
-                "recogniser: expected one that has learnt, got a new one; call fit with "
+                "recogniser: expected a fitted one, got a new one; call fit with "
                 "images and labels first"
             ) from None
         with np.errstate(over="ignore", invalid="ignore"):

@@ -88,7 +88,8 @@ class Stored:
             raise
         except Exception as error:  # Each part of a damaged model fails in its own way.
             raise PerceptionError(
-                f"recogniser: expected one that works, got {type(error).__name__}: {error}; "
+                f"recogniser: expected a recogniser that works, got {type(error).__name__}: "
+                f"{error}; "
                 "train it again"
             ) from None
         if not sound:

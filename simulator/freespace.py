@@ -73,7 +73,7 @@ class FreeSpace:
         width, height = ends.max(0) + MARGIN - corner
         if width * height > LARGEST:
             raise SimulatorError(
-                f"walls: expected them on at most {LARGEST:,} square metres, on which ways "
+                f"walls: expected an area of at most {LARGEST:,} square metres, in which ways "
                 f"can be planned, got {width:,.0f} x {height:,.0f} m; check the scale"
             )
         columns, rows = math.ceil(width / CELL), math.ceil(height / CELL)

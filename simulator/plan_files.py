@@ -74,7 +74,8 @@ def read_plan(path: str | os.PathLike[str]) -> tuple[str, tuple[Room, ...], tupl
     # Entities can expand to gigabytes.
     if b"<!ENTITY" in data:
         raise SimulatorError(
-            f"{named(path)}: expected a plan without entities of its own, got some; write them out"
+            f"{named(path)}: expected a plan without entities of its own, got some; replace each "
+            "by its text"
         )
     try:
         building = ElementTree.fromstring(data)

@@ -91,7 +91,8 @@ def simulate(
     an_instance("world", world, World, SimulatorError, mend="take World.named or World.load")
     if every is not None and world.lifts:
         raise SimulatorError(
-            f"every: expected none in {world.name}, as evenly spaced images would join the floors "
+            f"every: expected no distance in {world.name}, as evenly spaced images would join "
+            "the floors "
             "at its lifts; leave it out"
         )
     if world.by_places:

@@ -253,8 +253,14 @@ def test_wrong_choices_are_one_line(
     both = ["quick.jsonl", "tee.jsonl"]
     for words, message in (
         ([*both, "--jobs", "0"], r"--jobs: expected .* got 0; leave it out for 1"),
-        (["quick.jsonl", "-"], r"-: expected files .* got standard input; save it to a file"),
-        (["-", "--jobs", "2"], r"-: expected files .* got standard input; save it to a file"),
+        (
+            ["quick.jsonl", "-"],
+            r"-: expected files .* got standard input; save the trace to a file",
+        ),
+        (
+            ["-", "--jobs", "2"],
+            r"-: expected files .* got standard input; save the trace to a file",
+        ),
         (
             [*both, "--theory", "causal", "--set", "boundary=strict"],
             r"boundary: expected none with level=causal.*",

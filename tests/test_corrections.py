@@ -140,11 +140,13 @@ def test_a_file_of_another_map_is_refused(folder: Path, capsys: pytest.CaptureFi
     said = Corrections(MARKS).with_name("kitchen", "place", "monday:1")
     with pytest.raises(MapError, match=r"written for, 'monday', 'tuesday', got round"):
         solve(ROUND, corrections=said)
-    with pytest.raises(MapError, match="got other steps of monday; it belongs to another map"):
+    with pytest.raises(
+        MapError, match="got other steps of monday; the file belongs to another map"
+    ):
         solve(replace(TUESDAY, name="monday"), corrections=said)
     save_corrections(said, folder / "building")
     assert main(solving(folder, "round")) == 1
-    assert "it belongs to another map" in capsys.readouterr().err
+    assert "the file belongs to another map" in capsys.readouterr().err
     for unknown in ("sunday:1", "monday:9"):
         with pytest.raises(MapError, match=r"sunday:1|expected 0 to 3"):
             solve(JOINT, corrections=said.with_name("den", "place", unknown))
@@ -356,7 +358,7 @@ def test_verbs_with_the_recorded_trace_obey_what_was_said_of_its_stars(
     assert main(["check", maps, trace]) == 20
     assert "it is not obeyed" in capsys.readouterr().err
     assert main([*pair, "--corrections", str(file)]) == 1
-    assert "it belongs to another map" in capsys.readouterr().err
+    assert "the file belongs to another map" in capsys.readouterr().err
 
 
 def test_directions_on_the_map_are_those_of_its_drawing(

@@ -202,7 +202,7 @@ def test_rounds_that_cannot_be_driven(ring: Building, tmp_path: Path) -> None:
     with pytest.raises(
         SimulatorError,
         match=(
-            r"walls: expected them on at most 200,000 square metres, .*, got 2,784 x 1,984 m; "
+            r"walls: expected an area of at most 200,000 square metres, .*, got 2,784 x 1,984 m; "
             r"check the scale"
         ),
     ):
@@ -544,19 +544,19 @@ def test_a_bag_has_the_covariance_of_its_odometry(tmp_path: Path) -> None:
         ),
         (
             ["school.xml", "--format", "carmen", "--set", "reach=1"],
-            "--reach: expected none with a floor plan",
+            "--reach: expected no such option with a floor plan",
         ),
         (
             ["triangle", "--format", "carmen", "--set", "stars=false"],
-            "stars=false: expected none beside --format",
+            "stars=false: expected no such option with --format",
         ),
         (
             ["triangle", "--format", "carmen", "--set", "images=panoramas"],
-            "images=panoramas: expected none beside --format",
+            "images=panoramas: expected no such option with --format",
         ),
         (
             ["triangle", "--format", "carmen", "--set", "hours=7,19"],
-            "hours: expected none beside --format",
+            "hours: expected no such option with --format",
         ),
         (
             ["triangle", "--format", "carmen", "--set", "every=0"],

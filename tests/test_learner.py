@@ -205,7 +205,7 @@ def test_the_learner_is_an_estimator(run: Trace) -> None:
         ),
     )
     with pytest.raises(
-        LearnerError, match="expected some steps whose dstate the map tells, got none"
+        LearnerError, match="expected steps whose dstate follows from the map, got none"
     ):
         learner.score(broken)
     with pytest.raises(TraceError, match="traces: expected a Trace, or a list of them, got"):

@@ -335,9 +335,9 @@ def test_an_explanation_names_assertions_and_own_axioms() -> None:
     [
         (
             ":- same(I,T), T-I > 10.",
-            r"own\.lp:1: same: expected in a program part of steps, .* #program step\(t\)\.",
+            r"own\.lp:1: same: expected this rule in a program part of .* #program step\(t\)\.",
         ),
-        ("far :- act(0,A).", r"own\.lp:1: act: expected in a program part of steps"),
+        ("far :- act(0,A).", r"own\.lp:1: act: expected this rule in a program part of steps"),
         ("#program step(t).\n:- same(I,t) t > 3.", r"own\.lp:2:\d+-\d+: error: syntax error"),
         ("#program step(t).\n:- same(I,t), X > 3.", r"own\.lp:2.*unsafe"),
         (

@@ -99,7 +99,7 @@ def test_a_trace_without_a_map_says_nothing_of_places() -> None:
 
 
 def test_a_place_that_is_not_there() -> None:
-    with pytest.raises(MapError, match="place: expected one of the first minimal map, got 9"):
+    with pytest.raises(MapError, match="place: expected a place of the first minimal map, got 9"):
         explain_place(written(CORNER), 9)
     with pytest.raises(MapError, match=r"path: .* got 7; the map has paths 0, 1 and 2"):
         explain_place(written(CORNER), 0, 7)
@@ -115,7 +115,7 @@ def test_explain_in_the_shell(
     assert main(["explain", "corner.jsonl", "p2", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["sides"][0]["steps"] == [1, 2]
     assert main(["explain", "corner.jsonl", "p9"]) == 1
-    assert "expected one of the first minimal map, got 9" in capsys.readouterr().err
+    assert "expected a place of the first minimal map, got 9" in capsys.readouterr().err
     written("a T b A c A d").save("none.jsonl")
     assert main(["explain", "none.jsonl", "p0"]) == 20
     assert main(["explain", "corner.jsonl", "p2", "path0", "path1"]) == 1

@@ -75,7 +75,9 @@ class LiveLog:
                 "; give the width of the robot"
             )
         if not isinstance(items, Iterable) or isinstance(items, str | bytes):
-            raise LogError(f"scans: expected scans, got {brief(items)}; pass those of stream_log")
+            raise LogError(
+                f"scans: expected scans, got {brief(items)}; pass the scans of stream_log"
+            )
         if not callable(tell):
             raise LogError(
                 f"tell: expected a function that takes a text, got {brief(tell)}"
@@ -131,7 +133,7 @@ class LiveLog:
             else:
                 raise LogError(
                     f"scans: expected scans, got {brief(item)} as item {number}"
-                    "; take those of stream_log"
+                    "; take the scans of stream_log"
                 )
 
     def _keep(self, one: Followed) -> None:

@@ -234,8 +234,8 @@ def run(options: argparse.Namespace) -> int:
     paths: list[str] = options.traces
     if "-" in paths:
         raise AbductionError(
-            "-: expected files where there are several traces, --jobs or --scheduler, got "
-            "standard input; save it to a file"
+            "-: expected files, as several traces, --jobs and --scheduler need them, got standard "
+            "input; save the trace to a file"
         )
     check_jobs(options.jobs, "traces to solve at a time")
     speedups = Speedups.without(options.without_speedups)

@@ -215,7 +215,8 @@ def _bound(
         )
     if not isinstance(data, dict) or "certificate" not in data:
         raise MapError(
-            "certificate: expected one beside the maps, got none; use what solve --json printed"
+            "certificate: expected one in the file of maps, got none; use a file that solve "
+            "--json wrote"
         )
     bound = check_bound(trace, data["certificate"])
     said += [f"bound: {fault}" for fault in bound.faults]

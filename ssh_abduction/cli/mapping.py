@@ -295,10 +295,12 @@ class MapQuestion(FileQuestion):
 def run(options: argparse.Namespace) -> int:
     check_jobs(options.jobs, "logs to map at a time")
     if "-" in options.logs:
-        raise AbductionError("-: expected the files of logs, got standard input; save it to a file")
+        raise AbductionError(
+            "-: expected the files of logs, got standard input; save the log to a file"
+        )
     if options.maps < 0:
         raise AbductionError(
-            f"--maps: expected how many minimal maps to list, 0 for all, got {options.maps}"
+            f"--maps: expected a number of minimal maps to list, 0 for all, got {options.maps}"
             "; leave it out for 300"
         )
     check_limit("--time-limit", "seconds", options.time_limit)

@@ -21,7 +21,7 @@ def run(options: argparse.Namespace) -> int:
         if getattr(options, name) is not None:
             flag = f"--{name.replace('_', '-')}"
             raise AbductionError(
-                f"{flag}: expected none where a drive is added to a map; leave it out"
+                f"{flag}: expected no such option when a drive is added to a map; leave it out"
             )
     existing = Solution.load(options.onto)
     trace = together([Trace.load(path) for path in options.traces])

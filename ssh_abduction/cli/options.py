@@ -317,7 +317,8 @@ def check_jobs(jobs: int | None, things: str, default: int = 1) -> None:
     """Raise AbductionError if the option --jobs is 0."""
     if jobs == 0:
         raise AbductionError(
-            f"--jobs: expected how many {things}, or -1 for one per core, got 0; leave it out for "
+            f"--jobs: expected a number of {things}, or -1 for one per core, got 0; leave it out "
+            "for "
             f"{default}"
         )
 

@@ -97,9 +97,8 @@ class SavedMap:
         first = next(here, None)
         if first is None:
             raise MapError(
-                f"{text}: expected a {kind} of the map, got {brief(text)}, which is none"
-                + ", or has no place of its own" * (kind == "region")
-                + "; "
+                f"{text}: expected a {kind} of the map, got {brief(text)}, but the map has none "
+                "of this number" + ", or none with a place of its own" * (kind == "region") + "; "
                 "ssh-abduction show lists them"
             )
         return kind, step_name(self.drives, first)

@@ -193,7 +193,8 @@ def _drive(options: argparse.Namespace) -> RecordedDrive:
     ):
         if given:
             raise AbductionError(
-                f"{name}: expected none beside --format, as a robot's log is a file of scans; "
+                f"{name}: expected no such option with --format, as a robot's log is a file of "
+                "scans; "
                 "leave it out"
             )
     odometer = Odometer(scale=options.scale_error, bend=math.radians(options.bend_error))
@@ -206,7 +207,8 @@ def _drive(options: argparse.Namespace) -> RecordedDrive:
     for name in ("start", "route", "reach"):
         if getattr(options, name) is not None:
             raise AbductionError(
-                f"--{name}: expected none with a floor plan, whose rounds are drawn by --seed; "
+                f"--{name}: expected no such option with a floor plan, whose rounds are drawn by "
+                "--seed; "
                 "leave it out"
             )
     return record_plan(

@@ -172,7 +172,10 @@ class Corrections:
         one_of("kind", kind, PAIRS, MapError)
         said = Said(kind, (_a_step("first", first), _a_step("second", second)))
         if said.steps[0] == said.steps[1]:
-            raise MapError(f"second: expected a step other than {first}, got it again; name two")
+            raise MapError(
+                f"second: expected a step other than {first}, got it twice; name two different "
+                "steps"
+            )
         about = [other for other in self.pairs if set(other.steps) == set(said.steps)]
         new = () if any(other.kind == kind for other in about) else (said,)
         wrong = [other for other in about if other.kind in _AGAINST[kind]]
@@ -219,9 +222,10 @@ class Corrections:
         if other or (self.drives and not set(self.drives) & set(known)):
             found = f"other steps of {other[0]}" if other else f"{', '.join(known)}"
             raise MapError(
-                f"{where}: drives: expected those that it was written for, "
-                f"{', '.join(map(brief, self.drives))}, got {found}; it belongs to another map: "
-                "name another file, or remove it"
+                f"{where}: drives: expected the drives that it was written for, "
+                f"{', '.join(map(brief, self.drives))}, got {found}; the file belongs to another "
+                "map: "
+                "name another file, or remove this one"
             )
 
     def known_in(self, drives: Sequence[Drive]) -> Corrections:
@@ -334,7 +338,7 @@ class Corrections:
         """
         if not isinstance(sentence, Said | Passage):
             raise MapError(
-                f"sentence: expected one of pairs or gateways, got {brief(sentence)}; take one"
+                f"sentence: expected an entry of pairs or gateways, got {brief(sentence)}; take one"
             )
         return replace(
             self,

@@ -378,7 +378,7 @@ def _warn_of_other_views(traces: Sequence[Trace]) -> None:
     for i in alone[-1:] if len(seen) == 2 else alone:  # of two traces, one is enough
         warnings.warn(
             f"views: trace {i + 1}{_names_of(traces, i)} has no view in common with another "
-            "trace, so nothing seen says where it belongs; leave it out, or give one name to "
+            "trace, so no view says where the trace belongs; leave it out, or give one name to "
             "views that are one",
             stacklevel=3,
         )

@@ -303,7 +303,8 @@ class Trace:
         openings = [None] * len(seen) if stars is None else as_list(stars, "stars")
         if len(openings) != len(seen):
             raise TraceError(
-                f"trace: expected a star a view, got {len(openings)} stars and {len(seen)} views; "
+                f"trace: expected one star per view, got {len(openings)} stars and {len(seen)} "
+                "views; "
                 f"give None where none was seen"
             )
         moved = of_actions(displacements, "displacements", len(done))
@@ -487,6 +488,6 @@ def _dump(value: Mapping[str, Any]) -> str:
         return json_line(value)
     except (TypeError, ValueError, RecursionError) as error:
         raise TraceError(
-            f"trace: expected what JSON can hold, got {brief(dict(value))} ({error}); "
+            f"trace: expected values that JSON can hold, got {brief(dict(value))} ({error}); "
             f"mend the field"
         ) from None

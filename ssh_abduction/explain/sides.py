@@ -220,7 +220,7 @@ def _check(name: str, number: int, known: Iterable[int]) -> None:
     if number not in known:
         some = f"{name}s {list_in_words(known)}" if known else f"no {name}s"
         raise MapError(
-            f"{name}: expected one of the first minimal map, got {number}; the map has {some}"
+            f"{name}: expected a {name} of the first minimal map, got {number}; the map has {some}"
         )
 
 

@@ -95,7 +95,9 @@ def labels_of(
             stacklevel=2,
         )
     if not agreed.any():
-        raise LearnerError("labels: expected some that all maps agree on, got none; choose a map")
+        raise LearnerError(
+            "labels: expected labels on which all maps agree, got none; choose a map"
+        )
     return np.where(agreed, labels, -1)
 
 

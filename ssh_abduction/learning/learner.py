@@ -161,7 +161,7 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
         """
         if not hasattr(self, "recogniser_"):
             raise LearnerError(
-                "learner: expected one that has learnt, got a new one; call fit with a trace first"
+                "learner: expected a fitted one, got a new one; call fit with a trace first"
             )
         images = Traces.of(X).images if Traces.are(X) else X
         return np.asarray(self.recogniser_.predict(images), np.intp)
@@ -193,7 +193,7 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
             )
         if not (true >= 0).any():
             raise LearnerError(
-                "traces: expected some steps whose dstate the map tells, got none; "
+                "traces: expected steps whose dstate follows from the map, got none; "
                 "score a trace of the same world"
             )
         return float(np.mean(found[true >= 0] == true[true >= 0]))

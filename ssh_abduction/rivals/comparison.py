@@ -379,7 +379,7 @@ def _check_backbone(shared: Backbone, listed: Backbone, listing: Listing) -> Non
             first, later = wrong
             mend = "the file was changed by hand, or its maps are of another search: solve again"
             raise MapError(
-                f"{listing.source}: backbone: {sort}: it contradicts the maps listed about "
+                f"{listing.source}: backbone: {sort}: it contradicts the listed maps about "
                 f"steps {first} and {later}; {mend}"
             )
 

@@ -393,7 +393,7 @@ def _check(maps: Sequence[SSHMap], trace: Trace | None) -> None:
     """Raise MapError unless these are maps of one trace, and of `trace` if it is given."""
     if not maps:
         raise MapError(
-            "maps: expected at least one to seek an experiment for, got none; "
+            "maps: expected at least one map to find an experiment for, got none; "
             "see the status that solve gave"
         )
     for i, ssh_map in enumerate(maps):

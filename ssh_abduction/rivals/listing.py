@@ -207,7 +207,7 @@ class Listing:
             )
         if not is_whole(count) or count < 0:
             raise MapError(
-                f"{where}: count: expected how many minimal maps were found, got {brief(count)}; "
+                f"{where}: count: expected the number of minimal maps, got {brief(count)}; "
                 "solve again"
             )
         # with levels, only maps of the first level are minimal

@@ -263,7 +263,7 @@ def _check_rules(theory: Theory) -> None:
             if axiom.name in taken:
                 raise TheoryError(
                     f"{rules.name}: @axiom({axiom.name}): expected a name that no other axiom "
-                    "has; give it one of its own"
+                    "has; rename this axiom"
                 )
             taken.add(axiom.name)
 

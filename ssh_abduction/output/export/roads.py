@@ -162,7 +162,8 @@ class Roads:
         )
         if not roads:
             raise MapError(
-                f"map: expected roads between its {level}, got none; log a trace that moves on"
+                f"map: expected roads between its {level}, got none; log a trace in which the "
+                "robot travels"
             )
         return cls(level, drawn.metric, stops, roads)
 

@@ -111,7 +111,8 @@ def _check(rules: Rules, others: tuple[Rules, ...], files: tuple[str, ...]) -> N
             name = atom.name
             if name in of_steps and part == "base":
                 raise TheoryError(
-                    f"{where}: {name}: expected in a program part of steps, as the part base is "
+                    f"{where}: {name}: expected this rule in a program part of steps, as the "
+                    "part base is "
                     "grounded before there are steps; write #program step(t). before the rule"
                 )
             if name not in known | own | defined | OF_STEPS | READABLE:
