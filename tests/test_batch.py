@@ -255,11 +255,11 @@ def test_wrong_choices_are_one_line(
         ([*both, "--jobs", "0"], r"--jobs: expected .* got 0; leave it out for 1"),
         (
             ["quick.jsonl", "-"],
-            r"-: expected files .* got standard input; save the trace to a file",
+            r"-: expected files, .* got standard input; save the trace to a file",
         ),
         (
             ["-", "--jobs", "2"],
-            r"-: expected files .* got standard input; save the trace to a file",
+            r"-: expected files, .* got standard input; save the trace to a file",
         ),
         (
             [*both, "--theory", "causal", "--set", "boundary=strict"],
