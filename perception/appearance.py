@@ -1,6 +1,6 @@
 """Makes features of panoramas that hardly depend on the light.
 
-Each feature compares the brightness of a patch with that of the patch beside or below it.
+Each feature compares the brightness of a patch with that of its neighbours on the right and below.
 
 >>> import numpy as np
 >>> day = np.random.default_rng(0).uniform(40, 200, (2, 24 * 180 * 3))

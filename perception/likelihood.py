@@ -57,8 +57,8 @@ UNMAPPED = 0.1
 class ImageLikelihood:
     """Densities of images at each known place and elsewhere, from the distances of a recogniser.
 
-    The images below are those that the recogniser remembers, as its last estimator compares them
-    (by default, as reciprocals of ranges).
+    Below, the images are the remembered images of the recogniser, in the form in which its last
+    estimator compares images (by default, reciprocals of ranges).
 
     Attributes:
         recogniser: The fitted PlaceRecogniser, or a pipeline that ends with one.

@@ -31,8 +31,9 @@ class Odometer:
     """Noise and systematic errors of an odometer.
 
     The errors of two motions are independent, so the standard deviation of the noise grows with the
-    square root of the distance. The defaults are near those of recorded logs (ACES, Belgioioso,
-    CSAIL and Seattle), in which the motion between two scans was compared with the corrected poses:
+    square root of the distance. The defaults are near the values of recorded logs (ACES,
+    Belgioioso, CSAIL and Seattle), in which the motion between two scans was compared with the
+    corrected poses:
     `along` 0.02 to 0.08, `across` 0.015 to 0.05, `heading` 0.008 to 0.07, `turning` 0.1.
 
     Attributes:

@@ -1,4 +1,4 @@
-"""Finds closures: pairs of visits whose local maps match, and how they lie relative to each other.
+"""Finds closures: pairs of visits whose local maps match, and the relative pose of the two visits.
 
 Two places may look alike. So a match counts only if the track allows it: its pose has to agree with
 the track within ten times the covariance of the track, for some steady drift of the heading. A

@@ -222,8 +222,9 @@ def stream_visits(
     of the scans, the other visits follow. No visit is yielded before the units of the odometry are
     recognised, which takes about 100 scans of a moving robot.
 
-    If the odometry is good, the visits are those of `import_log`, without those where stretches of
-    the drive diverge (`partings`). A jump of the odometer is judged by earlier steps only.
+    If the odometry is good, the visits are the same as those of `import_log`, without visits where
+    stretches of the drive diverge (`partings`). A jump of the odometer is judged by earlier steps
+    only.
 
     Args:
         scans: The scans with odometry, in order, for example those of `stream_log`. Damaged parts

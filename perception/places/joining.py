@@ -1,8 +1,8 @@
 """Joins the logs of several drives through one building to one log.
 
-The scans of one drive follow those of another. How the frames of two drives relate is unknown. So
-the track of each drive begins where the previous track ends, which has no meaning. Closures between
-drives say how visits of two drives lie relative to each other.
+The scans of the drives are listed one drive after the other. How the frames of two drives relate is
+unknown. So the track of each drive begins where the previous track ends, which has no meaning.
+Closures between drives say how visits of two drives lie relative to each other.
 
 To find them, each pair of visits is matched in all rotations, and each reliable match says how the
 frames relate. Places look alike, so a match counts only if at least VOTES visits of the second

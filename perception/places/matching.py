@@ -1,4 +1,4 @@
-"""Matches two local maps: how the surroundings of one place lie relative to those of another.
+"""Matches two local maps: finds the relative pose at which the surroundings of two places agree.
 
 The score of a rotation and a shift is the mean, over the wall points of each map that the other map
 observed, of exp(-d² / (2 σ²)). Here d is the distance to the nearest wall of the other map. A wall

@@ -264,7 +264,8 @@ class _ScanPoses:
             from the grandparent to the parent, and so on; empty if the robot was not localised.
         mounts: For each frame of scans, the pose of the laser in the frame of the robot, and
             whether it hangs upside down.
-        by_stamp: Whether times are those of headers, instead of those of recording.
+        by_stamp: Whether times come from the headers of messages; otherwise, they are times of
+            recording.
     """
 
     odometry: TimedPoses

@@ -46,8 +46,8 @@ class ScanLine:
         ranges: (n,) ranges in metres.
         shape: Bearing of the first beam and step between beams in radians, and reach in metres;
             None if the line does not have them.
-        first: First pose, which is that of the laser or a corrected one; None without poses.
-        second: Second pose, which is that of the robot; None without poses.
+        first: First pose: the pose of the laser, or a corrected pose; None without poses.
+        second: Second pose: the pose of the robot; None without poses.
         time: Seconds; None if missing.
     """
 

@@ -85,8 +85,8 @@ def check(trace: Trace, ssh_map: SSHMap, theory: Theory | None = None) -> tuple[
     Returns:
         The violations; empty if the map is right. Violations of `map_explains_trace` come first:
         the map does not fit the trace, or its numbers do not fit each other. Violations of the
-        axioms follow in the order of the theory; those of axioms about regions come last. Axioms
-        of the user's own rules are skipped (`ssh_abduction.checker.checker.unchecked`).
+        axioms follow in the order of the theory. Violations of axioms about regions come last.
+        Axioms of the user's own rules are skipped (`ssh_abduction.checker.checker.unchecked`).
 
     Raises:
         TraceError, TheoryError: The trace lacks something that the theory needs.

@@ -40,10 +40,10 @@ FEW = 64
 class ErrorFilter:
     """Poses by dead reckoning, and the covariance of their errors.
 
-    Errors are those of the pose (x and y in metres, heading in radians), of the scale, and of the
-    drift of the heading. The arguments `first` and `last` of the methods are the steps at the ends
-    of m loops, as arrays of length m. For a single loop they may be two numbers; then the result
-    has no first axis.
+    The errors are errors of the pose (x and y in metres, heading in radians), of the scale, and of
+    the drift of the heading. The arguments `first` and `last` of the methods are the steps at the
+    ends of m loops, as arrays of length m. For a single loop they may be two numbers; then the
+    result has no first axis.
 
     Args:
         trace: The trace, with displacements.

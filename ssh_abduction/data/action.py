@@ -29,7 +29,7 @@ class Action:
         name: The name. Actions of a trace with the same name must be equal.
         kind: "travel", "turn", or None for other actions. A "lift" or "stairs" leads to another
             floor. "start" is no action of the robot: the next step begins another drive, and may be
-            anywhere. The name is then that of the drive.
+            anywhere. The name of the action is then the name of this drive.
         turn: The direction of a turn: "right", "left" or "around".
         extra: Fields of the trace file that this package does not know.
         gateway: For a turn right or left, the number of the gateway (way out of a place) that it

@@ -5,7 +5,7 @@
 >>> str(near)
 'the local maps of steps 3 and 19 match with an offset of 0.07 m'
 
-A closure does not say that the two steps are at one place. It says how far apart they are.
+A closure does not say that the two steps are at one place. It says how far apart the steps are.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Several drives through one building, as one trace.
 
-A *joint trace* has the steps of one drive after those of another. The last step of each drive but
-the last has an action of kind "start", which is named after the next drive. It is no action of the
-robot: nothing is known of how the first step of a drive relates to any step of another drive.
+A *joint trace* has the steps of several drives, one drive after the other. The last step of each
+drive but the last has an action of kind "start", which is named after the next drive. It is no
+action of the robot: nothing is known of how the first step of a drive relates to any step of
+another drive.
 
 >>> from ssh_abduction import Trace
 >>> monday = Trace.from_steps("ab", ["travel"], name="monday")

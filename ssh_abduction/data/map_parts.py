@@ -84,11 +84,12 @@ class Fault:
 
     Attributes:
         step: The step.
-        kind: "misread": the view of the step is not that of its dstate. "misseen": the star (the
-            gateways seen) is not that of its dstate. "slipped": the action did not do what its
-            name says, so no link joins this step and the next one. "jumped": the displacement
-            from the step before is wrong. "changed": a gateway was open on one drive and closed
-            on another. The step is the first of the later drive at the place.
+        kind: "misread": the view of the step differs from the view of its dstate. "misseen": the
+            star (the gateways seen) of the step differs from the star of its dstate. "slipped": the
+            action did not do what its name says, so no link joins this step and the next one.
+            "jumped": the displacement from the step before is wrong. "changed": a gateway was open
+            on one drive and closed on another. The step is the first of the later drive at the
+            place.
         seen: The view, the name of the action, or the displacement in words; None for a star. For a
             change, such as "closed on tuesday".
         expected: The view of the dstate if the view is misread. For a change, what an earlier drive

@@ -54,8 +54,8 @@ def explain_place(
         theory: The theory; Theory.topological() if None.
         time_limit: Seconds; None for no limit.
         memory_limit: MiB; None for no limit.
-        known: Maps of the trace that are known. The search begins with those that satisfy the
-            theory, so that the first map costs no more than they do.
+        known: Maps of the trace that are known. The search begins with the known maps that satisfy
+            the theory. So the first map costs no more than these maps.
 
     Returns:
         A reason for each side that is known, and the number of minimal maps that agree.

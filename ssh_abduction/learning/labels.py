@@ -169,9 +169,9 @@ def _followed(
 ) -> NDArray[np.intp]:
     """Follow a trace that may begin at any dstate. Return the dstate of each step, (m,).
 
-    `views` and `looks` are as in `labels_on`. Try each dstate as the first one. Drop those that
-    a later view contradicts. Take the one for which most images look like their dstates. After
-    an action for which the map has no link, dstates are unknown (-1) and contradict no view.
+    `views` and `looks` are as in `labels_on`. Try each dstate as the first one. Drop the dstates
+    that a later view contradicts. Take the dstate for which most images look like their dstates.
+    After an action for which the map has no link, dstates are unknown (-1) and contradict no view.
     All steps get -1 if two first dstates fit equally many images, or if the best one fits fewer
     than half of the steps with a known dstate.
     """

@@ -1,9 +1,9 @@
 """Does the second best number of views (the runner-up) give another map?
 
-A view is a cluster of images that look alike. The number of views is the one that separates the
-images best. No map shows whether this number is right: too few views give a map that is small,
-proven minimal, and wrong. So if a second number of views is nearly as good, the field `runner_up`
-of each step holds the step's view by that second number. The maps of both are then compared.
+A view is a cluster of images that look alike. The chosen number of views separates the images best.
+No map shows whether this number is right: too few views give a map that is small, proven minimal,
+and wrong. So if a second number of views is nearly as good, the field `runner_up` of each step
+holds the step's view by that second number. The maps of both are then compared.
 """
 
 from __future__ import annotations

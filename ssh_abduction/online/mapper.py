@@ -39,9 +39,9 @@ A theory that depends on the trace ---------------------------------- Two parts 
 on the whole trace, and may change as it grows. First, displacements are used as soon as there is
 one; from then on, places are minimised before paths. Second, the probability of rejecting a true
 map is shared among all returns that may be true. Their number is rounded up to a power of two, so
-that it changes only when it doubles. When one of the two parts changes, the minimal maps so far may
-not be minimal any more, so clingo searches again. If the number of returns has grown, fewer maps
-are rejected, so the maps so far serve as drafts.
+that it changes only when it doubles. When one of these two parts of the theory changes, the minimal
+maps so far may not be minimal any more, so clingo searches again. If the number of returns has
+grown, fewer maps are rejected, so the maps so far serve as drafts.
 
 When time is short ------------------ A map that predicts the step is minimal even if there is no
 time to look for others. When no map predicts the step and time is short, the answer is *feasible*:

@@ -99,7 +99,7 @@ def next_experiment(
         theory: The theory of the maps. It sets how stars are compared, and which axioms imply where
             untried actions lead. If None, stars are used unless a map has a dstate with two stars.
         complete: Whether these are all minimal maps.
-        actions: Actions that the robot can do, in addition to those that some map has a link for.
+        actions: Actions that the robot can do, in addition to the actions of links of the maps.
         can: A function from what the robot sees to the names of the actions that it can do there.
             If None, the robot can do any action that the star allows.
         implied: Whether the experiment may use links that no rival has but that the axioms imply.

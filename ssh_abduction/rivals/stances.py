@@ -59,7 +59,7 @@ class Stances:
     Args:
         trace: The trace of the map.
         theory: The theory of the map.
-        actions: Actions that the robot can do, in addition to those of the trace.
+        actions: Actions that the robot can do, in addition to the actions of the trace.
         can: A function from what the robot sees to the names of the actions that it can do there.
             If None, the robot can do any action that the star (the openings seen) allows.
     """

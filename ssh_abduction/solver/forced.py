@@ -8,13 +8,14 @@ If this sum is T or more, then every map of a cost below T has the join, and F g
 misfit of F is greater, and more dstates and places are needed without a further join. If the misfit
 of F plus the prices is T or more, then no map costs less than T.
 
-The joins are those of the best known map. If F gets no further join, assume that a map lacks a
-certain one, and find what all cheap maps without it have. If no map without it costs less than T, F
-gets it. This is a branch and bound with few branches: one of the two sides always ends.
+Only joins of the best known map are tried. If F gets no further join, assume that a map lacks a
+certain join, and find what all cheap maps without this join have. If no map without it costs less
+than T, F gets it. This is a branch and bound with few branches: one of the two sides always ends.
 
 *Counts.* Two visits that cannot be at one place are apart. If the same action leads from two visits
-to visits that are apart, these two are apart, too (`steps/chart.py`). Visits that F joins are apart
-from the same visits. A clique of dstates, or of places, is a lower bound on their number.
+to visits that are apart, these two are apart, too (`steps/chart.py`). Visits that are at one place
+by F are apart from the same visits. A clique of dstates, or of places, is a lower bound on their
+number.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Lay new drives on the map of old drives, in about the time that solving the new drives takes.
 
-This needs displacements. No search of all drives follows, so the joint map is not proven to be the
-one of least cost.
+This needs displacements. No search of all drives follows, so it is not proven that the joint map
+has the least cost.
 """
 
 from __future__ import annotations

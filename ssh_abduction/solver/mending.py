@@ -16,8 +16,9 @@ was guessed to be wrong may agree with the map after all. Then it is no fault of
 *Bound.* A map of the theory, without its places, is a causal map with the same dstates and with no
 more faults. So a lower bound for the causal theory holds here. If a mended trace has a map that
 costs no more than this bound, its dstates and faults are minimal. If all cheapest causal maps are
-listed, each minimal map of the theory has the labels and faults of one of them. So solve all traces
-that the cheapest causal maps mend. The best of their minimal maps are the complete answer.
+listed, each minimal map of the theory has the labels and faults of one of these causal maps. So
+solve all traces that the cheapest causal maps mend. The best of their minimal maps are the complete
+answer.
 """
 
 from __future__ import annotations

@@ -6,8 +6,8 @@ pose (for a dstate) or one position (for a place, `solver/fit.py`). More returns
 So a set of returns never has a smaller misfit than a part of the set, and a map never has a smaller
 misfit than a set of its returns.
 
-Laying drives on each other has a price (`theory/overlap.py`), and more returns never lower it. So
-twice this price is a part of the misfit.
+Places that drives have in common cost a price (`theory/overlap.py`), and more returns never lower
+it. So twice this price is a part of the misfit.
 
 A visit to a place has several steps, as turns stay at their place. So these steps have one position
 in each topological map, also without a return. But if displacements may be wrong, the

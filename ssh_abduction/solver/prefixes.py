@@ -12,9 +12,9 @@ cost.
 
 *Proof.* (1) A map of the trace that is cut down to the prefix is a map of the prefix. Every axiom
 forbids a pattern of links, observations and names, and a cut only removes patterns. Some axioms
-demand a course, an order, a side or a heading: the cut map keeps those of the whole map. If only a
+demand a course, an order, a side or a heading: the cut map has the same as the whole map. If only a
 later travel supports a course, the cut drops both. A cut adds no dstate, place, path or excuse, so
-no count grows. Therefore the minimum of the prefix is a lower bound on that of the trace.
+no count grows. So the minimum of the prefix is a lower bound on the minimum of the trace.
 (2) A map that replays to the end has the same links and observations over the whole trace as over
 the prefix. The axioms read nothing else, so the replayed map satisfies them, and it costs c. By
 (1), c is the minimum.

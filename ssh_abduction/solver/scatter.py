@@ -18,8 +18,8 @@ its share, and the other one nothing. All these losses are at most quadratic for
 numbers c are chosen so small that the sum of the forms is at most |z|^2 / 2. So bending costs more
 than it saves. A point whose losses are greater than its share is left out.
 
-*Pieces.* Displacements and closures tie some steps to each other. Steps that they do not tie, as
-those of two drives, may have any relative pose. A facility that serves several such pieces saves in
+*Pieces.* Displacements and closures connect some steps. Steps that are not connected, such as the
+steps of two drives, may have any relative pose. A facility that serves several such pieces saves in
 each piece at most what the best facility of this piece saves. So for each kind of points only those
 of one piece get shares.
 

@@ -89,8 +89,8 @@ def cost_as_counted(ssh_map: SSHMap, cost: tuple[int, ...], theory: Theory) -> C
     """Return the cost of a map, with the counts that the theory minimises taken from clingo.
 
     Without some axioms, a dstate may have several places or paths, but a map shows only one. Then
-    clingo counts more than the map shows. If maps are compared by their cost in nats, maps
-    of one cost may have different counts. Then the counts are those of the map.
+    clingo counts more than the map shows. If maps are compared by their cost in nats, maps of one
+    cost may have different counts. Then the result has the counts of the map.
 
     Args:
         ssh_map: The map.

@@ -1,4 +1,4 @@
-"""What weighing the maps of a trace has found: costs in nats, rival maps, and probabilities.
+"""Results of comparing the maps of a trace by cost: costs in nats, rivals, and probabilities.
 
 The cost of a map is the sum of the prices of its dstates, places and paths, and half of the
 chi-square of its misfit to the displacements. A nat is the unit of natural logarithms: of two maps,

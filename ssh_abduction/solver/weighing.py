@@ -1,16 +1,17 @@
 """Find the maps of least cost, and prove that none costs less.
 
 The cost of a map in nats is the sum of the prices of its dstates, places, paths and faults, plus
-half of the chi-square of its misfit to the displacements (`misfit.py`). The price of a fault is
-that of some dstates.
+half of the chi-square of its misfit to the displacements (`misfit.py`). The price of a fault is a
+multiple of the price of a dstate.
 
 *The search* is a logic-based Benders decomposition (Hooker & Ottosson 2003). Clingo finds the map
-with the fewest dstates, and among these the fewest places and paths. It does not know the misfit.
-If the misfit of some returns of this map makes each map with these returns too expensive, clingo
-gets a rule that excludes maps with all of them. Then it finds the next map. The number of dstates
-never falls from map to map. So the prices of the last map are a lower bound on the cost of all maps
-that are left. The search ends when this bound reaches the cost of the best map. If displacements
-may be wrong, a misfit excludes only maps that believe the displacements that cause it.
+with the fewest dstates, and among these the fewest places and paths. Clingo does not compute the
+misfit. If the misfit of some returns of this map makes each map with these returns too expensive,
+clingo gets a rule that excludes maps with all of them. Then it finds the next map. The number of
+dstates never falls from map to map. So the prices of the last map are a lower bound on the cost of
+all maps that are left. The search ends when this bound reaches the cost of the best map. If
+displacements may be wrong, a misfit excludes only maps that believe the displacements that cause
+it.
 
 *Rivals.* A map is too expensive if it costs at least `WITHIN` nats more than the best one. So all
 cheaper maps are found, each with a probability proportional to exp(-cost).

@@ -1,9 +1,9 @@
 """Compute the price of laying drives on each other, which is part of the cost of a joint map.
 
 Nothing is known of where a drive starts. So it can be laid on a map of other drives in very many
-ways, and in some of these ways a place or two look the same by chance. Closures tie some drives
-into groups. A map pays the price each time that common places join two groups. So drives are joined
-only if they have more in common than chance explains.
+ways, and in some of these ways a place or two look the same by chance. Closures (matches of local
+maps) connect some drives to groups. A map pays the price each time that common places connect two
+groups. So drives share places only if they have more in common than chance explains.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class Overlap:
     """Computes the price of laying the drives of one trace on each other."""
 
     def __init__(self, trace: Trace, theory: Theory) -> None:
-        """Find the drives that closures join.
+        """Find the drives that closures connect.
 
         Args:
             theory: The theory, which has the price.
@@ -33,11 +33,11 @@ class Overlap:
         self._tied = _joined(range(len(starts) + 1), closures)  # a group for each drive
 
     def is_tied(self, drive: int) -> bool:
-        """Whether closures tie a drive, given by its number, to others."""
+        """Whether closures connect a drive, given by its number, to others."""
         return self._tied.count(self._tied[drive]) > 1
 
     def nats(self, at: Sequence[Hashable]) -> float:
-        """Return the price of joining drives that have places in common.
+        """Return the price of the claim that drives have these places in common.
 
         Args:
             at: The place of each step, or of each of the first steps; without places, its dstate.
@@ -47,7 +47,7 @@ class Overlap:
         return self._price * (len({*self._tied}) - groups_of(at, self._drive, self._tied))
 
     def of_steps(self, labels: Sequence[int], places: Sequence[Hashable]) -> float:
-        """Return the price by the dstates of the first steps and the places of dstates."""
+        """Return the price for the dstates of the first steps and the places of dstates."""
         return self.nats([places[s] for s in labels]) if len(self._tied) > 1 else 0.0
 
     def of_map(self, ssh_map: SSHMap) -> float:
@@ -56,7 +56,7 @@ class Overlap:
         return self.of_steps(ssh_map.dstate_at, places)
 
     def between(self, some: Collection[int], others: Collection[int]) -> float:
-        """Return the price of joining two pieces of a map, given by their steps."""
+        """Return the price of a common place of two pieces of a map, given by their steps."""
         groups = [{self._tied[self._drive[t]] for t in steps} for steps in (some, others)]
         return 0.0 if groups[0] & groups[1] else self._price
 

@@ -228,11 +228,11 @@ class FramedEngine:
 def maps_with_frames(problem: Problem, watch: Watch, speedups: Speedups) -> Iterator[SSHMap]:
     """Yield ever cheaper maps in which places have frames, for a theory with star=pattern.
 
-    In a frame, the directions at a place are multiples of one angle, such as 90 degrees.
-    With star=pattern clingo gets all axioms for each step, and only manages a few dozen steps. With
+    In a frame, the directions at a place are multiples of one angle, such as 90 degrees. With
+    star=pattern clingo gets all axioms for each step, and only manages a few dozen steps. With
     frames, a good map of thousands of steps takes seconds. Each map of `Theory.with_frames` is also
-    a map of the theory with star=pattern. So if the world has frames, this finds the true map or
-    one that is about as small.
+    a map of the theory with star=pattern. So if the world has frames, this finds the true map or a
+    map that is about as small.
     """
     task = Task.of(problem.changed(theory=problem.theory.with_frames()), watch, speedups)
     engine = FramedEngine(task)

@@ -24,7 +24,7 @@ Not every step is needed. Clingo starts with the links of the pinned steps. Each
 along the trace, and the links that it does not explain are added, until it explains all links
 (`engines/name_program.py`). If clingo does not answer soon, it gets all links, or some at a time if
 the trace is long. A very long trace is charted only up to a step at which the clique is as large as
-that of all steps.
+the clique of all steps.
 
 The search for the fewest dstates is in `engines/name_search.py`.
 

@@ -83,8 +83,8 @@ def apart_yet_joined(
 
     Each triple includes both visits of `pair`, which are at one place, and reads (first, (middle,
     slot), (last, slot)). The middle visit is at one place with each of the others. The pair of the
-    first and the last visit is missing, or differs in its slot. Each slot is that of its visit
-    which is slot 0 of the first visit.
+    first and the last visit is missing, or differs in its slot. Each slot is given as the slot of
+    this visit that is slot 0 of the first visit.
     """
     i, j, r = pair
     of_i, of_j = turned[i], turned[j]

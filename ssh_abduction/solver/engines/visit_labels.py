@@ -18,8 +18,8 @@ that it learned, still hold. When the number of nodes has grown by a tenth, a ne
 with a new clique.
 
 *Transitivity.* If visits I and J are at one place, and J and K, then so are I and K. Clingo gets
-this rule only for visits at which an answer violates it (`engines/transitive.py`). Until then
-clingo solves a relaxation, so its bounds hold.
+this rule only for visits at which an answer violates it (`engines/transitive.py`). Without these
+rules clingo solves a relaxation, so its bounds hold.
 
 *Few visits.* Of a long trace, clingo first gets the visits of the clique, and some of the first
 visits, such that few pairs of them may be at one place. Mostly an answer also determines the places

@@ -6,7 +6,7 @@ other. An anchor is good if many other dstates then coincide with dstates that s
 that cross may share places, but no dstate. So an anchor may also be two places whose stars agree if
 one map is turned. It is good if many other places then coincide with places that may be one. The
 two maps with the best anchor are joined first: `overlaying.py` merges the places and dstates that
-coincide. Then the joint map may be joined to others. Maps that no anchor joins stay pieces. Some
+coincide. Then the joint map may be joined to others. Maps that no anchor connects stay pieces. Some
 of the maps may be the pieces of a map of old drives that must be kept.
 
 Reference:

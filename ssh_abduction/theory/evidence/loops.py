@@ -70,7 +70,7 @@ class Loops:
 
     Attributes:
         poses: Poses by dead reckoning, n x 3, in metres and radians. After a missing displacement,
-            the pose is that of the step before.
+            the pose is the same as at the step before.
         part: For each step, the number of missing displacements up to it. If a displacement on a
             loop is missing, nothing is known about the loop.
         moments: Sums over the displacements up to each step, n x 17. They give covariances.

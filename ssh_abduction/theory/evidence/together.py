@@ -13,9 +13,9 @@ of six equations for each pair takes minutes. So most pairs are accepted by an u
 joint chi-square. Let s be the largest singular value of S1^-1/2 C S2^-1/2. The eigenvalues of the
 whitened matrix are at least 1 - s, so the joint chi-square is at most (z1 + z2) / (1 - s).
 
-C comes from the errors that both loops share: those of some displacements, and those that repeat.
-If these errors contribute F to S1, then s squared is at most the largest eigenvalue of S1^-1 F. A
-first bound on this eigenvalue is the trace of the matrix. The matrix trace is a sum over
+C comes from the errors that both loops share: errors of common displacements, and errors that
+repeat. If these errors contribute F to S1, then s squared is at most the largest eigenvalue of
+S1^-1 F. A first bound on this eigenvalue is the trace of the matrix. The matrix trace is a sum over
 displacements, so two look-ups in a table give it. Pairs that the first bound does not accept are
 few. For these, there is a sharper bound (Wolkowicz & Styan 1980, "Bounds for eigenvalues using
 traces").

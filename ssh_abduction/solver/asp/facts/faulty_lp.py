@@ -76,10 +76,10 @@ def faulty_batch(
 ) -> str:
     """Return the facts for a batch: some further steps of a trace.
 
-    `seen` has the view of each step, and `actions` the action after it, as numbers. `steps` are
-    those of this batch, and `known` those of earlier ones, in the order in which they are given.
-    `price` has, for each kind of fault, its cost at each step, in tenths of a dstate. At `full`
-    steps an answer names the dstate even if they are misread.
+    `seen` has the view of each step, and `actions` the action after it, as numbers. `steps` are the
+    steps of this batch, and `known` the steps of earlier batches, in the order in which clingo got
+    them. `price` has, for each kind of fault, its cost at each step, in tenths of a dstate. At
+    `full` steps an answer names the dstate even if they are misread.
     """
     given = {*known, *steps}
     new = set(steps)

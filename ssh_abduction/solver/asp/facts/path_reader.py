@@ -2,7 +2,7 @@
 
 These encodings get dstates and links as input, and find places and paths for them. Travels and
 turns around join dstates to *segments*, which are parts of paths. Several segments may be one path.
-In the same way turns join dstates to small places, and several of these may be one place of the
+In the same way turns connect dstates to small places, and several of these may be one place of the
 map.
 """
 

@@ -1,7 +1,7 @@
 """Write facts for `fast/paths_framed.lp` and `fast/paths_frameless.lp`, and read their answers.
 
 These encodings find places and paths for fixed labels (the dstate of each step or node). A *node*
-is the steps of one visit that face the same way. Travels and turns around join dstates to
+is the steps of one visit that face the same way. Travels and turns around connect dstates to
 *segments*, which are parts of paths. Several segments may be one path.
 """
 
@@ -151,7 +151,8 @@ class Segments:
     """What paths_frameless.lp derives about places and segments before it merges any.
 
     Attributes:
-        places: The places that turns join. Several of them may be one place of a map.
+        places: The places whose dstates are connected by turns. Several of them may be one place of
+            a map.
         elsewhere: Pairs of these places that are different places of every map.
         travels: Triples of a segment and two places: in the direction of the segment, a travel
             leads from the first place to the second.
