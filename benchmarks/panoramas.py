@@ -178,7 +178,7 @@ class Found:
 
 
 class Rotated(TransformerMixin, BaseEstimator):  # type: ignore[misc]
-    """Features in the space that the fitted images span, which has at most one dimension an image.
+    """Features in the space that the fitted images span, which has at most one dimension per image.
 
     Distances between the fitted images stay the same, and k-means is about ten times as fast.
     """

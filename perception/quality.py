@@ -60,7 +60,7 @@ SAMPLE = 2_000
 # If the median cluster has at least SEEN images, trimmed M ignores the width of clusters of at most
 # FEW images, because clusterers often put two unusual images that differ into one cluster.
 SEEN, FEW = 6, 2
-# Number of pairs of images recomputed from differences at once; 12 MB for 180 ranges an image.
+# Number of pairs of images recomputed from differences at once; 12 MB for 180 ranges per image.
 GATHERED = 8192
 
 

@@ -195,7 +195,7 @@ def test_the_uncertainty_of_a_point_is_that_of_all_increments() -> None:
 def test_a_visit_is_matched_with_a_bounded_number_of_earlier_ones(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """With one match a visit, it is the nearest one: another pass of the same fork."""
+    """With one match per visit, it is the nearest one: another pass of the same fork."""
     _, track, visits, patches = rounds()
     every = find_closures(track, visits, patches, 2 * WINDOW)
     asked: list[Scene] = []

@@ -1,7 +1,7 @@
 """Imports a log while it is read or recorded.
 
 The scans are processed one at a time. Only the track, the visits with their local maps, and about
-400 bytes a scan for the checks at the end are kept.
+400 bytes per scan for the checks at the end are kept.
 
 The first scans wait until the units of the odometry are recognised. Then the scans get the checks
 of a whole log, but in stretches of 1,600 scans. Each stretch is checked four times: when it has

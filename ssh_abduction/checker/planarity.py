@@ -178,7 +178,8 @@ class Edges:
         )
 
     def _gateways(self) -> dict[Arm, Arm] | None:
-        """Find the arms that are one gateway: a dict from each arm to the arm that represents it.
+        """Find the arms (ahead of a dstate, or behind it) that are one gateway: a dict from each
+        arm to the arm that represents it.
 
         A turn around faces what was behind. A gateway leads to one gateway, so if two arms are one,
         the arms at their far ends are one. None if a gateway leads to two places.
@@ -230,7 +231,7 @@ class Edges:
         return False
 
     def _is_drawing(self, position: Option) -> bool:
-        """Tell whether a drawing exists for the travels whose arms both have a position.
+        """Tell whether travels whose two arms (gateways at their ends) are placed can be drawn.
 
         Each gateway has to be joined to one other, and V - E + F = 2 for each connected part.
         """

@@ -129,7 +129,7 @@ class MapKeeper:
         return self._solution(began)
 
     def _ask(self) -> None:
-        """Search for minimal maps with clingo, and keep them, or the best map as a draft."""
+        """Search for minimal maps with clingo. Keep them, or the best map to extend it later."""
         known = self.minimal.maps[0].map() if self.minimal.status is Status.OPTIMAL else None
         found = self.solver.maps(self.trace, self.theory, known)
         said = self.solver.solution
@@ -235,7 +235,7 @@ class IncrementalSolver:
 
 @dataclass(slots=True)
 class Draft:
-    """A sketch, with the progress of testing it against the evidence.
+    """A sketch (a map made without a search), and how far the evidence has tested it.
 
     Attributes:
         sketch: The sketch.
@@ -247,7 +247,7 @@ class Draft:
 
 
 class Drafts:
-    """Keeps drafts and sketches of the steps so far.
+    """Keeps drafts and sketches: maps of the steps so far that were made without a search.
 
     Args:
         problem: The steps so far, and the theory, in which no field is "auto".
@@ -278,16 +278,16 @@ class Drafts:
         return bool(self._drafts)
 
     def maps(self) -> list[SSHMap]:
-        """Return the maps of all drafts, the best first. They need not be consistent."""
+        """Return the maps of all drafts, the best first. These maps need not be consistent."""
         return [draft.sketch.map() for draft in self._drafts]
 
     def follow(self, action: Action, step: Step) -> None:
-        """Extend drafts and sketches by a step, and drop those that it contradicts."""
+        """Extend drafts and sketches by a step, and drop those that the step contradicts."""
         self._drafts = [draft for draft in self._drafts if draft.sketch.extend(action, step)]
         self._sketches = [draft for draft in self._sketches if draft.sketch.extend(action, step)]
 
     def add(self, ssh_map: SSHMap, trace: Trace) -> None:
-        """Make a draft of a map of the first steps, unless the later steps contradict it."""
+        """Extend a map of the first steps to a draft of all steps, unless a step contradicts it."""
         if not self._may_sketch:
             return
         known = len(ssh_map.dstate_at)
@@ -317,11 +317,11 @@ class Drafts:
         return None
 
     def _cost(self, draft: Draft) -> tuple[int, ...]:
-        """Count what the theory minimises in a draft."""
+        """Return the counts that the theory minimises, for the map of a draft."""
         return Cost.of(draft.sketch.map()).preferred_by(self._theory)
 
     def _is_consistent(self, draft: Draft, trace: Trace, pairs: Pairs) -> bool:
-        """Whether a draft satisfies the evidence and all other axioms."""
+        """Whether the map of a draft satisfies the evidence and all other axioms."""
         sketch, steps = draft.sketch, len(trace)
         if self._has_evidence and draft.passed < steps:
             ssh_map = sketch.map()

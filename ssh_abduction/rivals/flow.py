@@ -151,7 +151,7 @@ def shortest_flow(
 
 
 def _parts_cut_off(used: Sequence[StanceMove], start: int) -> list[set[int]]:
-    """Find the connected parts of a flow without the start (a stance), as sets of stances."""
+    """Find the connected parts of a flow without its start, as sets of stances (place, heading)."""
     near = reached_from(used, start)
     left = [move for move in used if move.source not in near]
     parts: list[set[int]] = []
@@ -168,7 +168,7 @@ def _parts_cut_off(used: Sequence[StanceMove], start: int) -> list[set[int]]:
 def nearest_of(
     moves: Sequence[StanceMove], start: int, due: set[int], unseen: set[int]
 ) -> tuple[str, ...]:
-    """Find the shortest way to make one required move or to visit one required stance.
+    """Find the shortest way to one required move or stance (a place and a heading).
 
     Parameters as in `shortest_walk`. Return the names of the actions; empty if there is no way.
     """
@@ -191,7 +191,7 @@ def nearest_of(
 
 
 def reached_from(moves: Iterable[StanceMove], start: int) -> set[int]:
-    """Find all stances that moves lead to from `start`, including `start`."""
+    """Find all stances (place, heading) that moves lead to from `start`, and `start`."""
     return followed_from(((move.source, move.target) for move in moves), start)
 
 

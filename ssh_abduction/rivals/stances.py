@@ -95,7 +95,7 @@ class Stances:
         self._back: dict[int, int] = {}  # where a travel from a stance leads if it leads back
 
     def moves(self) -> list[StanceMove]:
-        """List all moves from all stances. The call adds stances that were never seen."""
+        """List all moves from all stances (place, heading). This adds stances never seen before."""
         for source, tried in self._links.items():
             for name, target in tried.items():
                 if (
@@ -143,7 +143,7 @@ class Stances:
         return [at[n] for n in sorted(at)]
 
     def _possible(self, n: int) -> list[Action]:
-        """List the actions possible in stance n, by the turned star if it was never seen."""
+        """List the possible actions in stance n, from the turned star if n was never seen."""
         if n < len(self._looks):
             step = self._looks[n]
             seen = Seen(step.view, step.star if self._stars[n] else None)
@@ -189,7 +189,7 @@ class Stances:
         )
 
     def _around(self, n: int) -> int:
-        """Find the stance that a turn around leads to from stance n."""
+        """Find the stance (place and heading) that a turn around leads to from stance n."""
         degrees = _degrees(AROUND, self._frames[n])
         assert degrees is not None
         return self._turned(n, degrees)

@@ -111,7 +111,7 @@ class Candidates:
         yield from filter(self._judging.accepts, map(self._with_unknown_views, joining.maps()))
 
     def go_on(self, beam: Beam) -> None:
-        """Offer a sketch that begins with the longest map of a beam that later steps allow."""
+        """Offer a map that extends the longest map of a beam that later steps allow."""
         before = self._known.best
         for first in beam.partial():
             done = self._task.trace.prefix(len(first.dstate_at))
@@ -154,7 +154,8 @@ class Candidates:
                     return
 
     def sketch_least(self) -> bool:
-        """Offer a sketch that has only as many dstates as there are pairwise distinct steps.
+        """Offer a sketch (a map without a search) with no more dstates than pairwise distinct
+        steps.
 
         No map has fewer dstates. Such a sketch exists if the robot drives there and back and most
         views are different. Clingo then only has to find the fewest places and paths. Returns
@@ -182,7 +183,7 @@ class Candidates:
         return False
 
     def _attempts(self, beams: bool) -> list[Callable[[], None]]:
-        """List functions that each make one sketch. Those that make small maps come first."""
+        """List functions that each make a map without a search. Those for small maps come first."""
         trace, theory = self._task.trace, self._task.theory
         known = self._known.partial if trace is self._trace else None
         broad = [partial(self._offer_beam, width) for width in (BROAD, 1) if beams]
@@ -201,14 +202,14 @@ class Candidates:
                 self.offer(ssh_map)
 
     def _go_on_to_end(self, sketch: Sketch) -> None:
-        """Extend a sketch to the end of the trace and offer it, unless a step contradicts it."""
+        """Extend a map to the end of the trace and offer it, unless a step contradicts it."""
         if (wrong := first_contradiction(sketch, self._task.trace)) is None:
             self.offer(sketch.map())
         else:
             self.contradicting[wrong] = None
 
     def _offer_mended(self) -> None:
-        """Offer a sketch of the trace, mended where a step contradicts the sketch."""
+        """Offer a map made without a search. Treat steps that contradict it as wrong."""
         if ssh_map := mended_sketch(self._task.trace, self._task.theory):
             self.offer(ssh_map)
 

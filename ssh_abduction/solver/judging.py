@@ -86,7 +86,7 @@ class Judging:
         return accepted
 
     def accepts_grown(self, ssh_map: SSHMap, since: int) -> bool:
-        """Do the same for a map whose first `since` steps the evidence has accepted already."""
+        """Accept a map as `accepts` does. The evidence accepted its first `since` steps already."""
         return (
             self.can_accept
             and next(violations(self._trace, ssh_map, self._theory), None) is None

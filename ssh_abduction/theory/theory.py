@@ -433,7 +433,7 @@ class Theory:
 
     @classmethod
     def from_toml(cls, path: str | os.PathLike[str]) -> Theory:
-        """Read a theory from a TOML file with one field a line, such as `star = "frame"`.
+        """Read a theory from a TOML file with one field per line, such as `star = "frame"`.
 
         Args:
             path: The file. A line such as `preset = "causal"` names the preset that the other

@@ -42,7 +42,7 @@ PREPARING = (1.6, 2.1)
 
 @dataclass(frozen=True)
 class NodeLabels:
-    """The dstates of the nodes of a chart, and a clingo control for paths; None to make one."""
+    """The dstate of each node of a chart, and a clingo control for paths; None to make one."""
 
     chart: FramedChart
     labels: Sequence[int]
@@ -150,7 +150,7 @@ class FramedPaths:
         return control
 
     def _control(self, chart: FramedChart, facts: str, options: Sequence[str] = ()) -> Control:
-        """Make a control with the axioms and facts of a chart. Nothing is grounded yet."""
+        """Make a clingo control with the axioms and facts of a chart. Nothing is grounded yet."""
         control = Control(options, self.task.watch.check, PREPARING)
         control.load_encodings("paths_framed")
         trace, theory = self.task.trace, self.task.theory

@@ -68,7 +68,7 @@ def homes_of(segments: Segments) -> Mapping[int, list[int]] | None:
 
 
 def fewest_paths(segments: Segments) -> int:
-    """Return a lower bound on the number of paths, from pairwise distinct segments."""
+    """Return a lower bound on the number of paths: segments known to be on different paths."""
     return len(pairwise_distinct(segments.segments, segments.distinct))
 
 

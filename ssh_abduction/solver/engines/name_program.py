@@ -114,7 +114,7 @@ class NameProgram:
 
     @property
     def has_all_links(self) -> bool:
-        """Whether clingo has all links of the chart."""
+        """Whether clingo has all links between the nodes of the chart."""
         return len(self._known.links) == len(self.chart.links)
 
     def give_links(self, links: Iterable[Link]) -> None:

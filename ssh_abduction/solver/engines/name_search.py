@@ -44,7 +44,7 @@ class Incumbent:
 
 
 class NameSearch:
-    """The search for the fewest dstates of one chart."""
+    """The search for labels of the nodes of one chart with the fewest dstates."""
 
     def __init__(
         self,

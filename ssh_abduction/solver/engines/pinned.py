@@ -14,7 +14,7 @@ from ssh_abduction.solver.steps.log import Log
 
 @dataclass(frozen=True)
 class Pinned:
-    """A chart and a clique of its nodes, which are pinned to the names 0, 1, and so on.
+    """A chart, and a clique of its nodes: pairwise distinct nodes, which get the names 0, 1, ….
 
     Attributes:
         clique: Nodes that are pairwise distinct.

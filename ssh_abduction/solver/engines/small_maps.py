@@ -33,7 +33,7 @@ class SmallMaps:
     """Finds small maps of first steps by merging and guessing, for a search that stops early."""
 
     def __init__(self, task: Task, pinned: Pinned) -> None:
-        """Prepare for a chart of the first steps, each of them a node."""
+        """Prepare for a chart in which each of the first steps is a node."""
         self._task, self._pinned = task, pinned
 
     def merged(self) -> Iterator[list[int]]:

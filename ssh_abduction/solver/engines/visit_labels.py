@@ -63,7 +63,7 @@ class VisitLabels:
         asker: Asker,
         sides: FramedSides,
     ) -> None:
-        """Begin without any steps. `sides` adds axioms to each new control and batch."""
+        """Begin without any steps. `sides` adds axioms to each new control and batch of visits."""
         self.bound: int | None = None
         self.clique: list[int] = []
         self.size = 0

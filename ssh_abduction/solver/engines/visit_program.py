@@ -57,7 +57,7 @@ class VisitProgram:
     """
 
     def __init__(self, task: Task, asker: Asker, chart: FramedChart, sides: FramedSides) -> None:
-        """Make a control without visits. `sides` adds axioms to it and to each batch."""
+        """Make a control without visits. `sides` adds axioms to it and to each batch of visits."""
         self.chart = chart
         self.batch = -1
         self._asker, self._trace, self._sides = asker, task.trace, sides
@@ -88,7 +88,7 @@ class VisitProgram:
     def give(
         self, chart: FramedChart, visits: set[int], order: Iterable[int], fits: frozenset[Pair]
     ) -> None:
-        """Give clingo a new batch: all that it lacks about these visits.
+        """Give clingo a new batch: everything about these visits that it does not have yet.
 
         The visits include those that it has already. `order` has nodes in the order of choice;
         those new to clingo come after all others. `fits` are the pairs of these visits that may be

@@ -66,7 +66,7 @@ STEPS = (0.75, 1500), (0.75, 500)
 # There is no guess at steps if their transitions have more entries than this, of 12 bytes: 720 MB.
 ENTRIES = 60_000_000
 # Nor if the table of transitions (states x actions x states) has more entries than this. It is
-# built for each sweep, with some 20 bytes an entry: 40 MB.
+# built for each sweep, with some 20 bytes per entry: 40 MB.
 TABLE = 2_000_000
 # The guess is the best attempt so far after this many seconds.
 SECONDS = 10.0

@@ -43,7 +43,7 @@ _Seen = tuple[int, Star]
 
 
 def sketches_of(first: Step, theory: Theory) -> list[Sketch]:
-    """Make a sketch of each kind. Kinds that usually give smaller maps come first."""
+    """Make a sketch (a map without a search) of each kind, those with small maps first."""
     if _is_gated(theory):
         return [GatewaySketch(first, theory, homing) for homing in (True, False)]
     return Sketch.all_of(first, theory)
@@ -84,7 +84,7 @@ class _PlaceSights:
 
 
 class GatewaySketch(Sketch):
-    """A sketch of a trace with stars of any number of gateways, begun with its first step.
+    """A sketch (a map made without a search) for stars with any number of gateways.
 
     If `homing`, a travel may lead back to the place that the robot came from, even if it may lead
     to a new place.

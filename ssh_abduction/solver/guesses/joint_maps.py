@@ -110,7 +110,7 @@ class Joining:
             yield from self._beside(best)
 
     def _all_joined(self, parts: list[Part], anchors: _Anchors, start: _Pair) -> list[Part]:
-        """Join maps, first the pair `start`, then those with the best anchor, while any can be."""
+        """Join maps: first the pair `start`, then pairs with the best anchor (way to lay them)."""
         pair = start
         while anchors:
             ways = anchors.pop(pair)
@@ -142,7 +142,7 @@ class Joining:
         return Part.of(beam.best, drive.first, self._log, self.sights)
 
     def _anchors(self, first: Part, second: Part) -> list[_Anchor]:
-        """List anchors of two maps, the best one first."""
+        """List the anchors (ways to lay one map on the other) of two maps, the best first."""
         look_at_clock()
         changes = np.array(
             [[self.sights.merged(seen, other) for other in second.sights] for seen in first.sights]
@@ -157,7 +157,7 @@ class Joining:
     def _by_dstates(
         self, first: Part, second: Part, changes: Array, near: float
     ) -> Iterator[_Anchor]:
-        """Yield anchors that make two dstates of two maps one.
+        """Yield ways to lay one map on another that make two dstates one.
 
         `changes` has, for each place of the first map and each of the second, what changed gateways
         cost if they are one place; inf if they cannot be. Dstates coincide if they are nearer than
@@ -182,7 +182,7 @@ class Joining:
     def _by_places(
         self, first: Part, second: Part, same: NDArray[np.bool_], near: float
     ) -> list[_Anchor]:
-        """List the best anchors that make two places of two maps one, by the gateways there.
+        """List the best ways to lay one map on another that make two places one, by gateways.
 
         One pair of coinciding places is too little evidence, unless no other pair may be one.
         `same` tells whether each place of the first map may be each place of the second. Places
@@ -205,7 +205,7 @@ class Joining:
         return sorted((way for way in found if way.good >= least), reverse=True)[:CROSSED]
 
     def _joined(self, first: Part, second: Part, ways: Sequence[_Anchor]) -> Part | None:
-        """Join two maps by the cheapest anchor that breaks no axiom; None if apart is cheaper."""
+        """Join two maps in the cheapest way that breaks no axiom; None if apart is cheaper."""
         found: list[Part] = []
         overlay = Overlay(first, second, self._problem, self.sights)
         for way in ways:

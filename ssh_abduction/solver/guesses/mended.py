@@ -56,7 +56,7 @@ def mended_sketch(trace: Trace, theory: Theory) -> SSHMap | None:
 
 
 def first_contradiction(sketch: Sketch, trace: Trace) -> int | None:
-    """Extend a sketch to the end of a trace, or return the step that contradicts it."""
+    """Extend a map to the end of a trace, or return the step that contradicts it."""
     done = len(sketch.labels)
     later = each_looking(zip(trace.actions[done - 1 :], trace.steps[done:], strict=True))
     reaches_end = all(sketch.extend(action, step) for action, step in later)
@@ -64,7 +64,7 @@ def first_contradiction(sketch: Sketch, trace: Trace) -> int | None:
 
 
 def _mended(trace: Trace, mended: Trace, sketch: Sketch, theory: Theory) -> Trace | None:
-    """Mend the step that contradicts a sketch: its view and star, or else the action before it."""
+    """Correct the step that contradicts a map: its view and star, or else the action before it."""
     t, steps = len(sketch.labels), list(mended.steps)
     action = mended.actions[t - 1]
     right = _right(mended, sketch, theory) if theory.misread else None
@@ -79,7 +79,7 @@ def _mended(trace: Trace, mended: Trace, sketch: Sketch, theory: Theory) -> Trac
 
 
 def _right(trace: Trace, sketch: Sketch, theory: Theory) -> Step | None:
-    """Return the step after a sketch, with the view and star it predicts; None if neither."""
+    """Return the next step with the view and star that a map predicts; None if unknown."""
     t, action = len(sketch.labels), trace.actions[len(sketch.labels) - 1]
     there = sketch.leads_to(action)
     if there in sketch.labels:

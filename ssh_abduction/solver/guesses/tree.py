@@ -54,7 +54,7 @@ class Contradiction(Exception):  # noqa: N818 - not an error
 
 @dataclass(slots=True)
 class KnownDState:
-    """A dstate of a sketch, as far as it is known.
+    """A dstate of a sketch (a map made without a search), as far as it is known.
 
     Attributes:
         seen: The observation: the view, and the star if the theory uses stars.
@@ -114,7 +114,7 @@ class Sketch:
 
     @classmethod
     def all_of(cls, first: Step, theory: Theory) -> list[Sketch]:
-        """Make a sketch of each kind. Kinds that usually give smaller maps come first."""
+        """Make a sketch (a map without a search) of each kind, those with small maps first."""
         framed = (
             [True, False] if theory.level == "topological" and theory.star != "frame" else [False]
         )

@@ -74,7 +74,7 @@ class Chart:
 
     @cached_property
     def continuations(self) -> Continuations:
-        """The views and actions that follow each node. Only for a chart made by `of_steps`."""
+        """The views and actions after each node. Only for a chart whose nodes are steps."""
         from ssh_abduction.solver.steps.apart import Continuations  # loads numpy
 
         return Continuations(self.seen, [action for _, action, _ in self.links], self.excluded)

@@ -99,7 +99,7 @@ def with_changes(ssh_map: SSHMap, trace: Trace, theory: Theory) -> SSHMap | None
 
 
 def _with_changed_bearings(ssh_map: SSHMap, trace: Trace, theory: Theory) -> SSHMap:
-    """Do what `with_changes` does for gateways at bearings. The map has headings in degrees."""
+    """Add changed gateways as `with_changes` does, for bearings and headings in degrees."""
     names = [drive.name for drive in drives_of(trace)]
     faults = []
     for found in changes_in(trace, ssh_map, theory.axioms):

@@ -30,7 +30,7 @@ LEAST = 20
 MOST = 0.5
 # A step is noise only if two cliques have at most this share of the size of the clique up to the
 # step: the clique of the steps before, and the clique of the whole trace without the step. A step
-# that doubles the clique is no exploration, as exploring adds at most one dstate a step.
+# that doubles the clique is no exploration, as exploring adds at most one dstate per step.
 FALL = 0.5
 
 

@@ -350,7 +350,7 @@ def _at_edges(shown: _Shown) -> set[int]:
 
 
 def _can_complete(order: list[Arm], others: list[Arm], clockwise: Sequence[Sequence[Arm]]) -> bool:
-    """Whether other arms can join a clockwise order so that it agrees with all turns."""
+    """Whether a clockwise order of arms (gateways) can be completed to agree with all turns."""
     if not all(_is_clockwise(order, sequence) for sequence in clockwise):
         return False
     if not others:
@@ -371,7 +371,7 @@ def _is_clockwise(order: Sequence[Arm], sequence: Sequence[Arm]) -> bool:
 
 
 def _join(same: NodeClasses[Arm], first: Arm, second: Arm) -> None:
-    """Record that two arms are one gateway. Then their opposite arms are also one gateway."""
+    """Record that two arms (of dstates) are one gateway. Then their opposite arms are, too."""
     for turned in (1, -1):
         same.merge((second[0], second[1] * turned), (first[0], first[1] * turned))
 

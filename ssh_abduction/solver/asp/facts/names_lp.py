@@ -58,7 +58,7 @@ def batch_facts(
     links: Iterable[tuple[int, int, int]],
     apart: Iterable[tuple[int, int]],
 ) -> str:
-    """Return the facts for one batch of nodes.
+    """Return the facts for one batch: the nodes of one call.
 
     Each node has its number, its view, the names that it can have, and the last node with this view
     that clingo has already (or None). `links` are triples of a node, an action, and the node that

@@ -60,7 +60,7 @@ def paths_frameless_facts(
     *,
     single: bool = False,
 ) -> str:
-    """Return the facts for paths_frameless.lp about dstates and their links.
+    """Return the facts for paths_frameless.lp about dstates and the links between them.
 
     `links` are triples of a dstate, the number of an action, and the dstate that it leads to. In
     each set of `far`, at least one pair of dstates is at different places. If `single`, places and
@@ -107,7 +107,7 @@ def settled_facts(
     *,
     single: bool = False,
 ) -> str:
-    """Return the facts for paths_framed.lp about the labels of some nodes of a chart."""
+    """Return the facts for paths_framed.lp that give some nodes of a chart their dstates."""
     facts = [
         settled_labels((node, labels[node]) for node in nodes),
         *(["single."] if single else []),
@@ -133,7 +133,7 @@ def stretch_facts(trace: Trace, theory: Theory, labels: Iterable[int]) -> str:
 
 
 def read_distinct(control: Control) -> tuple[list[int], list[tuple[int, int]]]:
-    """Read all segments from a grounded control, and the pairs of them that cannot be one path."""
+    """Read all segments (parts of paths), and the pairs of segments that cannot be one path."""
     segments = sorted(
         read_atom(atom.symbol)[1][0] for atom in control.symbolic_atoms.by_signature("segment", 1)
     )
@@ -211,7 +211,7 @@ def open_labels(labels: Sequence[int]) -> str:
 
 
 def read_contraries(model: Model) -> list[int]:
-    """Read the dstates whose segments show that the labels have no places and paths."""
+    """Read the dstates whose segments (parts of paths) contradict the axioms."""
     return sorted(
         args[0] for name, args in map(read_atom, model.symbols(shown=True)) if name == "contrary"
     )

@@ -33,7 +33,7 @@ def sides_frameless_facts(theory: Theory, actions: Mapping[int, Action]) -> str:
 def turn_facts(
     batch: int, chart: FramedChart, visits: Iterable[int], turns: Iterable[tuple[int, str, int]]
 ) -> str:
-    """Return the facts about the new visits and the turns (node, direction, node) of a batch."""
+    """Return the facts about a batch: its new visits, and its turns (node, direction, node)."""
     facts = [f"visit({batch},{visit})." for visit in visits]
     for s, turn, x in turns:
         (visit, slot), (_, faced) = chart.facing[s], chart.facing[x]
