@@ -91,7 +91,7 @@ def dstates_look_as_seen(m: Reading) -> Found:
 
 
 def links_are_those_of_the_trace(m: Reading) -> Found:
-    """Check that the links of the map are those that its labels and the actions imply."""
+    """Check that the map has exactly the links that its labels and the actions imply."""
     shown = set(m.map.links)
     if len(shown) < len(m.map.links):
         yield [], "The map lists a link twice."

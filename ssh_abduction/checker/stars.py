@@ -121,7 +121,7 @@ def _one_star(seen: Iterable[tuple[DState, Openings, int]], how: str) -> Found:
 
 
 def one_heading(m: Reading) -> Found:
-    """Check that each dstate has one heading, a slot from 0 to 3."""
+    """Check that each dstate has one heading: a slot (direction of its place) from 0 to 3."""
     for s, records in m.records.items():
         if len({r.heading for r in records}) > 1:
             yield m.steps_of(s), f"Dstate {s} has several headings."
@@ -154,7 +154,7 @@ def turn_rotates(m: Reading) -> Found:
 
 
 def one_dstate_per_heading(m: Reading) -> Found:
-    """Check that at most one dstate faces each slot of a place."""
+    """Check that at most one dstate faces each slot (direction) of a place."""
     known: dict[tuple[int, int], int] = {}
     for s in m.states.values():
         heading = heading_of(s)
@@ -168,7 +168,7 @@ def one_dstate_per_heading(m: Reading) -> Found:
 
 
 def path_goes_straight(m: Reading) -> Found:
-    """Check that a path leaves a place through opposite slots, and that no paths share a slot."""
+    """Check that a path leaves a place through opposite slots (directions), each of one path."""
     slots: dict[tuple[int, int], tuple[Course, int]] = {}
     ways: dict[tuple[int, Course], tuple[int, int]] = {}
     for s in m.states.values():

@@ -95,7 +95,7 @@ def pair(text: str) -> tuple[int, int]:
 
 
 def _labelled(options: argparse.Namespace) -> tuple[Any, Any, Any]:
-    """Return the images, (n, d), of the labelled steps, their labels, and a new recogniser."""
+    """Return the images, (n, d), and the dstates of labelled steps, and a new recogniser."""
     from perception.recognition import recogniser
 
     images, labels, _, features = _mapped(options)

@@ -289,7 +289,7 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
     # Few steps around the pair
 
     def _ask_pieces(self, one: bool, most: int) -> None:
-        """Find a piece of at most `most` steps that has no map of the side `one`."""
+        """Find at most `most` steps that have no map in which the pair is `one`, or is not."""
         for steps in self._pieces(most):
             piece = Piece.of(self.problem, steps)
             if not self._has_map(piece, one):
@@ -328,12 +328,12 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
             width += 1 + width // 2
 
     def _has_map(self, piece: Piece, one: bool) -> bool:
-        """Tell whether a piece has a map of the side `one`."""
+        """Tell whether a piece has a map in which the pair is one dstate (if `one`; else two)."""
         pair = piece.steps.index(self.first), piece.steps.index(self.second)
         return Axioms(piece, self._over).consistent(assumed=[(facts.are_one(*pair), one)])
 
     def _shrunk(self, piece: Piece, one: bool) -> Piece:
-        """Drop steps at the ends of a piece, as long as the rest has no map of the side `one`."""
+        """Drop steps at the ends of a piece while the rest has no map as in `_has_map`."""
         if self.theory.rules or self.theory.has_faults:
             return piece
         for t in (*piece.steps, *reversed(piece.steps)):

@@ -226,7 +226,7 @@ def _frame(star: Star | None) -> Frame | None:
 
 
 def _faces(frame: Frame) -> int | None:
-    """Find the slot of a frame that the robot faces; None if it faces none."""
+    """Find the slot (direction of a place) that the robot faces; None if it faces none."""
     return next((slot for slot in range(frame.slots) if frame.faces(slot)), None)
 
 

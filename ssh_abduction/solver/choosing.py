@@ -55,7 +55,7 @@ def new_engine(task: Task) -> Engine:
 
 
 def labelling_engine(task: Task, labels: Sequence[int]) -> Engine:
-    """Make the engine that finds dstates first, if it can begin with these labels of a map."""
+    """Make the engine that finds dstates first, if it can begin with these dstates of steps."""
     engine = new_engine(task)
     if labels and isinstance(engine, StepEngine) and takes_all(task) and task.speedups.ways:
         from ssh_abduction.solver.engines.frameless import FramelessEngine

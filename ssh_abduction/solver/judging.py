@@ -131,7 +131,7 @@ class Judging:
             self._fail(violations[0])
 
     def _look_at_sample(self, ssh_map: SSHMap, prefix: int) -> None:
-        """Check links and views at random steps beyond the prefix. Raises InternalError."""
+        """Check links and views at random steps after the first ones. Raises InternalError."""
         links = set(ssh_map.links)
         beyond = range(prefix, len(self._trace))
         for t in random.Random(0).sample(beyond, min(SAMPLE, len(beyond))):

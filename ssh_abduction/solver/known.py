@@ -56,7 +56,7 @@ class Known:
             self.bound = replace(self.bound, **{first: proven})
 
     def raise_lower(self, cost: tuple[int, ...]) -> None:
-        """Raise the lower bound on the cost of every map to that of a minimal map of a prefix."""
+        """Raise the lower bound on the cost of all maps to the least cost for the first steps."""
         self.raise_bound(cost[0] if cost else None)
         if self.lower is None or cost > self.lower:
             self.lower = cost

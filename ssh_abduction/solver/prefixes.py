@@ -99,7 +99,7 @@ class Prefixes:
         self.start = len(task.trace) if self._at_once else FIRST_PREFIX
 
     def find_minimum(self) -> None:
-        """Extend the prefix until one of its minimal maps replays to the end, or it has none."""
+        """Extend the prefix until a minimal map of it predicts all later steps, or none exists."""
         size, steps = min(len(self._task.trace), self.start), len(self._task.trace)
         while True:
             if size == steps:
@@ -128,7 +128,7 @@ class Prefixes:
             size = self.engine.next_size(len(replayed.labels))
 
     def minimise(self) -> Found | None:
-        """Find a minimal map of the prefix that no evidence rejects; None if there is none."""
+        """Find a minimal map of the prefix (first steps) that no evidence rejects, or None."""
 
         def why_refused(found: Found) -> frozenset[Equality] | None:
             refusal = self._judging.refusal(found.map)

@@ -137,7 +137,7 @@ class _LinearTrack:
 
 
 def _pieces(trace: Trace) -> NDArray[np.int_]:
-    """Return the piece of each step: displacements and closures tie the steps of a piece, (n,)."""
+    """Return the piece of each step, (n,): displacements and closures connect its steps."""
     said, n = Equations.of(trace), len(trace)
     ties = coo_array((np.ones(len(said.first)), (said.first, said.last)), shape=(n, n))
     piece: NDArray[np.int_] = connected_components(ties, directed=False)[1]

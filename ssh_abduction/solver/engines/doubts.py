@@ -71,7 +71,7 @@ class Doubts:
 
 
 class Settled:
-    """Questions about the best maps with one labelling, for engines that find dstates first."""
+    """Questions about the best maps with given dstates, for engines that find dstates first."""
 
     def __init__(
         self,
@@ -87,7 +87,7 @@ class Settled:
         self._any: SSHMap | None = None
 
     def has_map(self) -> bool:
-        """Whether the labelling has a map."""
+        """Whether there is a map with these dstates."""
         return self.any_map() is not None
 
     def any_map(self) -> SSHMap | None:

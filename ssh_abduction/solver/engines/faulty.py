@@ -49,7 +49,7 @@ class FaultyEngine:
     """The engine for the causal theory with faults. It minimises dstates and faults together."""
 
     def __init__(self, task: Task, most_faults: int | None = None) -> None:
-        """Begin with an empty prefix. If given, up to `most_faults` faults cost nothing."""
+        """Begin without steps. If given, up to `most_faults` faults cost nothing."""
         self.asker = Asker(task.watch)
         self._most_faults = most_faults
         self.size = 0

@@ -60,7 +60,7 @@ class FramedEngine:
     """The engine for the topological theory with frames. It minimises the dstates first."""
 
     def __init__(self, task: Task) -> None:
-        """Begin with an empty prefix."""
+        """Begin with an empty prefix: no steps of the trace yet."""
         self.asker = Asker(task.watch)
         self._task = task
         self._sides = FramedSides(task.theory, self.asker)
@@ -73,12 +73,12 @@ class FramedEngine:
 
     @property
     def size(self) -> int:
-        """The number of steps in the prefix."""
+        """The number of first steps that are the prefix."""
         return self._visits.size if self._framed else self._unframed_size
 
     @property
     def bound(self) -> int | None:
-        """A proven lower bound on the number of dstates of the prefix; None if none is known."""
+        """A proven lower bound on the dstates of the prefix (first steps); None if unknown."""
         return self._visits.bound
 
     @property
@@ -105,7 +105,7 @@ class FramedEngine:
         self._unframed_size = size
 
     def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
-        """Yield maps of the prefix, each cheaper than the one before; the last is minimal."""
+        """Yield maps of the first steps, each cheaper than the one before; the last is minimal."""
         if not self._framed:
             return
         first = self._first_with_paths()
@@ -128,7 +128,7 @@ class FramedEngine:
         self._best = best.cost, namings
 
     def _first_with_paths(self) -> Fitted | None:
-        """Find a map with the fewest dstates, and its labels; None if the prefix has no map."""
+        """Find a map of the first steps with the fewest dstates, and its labels; None if none."""
         fitted: list[Fitted] = []
 
         def why_not(labels: list[int]) -> list[int] | None:
@@ -166,7 +166,7 @@ class FramedEngine:
         yield from islice(found, enough or None)
 
     def labellings(self, cost: tuple[int, ...]) -> Iterator[Settled]:
-        """Yield the maps of this cost, grouped by their labelling."""
+        """Yield the maps of this cost, grouped by their dstates."""
         if not self._framed:
             return
         mode = listing(cost)
@@ -176,13 +176,13 @@ class FramedEngine:
                 yield settled
 
     def _namings_of_cost(self, cost: tuple[int, ...]) -> Iterator[NodeLabels]:
-        """Yield the known labels of maps of this cost, else all with its number of dstates."""
+        """Yield the known labels of maps of this cost; if none, all labels with as many dstates."""
         if self._best and self._best[0] == cost:
             return iter(self._best[1])
         return self._all_with_paths(cost[0])
 
     def _all_with_paths(self, dstates: int, besides: Sequence[int] = ()) -> Iterator[NodeLabels]:
-        """Yield all labels with this many dstates that some paths fit, except `besides`."""
+        """Yield all labels (dstates of steps) of this number that paths fit, except `besides`."""
         known: set[Hashable] = {tuple(besides)}
         fitted: dict[tuple[int, ...], Fitted] = {}
 
@@ -199,7 +199,7 @@ class FramedEngine:
             yield fitted.pop(tuple(labels)).naming
 
     def _refuse(self, labels: Sequence[int]) -> None:
-        """Give clingo rules that exclude these labels, as no paths fit them."""
+        """Give clingo rules that exclude these labels (dstates of steps), as no paths fit them."""
         visits, fitting = self._visits, self._fitting
         visits.take_back(labels)
         passed = (

@@ -51,14 +51,14 @@ class NodeLabels:
 
 @dataclass(frozen=True)
 class Fitted:
-    """A map (`found`), and its labels (`naming`)."""
+    """A map (`found`), and the dstate of each step (`naming`)."""
 
     found: Found
     naming: NodeLabels
 
 
 class FramedPaths:
-    """Asks clingo for the places and paths that fit labels.
+    """Asks clingo for the places and paths that fit labels (the dstate of each step).
 
     Attributes:
         forbidden: Sets of equalities of steps. In no map do all equalities of one set hold.

@@ -92,7 +92,7 @@ class FramelessEngine:
         yield from islice(self._listed(self._labels_of(cost), listing(cost)), enough or None)
 
     def _listed(self, every: Iterable[list[int]], mode: str) -> Iterator[Found]:
-        """Yield the maps with these labels; with displacements, first those whose places differ."""
+        """Yield the maps with these dstates; with displacements, first maps whose places differ."""
         left, sooner, first = iter(every), list[list[int]](), set[SSHMap]()
         while (
             self._task.theory.displacement == "use"
@@ -123,7 +123,7 @@ class FramelessEngine:
         return self._all_that_fit(cost[0])
 
     def _all_that_fit(self, dstates: int, besides: Sequence[int] = ()) -> Iterator[list[int]]:
-        """Yield all labels with this many dstates that places and paths fit, except `besides`."""
+        """Yield all labels with this many dstates, except `besides`, that places and paths fit."""
         return all_accepted(
             ask=lambda: self._named.all_of(dstates, 0),
             refuse=self._fitting.why_not,

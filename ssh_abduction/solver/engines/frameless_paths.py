@@ -78,7 +78,7 @@ class _Far:
 
 
 class PlacesAndPaths:
-    """Finds the best places and paths for labels, or the reason why none fit.
+    """Finds the best places and paths for labels (dstates of steps), or why none fit.
 
     Attributes:
         named: The search for labels. Its control gets the rules that exclude labels.
@@ -102,7 +102,7 @@ class PlacesAndPaths:
         self._failed: set[tuple[int, ...]] = set()
 
     def forget(self) -> None:
-        """Forget everything about the control. Call this before there is one for another prefix."""
+        """Forget everything about the control. Call this before other steps get a control."""
         self._grounded = set()
         self._forget_tight()
 
@@ -137,7 +137,7 @@ class PlacesAndPaths:
             self._grounded.update(dstates)
 
     def fits(self, labels: Sequence[int]) -> bool:
-        """Whether any places and paths fit these labels."""
+        """Whether any places and paths fit these labels (the dstate of each step)."""
         return self._tightly(labels) is not None or self._has_paths(self._path_control(labels))
 
     def _tightly(self, labels: Sequence[int]) -> Found | None:
@@ -203,7 +203,7 @@ class PlacesAndPaths:
         return next(self._asker.answers(lambda _: True, "ignore", 1, control=control), False)
 
     def forbid(self, labels: Sequence[int]) -> None:
-        """Give clingo rules that exclude these labels, as no places and paths fit them."""
+        """Give clingo rules that exclude these dstates of steps, as no places and paths fit."""
         links = self._links_of(labels)
         control = self._control_for(links, parts=("base",))
         contrary = next(self._asker.answers(paths_lp.read_contraries, "ignore", 1, control=control))
@@ -291,7 +291,7 @@ class PlacesAndPaths:
         options: Sequence[str] = (),
         parts: Sequence[str] = (*PARTS, *EACH),
     ) -> clingo.Control:
-        """Make a control for the places and paths of labels, or reuse the last one."""
+        """Make a control for the places and paths of given dstates, or reuse the last one."""
         key = tuple(labels), tuple(options), tuple(parts)
         if self._asked is None or self._asked[0] != key:
             with self._asker.grounding_timed():

@@ -41,14 +41,14 @@ _Trail: TypeAlias = "tuple[Link, _Trail] | None"
 
 
 class Fitting(Protocol):
-    """Axioms beyond the causal theory that labels have to satisfy (`engines/frameless.py`)."""
+    """Axioms beyond the causal theory that dstates have to satisfy (`engines/frameless.py`)."""
 
     def fits(self, labels: Sequence[int]) -> bool:
-        """Whether some map with these labels satisfies these axioms."""
+        """Whether some map with these labels (dstates of steps) satisfies these axioms."""
         ...
 
     def forbid(self, labels: Sequence[int]) -> None:
-        """Give clingo rules that exclude these labels, as they have no map."""
+        """Give clingo rules that exclude these labels (dstates of steps), as they have no map."""
         ...
 
     def give_again(self) -> None:
@@ -126,7 +126,7 @@ class NameProgram:
             self._fitting.give_again()
 
     def name_more(self, views: Collection[int]) -> None:
-        """Add a spare name to each of these views, in a new control with the same links."""
+        """Add a name for dstates to each of these views, in a new control with the same links."""
         for view in views:
             self._spares[view] += 1
         self._asker.watch.check()
@@ -166,7 +166,7 @@ class NameProgram:
         self._asker.watch.check(PREPARING * (self._asker.ground_seconds - before))
 
     def add_links_at(self, nodes: Collection[int]) -> None:
-        """Give clingo all links to and from these nodes that it lacks."""
+        """Give clingo all links to and from these steps that it lacks."""
         self.add(
             link
             for link in self.chart.links
@@ -187,7 +187,7 @@ class NameProgram:
         )[:MORE_LINKS]
 
     def _give(self, links: Iterable[Link]) -> None:
-        """Ground one batch of links, with the nodes at their ends."""
+        """Ground one batch (portion) of links, with the steps at their ends."""
         known = self._known
         added = [link for link in links if link not in known.links]
         given: list[tuple[int, int, Sequence[int], int | None]] = []
@@ -223,7 +223,7 @@ class NameProgram:
         self.add_rules(f"not_together_{number}", names_lp.not_together(number, pairs))
 
     def is_allowed(self, labels: Sequence[int]) -> bool:
-        """Whether the labels of a map agree with evidence about pairs of nodes."""
+        """Whether the dstates of a map agree with the evidence about pairs of steps."""
         if any(all(labels[i] == labels[j] for i, j in pairs) for pairs in self.forbidden):
             return False
         return not self.chart.excluded or self.chart.is_map(labels)
@@ -296,7 +296,7 @@ class NameProgram:
         return labels, list(failed)
 
     def _links_at_excluded(self, labels: Sequence[int]) -> list[Link]:
-        """List links that clingo lacks, at nodes that share a label against the evidence."""
+        """List links that clingo lacks, at steps that share a dstate against the evidence."""
         excluded = {
             node
             for pair in self.chart.excluded

@@ -27,10 +27,10 @@ CORES = 10_000
 
 
 class Incumbent:
-    """The labels with the fewest dstates so far, and a lower bound on dstates; None if unknown."""
+    """The steps' dstates, as few as known, and a lower bound on dstates; None if unknown."""
 
     def __init__(self) -> None:
-        """Begin with no labels and no bound."""
+        """Begin with no known labels (dstates of steps) and no bound."""
         self.bound: int | None = None
         self.labels: list[int] | None = None
 
@@ -39,7 +39,7 @@ class Incumbent:
         self.bound = max(self.bound or 0, bound)
 
     def is_settled(self) -> bool:
-        """Whether the known labels reach the bound."""
+        """Whether the known labels have as few dstates as the lower bound."""
         return self.labels is not None and len(set(self.labels)) <= (self.bound or 0)
 
 
@@ -62,7 +62,7 @@ class NameSearch:
         self._had_all_help = False  # whether maps near a guess were sought already
 
     def improving(self) -> Iterator[list[int]]:
-        """Yield labels of all nodes. The labels that are yielded last have the fewest dstates."""
+        """Yield the dstates of all steps, better and better. The last ones are the fewest."""
         known = self._incumbent
         if not self._program.chart.links:
             yield [0]
@@ -150,7 +150,7 @@ class NameSearch:
         )
 
     def _helped(self) -> Iterator[list[int]]:
-        """Look for small maps in other ways, as clingo's search takes long. Yield their labels."""
+        """Look for small maps in other ways, as clingo takes long. Yield the dstates of steps."""
         if self._may_help and not self._hard and not self._program.pinned.is_long:
             yield from self._small.merged()
         self._hard = True
@@ -159,7 +159,7 @@ class NameSearch:
             yield from self._near_a_guess()
 
     def _near_a_guess(self) -> Iterator[list[int]]:
-        """Guess maps, and yield the labels of those with fewer dstates than all maps before."""
+        """Guess maps. Yield the labels of each with fewer dstates than all maps before."""
         is_long = self._program.pinned.is_long
         known = self._incumbent.labels
         for labels in self._small.from_beginning() if is_long else self._small.guessed():

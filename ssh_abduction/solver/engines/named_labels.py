@@ -58,7 +58,7 @@ WHOLE = 100_000
 
 
 class NamedLabels:
-    """Finds labels with the fewest dstates for the first `size` steps of a trace."""
+    """Finds labels (dstates of steps) with the fewest dstates, for the first `size` steps."""
 
     def __init__(
         self,
@@ -155,7 +155,7 @@ class NamedLabels:
         self._program.give_links(links)
 
     def _first_spares(self, pinned: Pinned) -> dict[int, int]:
-        """Return the spare names per view: one more than the given map needs, at least `SPARES`."""
+        """Return the names per view: one more than the given map needs, at least `SPARES`."""
         seen = pinned.chart.seen
         found = Counter(dict(zip(self._given_map, seen, strict=False)).values())
         taken = Counter(seen[node] for node in pinned.clique)
@@ -165,7 +165,7 @@ class NamedLabels:
         }
 
     def improving(self) -> Iterator[list[int]]:
-        """Yield labels of all steps of the prefix. The last ones have the fewest dstates."""
+        """Yield labels of the first steps, better and better. The last have the fewest dstates."""
         assert self._search is not None  # `grow` comes first
         known = self._incumbent
         # Evidence about places may have refused the places of a known map since it was found.
@@ -174,7 +174,7 @@ class NamedLabels:
         return self._search.improving()
 
     def forbid_together(self, pairs: Collection[tuple[int, int]]) -> None:
-        """Exclude all labels that have both steps of every one of these pairs at one dstate."""
+        """Exclude labels in which both steps of each of these pairs are at one dstate."""
         self._forbidden.append(list(pairs))
         known = self._incumbent
         if known.labels and not self.program.is_allowed(known.labels):

@@ -121,7 +121,7 @@ class StepEngine:
         return self.asker.answers(self._read, f"enum,{bound}" if bound else "ignore", 0)
 
     def map_with(self, doubts: Collection[Doubt], cost: tuple[int, ...]) -> SSHMap | None:
-        """Find a map of the prefix, within the cost, in which one of these doubts holds."""
+        """Find a map of the first steps, within the cost, in which one of these doubts holds."""
         found = self._doubts.answer(
             doubts, self._read, f"enum,{','.join(map(str, cost))}" if cost else "ignore"
         )
@@ -133,7 +133,7 @@ class StepEngine:
         return True
 
     def ask_for(self, number: int, count: Count) -> None:
-        """Ask only for maps with exactly this count from now on. The prefix must not grow."""
+        """Ask only for maps with exactly this count from now on. No steps may be added."""
         if self._number is not None:
             self.asker.control.release_external(further_rules.of_number(*self._number))
         self._number = number, count

@@ -155,7 +155,7 @@ class VisitLabels:
         self.bound = max(self.bound or 0, bound)
 
     def fewest(self) -> list[int] | None:
-        """Find labels of all nodes with the fewest dstates; None if no labels satisfy all rules."""
+        """Find the dstates of all nodes, as few as possible; None if the rules allow none."""
         if not self._found:
             labels = self._first_labels(self._best_answer)
             if labels is None:
@@ -180,7 +180,7 @@ class VisitLabels:
         return None
 
     def _best_answer(self) -> list[Pair] | None:
-        """Find an answer with the fewest first nodes of dstates; None if there is no answer."""
+        """Find an answer with the fewest dstates (nodes that are the first at theirs), or None."""
         read = self.program.read
         better = list(
             self._asker.answers(

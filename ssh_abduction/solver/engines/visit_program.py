@@ -196,7 +196,7 @@ class VisitProgram:
         return {labels[node]: self.chart.facing[node] for node in self._known.place_of}
 
     def spanning(self, labels: Sequence[int], nodes: Iterable[int]) -> list[Pair]:
-        """List the pairs of visits that have to be at one place so that nodes have these labels."""
+        """List the pairs of visits that must be at one place if nodes have these dstates."""
         first: dict[int, int] = {}
         return [
             self.pair(other, node)

@@ -146,7 +146,7 @@ def annealed_steps(
 
 
 def _options(chart: FramedChart, spares: int) -> States:
-    """List the possible states of each visit, in a row padded with -1."""
+    """List the possible states (place and slot) of each visit, in a row padded with -1."""
     misfits = chart.misfits
     # turned[visit][r] is the star of the visit in a frame whose slot r is slot 0 of the visit. The
     # least of these four stars is the kind of the visit.

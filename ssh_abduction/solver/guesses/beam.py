@@ -283,7 +283,7 @@ class Beam:
         return None if next(violations(whole, ssh_map, theory), None) else ssh_map
 
     def _completed(self, found: Hypothesis, trace: Trace, theory: Theory) -> Iterator[SSHMap]:
-        """Yield the valid maps of a hypothesis, one for each way to turn its pieces."""
+        """Yield the valid maps of a hypothesis, one for each way to rotate its unrelated pieces."""
         ways = headings_by_turn(found)
         for facing in ways if theory.star == "frame" else islice(ways, 1):
             ssh_map = completed(trace, theory, found.labels, found.places, facing)
@@ -337,7 +337,7 @@ class Beam:
         return sorted(options, key=lambda option: option.nats)
 
     def _laid(self, option: _Extension) -> _Extension:
-        """Add the price if an option lays the drive of the robot on others."""
+        """Add the price if an option makes the drive share a place with other drives."""
         places = [option.of.places[s] for s in option.of.labels]
         nats = self._problem.overlap.nats
         price = nats([*places, option.place]) - nats(places)

@@ -335,7 +335,7 @@ class Overlay:
         return self._state is not before
 
     def _merge_coinciding(self, places: set[int]) -> None:
-        """Merge the coinciding dstates at some places, unless that leads to a clash."""
+        """Merge the coinciding dstates at some places, unless some of them cannot be one."""
         refused: set[tuple[int, int]] = set()
         while pairs := [
             found for p in places for found in self._coinciding(p) if found[1] not in refused

@@ -90,7 +90,7 @@ class Continuations:
         self._shared = 2 * (here - self._sorted[:-1]) + (shown[here] == shown[there])
 
     def apart_from(self, step: int) -> Matrix:
-        """Flag the steps that are apart from one step. This is a row of `apart`."""
+        """Flag the steps that are apart from (not one dstate with) a step: a row of `apart`."""
         place, steps = self._place[step], len(self._place)
         shared = np.empty(steps, dtype=int)
         shared[:place] = np.minimum.accumulate(self._shared[:place][::-1])[::-1]
@@ -186,7 +186,7 @@ def _ranked(keys: NDArray[np.int_]) -> NDArray[np.int_]:
 
 
 def clique(apart: Matrix, seen: Sequence[int]) -> list[int]:
-    """Grow a clique greedily among the nodes of each view, and return all of them, sorted."""
+    """Grow a clique (pairwise apart nodes) greedily for each view. Return all, sorted."""
     shown = np.asarray(seen)
     found: list[int] = []
     for view in range(int(shown.max()) + 1):

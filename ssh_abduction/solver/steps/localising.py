@@ -115,7 +115,7 @@ class _VisitLocaliser:
             back *= 2
 
     def _anywhere(self, visit: int) -> set[State]:
-        """Return the states that fit a visit by itself, whatever came before."""
+        """Return the states (place and slot) that fit a visit by itself, whatever came before."""
         return set(np.flatnonzero(self._fits[visit]).tolist())
 
     def _after(self, possible: set[State], visit: int) -> set[State]:

@@ -58,7 +58,7 @@ def _lifted(trace: Trace) -> tuple[int, ...]:
 
 @lru_cache(maxsize=8)
 def _pairs(stretches: tuple[int, ...], lifted: tuple[int, ...]) -> Pairs:
-    """Pair each step on the stretch before a lift with each step on the stretch behind it."""
+    """Pair each step of the stretch before a lift with each step of the stretch after it."""
     steps = gathered((stretch, t) for t, stretch in enumerate(stretches))
     return Pairs.of(
         elsewhere=[

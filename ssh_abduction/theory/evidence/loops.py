@@ -179,7 +179,7 @@ class Loops:
         return covariance
 
     def _repeated(self, loops: tuple[Steps, Steps], others: tuple[Steps, Steps]) -> Array:
-        """Return the covariances, between closings, from a wrong scale and a steady drift."""
+        """Return covariances between closings (loop errors) from wrong scale and steady drift."""
         # A scale that is wrong by 1 moves the end of a loop by the whole loop.
         scaled, other_scaled = (
             (self.poses[j] - self.poses[i]) * (1.0, 1.0, 0.0) for i, j in (loops, others)
@@ -251,7 +251,7 @@ class Reckoning:
     """
 
     def __init__(self, trace: Trace, before: Reckoning | None = None) -> None:
-        """Compute the poses and sums for each drift, from those of the first steps, if known."""
+        """Compute the poses and sums for each drift of heading. Reuse those of first steps."""
         self.odometry = trace.odometry or Odometry()
         sigma = self.odometry.bend
         step = sigma / BENDS_A_SIGMA

@@ -176,7 +176,7 @@ class Together:
         return safe
 
     def _least_excess(self, end: int, later: Steps, earlier: Steps) -> Array:
-        """Return the least `_excess` of each pair over all drifts."""
+        """Return the least `_excess` of each pair of returns over all drifts of heading."""
         excess = np.full(len(later), np.inf)
         others = (number for number in range(len(self._reckoning.bends)) if number != self._number)
         for number in (self._number, *others):
@@ -189,7 +189,7 @@ class Together:
         return excess
 
     def _excess(self, number: int, end: int, later: Steps, earlier: Steps) -> Array:
-        """Return the chi-square of each pair minus the threshold, at least 0, for one drift."""
+        """Return chi-square minus threshold of each pair of returns, at least 0, for one drift."""
         alone, rows, loops = self._of_each(number), self.rows, self._loops(number)
         squares = alone.square[later] + alone.square[earlier]
         # The stretch that both loops share.
@@ -275,7 +275,7 @@ class Together:
 
 
 def joint_squares(loops: Loops, these: Steps, others: Steps) -> Array:
-    """Return the joint chi-square of each return, a row of `Together.rows`, with its partner."""
+    """Return the joint chi-square of each pair of returns (rows of `Together.rows`)."""
     joint, off = np.empty((len(these), 6, 6)), np.empty((len(these), 6))
     for rows, at in ((these, slice(3)), (others, slice(3, 6))):
         closing, covariance = loops.closings(rows[:, 0], rows[:, 1])

@@ -131,7 +131,7 @@ def views_of(
 
 
 def causal_map(labels: Sequence[int], trace: Trace) -> SSHMap:
-    """Make a causal map (without places) from labels. Dstates are numbered by first visit."""
+    """Make a causal map (no places) from the dstates of steps, numbered by first visit."""
     number: dict[int, int] = {}
     first: list[int] = []
     for t, label in enumerate(labels):

@@ -195,7 +195,7 @@ def pinned_facts(segments: Iterable[int]) -> str:
 
 
 def settled_labels(labels: Iterable[tuple[int, int]]) -> str:
-    """Return the facts that give nodes their dstates, from pairs of both."""
+    """Return the facts that give nodes their dstates, from pairs (node, dstate)."""
     return "\n".join(f"is({node},{label})." for node, label in labels)
 
 
