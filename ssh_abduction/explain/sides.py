@@ -5,9 +5,9 @@
 >>> print(explain_place(corner, 2, 0))
 place 2 lies right of path 0+: step 1 turned right from path 0+ onto path 1+ at place 1, and place 2 is ahead on path 1+
 
-Numbers are those of the first minimal map. Other maps may number differently, so places and paths
-are identified by steps: take the first step at the place in the first map, and then the place of
-this step in the other map. Likewise for a path, by the first step along it.
+Places and paths have the numbers of the first minimal map. Other maps may have other numbers, so
+places and paths are identified by steps: take the first step at the place in the first map, and
+then the place of this step in the other map. Likewise for a path, by the first step along it.
 """  # noqa: E501 - one line of output
 
 from __future__ import annotations

@@ -15,9 +15,10 @@ and when the number of maps has changed. It takes the first of these that exists
 3. An untried action for which the minimal maps predict different outcomes.
 4. Actions that distinguish the map from a map without one of its returns (`return_doubts.py`).
 
-When it is done --------------- 1. *Unique.* All minimal maps have the same dstates and the same
-places. They may differ in paths. 2. *Closed.* At each dstate that the robot can reach, each action
-that it can do there was tried, or
+When it is done
+---------------
+1. *Unique.* All minimal maps have the same dstates and the same places. They may differ in paths.
+2. *Closed.* At each dstate that the robot can reach, each action that it can do there was tried, or
    the axioms imply where the action leads.
 3. *Beyond doubt.* A minimal map may still have too few dstates, as it merges all that can be
    merged. So the explorer doubts each return of the map. It looks for the best map in which the two

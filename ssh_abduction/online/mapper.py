@@ -8,12 +8,13 @@
 >>> solution.status.value, solution.count, solution.cost.dstates, solution.complete
 ('optimal', 2, 5, True)
 
-Most steps are replayed, without asking clingo ---------------------------------------------- A
-dstate (distinctive state) is a place and the direction that the robot faces there. Let M be the set
-of all minimal maps of the steps so far, and c their cost. Consider the link of a map for the new
-action at the robot's dstate. The map *predicts* the new step if the dstate at the end of this link
-shows what is seen. If that dstate shows something else, the map *contradicts* the step. If there is
-no such link, the step is *unknown* to the map.
+Most steps are replayed, without asking clingo
+----------------------------------------------
+A dstate (distinctive state) is a place and the direction that the robot faces there. Let M be the
+set of all minimal maps of the steps so far, and c their cost. Consider the link of a map for the
+new action at the robot's dstate. The map *predicts* the new step if the dstate at the end of this
+link shows what is seen. If that dstate shows something else, the map *contradicts* the step. If
+there is no such link, the step is *unknown* to the map.
 
 *Claim.* If some map of M predicts the step, and no map of M has no link for it, then the maps of M
 that predict the step are exactly the minimal maps of the longer trace.
@@ -35,24 +36,29 @@ not where the map says, or cannot be there together with other returns. The proo
 because evidence that rejects a map of fewer steps also rejects it for more steps. So evidence has
 to test only returns to the new step.
 
-A theory that depends on the trace ---------------------------------- Two parts of a theory depend
-on the whole trace, and may change as it grows. First, displacements are used as soon as there is
-one; from then on, places are minimised before paths. Second, the probability of rejecting a true
-map is shared among all returns that may be true. Their number is rounded up to a power of two, so
-that it changes only when it doubles. When one of these two parts of the theory changes, the minimal
-maps so far may not be minimal any more, so clingo searches again. If the number of returns has
-grown, fewer maps are rejected, so the maps so far serve as drafts.
+A theory that depends on the trace
+----------------------------------
+Two parts of a theory depend on the whole trace, and may change as it grows. First, displacements
+are used as soon as there is one; from then on, places are minimised before paths. Second, the
+probability of rejecting a true map is shared among all returns that may be true. Their number is
+rounded up to a power of two, so that it changes only when it doubles. When one of these two parts
+of the theory changes, the minimal maps so far may not be minimal any more, so clingo searches
+again. If the number of returns has grown, fewer maps are rejected, so the maps so far serve as
+drafts.
 
-When time is short ------------------ A map that predicts the step is minimal even if there is no
-time to look for others. When no map predicts the step and time is short, the answer is *feasible*:
-it has a consistent map, and the last bound, which holds for the longer trace by (1). The map is a
-draft or a sketch. clingo searches again when the trace has grown (`keeper.py`). It continues from
-the state in which it stopped, and may prove a map minimal again.
+When time is short
+------------------
+A map that predicts the step is minimal even if there is no time to look for others. When no map
+predicts the step and time is short, the answer is *feasible*: it has a consistent map, and the last
+bound, which holds for the longer trace by (1). The map is a draft or a sketch. clingo searches
+again when the trace has grown (`keeper.py`). It continues from the state in which it stopped, and
+may prove a map minimal again.
 
-If faults are allowed --------------------- Faults are steps that a map treats as wrong. If the
-theory allows them, `recovery.py` keeps the maps. When a step contradicts all maps, it says what
-broke, lists what may be true with probabilities, and restores the map when the evidence decides.
-`standing` says how sure it is.
+If faults are allowed
+---------------------
+Faults are steps that a map treats as wrong. If the theory allows them, `recovery.py` keeps the
+maps. When a step contradicts all maps, it says what broke, lists what may be true with
+probabilities, and restores the map when the evidence decides. `standing` says how sure it is.
 """
 
 from __future__ import annotations

@@ -52,15 +52,15 @@ class DrivePair:
     """The places that two drives share.
 
     Take a place of one drive and a place of the other drive, in the first map. For each such pair
-    of places, only the most probable join is listed.
+    of places, only the most probable join (two steps at one place) is listed.
 
     Attributes:
         first: The name of the earlier drive.
         second: The name of the later drive.
         of: "place"; or "dstate", if maps have no places.
-        forced: The joins that all maps have.
-        possible: The joins that some maps have.
-        excluded: The number of pairs of places that no map joins.
+        forced: The joins in all maps.
+        possible: The joins in some maps, but not in all.
+        excluded: The number of pairs of places that are one place in no map.
         proven: Whether all maps are known. If not, other maps may differ.
         of_maps: The number of maps that were compared; None if joins have a probability instead.
     """

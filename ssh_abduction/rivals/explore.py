@@ -14,10 +14,12 @@ homing sequences (Rivest & Schapire 1989) or the rehearsal procedure (Kuipers & 
 each rival says where the robot is: at the dstate of the last step. So the first states of all
 machines are known, and the task is to find a distinguishing sequence, not a homing sequence.
 
-Known links ----------- Each map predicts what is seen along its links. With `implied` it also
-predicts along links that the axioms imply: if places have frames, four right turns lead back
-(`rivals/consequences.py`). A sequence of actions is followed while all rivals that are left have
-each link. Once their predictions differ, the observation refutes some of them.
+Known links
+-----------
+Each map predicts what is seen along its links. With `implied` it also predicts along links that the
+axioms imply: if places have frames, four right turns lead back (`rivals/consequences.py`). A
+sequence of actions is followed while all rivals that are left have each link. Once their
+predictions differ, the observation refutes some of them.
 
 *Two rivals.* The robot is at one dstate in each map. The two dstates are a joint state. A
 breadth-first search over joint states finds the fewest actions after which the predictions differ,
@@ -30,11 +32,13 @@ log(n / m) if it leaves m of n rivals in the worst case. The plan takes the sequ
 greatest gain per action. Then it plans for the rivals that are left after each observation. So it
 may leave more rivals than the best plan.
 
-Untried actions --------------- Some rivals predict the same along all links that they have in
-common, for example rivals that differ only in paths. An action that some of them have not tried may
-distinguish them: if two rivals are sure of different outcomes, one is refuted. The most informative
-action leaves the fewest rivals in the worst case. Ties go to the action for which most pairs of
-rivals expect different outcomes, then to the nearest action.
+Untried actions
+---------------
+Some rivals predict the same along all links that they have in common, for example rivals that
+differ only in paths. An action that some of them have not tried may distinguish them: if two rivals
+are sure of different outcomes, one is refuted. The most informative action leaves the fewest rivals
+in the worst case. Ties go to the action for which most pairs of rivals expect different outcomes,
+then to the nearest action.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The engine for the causal theory on long traces.
 
-It finds a map with the fewest dstates, proves that there are no fewer, and lists all such maps. The
-search for the dstate of each step is in `engines/named_labels.py`.
+This engine finds a map with the fewest dstates, proves that no map has fewer, and lists all such
+maps. The search for the dstate of each step is in `engines/named_labels.py`.
 """
 
 from __future__ import annotations

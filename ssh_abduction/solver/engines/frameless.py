@@ -1,7 +1,7 @@
 """The engine for the topological theory without frames, if fewest dstates are preferred first.
 
-It is for traces for which some map is known. It finds the dstates first, then the places and paths.
-It lists all minimal maps, and proves its lower bound on the number of dstates.
+This engine is for traces for which some map is known. It finds the dstates first, then the places
+and paths. It lists all minimal maps, and proves its lower bound on the number of dstates.
 
 With the axioms of places and paths for each step, clingo only manages a few dozen steps of
 exploring. But these axioms are about dstates: the place of a dstate, and the path that it is along.

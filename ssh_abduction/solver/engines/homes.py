@@ -4,9 +4,9 @@ Some places are pairwise distinct. If a map needs no others, no map has fewer pl
 narrows down the search for such a map.
 
 As an example, take a corridor of forty landmarks, driven there and back. The dstates are found at
-once. The places of the way there follow each other on one path, so they are forty distinct ones.
-No map has fewer. But to prove that the way back needs no other places is a pigeonhole problem, and
-it takes clasp minutes.
+once. The places of the way there follow each other on one path, so they are forty distinct places.
+No map has fewer places. But to prove that the way back needs no other places is a pigeonhole
+problem, and it takes clasp minutes.
 
 So this module finds a large clique of pairwise distinct places, which are called *fixed*. Suppose
 that a map has only as many places as there are fixed ones. Then each other place is one with a

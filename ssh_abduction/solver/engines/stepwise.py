@@ -1,7 +1,7 @@
 """The engine that grounds the readable encodings step by step.
 
-It works for every theory, and finds all minimal maps of the prefix. The other engines are faster,
-but each is for certain theories only.
+This engine works for every theory, and finds all minimal maps of the prefix. The other engines are
+faster, but each of them is for certain theories only.
 """
 
 from __future__ import annotations

@@ -8,8 +8,9 @@ chi-square of its returns, as for a map (`solver/weighing.py`).
 Each drive, and each stretch after a lift, begins a *piece* with a frame of its own (`pieces.py`).
 At any step, this piece may be joined to others.
 
-A closure says how a step lies relative to an earlier one. At the later step, the closure corrects
-the poses of a hypothesis, and its misfit adds to the cost.
+A closure is the pose of a step relative to an earlier step, from a match of local maps. At the
+later step, the closure corrects the poses of a hypothesis, and the misfit of the closure adds to
+the cost.
 
 Each step extends each hypothesis in all ways that cost little: the robot is at a known dstate, at a
 new dstate of a known place, or at a new place. If faults are allowed, the action may have slipped,
@@ -176,11 +177,12 @@ class Beam:
     ) -> Iterator[Hypothesis]:
         """Yield the hypotheses to keep: the first `width` that the options make.
 
-        With several drives or floors, keep at most ALIKE hypotheses that join them in the same way,
-        and at most LOST * ALIKE in all. Drop those that cost at least UNSURE more than the best.
-        The last two limits apply separately to hypotheses whose present piece is not joined yet
-        (`Pieces.is_loose`), as they cost more until it is joined. `options` are ways to extend the
-        beam by step t, sorted by cost. If `checked`, drop what the checker refuses.
+        With several drives or floors, keep at most ALIKE hypotheses that connect the drives or
+        floors in the same way, and at most LOST * ALIKE in all. Drop those that cost at least
+        UNSURE more than the best. The last two limits apply separately to hypotheses whose present
+        piece is not joined to others yet (`Pieces.is_loose`), as such hypotheses cost more.
+        `options` are ways to extend the beam by step t, sorted by cost. If `checked`, drop what the
+        checker refuses.
         """
         most, several = width, bool(self._frames)
         if several:

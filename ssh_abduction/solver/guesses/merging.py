@@ -13,8 +13,8 @@ If two steps are one dstate, then so are the steps that the same action leads to
 on. All of these are merged. If two of them are apart, nothing is merged. The more steps a merge
 affects without a contradiction, the less likely it is wrong. So the *evidence* for a merge is the
 number of classes that it merges, plus the number of earlier merges that it confirms. Steps that fit
-only one known dstate, with much evidence, are merged first. Then follow steps with less evidence,
-and steps that fit several known dstates if the evidence for one of them is clearly the greatest. A
+only one known dstate, with much evidence, are merged first. Then come steps with less evidence.
+Steps that fit several known dstates come if the evidence for one dstate is clearly the greatest. A
 step that fits no known dstate becomes one.
 
 A guess is completed in the same way. First, nodes with one label in the guess are merged if they

@@ -253,11 +253,11 @@ class Sampler:
     ) -> NDArray[np.float32]:
         """Compute the forward messages: the probability of each state of each visit.
 
-        It is given the visits before it in its stretch, and the last draw of the visit before the
-        stretch. The states have the shape visits x states, padded with -1, and so have the
-        messages, whose rows add up to 1. `likely` has the probabilities of transitions between
-        these states. `drawn` has, for each visit, the column of its last drawn state. `starts` and
-        `lengths` are those of the stretches.
+        These probabilities are conditional on the earlier visits of the stretch, and on the last
+        draw of the visit before the stretch. The states have the shape visits x states, padded with
+        -1, and so have the messages, whose rows add up to 1. `likely` has the probabilities of
+        transitions between these states. `drawn` has, for each visit, the column of its last drawn
+        state. `starts` has the first visit of each stretch, and `lengths` its number of visits.
         """
         ahead = (states >= 0).astype(np.float32)
         for i in range(int(lengths.max())):
