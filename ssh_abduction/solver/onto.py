@@ -46,6 +46,7 @@ from ssh_abduction.solver.recorded import Support
 from ssh_abduction.solver.result import Solution
 from ssh_abduction.solver.values import Cost, Level, Status
 from ssh_abduction.solver.weighed import Weighed
+from ssh_abduction.theory.fields import ASSERTIONS
 from ssh_abduction.theory.settle import Problem, settle
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory, checked_theory
@@ -124,7 +125,8 @@ def solve_onto(
     solution = replace(
         found,
         maps=maps,
-        theory=_settled(found.theory, theory),
+        # The theory for the digest has assertions about its steps.
+        theory=found.theory.replace(**{kind: getattr(theory, kind) for kind in ASSERTIONS}),
         steps=len(joint),
         effort=replace(found.effort, seconds=replace(found.seconds, total=solving.watch.elapsed())),
         levels=(Level(found.cost, len(maps), found.complete),) if found.within else (),
@@ -295,16 +297,6 @@ def _weighed(found: Solution, old: int, ssh_map: SSHMap) -> Weighed | None:
         if rival.dstates[:old] == dstates and rival.places[:old] in ((), places)
     )
     return replace(found.weighed, rivals=rivals) if rivals else None
-
-
-def _settled(found: Theory, theory: Theory) -> Theory:
-    """Return the theory `found`, with the assertions of `theory` instead of those for a digest."""
-    return found.replace(
-        same=theory.same,
-        different=theory.different,
-        elsewhere=theory.elsewhere,
-        same_place=theory.same_place,
-    )
 
 
 def _contradiction(

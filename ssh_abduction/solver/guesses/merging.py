@@ -36,9 +36,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssh_abduction.runtime.clock import look_at_clock
-from ssh_abduction.solver.guesses.classes import Classes
 from ssh_abduction.solver.steps.apart import Matrix
 from ssh_abduction.solver.steps.chart import Chart, Link, numbered
+
+# The demands on the merge of a step with a known dstate, from strict to lenient. The first number
+# is by how much its evidence has to exceed that for the next best merge of the step. The second
+# number is how many known dstates may fit the step at most. The last demand allows anything.
+DEMANDS = (
+    (10, 1),
+    (5, 1),
+    (5, 2),
+    (3, 1),
+    (3, 3),
+    (2, 2),
+    (2, 10),
+    (1, 3),
+    (1, 100),
+    (0, 1),
+    (0, 2),
+    (0, 10**9),
+)
+# When a map is thinned, the evidence for a merge of two known dstates has to exceed that for the
+# next best merge by these numbers. They are tried in this order.
+THINNED = 10, 5, 3, 0
 
 
 def merged(
@@ -124,3 +144,181 @@ def _apart_in_map(
             apart[np.ix_(known, known)] |= apart[np.ix_(there[known], there[known])]
         if (apart == before).all():
             return apart
+
+
+class Classes:
+    """Classes of steps that are taken to be one dstate.
+
+    Some classes are *known* dstates. Each other class is later merged with one of these, or becomes
+    a known dstate. A merge of two classes also merges the classes that the same actions lead to
+    from both, and so on. A merge of steps that are apart is undone.
+
+    Attributes:
+        root: For each step, the step that represents its class.
+        known: For each root, whether its class is a known dstate.
+    """
+
+    def __init__(
+        self,
+        apart: Matrix,
+        links: Iterable[Link],
+        nodes: NDArray[np.int_] | None = None,
+    ) -> None:
+        """Begin with a class for each step. The matrix `apart` has the shape steps x steps.
+
+        Links are triples (step, action, step). If the "steps" are dstates of a map, `nodes` has the
+        number of nodes at each; None for 1 each.
+        """
+        steps = len(apart)
+        self._nodes = nodes
+        self.root = np.arange(steps)
+        self.known = np.zeros(steps, dtype=bool)
+        # The row of each root has the steps that are apart from some step of its class.
+        self._apart = apart.copy()
+        self._members: list[NDArray[np.int_]] = [np.array([t]) for t in range(steps)]
+        # For each root, a step that each action leads to.
+        self._leads: list[dict[int, int]] = [{} for _ in range(steps)]
+        for t, action, u in links:
+            self._leads[t][action] = u
+        # The values before the last call of `merge`, to undo it.
+        self._undo: list[
+            tuple[int, int, bool, NDArray[np.bool_], dict[int, int], NDArray[np.int_]]
+        ] = []
+
+    def take(self, guess: Sequence[int]) -> None:
+        """Merge the steps that share a label in a guess, if they can be one dstate.
+
+        Their classes become known dstates. The label is -1 where it is unknown.
+        """
+        first = {label: node for node, label in reversed(list(enumerate(guess))) if label >= 0}
+        self.known[list(first.values())] = True
+        for node, label in enumerate(guess):
+            look_at_clock()
+            if label >= 0:
+                self.merge(first[label], node)
+
+    def settle_all(self) -> None:
+        """Merge classes with known dstates, or make them known, until every class is known."""
+        for evidence, rivals in DEMANDS:
+            while self._settle(evidence, rivals):
+                pass
+
+    def thin_all(self) -> None:
+        """Merge known dstates until no two of them can be one."""
+        for evidence in THINNED:
+            while self._thin(evidence):
+                pass
+
+    def _settle(self, evidence: int, rivals: int) -> bool:
+        """Merge each class that is not known with its best known dstate, if that is clear enough.
+
+        A class that fits no known dstate becomes known. The classes that fit the fewest known
+        dstates come first. The evidence for the best dstate has to exceed that for the next by
+        `evidence`. A class that fits more than `rivals` known dstates is left as it is. Returns
+        whether anything changed.
+        """
+        has_changed = False
+        steps = np.flatnonzero(~self.known[self.root])
+        fitting = (~self._apart[np.flatnonzero(self.known)][:, steps]).sum(axis=0)
+        for t in steps[np.argsort(fitting, kind="stable")].tolist():
+            look_at_clock()
+            root = int(self.root[t])
+            if self.known[root]:
+                continue
+            fits = self._fitting(root)
+            if len(fits) > rivals:
+                continue
+            ranked = self._ranked(root, fits)
+            if not ranked:
+                self.known[root] = has_changed = True
+            elif _is_ahead(ranked, evidence):
+                self.merge(ranked[0][1], root, forced=True)
+                has_changed = True
+        return has_changed
+
+    def _thin(self, evidence: int) -> bool:
+        """Merge each known dstate with another one, if the evidence for that one is clear enough.
+
+        Dstates with the fewest nodes come first. The evidence for the best dstate has to exceed
+        that for the next by `evidence`. Returns whether any were merged.
+        """
+        has_merged = False
+        nodes = np.bincount(self.root, self._nodes)
+        for root in sorted(np.flatnonzero(self.known).tolist(), key=lambda root: nodes[root]):
+            look_at_clock()
+            if self.known[root]:  # it was not merged meanwhile
+                ranked = self._ranked(
+                    root, [dstate for dstate in self._fitting(root) if dstate != root], forced=True
+                )
+                if ranked and _is_ahead(ranked, evidence):
+                    self.merge(ranked[0][1], root, forced=True)
+                    has_merged = True
+        return has_merged
+
+    def _fitting(self, root: int) -> list[int]:
+        """List the known dstates that are apart from no step of a root's class."""
+        known = np.flatnonzero(self.known)
+        fits: list[int] = known[
+            ~self._apart[np.ix_(known, self._members[root])].any(axis=1)
+        ].tolist()
+        return fits
+
+    def _ranked(
+        self, root: int, fits: Sequence[int], *, forced: bool = False
+    ) -> list[tuple[int, int]]:
+        """Rank possible merges of a class with dstates: pairs (evidence, dstate), best first."""
+        found = []
+        for dstate in fits:
+            evidence = self.merge(dstate, root, forced=forced)
+            if evidence is not None:
+                found.append((evidence, dstate))
+                self._take_back()
+        return sorted(found, reverse=True)
+
+    def merge(self, a: int, b: int, *, forced: bool = False) -> int | None:
+        """Merge the classes of two roots, and all classes that have to be merged with them.
+
+        Returns the evidence. If this would merge steps that are apart, or two known dstates without
+        `forced`, it returns None, and nothing has changed.
+        """
+        self._undo = []
+        work = [(a, b)]
+        confirmed = 0
+        while work:
+            a, b = (int(self.root[t]) for t in work.pop())
+            if a == b:
+                confirmed += 1
+                continue
+            both_known = self.known[a] and self.known[b]
+            if (both_known and not forced) or self._apart[a, self._members[b]].any():
+                self._take_back()
+                return None
+            # Keep the class that is known. If none is, keep the larger one.
+            if self.known[b] or (
+                not self.known[a] and len(self._members[a]) < len(self._members[b])
+            ):
+                a, b = b, a
+            leads, more = self._leads[a], self._leads[b]
+            self._undo.append(
+                (a, b, bool(self.known[b]), self._apart[a].copy(), leads, self._members[a])
+            )
+            self.known[b] = False
+            work += [(leads[action], t) for action, t in more.items() if action in leads]
+            self._leads[a] = more | leads
+            self._apart[a] |= self._apart[b]
+            self.root[self._members[b]] = a
+            self._members[a] = np.concatenate([self._members[a], self._members[b]])
+        return confirmed + len(self._undo)
+
+    def _take_back(self) -> None:
+        """Undo the last merge."""
+        for a, b, known, apart, leads, members in reversed(self._undo):
+            self._apart[a], self._leads[a], self._members[a] = apart, leads, members
+            self.known[b] = known
+            self.root[self._members[b]] = b
+        self._undo = []
+
+
+def _is_ahead(ranked: Sequence[tuple[int, int]], evidence: int) -> bool:
+    """Whether the evidence for the best merge exceeds that for the next best by this much."""
+    return ranked[0][0] >= evidence + (ranked[1][0] if len(ranked) > 1 else 0)
