@@ -116,6 +116,18 @@ def true_map(known: truth.Known) -> SSHMap:
     return SSHMap(labels, tuple(dstates.values()), (), ())
 
 
+def test_the_bound_counts_what_laying_drives_on_each_other_costs() -> None:
+    noise = truth.Noise(Odometry(**truth.NOISE))
+    (known,) = together.of_mazes(4, 60, [4], noise, 3)
+    ssh_map, problem = true_map(known), settle(known.trace)
+    cost = 8 * (len(ssh_map.dstates) + len(set(known.places))) + Misfit(problem).of_map(ssh_map) / 2
+    bounds = []
+    for least in (Forcing._least_laying, lambda *_: 0.0):
+        with patch.object(Forcing, "_least_laying", least):
+            bounds.append(next(forcing_of(known.trace, Theory.topological(), ssh_map).bounds(cost)))
+    assert bounds[1] + problem.overlap.price - EQUAL <= bounds[0] <= cost + EQUAL
+
+
 def test_the_lack_of_one_join_is_assumed_if_no_other_way_leads_on() -> None:
     known = truth.random_walk(6, 150, 3002, truth.Noise(Odometry(**FINE)))
     ssh_map, problem = true_map(known), settle(known.trace)

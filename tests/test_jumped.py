@@ -22,10 +22,12 @@ from ssh_abduction.data.errors import TheoryError
 from ssh_abduction.data.maps import Fault
 from ssh_abduction.data.odometry import in_words
 from ssh_abduction.explain.no_map import explain
-from ssh_abduction.solver import weighing
+from ssh_abduction.solver import Misfit, Search, weighing
 from ssh_abduction.solver.front import fault_front
 from ssh_abduction.solver.guesses.outliers import wrong_displacements
+from ssh_abduction.solver.jumps import search_jumps
 from ssh_abduction.theory import Speedups
+from ssh_abduction.theory.evidence.displacement import jumped
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.speedups import SPEEDUPS
 
@@ -161,6 +163,30 @@ def test_a_maze_with_wrong_displacements_has_a_map_that_costs_no_more_than_the_t
     assert solution.weighed is not None
     assert solution.weighed.proven or not solution.weighed.searched
     assert solution.weighed.proven or solution.weighed.confidence < 0.5
+
+
+def test_a_local_search_finds_a_map_that_costs_no_more_than_the_truth() -> None:
+    """It begins with a map that believes all displacements, and changes one guess at a time."""
+    walk, jump = maze(3, 3, steps=16, seed=12, stars=True, follow=True, odometry=NOISE), 6
+    steps = list(walk.trace.steps)
+    steps[jump] = replace(steps[jump], displacement=AWAY, covariance=None)
+    search = Search(replace(walk.trace, steps=tuple(steps)), Theory(jumped=1))
+    parts, found = search._parts, dict[tuple[int, ...], float]()
+    misfit, (dstate, place, _) = Misfit(parts.task.problem), search.theory.prices
+
+    def add(ssh_map: SSHMap) -> float:
+        assert not check(search.trace, ssh_map, search.theory)
+        return found.setdefault(jumped(ssh_map), misfit.nats_of(ssh_map))
+
+    believing = parts.candidates.map_without(())
+    assert believing
+    search_jumps(search.trace, parts.candidates, believing, add)
+    dstates, places = walk.truth, [state[:2] for state in walk.truth]
+    number = [[*dict.fromkeys(names)].index for names in (dstates, places)]
+    course = [*map(number[0], dstates)], [*map(number[1], places)]
+    true = misfit.of_course(*course, [jump]) / 2 + dstate * (len({*dstates}) + search.theory.jumped)
+    assert min(found.values()) <= true + place * len({*places}) + 1e-6 < found[()]
+    assert parts.candidates.map_without((), most=true / 2) is None
 
 
 @pytest.mark.parametrize("jumps", [(), (17,), (11, 30)])

@@ -17,6 +17,9 @@ from ssh_abduction.solver.weighed import EQUAL
 # The widths of the beams, and the share of the time after which each of them ends. The beam without
 # axioms ends at the share BREAKING.
 WIDTHS, BREAKING = {1: 0.7, 4: 0.6, 16: 0.7}, 0.8
+# If displacements may be wrong, all beams end at the share JUMPED. Then the best map is often one
+# that they drop, and `jumps.py` looks for it.
+JUMPED = 0.4
 # Joining the maps of drives ends after the share JOINING.
 JOINING = 0.5
 # A beam of this width or more nearly always ends with the map of least cost.
@@ -88,7 +91,9 @@ class Beams:
         """Search by the beams of WIDTHS for which there is time. Returns the same as `search`."""
         parts, watch = self._parts, self._parts.watch
         # With several drives or floors, a broad beam keeps as many hypotheses as a wider one.
-        several = parts.task.theory.several_drives or parts.task.theory.lifts
+        theory = parts.task.theory
+        several = theory.several_drives or theory.lifts
+        shares = {w: min(end, JUMPED) if theory.jumped else end for w, end in WIDTHS.items()}
         widths = [width for width in WIDTHS if width <= BROAD or not several]
         if several:
             watch.stage_ends = time.end(JOINING)
@@ -101,9 +106,9 @@ class Beams:
             began = watch.elapsed()
             # A beam of width n takes about n times as long as the first one.
             last, first = widths[-1], self._took[0] if self._took else math.inf
-            if width < last and began + last * first < time.end(WIDTHS[last]):
+            if width < last and began + last * first < time.end(shares[last]):
                 continue  # there is time for the last one, so leave this one out
-            watch.stage_ends = time.end(WIDTHS[width])
+            watch.stage_ends = time.end(shares[width])
             if (beam := parts.candidates.beam(width)) is None:
                 break
             if not self._ends(beam, width) and not self._ended:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -25,6 +25,7 @@ from ssh_abduction.solver.guesses.mended import first_contradiction, mended_sket
 from ssh_abduction.solver.guesses.tree import Sketch
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
+from ssh_abduction.solver.steps.faults import faults_of, with_more_faults
 from ssh_abduction.theory.speedups import Speedups, row
 
 if TYPE_CHECKING:
@@ -95,6 +96,25 @@ class Candidates:
     def maps_of(self, beam: Beam) -> Iterator[SSHMap]:
         """Yield the maps that a beam finds and the checker accepts, the best one first."""
         yield from filter(self._judging.accepts, map(self._with_unknown_views, beam.maps()))
+
+    def map_without(self, wrong: Collection[int], most: float = math.inf) -> SSHMap | None:
+        """Find a map by a narrow beam if just the displacements to these steps are wrong.
+
+        Return the first map that the checker accepts; None if there is none, or if it costs more
+        than about `most` nats.
+        """
+        from ssh_abduction.solver.guesses.beam import Beam  # loads numpy
+
+        trace, theory = self._task.trace, self._task.theory
+        mended = trace.without_displacements_at(wrong)
+        problem = self._task.problem.changed(mended, theory.replace(jumped=0.0))
+        jumps = faults_of(((t, "jumped") for t in wrong), {}, {}, trace, theory)
+        most -= theory.prices[0] * sum(fault.cost for fault in jumps)
+        for ssh_map in Beam(problem, self._task.log, 1).maps(most):
+            whole = self._with_unknown_views(with_more_faults(ssh_map, jumps))
+            if self._judging.accepts(whole):
+                return whole
+        return None
 
     def joined(self) -> Iterator[SSHMap]:
         """Yield maps that join the maps of single drives, if the checker accepts them.

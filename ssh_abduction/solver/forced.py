@@ -127,6 +127,11 @@ class Visits:
         apart[0, first, second] = apart[0, second, first] = True
         return replace(self, apart=apart)
 
+    def cut(self, side: Flags) -> Visits:
+        """Return the same visits, but those on one side share no place with the others."""
+        apart = self.apart | (side[:, None] != side)
+        return replace(self, apart=apart, away=None if self.away is None else apart[0])
+
     def joined(self, of: Ints, pairs: Iterable[tuple[int, int]]) -> Ints:
         """Merge the classes of pairs of visits, then those that one action leads to from each."""
         of = of.copy()
@@ -295,7 +300,7 @@ class Forcing:
         self, problem: Problem, log: Log, misfit: Misfit, ssh_map: SSHMap, dstates: int = 0
     ) -> None:
         """Chart the trace, for its best known map and the proven least number of dstates."""
-        self._misfit, self._dstates = misfit, dstates
+        self._misfit, self._dstates, self._overlap = misfit, dstates, problem.overlap
         dstate, place, _ = problem.theory.prices
         self._prices = dstate, place if problem.theory.level == "topological" else 0.0
         self.visits = Visits.of(problem, log, ssh_map)
@@ -311,6 +316,7 @@ class Forcing:
         ]
         self.joins = self.visits.joined(np.arange(len(self.visits.place)), [])
         self.low = 0.0
+        self._laying = 0.0  # what every map of a cost below the present one pays for laying drives
 
     @staticmethod
     def holds_for(problem: Problem) -> bool:
@@ -326,6 +332,7 @@ class Forcing:
 
     def bounds(self, most: float) -> Iterator[float]:
         """Yield rising lower bounds, at most `most`, on the cost of every map. Keep `joins`."""
+        self._laying = self._least_laying(most)
         low = self._bound(most)
         yield low
         while most - low > NEARLY * most:
@@ -348,7 +355,26 @@ class Forcing:
 
     def force(self, most: float) -> None:
         """Find joins that every map of a cost below `most` has, until no more are found."""
+        self._laying = self._least_laying(most)
         self._forced(self.visits, self.joins, most, {}, 1)
+
+    def _least_laying(self, most: float) -> float:
+        """Return what every map of a cost below `most` pays for laying drives on each other.
+
+        If a map in which a drive shares no place with the others costs `most` or more, each cheap
+        map lays this drive on others. Drives that closures tie count as one.
+        """
+        unit = np.array(self._overlap.unit_of_step)[
+            np.unique(self.visits.visit, return_index=True)[1]
+        ]
+        units, laid = np.unique(unit), 0
+        base = self._misfit.of_returns(self.returns) / 2
+        for one in units if len(units) > 1 else ():
+            look_at_clock()
+            classes = _Joined(self.visits.cut(unit == one), self.joins)
+            laid += classes.fails or self._price(classes.counts) + base >= most
+        # There are most groups of drives if those that must be laid on others form pairs.
+        return self._overlap.price * (laid - laid // 2)
 
     def _price(self, counts: tuple[int, int]) -> float:
         """Return the price of at least this many dstates and places."""
@@ -396,6 +422,8 @@ class Forcing:
             if classes.fails:
                 return joins, math.inf, []
             misfit = self._misfit.of_returns(visits.returns(joins)) / 2
+            laid = self._overlap.nats(joins[visits.visit].tolist())
+            misfit += max(self._laying - laid, 0.0)
             low = self._price(classes.counts) + misfit
             if low >= most:
                 return joins, low, []

@@ -333,11 +333,7 @@ class Search:
             if not weighing.guess(clashes):
                 self._parts.known.status = Status.UNSATISFIABLE
                 return
-        if watch.left() < math.inf:
-            watch.stage_ends = watch.elapsed() + COUNTING_SHARE * watch.left()
-        with suppress(StageTimeError):
-            self._stages.find_minimum()
-        watch.stage_ends = math.inf
+        self._stages.find_minimum_within(COUNTING_SHARE)
         if self._parts.known.status is not Status.UNSATISFIABLE:
             most = self.limits.most
             weighing.search(lambda trace, theory, s: self._solve_mended(trace, theory, most, s))

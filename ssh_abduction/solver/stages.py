@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver import choosing, prefixes
@@ -89,6 +91,20 @@ class Stages:
                 self._settle_dstates_first()
         if parts.known.status is Status.UNKNOWN:
             parts.prefixes.find_minimum()
+
+    def find_minimum_within(self, share: float) -> None:
+        """Find the minimal cost as `find_minimum` does, in a share of the time left."""
+        watch = self._parts.watch
+        if watch.left() < math.inf:
+            watch.stage_ends = watch.elapsed() + share * watch.left()
+        try:
+            self.find_minimum()
+        except StageTimeError:
+            pass
+        except LimitError as limit:
+            if limit.reason != "no proof":
+                raise
+        watch.stage_ends = math.inf
 
     def _mend(self) -> bool:
         """Look for maps by mending the trace. Return whether minimal ones were found and proven."""

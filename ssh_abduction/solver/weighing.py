@@ -26,7 +26,7 @@ poses of its dstates, as in logs, `scatter.py` gives one, too.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -35,7 +35,7 @@ from typing import TypeAlias
 from scipy.special import gammaincc
 
 from ssh_abduction.data.drives import drives_of
-from ssh_abduction.data.maps import Fault, SSHMap
+from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import heeding, look_at_clock
 from ssh_abduction.runtime.loggers import log_of
@@ -53,12 +53,14 @@ from ssh_abduction.solver.estimating import (
 )
 from ssh_abduction.solver.forced import Forcing
 from ssh_abduction.solver.judging import Judging
+from ssh_abduction.solver.jumps import search_jumps
 from ssh_abduction.solver.known import Known
 from ssh_abduction.solver.map_list import Priced
 from ssh_abduction.solver.misfit import Misfit
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.prefixes import Prefixes
 from ssh_abduction.solver.scatter import is_for, least_cost
+from ssh_abduction.solver.steps.faults import with_more_faults
 from ssh_abduction.solver.values import Cost, Status
 from ssh_abduction.solver.weighed import EQUAL, Rival, Weighed
 from ssh_abduction.theory.evidence import Equality
@@ -159,6 +161,8 @@ class Weighing:
         if self.candidates and Forcing.holds_for(task.problem):
             task = self._with_forced_joins(task)
         if parts.task.theory.has_faults and len(parts.task.trace) > READABLE:
+            if self.candidates and parts.task.theory.jumped and parts.candidates.beam(1):
+                search_jumps(parts.task.trace, parts.candidates, self.candidates[0].map, self.add)
             raise LimitError("no proof")
         best = parts.known.best
         engine = labelling_engine(task, best.dstate_at if best else ())
@@ -210,8 +214,9 @@ class Weighing:
         if known.best is not None:
             self.add(known.best)
         if not self.proven:
-            first = next(iter(self._prices))
-            least = {**self._least, first: getattr(known.bound, first) or 0}
+            first, dstates = next(iter(self._prices)), known.bound.dstates or 0
+            counts = {"dstates": dstates, "tenths": max(known.bound.tenths or 0, 10 * dstates)}
+            least = {**self._least, first: counts[first]}
             self.bound = max(self.bound, self._price(least) + self._base)
         if self.candidates:
             best = self.candidates[0].map
@@ -255,7 +260,7 @@ class Weighing:
         found, proven = self._of_labels(trace, pinned, self._parts.watch.left())
         jumps = tuple(fault for fault in ssh_map.faults if fault.kind == "jumped")
         alike = [
-            _with(jumps, other)
+            with_more_faults(other, jumps)
             for other in found
             if dstates_and_places(other) == dstates_and_places(ssh_map)
         ]
@@ -396,14 +401,6 @@ def _exactly(ssh_map: SSHMap) -> list[Equality]:
         pairs = combinations(range(len(names)), 2)
         found += [Equality(i, j, of, names[i] == names[j]) for i, j in pairs]
     return found
-
-
-def _with(faults: Sequence[Fault], ssh_map: SSHMap) -> SSHMap:
-    """Add faults to a map."""
-    if not faults:
-        return ssh_map
-    both = sorted((*ssh_map.faults, *faults), key=lambda fault: (fault.step, fault.kind))
-    return replace(ssh_map, faults=tuple(both))
 
 
 def _pinned(theory: Theory, ssh_map: SSHMap) -> Theory:

@@ -18,7 +18,11 @@ from ssh_abduction.theory.theory import Theory
 
 
 class Overlap:
-    """Computes the price of laying the drives of one trace on each other."""
+    """Computes the price of laying the drives of one trace on each other.
+
+    Attributes:
+        price: The price of joining two groups of drives.
+    """
 
     def __init__(self, trace: Trace, theory: Theory) -> None:
         """Find the drives that closures connect.
@@ -27,10 +31,15 @@ class Overlap:
             theory: The theory, which has the price.
         """
         starts = starts_of(trace)
-        self._price = theory.price_of_laying
+        self.price = theory.price_of_laying
         self._drive = [bisect_right(starts, t) for t in range(len(trace))]
         closures = ((self._drive[c.first], self._drive[c.last]) for c in trace.closures)
         self._tied = _joined(range(len(starts) + 1), closures)  # a group for each drive
+
+    @property
+    def unit_of_step(self) -> list[int]:
+        """For each step, a number of its drive. Drives that closures tie have the same number."""
+        return [self._tied[drive] for drive in self._drive]
 
     def is_tied(self, drive: int) -> bool:
         """Whether closures connect a drive, given by its number, to others."""
@@ -44,7 +53,7 @@ class Overlap:
         """
         if len(self._tied) == 1:
             return 0.0
-        return self._price * (len({*self._tied}) - groups_of(at, self._drive, self._tied))
+        return self.price * (len({*self._tied}) - groups_of(at, self._drive, self._tied))
 
     def of_steps(self, labels: Sequence[int], places: Sequence[Hashable]) -> float:
         """Return the price for the dstates of the first steps and the places of dstates."""
@@ -58,7 +67,7 @@ class Overlap:
     def between(self, some: Collection[int], others: Collection[int]) -> float:
         """Return the price of a common place of two pieces of a map, given by their steps."""
         groups = [{self._tied[self._drive[t]] for t in steps} for steps in (some, others)]
-        return 0.0 if groups[0] & groups[1] else self._price
+        return 0.0 if groups[0] & groups[1] else self.price
 
 
 def groups_of(at: Iterable[Hashable], drive: Iterable[int], tied: Sequence[int]) -> int:

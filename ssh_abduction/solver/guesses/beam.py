@@ -111,8 +111,10 @@ class Beam:
             if getattr(theory, kind)
         }
 
-    def maps(self) -> Iterator[SSHMap]:
+    def maps(self, most: float = math.inf) -> Iterator[SSHMap]:
         """Yield the maps of the hypotheses of the whole trace that satisfy the axioms, by cost.
+
+        Give up as soon as all hypotheses cost more than `most` nats.
 
         If an exception ended an earlier call, such as that of a time limit, go on from there. If no
         hypothesis is left after some steps, go back to an earlier beam and check each hypothesis at
@@ -131,7 +133,7 @@ class Beam:
                 if back == len(kept):
                     break
                 back = min(2 * back, len(kept))
-            if not beam:
+            if not beam or beam[0].nats > most:
                 return
             kept[-1] = kept[-1][:SPARE]  # saves memory
             kept.append(beam)

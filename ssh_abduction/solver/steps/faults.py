@@ -66,6 +66,12 @@ def view_at(trace: Trace, step: int) -> str | int:
     return view
 
 
+def with_more_faults(ssh_map: SSHMap, faults: Iterable[Fault]) -> SSHMap:
+    """Add faults to a map, in the order of their steps."""
+    both = sorted((*ssh_map.faults, *faults), key=lambda fault: (fault.step, fault.kind))
+    return replace(ssh_map, faults=tuple(both))
+
+
 def with_changes(ssh_map: SSHMap, trace: Trace, theory: Theory) -> SSHMap | None:
     """Add a fault of kind "changed" to a map for each gateway that differs between drives.
 
