@@ -233,7 +233,7 @@ class Nothing(Machine):
         (
             lambda robot: Explorer(robot, Theory.causal().replace(misread=1)),
             TheoryError,
-            "theory: expected one without faults",
+            "theory: expected a theory without faults",
         ),
         (
             lambda robot: Explorer(Nothing("a", {0: {}})),

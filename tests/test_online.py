@@ -363,7 +363,7 @@ def test_a_step_that_does_not_fit_changes_nothing(
         ({"displacement": (10_000.0, 0.0, 0.0)}, "step 2: displacement: expected metres"),
         (
             {"covariance": np.eye(3)},
-            "step 2: covariance: expected a displacement that it belongs to",
+            "step 2: covariance: expected a displacement at the same step",
         ),
         (
             {"displacement": (1.0, 0.0, 0.0), "covariance": np.diag([1.0, 1.0, -1.0])},

@@ -356,7 +356,7 @@ def test_a_refused_step_leaves_a_mapper_with_faults_unchanged() -> None:
         mapper.observe({"name": "right", "kind": "travel"}, "v2")
     assert mapper.solution is before
     assert repr(mapper) == "<OnlineMapper: 2 steps, optimal, 2 dstates>"
-    with pytest.raises(TheoryError, match="expected one that allows faults"):
+    with pytest.raises(TheoryError, match="expected a theory that allows faults"):
         _ = OnlineMapper("v0", Theory.causal()).standing
 
 

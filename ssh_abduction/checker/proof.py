@@ -50,7 +50,9 @@ def check_bound(trace: Trace, certificate: Any) -> ProvenBound:
             f"certificate: expected an object, got {brief(certificate)}; write it with solve --json"
         )
     if "clique" not in certificate:
-        raise MapError("certificate: clique: expected one, got none; write it with solve --json")
+        raise MapError(
+            "certificate: clique: expected a clique, got none; write the file with solve --json"
+        )
     steps, words, refuted = (certificate.get(name, []) for name in ("clique", "words", "refuted"))
     if (
         not _integers(steps)

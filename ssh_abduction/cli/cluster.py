@@ -28,8 +28,8 @@ def add_parser(verbs: Verbs) -> None:
         "cluster images into views",
         "Cluster the images of a trace into views, and write the trace with its views. The number "
         "of views k is chosen by M, the smallest distance between clusters divided by the largest "
-        "distance within one: the largest M wins. If another number of views is about as good, "
-        "the trace also keeps those views, and a warning says whether they give another map.",
+        "distance within a cluster: the largest M wins. If another number of views is about as "
+        "good, the trace also keeps those views, and a warning says whether they give another map.",
     )
     parser.add("trace", "trace file with images, or - for standard input")
     add_output(parser)

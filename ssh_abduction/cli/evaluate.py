@@ -41,11 +41,11 @@ def add_parser(verbs: Verbs) -> None:
         run,
         "compare maps with the truth",
         "Compare maps with the truth in the trace. Reports which map is true, and how far the "
-        "others are from it.",
+        "other maps are from the truth.",
         "The table gives precision and recall (shares from 0 to 1) for pairs of steps at one "
-        "place, for edges (two places that a travel joins), and for links. If steps have true "
-        "poses but no true names, as in an imported log, visits near each other count as one "
-        "place. docs/reference/formats.md describes what is counted.",
+        "place, for edges (two places between which the robot travelled), and for links. If steps "
+        "have true poses but no true names, as in an imported log, visits near each other count "
+        "as one place. docs/reference/formats.md describes what is counted.",
     )
     add_maps(parser)
     add_trace(parser, " with truth")

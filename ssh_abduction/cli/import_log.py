@@ -46,8 +46,8 @@ def add_parser(verbs: Verbs) -> None:
     parser.add(
         "log",
         "a CARMEN log, a g2o-style log with scans, a ROS 1 bag, a ROS 2 bag or MCAP; may be "
-        "compressed by gzip, bzip2, xz or zstd. '-' reads lines of CARMEN from standard input, "
-        "with little memory, and shows each place when it is final",
+        "compressed by gzip, bzip2, xz or zstd. '-' reads a CARMEN log from standard input, with "
+        "little memory, and shows each place when it is final",
     )
     add_output(parser)
     add_reading(parser)

@@ -30,9 +30,10 @@ def add_parser(verbs: Verbs) -> None:
         run,
         "show how much each kind of evidence helps",
         "Solve a trace several times, to show what each kind of evidence is worth. Begin with "
-        "views alone, then add one kind at a time: stars, pairs of steps that displacements "
-        "distinguish, pairs of returns that displacements exclude together, planarity. Each time "
-        "(a rung of the ladder), report the number and the size of the minimal maps; and, if the "
+        "views alone, then add one kind at a time: stars (openings seen), pairs of steps that "
+        "displacements distinguish, pairs of returns (two steps at one place or dstate) that "
+        "displacements exclude together, planarity (paths cross only at places). Each time (a "
+        "rung of the ladder), report the number and the size of the minimal maps; and, if the "
         "trace has truth, which map is true.",
     )
     parser.add("trace", "trace file (JSON Lines), or - for standard input", type=trace_path)

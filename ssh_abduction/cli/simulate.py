@@ -90,7 +90,7 @@ def add_parser(verbs: Verbs) -> None:
         (
             "reach",
             "half the width of a corridor: the distance that the robot keeps from a wall that it "
-            "follows (default: that of the world)",
+            "follows (default: the world's own)",
             None,
             METRES,
         ),
@@ -116,7 +116,7 @@ def add_parser(verbs: Verbs) -> None:
         ),
         (
             "textures",
-            "whether each wall has its own texture in panoramas, or parallel walls the same one "
+            "whether each wall has its own texture in panoramas, or parallel walls share one "
             "(default: unique)",
             None,
             {"choices": ("unique", "repeated")},

@@ -96,8 +96,8 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.add(
         "--corrections FILE",
-        "obey the names and corrections in this file; for a folder, in its corrections.yaml "
-        "(default: corrections.yaml beside the file of --output, if it exists)",
+        "obey the names and corrections in this file, or in corrections.yaml of this folder "
+        "(default: corrections.yaml in the folder of the file of --output, if there is one)",
     )
     parser.add(
         "--front K",
@@ -114,7 +114,7 @@ def add_parser(verbs: Verbs) -> None:
             "With several traces, or with one of these options, each result is one line, in the "
             "order of the traces. If a trace fails, its line says why, and the others are still "
             "solved. The exit code is 1 if there was an error, else the highest code of the "
-            "traces. Limits hold for each trace. The memory is that of the whole process: it "
+            "traces. Limits hold for each trace. The memory limit is for the whole process: it "
             "includes other threads of a Dask worker and, except on Linux, earlier traces."
         ),
     )

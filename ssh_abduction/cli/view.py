@@ -39,7 +39,7 @@ def add_parser(verbs: Verbs) -> None:
         "Show maps in the browser, on one page: what all maps share, where they differ, each "
         "map alone, two maps side by side, and what happened at each step.",
         "The page is one file that works without a network. Without --serve, it cannot ask the "
-        "solver. It shows the commands that do.",
+        "solver. It shows the commands for that.",
     )
     add_maps(parser)
     parser.add(

@@ -28,8 +28,8 @@ class FieldReader:
     def wrong(self, name: str, expected: str, value: Any) -> MapError:
         """Return the MapError for a field with a wrong value."""
         return MapError(
-            f"{self.where}: {name or 'map'}: expected {expected}, got {brief(value)}; "
-            f"write it with solve --json"
+            f"{self.where}: {name or 'map'}: expected {expected}, got {brief(value)}; write the "
+            "file with solve --json"
         )
 
     def mapping(self, value: Any, name: str) -> Mapping[str, Any]:

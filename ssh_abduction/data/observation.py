@@ -46,8 +46,8 @@ def checked_probability(value: Any, where: str) -> float:
     """Return a value as a float if it is a probability from 0 to 1, or raise TraceError."""
     if not is_finite(value) or not 0 <= value <= 1:
         raise TraceError(
-            f"{where}: expected a probability from 0 to 1, got {brief(value)}; "
-            f"leave it out where none is known"
+            f"{where}: expected a probability from 0 to 1, got {brief(value)}; leave it out if "
+            "the probability is unknown"
         )
     return float(value)
 

@@ -83,8 +83,8 @@ class Step:
         if self.covariance is not None:
             if self.displacement is None:
                 raise TraceError(
-                    "covariance: expected a displacement that it belongs to, got none; "
-                    "add it, or leave the covariance out"
+                    "covariance: expected a displacement at the same step, got none; add the "
+                    "displacement, or leave the covariance out"
                 )
             noise = checked_covariance(self.covariance, "covariance")
             object.__setattr__(self, "covariance", noise)

@@ -205,7 +205,7 @@ class Explorer:
             )
         if theory is not None and checked_theory(theory).has_faults:
             raise TheoryError(
-                "theory: expected one without faults, as a contradiction ends an "
+                "theory: expected a theory without faults, as a contradiction ends an "
                 "exploration, got misread or slipped; leave them out"
             )
         self._robot, self._time_limit, self._max_maps = robot, time_limit, max_maps

@@ -173,8 +173,8 @@ class OnlineMapper:
         """
         if self._keeper.standing is None:
             raise TheoryError(
-                "theory: expected one that allows faults, as `standing` is about faults, got one "
-                "without; set misread or slipped, or read `solution`"
+                "theory: expected a theory that allows faults, as `standing` is about faults, got "
+                "one without; set misread or slipped, or read `solution`"
             )
         return self._keeper.standing
 

@@ -195,8 +195,8 @@ class Listing:
         for i, ssh_map in enumerate(maps):
             if (known := first_with.setdefault(ssh_map.id, i)) != i:
                 raise MapError(
-                    f"{where}: maps[{i}]: expected another map, got that of maps[{known}] again; "
-                    "leave it out"
+                    f"{where}: maps[{i}]: expected another map, got the same map as maps[{known}] "
+                    "again; leave it out"
                 )
         theory = theory_in(answer["theory"], where) if "theory" in answer else None
         status, count = answer.get("status"), answer.get("count", len(maps))

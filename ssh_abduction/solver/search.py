@@ -115,8 +115,8 @@ class Search:
         self._asked_weigh = theory.weigh if theory else "auto"
         if within and self.theory.has_faults:
             raise TheoryError(
-                f"within: expected 0 where faults are allowed, got {within}; leave it out, or see "
-                "what each number of faults is worth (--front)"
+                f"within: expected 0 where faults are allowed, got {within}; leave within out, or "
+                "compare the numbers of faults (--front)"
             )
         check_rules(self.theory)
         self.trace = trace

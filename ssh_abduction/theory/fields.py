@@ -131,8 +131,8 @@ def normalise(theory: Theory) -> None:
         )
     if "auto" in theory.prefer and theory.prefer != AUTO:
         raise TheoryError(
-            f"prefer: expected auto alone, got {', '.join(theory.prefer)}; name the counts, or "
-            "leave it out"
+            f"prefer: expected auto without other counts, got {', '.join(theory.prefer)}; name "
+            "the counts, or leave it out"
         )
     if theory.has_faults:
         _check_faults(theory)
@@ -160,8 +160,8 @@ def _check_weigh(theory: Theory) -> None:
         )
     if theory.boundary == "defeasible":
         raise TheoryError(
-            "weigh: expected count where excuses are allowed, as their price in nats is not "
-            f"known, got cost; take {choice('weigh', 'count')}"
+            "weigh: expected count where excuses are allowed, as the price of an excuse in nats "
+            f"is not known, got cost; take {choice('weigh', 'count')}"
         )
 
 
