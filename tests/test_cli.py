@@ -608,7 +608,10 @@ def test_errors_say_what_mends_them(
         (["check", str(tmp_path / "no.json")], "no.json: expected a readable file of maps"),
         (["next", ACES], "expected a file of maps, got a trace; name the maps first"),
         (["train", str(solved), ACES, "--map", "5", "-o", "x"], "--map: expected 1 to 4, got 5"),
-        (["reproduce", "notched-rectangle", "--jobs", "0"], "--jobs: expected how many processes"),
+        (
+            ["reproduce", "notched-rectangle", "--jobs", "0"],
+            "--jobs: expected a number of processes",
+        ),
         (
             ["reproduce", "notched-rectangle", "--seeds", "0", "--jobs", "1", "-o", str(taken)],
             "File exists; take another name",

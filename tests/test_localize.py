@@ -589,7 +589,7 @@ IMAGES, AT = pictures(3, 4, seed=1)
         (
             lambda: Localiser(RING, recogniser()),
             PerceptionError,
-            "expected one that has learnt, got a new one",
+            "expected a fitted one, got a new one",
         ),
         (
             lambda: list(Localiser(RING).beliefs(_imaged(IMAGES))),

@@ -382,7 +382,7 @@ def test_a_search_says_why_it_has_no_map_or_no_proof() -> None:
         (["-o", "{file}"], "expected a folder to write, got a file"),
         (["-o", "{file}/x"], "expected a folder to write, got a file"),
         (["-o", "x", "--time-limit", "-1"], "--time-limit: expected a number of seconds above 0"),
-        (["-o", "x", "--maps", "-1"], "--maps: expected how many minimal maps to list"),
+        (["-o", "x", "--maps", "-1"], "--maps: expected a number of minimal maps to list"),
     ],
 )
 def test_map_refuses_wrong_options_before_it_reads_a_log(

@@ -200,7 +200,7 @@ def test_check_bound_on_the_command_line(
     del data["certificate"]
     maps.write_text(json.dumps(data))
     assert main(["check", "--bound", str(trace), str(maps)]) == 1
-    assert "certificate: expected one beside the maps" in capsys.readouterr().err
+    assert "certificate: expected one in the file of maps" in capsys.readouterr().err
     assert main(["check", "--bound", "--set", "without=deterministic", str(trace), str(maps)]) == 1
     assert "which the proof rests on" in capsys.readouterr().err
 

@@ -415,7 +415,7 @@ def test_steps_that_make_no_sense(view: str) -> None:
 
 
 def test_what_json_cannot_hold_is_not_written(tmp_path: Path) -> None:
-    with pytest.raises(TraceError, match="expected what JSON can hold"):
+    with pytest.raises(TraceError, match="expected values that JSON can hold"):
         Trace((Step(view="a", truth=float("inf")),)).save(tmp_path / "t.jsonl")
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(TraceError):

@@ -243,7 +243,7 @@ def leads_of(ssh_map: SSHMap, number: int) -> dict[int, dict[str, int]]:
             raise MapError(
                 f"maps[{number}]: links: expected that {brief(action)} leads from dstate {source} "
                 f"to one dstate, got dstates {found[source][action]} and {target}; solve the trace "
-                "with the axiom deterministic (do not leave it out by --set without)"
+                "with the axiom deterministic"
             )
     return found
 
