@@ -314,7 +314,7 @@ class _Cells:
         return search.best, self.order[search.ends]
 
     def _compare(self, a: int, b: int, search: _ShortestEdges) -> float:
-        """Compare all images of two cells, a and b; return the new bound for these cells."""
+        """Compare all images of two cells (groups), a and b; return the new bound for them."""
         rows, columns = self.slices[a], self.slices[b]
         squares = self.images[rows] @ self.images[columns].T
         squares *= -2

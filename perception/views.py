@@ -227,7 +227,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
 
     @property
     def runner_up_(self) -> int | None:
-        """Another k whose views may make a better map; None if there is none.
+        """Another number of views k that may give a better map; None if there is none.
 
         Let T be the largest trimmed M of the other k. If the trimmed M of k_ is below 1.5 T, the
         runner-up is the smallest other k with a trimmed M of at least 0.95 T. Otherwise it is the k

@@ -76,7 +76,8 @@ class MapFile:
 
 
 def read_occupancy(path: Path) -> tuple[str, NDArray[np.float64]]:
-    """Read the name of an occupancy map, which is that of the file, and its walls, (n, 4) metres.
+    """Read the name of an occupancy map, which is the name of the file, and its walls, (n, 4)
+    metres.
 
     Raises SimulatorError, which names the file and the field.
     """

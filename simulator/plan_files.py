@@ -58,7 +58,7 @@ class Door:
 
 
 def read_plan(path: str | os.PathLike[str]) -> tuple[str, tuple[Room, ...], tuple[Door, ...]]:
-    """Read the name of a plan, which is that of the XML file, its rooms, and its doors.
+    """Read the name of a plan (the name of the XML file), its rooms, and its doors.
 
     Raises SimulatorError if the file cannot be read, or a part of the plan is wrong.
     """

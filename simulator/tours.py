@@ -135,9 +135,9 @@ def record(
 ) -> RecordedDrive:
     """Drive tours as `simulate` does, or to the places of a route, and return the scans.
 
-    The odometry in the log, with the noise of `odometer`, is not the odometry that the robot
-    drives by. It is as noisy as that of recorded logs. There is a scan each `every` metres, and
-    in turns every ten degrees. Raises SimulatorError if the route cannot be driven.
+    The odometry in the log, with the noise of `odometer`, is not the odometry that the robot drives
+    by. It is as noisy as the odometry of recorded logs. There is a scan each `every` metres, and in
+    turns every ten degrees. Raises SimulatorError if the route cannot be driven.
     """
     driver = _driver(world, tours, seed, laser, body, None)
     if world.lifts:

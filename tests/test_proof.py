@@ -167,7 +167,7 @@ def test_malformed_certificates_are_errors(change: dict[str, Any], word: str) ->
 
 
 def test_a_certificate_says_its_clique() -> None:
-    with pytest.raises(MapError, match="clique: expected one"):
+    with pytest.raises(MapError, match="clique: expected a clique"):
         check_bound(certified()[0], {})
 
 

@@ -47,7 +47,8 @@ class VisitMatch:
     Attributes:
         first: Index of the earlier visit.
         last: Index of the later visit.
-        match: How the middle of the later place lies relative to that of the earlier one.
+        match: The pose of the middle of the later place relative to the middle of the earlier
+            place.
     """
 
     first: int
@@ -183,7 +184,7 @@ class _Corrected:
         self._turns = np.zeros(len(visits))
 
     def predict(self, visit: int) -> None:
-        """Compute the position of a visit from that of the visit before it and the track."""
+        """Compute the position of a visit from the position before it and the track."""
         if visit:
             turn = self._turns[visit - 1]
             onward = points_turned(turn, self._middles[visit] - self._middles[visit - 1])

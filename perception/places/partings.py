@@ -236,8 +236,8 @@ def _links(
 ) -> dict[int, list[tuple[int, float, Array]]]:
     """For each visit, list the visits with nearly the same middle, and their relative poses.
 
-    Such a pose is the rotation from the axes of the other visit in radians, and its middle
-    relative to that of the first one in metres.
+    Such a pose is the rotation from the axes of the other visit in radians, and the middle of the
+    other visit relative to the middle of the visit in metres.
     """
     links: dict[int, list[tuple[int, float, Array]]] = defaultdict(list)
     for one in relations:

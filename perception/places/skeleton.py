@@ -192,8 +192,8 @@ def _out(edge: Edge, nodes: Mapping[int, Node], degrees: Mapping[int, int]) -> f
 def junctions_merged(graph: Graph, distance: Array) -> list[Fork]:
     """Merge junctions in one open space, and give each its branches: (n, 2) rows and columns.
 
-    The radius of a merged junction is that of its largest disc. `distance` is from each cell to
-    the nearest obstacle, in cells, (rows, columns).
+    The radius of a merged junction is the radius of its largest disc. `distance` is from each cell
+    to the nearest obstacle, in cells, (rows, columns).
     """
     degrees = graph.degrees
     head = {node: node for node in graph.nodes if degrees[node] > 2}

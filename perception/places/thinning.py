@@ -128,8 +128,7 @@ def thinned(mask: Bools) -> Bools:
 def graph_of(lines: Bools, distance: Array) -> Graph:
     """Read lines one cell wide, (rows, columns), as a graph.
 
-    `distance` has that of each cell to the nearest one outside of the mask that was thinned, in
-    cells.
+    `distance` is from each cell to the nearest cell outside of the mask that was thinned, in cells.
     """
     # The cells are numbered row by row, with a margin, so that neighbours have fixed offsets.
     lines = np.pad(lines, 1)

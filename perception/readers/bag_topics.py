@@ -112,7 +112,7 @@ def bag_opened(path: str | os.PathLike[str], format: str) -> Iterator[Bag]:
 
 
 def typestore(is_ros1: bool) -> Any:
-    """Make the store of rosbags with the types of messages, those of transforms among them."""
+    """Make the store of rosbags with the types of messages, including transforms."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)

@@ -161,7 +161,7 @@ def _wrong_recording(name: str, times: Array, stamps_are_wrong: bool) -> str | N
 
 
 def _apart(topics: Mapping[str, Array]) -> list[str]:
-    """Describe topics whose stamps differ from those of the first topic; empty if all agree."""
+    """Describe topics whose stamps disagree with the stamps of the first topic; else empty."""
     begin = min(times[:, 1].min() for times in topics.values())
     every = max(COMPARED, (max(times[:, 1].max() for times in topics.values()) - begin) / TIMES)
     (first, reference), *others = (

@@ -200,7 +200,7 @@ class Drifts:
 
     @property
     def none(self) -> ErrorFilter:
-        """The filter with the poses without a drift."""
+        """The error filter that uses the poses without a drift of heading."""
         return self._filter(0)
 
     def _filter(self, number: int) -> ErrorFilter:

@@ -34,7 +34,7 @@ def star_pattern(m: Reading) -> Found:
 
 
 def star_frame(m: Reading) -> Found:
-    """Check that the stars seen at a place agree after each is turned by the heading.
+    """Check that the stars seen at a place agree after each star is turned by the heading.
 
     If gateways may change between drives, this holds within each drive.
     """

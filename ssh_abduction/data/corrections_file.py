@@ -92,8 +92,8 @@ def named_beside(
 ) -> tuple[SSHMap, ...]:
     """Return maps with the names in the file of corrections beside their file, if there is one.
 
-    `drives` are those of their trace, with fingerprints; empty if unknown. If the file of
-    corrections is of other drives, a warning says so. Raises MapError if it is malformed.
+    `drives` are the drives of the trace of the maps, with fingerprints; empty if unknown. If the
+    file of corrections is of other drives, a warning says so. Raises MapError if it is malformed.
     """
     file = beside(path)
     if file is None or not drives:

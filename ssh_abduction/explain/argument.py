@@ -256,8 +256,8 @@ class Argument:
     ) -> tuple[list[clingo.Symbol], tuple[tuple[str, int], ...]]:
         """Find the premises of a conclusion: a minimal set of earlier conclusions, and the links.
 
-        The links are those of the conclusion's own line, and links of earlier lines if the
-        conclusions of these lines do not suffice. The conclusion None is the contradiction.
+        The links come from the line of the conclusion, and from earlier lines if the conclusions of
+        these lines do not suffice. The conclusion None is the contradiction.
         """
         line = self._line_of(conclusion)
         number = len(self._lines) - 1 if conclusion is None else self._born[conclusion]

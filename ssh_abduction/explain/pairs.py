@@ -280,7 +280,7 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
             self._best = ssh_map, side
 
     def _is_cheaper(self, side: Side, other: Side) -> bool:
-        """Tell whether the map of a side costs less than that of another. Both have a map."""
+        """Tell whether the map of a side costs less than the map of another. Both have a map."""
         if (side.nats is None) is not (other.nats is None):  # a limit came before the price
             return side.nats is not None
         here, there = side.dearness(self.theory), other.dearness(self.theory)

@@ -160,7 +160,7 @@ class PairExplanation:
                 yield "nothing observed decides this: it rests on minimality alone"
 
     def _weighed(self, lost: Side, won: Side) -> str:
-        """Say in nats why the maps of one side cost more than those of the other."""
+        """Say in nats why the maps of one side cost more than the maps of the other side."""
         assert lost.nats is not None
         assert won.nats is not None
         assert lost.cost is not None

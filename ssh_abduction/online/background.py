@@ -157,7 +157,7 @@ class FaultSolver:
         return len(trace) >= self._next_search
 
     def make_due(self) -> None:
-        """Make the next search due at once, whatever the last one found."""
+        """Make the next search due at once, whatever the last search found."""
         self._next_search = 0
 
     def solve(self, trace: Trace, theory: Theory, has_map: bool) -> Solved | None:

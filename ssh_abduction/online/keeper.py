@@ -205,7 +205,7 @@ class IncrementalSolver:
         return len(trace) >= self._next_search
 
     def make_due(self) -> None:
-        """Make the next search due at once, whatever the last one found."""
+        """Make the next search due at once, whatever the last search found."""
         self._next_search = 0
 
     def maps(self, trace: Trace, theory: Theory, known: SSHMap | None) -> tuple[SSHMap, ...]:

@@ -212,7 +212,7 @@ class MoveGraph:
                     self._imply(course, other, around if self._is_around(course, other) else None)
 
     def _stretches(self) -> Iterator[tuple[int, tuple[int, ...]]]:
-        """Yield the id of each path and its places in order, those of each piece for themselves.
+        """Yield the id of each path and its places in order, separately for each piece of the map.
 
         Pieces of a joint map may share a path, only because fewer paths are preferred.
         """

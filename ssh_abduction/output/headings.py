@@ -48,7 +48,7 @@ class Turn(NamedTuple):
     Attributes:
         a: The first dstate.
         b: The second dstate.
-        angle: Radians counterclockwise from the heading of a to that of b.
+        angle: Radians counterclockwise from the heading of a to the heading of b.
         weight: SURE if the angle is known, GUESSED if only the side is known.
     """
 
@@ -97,10 +97,10 @@ def headings_by(
 ) -> tuple[dict[int, float], int]:
     """Find headings that agree best with all turns.
 
-    In each connected part of the map, the first dstate faces right. `courses` has, for each
-    dstate, its course, and the angle in radians from the heading of the course to its own. If
-    turns contradict each other, `robust` draws most turns exactly and a few of them very wrong,
-    instead of all a little wrong. Return the heading of each dstate, in radians
+    In each connected part of the map, the first dstate faces right. `courses` has, for each dstate,
+    its course, and the angle in radians from the heading of the course to the heading of the
+    dstate. If turns contradict each other, `robust` draws most turns exactly and a few of them very
+    wrong, instead of all a little wrong. Return the heading of each dstate, in radians
     counterclockwise from x, and the number of turns that may go to a wrong side.
     """
     graph: nx.MultiDiGraph[Any] = nx.MultiDiGraph()

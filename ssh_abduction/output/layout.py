@@ -119,7 +119,7 @@ def _is_origin(pose: Pose) -> bool:
 
 
 def _parts(ssh_map: SSHMap, poses: Sequence[Pose]) -> tuple[tuple[int, ...], ...]:
-    """List the dstates of each floor; without floors, those of each piece with poses of its own."""
+    """List the dstates of each floor; without floors, of each piece with poses of its own."""
     is_apart = all(_is_origin(poses[_first(ssh_map, piece)]) for piece in ssh_map.pieces)
     pieces = ssh_map.pieces if is_apart else (tuple(range(len(ssh_map.dstates))),)
     return ssh_map.floors or pieces

@@ -35,7 +35,7 @@ _Side: TypeAlias = Literal["right", "left"]
 class Beside:
     """A place that lies right or left of a path.
 
-    Right and left are those of the robot at the step `along`.
+    Right and left are as seen by the robot at the step `along`.
 
     Attributes:
         step: The first step at the place.

@@ -47,7 +47,8 @@ def report(
 ) -> str:
     """Make the page as the text of an HTML file that loads no other file.
 
-    `rungs` are those of the ladder, each with one more kind of evidence; empty without a ladder.
+    `rungs` are the results of the ladder, each with one more kind of evidence; empty without a
+    ladder.
     """
     name = imported.trace.name or "log"
     parts = [

@@ -88,7 +88,7 @@ class Beams:
         return may_have_map
 
     def _search_widths(self, time: _Time, clashes: Callable[[], bool]) -> bool:
-        """Search by the beams of WIDTHS for which there is time. Returns the same as `search`."""
+        """Search with beams of each width in WIDTHS, while there is time. Returns as `search`."""
         parts, watch = self._parts, self._parts.watch
         # With several drives or floors, a broad beam keeps as many hypotheses as a wider one.
         theory = parts.task.theory

@@ -30,8 +30,8 @@ class Equations:
     """The n displacements and closures of a trace. The displacements come first.
 
     Attributes:
-        first: The step from which each of them leads, (n,).
-        last: The step to which each of them leads, (n,).
+        first: The step from which each displacement or closure leads, (n,).
+        last: The step to which each displacement or closure leads, (n,).
         moved: The displacements in metres and radians, (n, 3).
         noise: Their covariances, (n, 3, 3).
         scaled: 1 if the shared error of scale applies, 0 if not, (n,).

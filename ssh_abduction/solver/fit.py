@@ -263,7 +263,7 @@ class Poses:
         return form
 
     def _moves(self) -> Any:
-        """Make the matrix that maps x of all positions to x of all displacements, or y to y."""
+        """Make the matrix that turns positions, x or y, into displacements, x or y."""
         return self._differences(self._place[self._from], self._place[self._to], self._positions)
 
     def _graph(self, first: NDArray[np.int_], second: NDArray[np.int_], size: int) -> csr_array:

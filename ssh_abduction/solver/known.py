@@ -46,7 +46,7 @@ class Known:
         return self.best is None or found.cost < self.cost
 
     def keep(self, found: Found, labels: tuple[int, ...]) -> None:
-        """Make a map, perhaps of a prefix, the best one. `labels` are those of the whole trace."""
+        """Make a map, perhaps of the first steps, the best one. `labels` is for the whole trace."""
         self.best, self.cost = replace(found.map, dstate_at=labels), found.cost
 
     def raise_bound(self, proven: int | None) -> None:

@@ -38,7 +38,7 @@ class Overlap:
 
     @property
     def unit_of_step(self) -> list[int]:
-        """For each step, a number of its drive. Drives that closures tie have the same number."""
+        """For each step, a number of its drive. Drives connected by closures have the same one."""
         return [self._tied[drive] for drive in self._drive]
 
     def is_tied(self, drive: int) -> bool:

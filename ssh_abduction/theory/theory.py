@@ -190,7 +190,7 @@ class Theory:
         """The names of the counts to minimise, most important first.
 
         With boundary=defeasible, they include "excuses". With faults, "tenths" comes first: the
-        cost in tenths of a dstate. With displacement=auto, the order is that for a trace without
+        cost in tenths of a dstate. With displacement=auto, the order is as for a trace without
         displacements.
         """
         prefer = self.prefer

@@ -192,7 +192,7 @@ class Asker:
 
     @contextmanager
     def grounding_timed(self) -> Iterator[None]:
-        """Count the time in this context as grounding."""
+        """Count the time in this `with` block as time for grounding."""
         began = time.perf_counter()
         try:
             yield

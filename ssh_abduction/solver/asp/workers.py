@@ -77,8 +77,8 @@ class Worker:
     def done(self, number: int, work: Callable[..., Any], arguments: tuple[object, ...]) -> Any:
         """Let the process call `work`. Return the result of `work`, or Lost if the process ends.
 
-        `number` is that of the task, for Lost. `work` can be pickled. After `arguments`, it gets a
-        function that returns whether to stop early.
+        `number` is the number of the task, for Lost. `work` can be pickled. After `arguments`, it
+        gets a function that returns whether to stop early.
         """
         self._send((work, arguments))
         output = self._process.stdout

@@ -105,7 +105,7 @@ class NamedLabels:
     def large_enough(self, size: int) -> int:
         """Return how many steps of the trace to take: at least `size`.
 
-        In a long trace this is enough for a clique as large as that of the whole trace.
+        In a long trace this is enough for a clique as large as the clique of the whole trace.
         """
         most = min(len(self._task.trace), WHOLE)
         if AT_ONCE <= size < most and self._task.speedups.clique:

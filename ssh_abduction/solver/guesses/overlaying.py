@@ -83,7 +83,7 @@ class Part:
         """Make a part from labels (the dstate of each step) and the place of each dstate.
 
         `poses` are the means and the covariance of x and y of each place, in metres, and then of
-        the heading of each dstate, in radians. `log` and `sights` are those of all steps.
+        the heading of each dstate, in radians. `log` and `sights` are about all steps.
         """
         seen: list[set[int]] = [set() for _ in places]
         stars: list[Sight] = [None for _ in places]
@@ -188,7 +188,7 @@ class _ClashError(Exception):
 
 
 class Overlay:
-    """Merges the dstates and places of a standing map with those of a drive."""
+    """Merges the dstates and places of a standing map with the dstates and places of a drive."""
 
     def __init__(self, standing: Part, drive: Part, problem: Problem, sights: Sights) -> None:
         theory, both = problem.theory, standing.beside(drive)

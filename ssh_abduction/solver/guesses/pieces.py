@@ -114,7 +114,7 @@ def headings_by_turn(found: Hypothesis) -> Iterator[list[float]]:
 
 
 def closed(found: Hypothesis, dstate: int, turn: float) -> Hypothesis:
-    """Turn the piece of the robot, and join it to that of a closure's earlier dstate.
+    """Turn the piece of the robot, and join it to the piece of the earlier dstate of a closure.
 
     This comes before the update by the closure, which is linear in the heading of the piece and so
     needs a heading that is nearly right. If the dstate is in the piece of the robot, nothing
@@ -131,7 +131,7 @@ def closed(found: Hypothesis, dstate: int, turn: float) -> Hypothesis:
 
 
 def _turned(found: Hypothesis, angle: float, centre: int) -> Hypothesis:
-    """Turn all poses of the piece of the robot about a centre (its entry), by radians."""
+    """Turn all poses of the robot's piece about a centre (index of its x), by radians."""
     n, pieces = len(found.mean) - 3, found.pieces
     places = zip(found.position, pieces.of_place, strict=True)
     headings = zip(found.heading, pieces.of_heading, strict=True)

@@ -74,9 +74,10 @@ def _map(
 ) -> SSHMap:
     """Make a map from the atoms of an answer, which name a dstate or place by its first step.
 
-    `course` has the path and the direction of each step that is along a path. `heading` has that of
-    each step, if places have frames or gateways. `before` has triples of a path and two places on
-    it, the earlier one first. The theory has the costs of faults; None for a map without faults.
+    `course` has the path and the direction of each step that is along a path. `heading` has the
+    heading of each step, if places have frames or gateways. `before` has triples of a path and two
+    places on it, the earlier one first. The theory has the costs of faults; None for a map without
+    faults.
     """
     views = views_of(is_at, trace, faults)
     names = sorted(set(is_at.values()))
