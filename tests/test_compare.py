@@ -556,7 +556,7 @@ def edited(path: Path, change: Callable[[dict[str, object]], object]) -> Path:
         ),
         (
             lambda d: (d.update(complete=False), d["backbone"]["places"].update(sometimes=[])),
-            "backbone: places: it contradicts the maps",
+            "backbone: places: it contradicts the listed maps",
         ),
         (
             lambda d: (d["maps"][0]["dstates"][0].update(view="x"), d["maps"][0].pop("id")),
