@@ -22,6 +22,7 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.data import Odometry
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.explain.no_map import explain
+from ssh_abduction.robot_logs.log_maps import PATHS
 from ssh_abduction.runtime.clock import heeding
 from ssh_abduction.solver import Search, Status
 from ssh_abduction.solver.guesses.beam import Beam
@@ -85,6 +86,23 @@ def test_a_beam_that_did_not_end_begins_a_map(looks: int) -> None:
     assert search.best
     assert len(search.best.dstates) < len(trivial.dstates)
     assert check(known.trace, search.best, search.theory) == ()
+
+
+def test_a_dstate_that_leads_elsewhere_is_no_dead_end() -> None:
+    """The robot drives along a corridor twice, and stops halfway at the second time only.
+
+    Both times it begins at one place, and nothing but the next displacement shows that it begins at
+    another dstate there. A beam of one hypothesis finds this without going back.
+    """
+    actions = ["travel", "around", "travel", "around", "travel", "travel"]
+    metres = [10.0, 0.0, 10.0, 0.0, 5.0, 5.0]
+    moves = [(far, 0.0, 0.0 if far else math.pi) for far in metres]
+    noise = Odometry(offset=0.2, facing=0.1)
+    trace = Trace.from_steps([0] * 7, actions, displacements=moves, odometry=noise)
+    with patch.object(Beam, "_checked", side_effect=AssertionError):
+        best = maps_of(trace, Theory.topological().replace(star="none", without=PATHS), 1)[0]
+    places = [best.dstates[d].place for d in best.dstate_at]
+    assert places == [0, 1, 1, 0, 0, 2, 1]
 
 
 @pytest.mark.slow

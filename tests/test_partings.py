@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -32,11 +33,11 @@ def walked(corners: Points, pace: float = PACE) -> Array:
 @pytest.mark.parametrize(
     ("first", "last", "where"),
     [
-        (STRAIGHT, LANE, [(11, 0)]),
-        (STRAIGHT, LANE[::-1], [(11, 0)]),
-        (STRAIGHT[::-1], LANE, [(11, 0)]),
-        (STRAIGHT, [(0, 3), (7, 3), (10, 0), (20, 0)], [(9, 0)]),
-        (STRAIGHT, [(0, 3), (4, 3), (7, 0), (13, 0), (16, 3), (20, 3)], [(6, 0), (14, 0)]),
+        (STRAIGHT, LANE, [(10.5, 0)]),
+        (STRAIGHT, LANE[::-1], [(10.5, 0)]),
+        (STRAIGHT[::-1], LANE, [(10.5, 0)]),
+        (STRAIGHT, [(0, 3), (7, 3), (10, 0), (20, 0)], [(9.5, 0)]),
+        (STRAIGHT, [(0, 3), (4, 3), (7, 0), (13, 0), (16, 3), (20, 3)], [(6.5, 0), (13.5, 0)]),
         (STRAIGHT, STRAIGHT, []),
         (STRAIGHT, [(0, 0.8), (20, 0.8)], []),
         (STRAIGHT, [(0, 3), (20, 3)], []),
@@ -50,8 +51,8 @@ def test_stretches_lead_apart_where_both_go_on(first: Points, last: Points, wher
     ours, theirs = walked(first), walked(last)
     found = [(ours[a] + theirs[b]) / 2 for a, b in lead_apart(cdist(ours, theirs))]
     assert len(found) >= len(where)
-    assert all(min(math.dist(p, q) for q in where) < 0.8 for p in found)
-    assert all(min(math.dist(p, q) for p in found) < 0.8 for q in where)
+    assert all(min(math.dist(p, q) for q in where) < 0.5 for p in found)
+    assert all(min(math.dist(p, q) for p in found) < 0.5 for q in where)
 
 
 def drive(
@@ -101,7 +102,7 @@ def test_each_pass_of_a_parting_has_a_visit(
     middles = [new[0].middle, *points_moved(pose, new[:1][0].middle[None])] * 2
     for visit, middle in zip(new, [*middles[:2], middles[1]], strict=True):
         assert math.dist(visit.middle, middle) < 1e-6
-    assert math.dist(new[0].middle, (11, 0)) < 1.0
+    assert math.dist(new[0].middle, (10.5, 0)) < 0.5
     for visit in new:
         here = track.poses[visit.scan, :2]
         assert math.dist(here, visit.middle) <= 1.0
@@ -120,9 +121,11 @@ def test_each_pass_of_a_parting_has_a_visit(
 
 
 def test_a_place_nearby_is_the_place_of_a_parting() -> None:
-    for other, count in (((11.0, 0.0), 0), ((9.0, 0.0), 2)):
-        track, visits, closings = drive([STRAIGHT, LANE], (0.0, 50.0, 0.0), [other])
-        assert len(added(visits, with_partings(track, visits, closings)[0])) == count
+    for x, count in ((11.0, 0), (8.0, 2)):
+        track, visits, closings = drive([STRAIGHT, LANE], (0.0, 50.0, 0.0), [(x, 0.0)])
+        for radius in (0.5, 4.0):  # even if the parting is in its disc
+            wide = [replace(visit, radius=radius) for visit in visits]
+            assert len(added(wide, with_partings(track, wide, closings)[0])) == count
 
 
 @pytest.mark.parametrize(("off", "one"), [(0.8, True), (1.3, False)])

@@ -24,7 +24,7 @@ from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial.distance import cdist, pdist
 
 from perception.places.closures import VisitMatch
-from perception.places.stays import taken, with_ways_in_order
+from perception.places.stays import RIM, taken, with_ways_in_order
 from perception.places.track import Array, Track, points_turned
 from perception.places.visits import Visit, Way
 
@@ -32,15 +32,15 @@ from perception.places.visits import Visit, Way
 # apart.
 REACH, PACE = 12.0, 0.25
 # Two stretches run together if they are within BESIDE metres for TOGETHER metres. Then they diverge
-# if each is more than APART metres from the other one within AHEAD metres.
-BESIDE, TOGETHER, APART, AHEAD = 1.0, 2.0, 2.0, 4.0
-# A parting within NEAR metres of the middle of a visit, or within BEYOND metres of its disc, is at
-# the place of the visit. Partings within ONE metres are one. Points within PASS metres of the
-# trajectory belong to one pass.
-NEAR, BEYOND, ONE, PASS = 1.5, 0.5, 2.0, 4.0
-# The radius of the disc of a parting in metres. The robot crosses its rim at RIM metres, less than
-# BOW metres of trajectory away.
-RADIUS, RIM, BOW = 1.0, 1.5, 6.0
+# if each is more than APART metres from the other one within AHEAD metres. The parting is BEFORE
+# metres before the point where they are BESIDE metres apart.
+BESIDE, TOGETHER, APART, AHEAD, BEFORE = 1.0, 2.0, 2.0, 4.0, 0.5
+# A parting within NEAR metres of the middle of a visit is at the place of the visit. Partings
+# within ONE metres are one. Points within PASS metres of the trajectory belong to one pass.
+NEAR, ONE, PASS = 1.5, 2.0, 4.0
+# The radius of the disc of a parting in metres. The robot crosses its rim less than BOW metres of
+# trajectory away.
+RADIUS, BOW = 1.0, 6.0
 # Visits whose middles are within AGREED metres of each other are to one place.
 AGREED = 1.0
 # Between visits at most MOST metres of trajectory apart, the track is as good as a closure. Two
@@ -125,7 +125,6 @@ class _DrivePoints:
         self.points = np.stack([np.interp(at, self._way, track.poses[:, k]) for k in (0, 1)], 1)
         self.visits = visits
         self.ways = self._way[[visit.scan for visit in visits]]
-        self._reaches = np.array([max(NEAR, visit.radius + BEYOND) for visit in visits])
         self.middles = np.array([visit.middle for visit in visits]).reshape(-1, 2)
         self._cuts = [0.0, *(float(self._way[cut]) for cut in track.cuts), float(self._way[-1])]
 
@@ -153,7 +152,7 @@ class _DrivePoints:
     def is_near(self, some: _Pass) -> bool:
         """Whether a visit is so near to a pass that it is at the same place."""
         soon = np.abs(self.ways - some[0]) <= PASS
-        return bool((soon & (np.hypot(*(self.middles - some[1]).T) <= self._reaches)).any())
+        return bool((soon & (np.hypot(*(self.middles - some[1]).T) <= NEAR)).any())
 
     def visit(self, way: float, middle: Array) -> Visit:
         """Make the visit of a pass."""
@@ -172,7 +171,7 @@ class _DrivePoints:
         """The index in `ways` of the way by which points leave a disc; None if they stay in it."""
         for k in side:
             x, y = self.points[k] - middle
-            if math.hypot(x, y) >= RIM:
+            if math.hypot(x, y) >= RADIUS + RIM:
                 return taken(ways, math.atan2(y, x))
         return None
 
@@ -257,7 +256,7 @@ def _moved(visit: Visit, move: Array) -> Visit:
     """Move the middle of the place of a visit, and keep the points where its ways cross the rim."""
     if not move.any():
         return visit
-    rim = visit.radius + BEYOND
+    rim = visit.radius + RIM
     ways = []
     for way in visit.ways:
         x, y = rim * math.cos(way.bearing) - move[0], rim * math.sin(way.bearing) - move[1]
@@ -315,4 +314,5 @@ def _ahead(far: Array) -> Iterator[tuple[int, int]]:
         onward = theirs[b + 1 : b + 1 + ahead] if b > before else theirs[max(b - ahead, 0) : b]
         # It runs along, too, and does not turn around.
         if abs(b - before) >= back // 2 and len(onward) and onward.max() > APART:
-            yield a, b
+            begin = a - round(BEFORE / PACE)
+            yield begin, int(far[begin].argmin())

@@ -403,12 +403,13 @@ class Beam:
                     both = float(self._reckoning.squares(facing, t, [place], s)[0])
                     nats = moved.nats + changes + misread + both / 2
                     options.append(_Extension(nats, place, s, facing))
-        least = min(option.nats for option in options)
-        return [
-            option
-            for option in options
-            if option.nats <= least + self._sights.dearest and self._is_allowed(option, t)
-        ]
+        kept: list[_Extension] = []
+        for option in sorted(options, key=lambda option: option.nats):
+            if kept and option.nats > kept[0].nats + self._sights.dearest:
+                break
+            if self._is_allowed(option, t) and self._may_go_on(option, t):
+                kept.append(option)
+        return kept
 
     def _near(
         self, moved: Hypothesis, t: int, places: Sequence[int]
@@ -433,6 +434,13 @@ class Beam:
             return self._log.pairs.allow(t, [*labels, option.dstate], places)
         place = len(option.of.position) if option.place is None else option.place
         return self._log.pairs.allow(t, [*labels, len(places)], [*places, place])
+
+    def _may_go_on(self, option: _Extension, t: int) -> bool:
+        """Whether the next displacements agree with the links of the dstate of an option."""
+        if option.dstate is None or "slipped" in self._fault or "jumped" in self._fault:
+            return True
+        actions = self._log.actions
+        return self._reckoning.square_ahead(option.of, t, option.dstate, actions) <= 2 * DEAREST
 
     def _child(self, option: _Extension, t: int) -> Hypothesis:
         """Make the hypothesis that an option leads to, with its pose at step t."""

@@ -35,6 +35,8 @@ UNKNOWN = (1e3, 1e3, 3.0)
 # If the standard deviation of the sum of all turns exceeds this, in radians, linear equations are
 # too rough: if the robot drives on for 10 m, they miss its position by about 0.5 m.
 ROUGH = 0.3
+# Displacements of at most this many next steps are compared with the links of a hypothesis.
+AHEAD = 16
 # The indices of the first entries of the means: the errors of the scale and of the drift of the
 # odometry, in standard deviations.
 SCALE, BEND = 0, 1
@@ -146,6 +148,8 @@ class HypothesisPoses:
             pieces=replace(found.pieces, here=piece),
         )
         for closure in self._closures.get(t, ()):
+            if closure.first >= len(moved.labels):  # only in `square_ahead`
+                continue
             turned = closed(moved, moved.labels[closure.first], closure.displacement[2])
             moved = self._closed(turned, closure)
         return moved
@@ -234,6 +238,22 @@ class HypothesisPoses:
         )
         squares: Array = np.einsum("ni,ni->n", off, np.linalg.solve(spread, off[..., None])[..., 0])
         return squares
+
+    def square_ahead(self, moved: Hypothesis, t: int, dstate: int, actions: Sequence[int]) -> float:
+        """Compute the largest chi-square of the next steps if step t is at a known dstate.
+
+        An action at a dstate always leads to the same dstate. So links say where the next steps
+        are, until one is not known. The hypothesis is moved to step t. `actions` has a number for
+        each action of the trace.
+        """
+        largest = 0.0
+        for k in range(t + 1, min(t + 1 + AHEAD, len(self._trace))):
+            there = moved.links.get((dstate, actions[k - 1]))
+            if there is None or self._trace.steps[k].displacement is None:
+                break
+            moved, dstate = self.moved(moved, k), there
+            largest = max(largest, float(self.squares(moved, k, [moved.places[dstate]])[0]))
+        return largest
 
     def met(
         self, moved: Hypothesis, t: int, position: int | None, heading: int | None
