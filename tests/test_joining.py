@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import product
 from unittest.mock import patch
 
 import changes
@@ -15,6 +16,7 @@ from ssh_abduction import SSHMap, Theory, Trace, explain_pair, solve
 from ssh_abduction.checker.checker import violations
 from ssh_abduction.data import Closure, Odometry, Step, together
 from ssh_abduction.data.star import Gateway, Star
+from ssh_abduction.solver.estimating import doubt_of
 from ssh_abduction.solver.guesses.joint_maps import Joining
 from ssh_abduction.solver.guesses.sights import Sights
 from ssh_abduction.solver.misfit import Misfit
@@ -70,6 +72,31 @@ def test_the_joint_map_names_the_gateways_that_changed(seed: int) -> None:
     assert case.changed
     assert {*changes.named(best, case.known)} == case.changed
     assert not [*violations(problem.trace, best, problem.theory)]
+
+
+def test_drives_with_two_places_at_one_position_may_overlap_by_chance() -> None:
+    """A gateway is closed on the second drive. If gateways may not change, a place is two."""
+    drives = [
+        Trace.from_steps(
+            "abcde",
+            ["travel"] * 4,
+            displacements=[(5.0, 0.0, 0.0)] * 4,
+            stars=[(1, is_open, 1, 0)] + [(1, 0, 1, 0)] * 4,
+            name=name,
+        )
+        for is_open, name in ((1, "monday"), (0, "tuesday"))
+    ]
+    solution = solve(drives)
+    assert solution.joined.startswith("the map joins all 2 drives")
+    assert solution.confidence == 0.0
+    said = "as monday:0 and tuesday:0 are at one position, but at two places"
+    assert solution.sureness == f"no probability is given, {said}"
+    with_change = solve(drives, Theory(changed=0.9, star="frame"))
+    assert with_change.confidence == pytest.approx(0.99, abs=0.01)
+    # Nothing says how two pieces lie.
+    apart = solve(drives, Theory(elsewhere=tuple(product(range(5), range(5, 10)))))
+    assert len(apart[0].pieces) == 2
+    assert doubt_of(settle(together(drives), Theory()), apart[0]) is None
 
 
 def test_a_gateway_that_closes_and_opens_again_changes_twice() -> None:

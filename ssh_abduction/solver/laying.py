@@ -17,7 +17,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.digest import Digest
-from ssh_abduction.solver.estimating import rival_of
+from ssh_abduction.solver.estimating import doubt_of, rival_of
 from ssh_abduction.solver.guesses.completing import completed
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.ranking import Ranking, noise_warning, units_warning
@@ -63,6 +63,7 @@ def laid(
         rivals=tuple(
             replace(rival_of(m, _nats(m, problem)), estimated=i > 0) for i, m in enumerate(found)
         ),
+        doubt=doubt_of(problem, best),
         drives=drives_of(joint),
     )
     return unproven(best, ssh_map, old, problem, watch, "no proof", weighed)

@@ -46,6 +46,7 @@ from ssh_abduction.solver.engines.base import Found, Task
 from ssh_abduction.solver.equations import spreads_of
 from ssh_abduction.solver.estimating import (
     Course,
+    doubt_of,
     dstates_and_places,
     least_places,
     rival_of,
@@ -348,6 +349,7 @@ class Weighing:
             searched=self._beams.found(self.candidates[0].nats) and excess < math.inf,
             broken=self._beams.broken,
             excess=excess if excess < math.inf else 1.0,
+            doubt=doubt_of(self._parts.task.problem, self.candidates[0].map),
             drives=drives_of(self._parts.task.trace),
         )
 

@@ -8,6 +8,7 @@ groups. So drives share places only if they have more in common than chance expl
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from collections.abc import Collection, Hashable, Iterable, Sequence
 
@@ -15,6 +16,10 @@ from ssh_abduction.data.drives import starts_of
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory.theory import Theory
+
+# Two places are at one position if they are nearer than this share of the shortest travel. A move
+# is a travel if it is longer than TRAVEL of the longest one.
+NEAR, TRAVEL = 0.4, 0.1
 
 
 class Overlap:
@@ -35,6 +40,10 @@ class Overlap:
         self._drive = [bisect_right(starts, t) for t in range(len(trace))]
         closures = ((self._drive[c.first], self._drive[c.last]) for c in trace.closures)
         self._tied = _joined(range(len(starts) + 1), closures)  # a group for each drive
+        ways = [math.hypot(*step.displacement[:2]) for step in trace.steps if step.displacement]
+        longest = max(ways, default=0.0)
+        # Places of two drives that are nearer than this, in metres, are at one position.
+        self.near = NEAR * min((way for way in ways if way > TRAVEL * longest), default=0.0)
 
     @property
     def unit_of_step(self) -> list[int]:
