@@ -251,7 +251,7 @@ def test_lifts_that_cannot_be_driven(tmp_path: Path) -> None:
         simulate(tower.with_choices(route="lift to 1"))
     with pytest.raises(SimulatorError, match="lifts: expected none in the log of a robot"):
         record(tower)
-    with pytest.raises(SimulatorError, match="every: expected none"):
+    with pytest.raises(SimulatorError, match="every: expected no distance"):
         simulate(tower, every=0.5)
     with pytest.raises(SimulatorError, match="whose streets meet at right angles"):
         simulate(replace(tower, angles="any"))
