@@ -6,6 +6,7 @@ import math
 import random
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from ssh_abduction.solver.choosing import READABLE
 from ssh_abduction.solver.facilities import Facilities
 from ssh_abduction.solver.misfit import Misfit
 from ssh_abduction.solver.scatter import is_for, least_cost
+from ssh_abduction.theory.pairs import NO_PAIRS
 from ssh_abduction.theory.settle import Problem, settle
 
 PRICE = 8.0
@@ -158,6 +160,14 @@ def test_the_bound_of_eight_rounds_is_near_the_cost_if_the_track_can_hardly_bend
     places = [(t + 1) // 2 % 4 for t in range(len(trace))]
     cost = 12 * PRICE + Misfit(problem).of_course(dstates, places) / 2
     assert 0.85 * cost <= bound_of(problem, cost) < cost
+
+
+def test_pairs_that_evidence_keeps_apart_raise_the_bound() -> None:
+    """A bent track would bring steps together that the displacements say are at two places."""
+    theory = Theory.topological().replace(boundary="none", star="none", weigh="cost")
+    with patch.object(Problem, "pairs", NO_PAIRS):
+        low = bound_of(settle(rounds(2), theory), 1000)
+    assert bound_of(settle(rounds(2), theory), 1000) > 3 * low > 0
 
 
 def test_a_short_second_drive_hardly_lowers_the_bound() -> None:

@@ -24,8 +24,9 @@ each piece at most what the best facility of this piece saves. So for each kind 
 of one piece get shares.
 
 The poses are linearised at the best track without returns. All other axioms can only raise the
-cost. One of them is used: steps with different views are different dstates. If a view may be wrong,
-the step pays for this at a dstate with another view.
+cost. Two kinds are used. Steps with different views are different dstates; if a view may be wrong,
+the step pays for this at a dstate with another view. And evidence keeps pairs of steps apart,
+mostly the displacements between them. Such pairs share no facility, however the track bends.
 """
 
 from __future__ import annotations
@@ -45,6 +46,7 @@ from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.equations import Equations, spreads_of
 from ssh_abduction.solver.facilities import Array, Facilities
 from ssh_abduction.solver.fit import Poses
+from ssh_abduction.theory.pairs import Earlier
 from ssh_abduction.theory.settle import Problem
 
 # The share of the error of position that is counted in the problem of places.
@@ -52,7 +54,7 @@ PLACES = 0.5
 # The number of errors of the track that are treated one by one. The rest adds to the scatter.
 MODES = 25
 # Points are far if they are this many standard deviations too far apart to share a facility.
-GAPS = (4.0, 6.0, 8.0, 12.0)
+GAPS = (2.5, 4.0, 6.0, 10.0)
 # Shares are first computed with variances multiplied by FIRST. Later, no share may be more than
 # GROWTH times the first one plus SLACK.
 FIRST, GROWTH, SLACK = 1.3, 1.15, 0.2
@@ -173,7 +175,11 @@ def _parts(problem: Problem, track: _LinearTrack, visit: NDArray[np.int_]) -> li
         fees[[step.view is None for step in steps]] = 0.0
     weights = np.array([1 - PLACES * has_places] * 2 + [1.0])
     scatter = track.scatter / weights
-    parts = [_MovedPoints(track.poses, scatter, kinds, fees, dstate, track.piece, track.moves)]
+    apart, away = (
+        _flags(pairs, len(steps)) for pairs in (problem.pairs.apart, problem.pairs.elsewhere)
+    )
+    own = track.piece, track.moves, apart
+    parts = [_MovedPoints(track.poses, scatter, kinds, fees, dstate, *own)]
     if has_places:
         together = np.column_stack([visit, track.piece])
         _, first, at, count = np.unique(
@@ -185,8 +191,18 @@ def _parts(problem: Problem, track: _LinearTrack, visit: NDArray[np.int_]) -> li
         scatter = track.scatter[first, :2] / count[:, None] / PLACES
         points, alike = mean @ track.poses[:, :2], np.zeros(len(first), dtype=int)
         free = np.zeros(len(first))
-        parts.append(_MovedPoints(points, scatter, alike, free, place, track.piece[first], moves))
+        is_in = (mean > 0).astype(int)
+        own = track.piece[first], moves, is_in @ away @ is_in.T > 0
+        parts.append(_MovedPoints(points, scatter, alike, free, place, *own))
     return parts
+
+
+def _flags(pairs: Earlier, steps: int) -> NDArray[np.bool_]:
+    """Flag pairs of steps in a matrix, (steps, steps)."""
+    flags = np.zeros((steps, steps), dtype=bool)
+    for j, others in pairs.items():
+        flags[j, list(others)] = flags[list(others), j] = True
+    return flags
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,15 +212,18 @@ class _MovedPoints(Facilities):
     Attributes:
         piece: The piece of the track of each point, (n,).
         moves: How far each error of the track moves each point, (n, d, k).
+        apart: The flag [i, j] says that two points share no facility by evidence, (n, n).
     """
 
     piece: NDArray[np.int_]
     moves: Array
+    apart: NDArray[np.bool_]
 
     def only(self, chosen: NDArray[np.bool_]) -> _MovedPoints:
         """Return the chosen points."""
         of_points = ("points", "variances", "kinds", "fees", "piece", "moves")
-        return replace(self, **{name: getattr(self, name)[chosen] for name in of_points})
+        kept = {name: getattr(self, name)[chosen] for name in of_points}
+        return replace(self, **kept, apart=self.apart[chosen][:, chosen])
 
     def of_best_pieces(self) -> tuple[_MovedPoints, Array, Array]:
         """Return the points of one piece for each kind: the piece with the greatest shares.
@@ -273,6 +292,7 @@ class _Losses:
         apart = np.linalg.norm(part.offsets(part.points) / unit, axis=-1) - reach - reach[:, None]
         may_pay = part.fees < most
         may_share = (part.kinds[:, None] == part.kinds) | may_pay | may_pay[:, None]
+        may_share &= ~part.apart
 
         def far(i: int, others: NDArray[np.bool_]) -> Array:
             moved, gaps = (part.moves[i] - part.moves[others]) / unit[:, None], apart[i, others]
