@@ -93,7 +93,7 @@ class SpanningTree:
 
 
 def cluster_quality(X: ArrayLike, labels: ArrayLike, tree: SpanningTree | None = None) -> float:
-    """Compute M: the smallest distance between clusters divided by the largest within one.
+    """Compute M: the smallest distance between clusters over the largest within a cluster.
 
     Larger is better. M is eq. 5 of the paper.
 

@@ -162,7 +162,7 @@ def import_live(
 
 
 def _refuse_bad(log: RobotLog, track: Track, notes: Sequence[str]) -> None:
-    """Raise a LogError if the track shows no drive. It carries the notes, which may say why."""
+    """Raise a LogError if the track shows no drive. The error carries the notes on the log."""
     if len(track.breaks) > MOST_BREAKS * len(log):
         raise _noted(
             f"{named(log.source)}: expected a log of one drive, got {len(log)} scans of which "

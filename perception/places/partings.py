@@ -288,7 +288,7 @@ def _passes(
 
 
 def _is_known(some: _Pass, known: Sequence[_Pass]) -> bool:
-    """Whether a pass is one of those that are known."""
+    """Whether a pass of a parting is already known."""
     return any(abs(some[0] - way) <= PASS and math.dist(some[1], at) <= ONE for way, at in known)
 
 

@@ -232,7 +232,7 @@ def _odometer_of_transforms(bag: Bag, frames: Frames, frame: str) -> tuple[Recor
 
 
 def _of_one_source(track: RecordedTrack, called: str, notes: list[str]) -> RecordedTrack:
-    """Keep the poses of the largest source if those of several alternate, and note it."""
+    """If the poses of several sources alternate, keep those of the largest one, with a note."""
     sources = sources_of(track)
     if len(sources) == 1:
         return track

@@ -73,7 +73,7 @@ def clashes(sights: Sequence[Sight], turns: Turns, axioms: Collection[str]) -> I
 
 
 def _clashes_of(m: Reading) -> list[Clash]:
-    """List the clashes of a map."""
+    """List the clashes of a map: sights of a place that fit no frame."""
     return list(clashes(*_sights_of(m), m.axioms))
 
 

@@ -224,7 +224,7 @@ def _opposite_sights(fitted: tuple[Turned, ...]) -> tuple[tuple[int, int], ...]:
 def are_opposite(seen_a: Turned, seen_b: Turned) -> bool:
     """Whether the robot surely faces opposite ways in two sights of a place.
 
-    The sights are as `frames_that_fit` read them.
+    The sights (dstate and star) have the frames and shifts that `frames_that_fit` found.
     """
     (first, back), (then, on) = seen_a, seen_b
     shift = (on - back) % max(first.slots, 1)

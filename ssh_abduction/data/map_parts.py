@@ -86,7 +86,7 @@ class Fault:
         step: The step.
         kind: "misread": the view of the step differs from the view of its dstate. "misseen": the
             star (the gateways seen) of the step differs from the star of its dstate. "slipped": the
-            action did not do what its name says, so no link joins this step and the next one.
+            action did not do what its name says, so no link leads from this step to the next one.
             "jumped": the displacement from the step before is wrong. "changed": a gateway was open
             on one drive and closed on another. The step is the first of the later drive at the
             place.

@@ -1,6 +1,7 @@
 """Choose positions for drawing a map, by the poses of its dstates or, without poses, by its turns.
 
-A dstate (distinctive state) is a place and a heading. A street joins two neighbours on a path.
+A dstate (distinctive state) is a place and a heading. A street is a line between two neighbours on
+a path.
 
 A map without poses has no distances, but it says to which side turns go. It is drawn with straight
 paths: first each path gets a heading (`headings`), then places are put along these headings

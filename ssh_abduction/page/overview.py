@@ -1,6 +1,6 @@
 """Make the overview of the page: everything that any map has, and in how many maps it occurs.
 
-A dstate (distinctive state) is a place and a heading. A street joins two neighbours on a path.
+A dstate (distinctive state) is a place and a heading. A street is a line between two neighbours.
 Dstates, places and streets of two maps count as the same if they have the same steps.
 """
 

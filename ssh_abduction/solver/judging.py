@@ -66,7 +66,7 @@ class Judging:
         return None
 
     def allows_grown(self, trace: Trace, ssh_map: SSHMap, since: int) -> bool:
-        """Whether no evidence rejects a map of a longer trace, which later checks use."""
+        """Whether no evidence rejects a map of a longer trace. Later checks use this trace."""
         self._trace = trace
         return not any(evidence.refuse(trace, ssh_map, since) for evidence in self._evidence)
 
@@ -116,7 +116,7 @@ class Judging:
         return self._shown and self._a_step * steps <= BEYOND + SHARE * elapsed - self._seconds
 
     def pass_grown_map(self, trace: Trace, ssh_map: SSHMap) -> None:
-        """Check a map of a longer trace, which later checks use. Raises InternalError."""
+        """Check a map of a longer trace. Later checks use this trace. Raises InternalError."""
         self._trace = trace
         self._check(ssh_map, len(trace))
 

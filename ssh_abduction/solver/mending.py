@@ -59,7 +59,7 @@ Solver = Callable[[Trace, Theory, int, float], tuple[tuple[SSHMap, ...], bool]]
 
 
 class Mending:
-    """Finds maps with faults by mending the trace of a task."""
+    """Finds maps with faults by correcting (mending) the trace of a task."""
 
     def __init__(self, task: Task, solver: Solver) -> None:
         self._task, self._solver = task, solver

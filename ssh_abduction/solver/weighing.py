@@ -268,7 +268,7 @@ class Weighing:
         return tuple(alike) or (ssh_map,), proven and bool(alike)
 
     def add(self, ssh_map: SSHMap) -> float:
-        """Return the cost of a map in nats. Keep it if it costs little more than the best one."""
+        """Return the cost of a map in nats. Keep the map if it costs little more than the best."""
         nats = self._misfit.nats_of(ssh_map)
         if self.candidates and nats < self.candidates[0].nats - EQUAL:
             self._improved = self._parts.watch.elapsed()

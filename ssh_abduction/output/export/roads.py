@@ -52,7 +52,7 @@ class Stop:
 
     @property
     def properties(self) -> dict[str, str]:
-        """Its views, and its regions if there are any, as texts for files."""
+        """The views of the stop, and its regions if there are any, as texts for files."""
         regions = {"regions": " ".join(map(str, self.regions))} if self.regions else {}
         names = {"region_names": ", ".join(self.region_names)} if self.region_names else {}
         return {"views": " ".join(map(str, self.views)), **regions, **names}

@@ -98,9 +98,9 @@ class SmallMaps:
 def mended(guess: Sequence[int], chart: Chart) -> list[int]:
     """Correct a guess by a vote: what does an action at a dstate mostly lead to?
 
-    Each node gets the label to which the label and action before it mostly lead in the guess,
-    unless the view at the node contradicts it. If only a few labels were wrong, all labels after a
-    right one become right. In the guess, -1 is an unknown label.
+    Each node gets the dstate to which the action before it mostly leads from the dstate before it
+    in the guess, unless the view at the node contradicts this. If only a few dstates were wrong,
+    all dstates after a right one become right. In the guess, -1 is an unknown dstate.
     """
     keys = [
         None if label < 0 else (view, label) for view, label in zip(chart.seen, guess, strict=True)

@@ -243,8 +243,8 @@ class HypothesisPoses:
         """Compute the largest chi-square of the next steps if step t is at a known dstate.
 
         An action at a dstate always leads to the same dstate. So links say where the next steps
-        are, until one is not known. The hypothesis is moved to step t. `actions` has a number for
-        each action of the trace.
+        are, until a link is not known. The hypothesis is moved to step t. `actions` has a number
+        for each action of the trace.
         """
         largest = 0.0
         for k in range(t + 1, min(t + 1 + AHEAD, len(self._trace))):

@@ -117,7 +117,7 @@ class Merging:
                 )
 
     def merge(self) -> None:
-        """Merge groups while that lowers the total cost, those with the largest gain first."""
+        """Merge groups of visits while this lowers the total cost, the largest gain first."""
         while True:
             waiting = [
                 (-gain, pair) for pair in self._candidates() if (gain := self._gain(*pair)[0]) > 0

@@ -206,8 +206,8 @@ def large_clique(apart: Matrix) -> list[int]:
 def pairwise_distinct(members: Sequence[int], pairs: Iterable[tuple[int, int]]) -> list[int]:
     """Find a large clique: a list of segments, or places, that are pairwise distinct.
 
-    `pairs` are distinct. A pair of a member with itself means that the labels contradict the
-    axioms, and is ignored.
+    `pairs` has the pairs that are distinct. A pair of a member with itself means that the labels
+    contradict the axioms, and is ignored.
     """
     number = {member: i for i, member in enumerate(members)}
     rivals = np.zeros((len(members), len(members)), dtype=bool)

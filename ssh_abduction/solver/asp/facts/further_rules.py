@@ -35,7 +35,7 @@ def forbidden_equalities(equalities: Iterable[Equality], where: Symbol | None = 
 
 
 def rests_on(axiom: str, t: int, other: str) -> str:
-    """Return the rule that an axiom, if active at step t, makes another hold at every step."""
+    """Return the rule: if an axiom is active at step t, another axiom holds at every step."""
     return f":- {active(axiom, t)}, violation({other},T)."
 
 

@@ -167,7 +167,7 @@ class Segments:
 
     @classmethod
     def read(cls, control: Control) -> Segments:
-        """Read these values from a control in which the parts base and segments are grounded."""
+        """Read places and segments from a control with the parts base and segments grounded."""
         symbols = control.symbolic_atoms
 
         def atoms(name: str, arity: int) -> list[tuple[int, ...]]:
