@@ -46,6 +46,7 @@ from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.equations import Equations, spreads_of
 from ssh_abduction.solver.facilities import Array, Facilities
 from ssh_abduction.solver.fit import Poses
+from ssh_abduction.solver.steps.apart import large_clique
 from ssh_abduction.theory.pairs import Earlier
 from ssh_abduction.theory.settle import Problem
 
@@ -82,8 +83,11 @@ def least_cost(problem: Problem, visit: Sequence[int], most: float) -> float:
     nats. The bound is at most `most` minus UNPROVEN. If no points get shares, it is what the misfit
     of the track costs.
     """
-    track, within = _LinearTrack.of(problem), math.sqrt(2 * most)
-    parts = [part.of_best_pieces() for part in _parts(problem, track, np.array(visit))]
+    track = _LinearTrack.of(problem)
+    every = _parts(problem, track, np.array(visit))
+    # A map pays for these points, so for a cost below `most` the track bends by less than `within`.
+    paid = track.nats + sum(part.price * len(large_clique(part.apart)) for part in every)
+    within, parts = math.sqrt(2 * max(most - paid, 0.0)), [part.of_best_pieces() for part in every]
     shares, pays = (np.concatenate([part[k] for part in parts]) for k in (1, 2))
     best: tuple[float, Array, list[_Losses]] = (0.0, np.zeros(0), [])
     for gap in GAPS:
@@ -284,7 +288,7 @@ class _Losses:
         """Bound the losses of points with these approximate shares, (n,).
 
         Two points are far if they are `gap` standard deviations too far apart to share a facility.
-        `within` is the greatest |z|. Bending more costs more than the known map.
+        `within` is the greatest |z|. A map that bends the track more costs more than the known one.
         """
         most = np.minimum(part.price, GROWTH * first + SLACK)
         unit = np.sqrt(part.variances.max(0))
