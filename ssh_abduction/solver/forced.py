@@ -33,7 +33,7 @@ from scipy.sparse.csgraph import connected_components
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.misfit import Misfit
-from ssh_abduction.solver.steps.apart import clique, grown_clique
+from ssh_abduction.solver.steps.apart import clique, flags_of, grown_clique
 from ssh_abduction.solver.steps.chart import Chart, FramedChart
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.evidence import Equality
@@ -113,12 +113,10 @@ class Visits:
     @classmethod
     def _of_steps(cls, log: Log, ssh_map: SSHMap) -> Visits:
         steps, none = len(log.seen), np.zeros(len(log.seen), dtype=int)
-        away = np.zeros((steps, steps), dtype=bool)
-        for j, others in log.pairs.elsewhere.items():
-            away[j, list(others)] = away[list(others), j] = True
         links = np.stack([none[1:], np.array(log.actions, dtype=int), none[1:]], 1)
         apart = Chart.of_steps(log, steps).apart()[None]
         place = np.array(ssh_map.dstate_at)
+        away = flags_of(log.pairs.elsewhere, steps)
         return cls(np.arange(steps), none, np.array(log.seen), place, links, apart, away)
 
     def lacking(self, first: int, second: int) -> Visits:

@@ -46,8 +46,7 @@ from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.equations import Equations, spreads_of
 from ssh_abduction.solver.facilities import Array, Facilities
 from ssh_abduction.solver.fit import Poses
-from ssh_abduction.solver.steps.apart import large_clique
-from ssh_abduction.theory.pairs import Earlier
+from ssh_abduction.solver.steps.apart import flags_of, large_clique
 from ssh_abduction.theory.settle import Problem
 
 # The share of the error of position that is counted in the problem of places.
@@ -180,7 +179,7 @@ def _parts(problem: Problem, track: _LinearTrack, visit: NDArray[np.int_]) -> li
     weights = np.array([1 - PLACES * has_places] * 2 + [1.0])
     scatter = track.scatter / weights
     apart, away = (
-        _flags(pairs, len(steps)) for pairs in (problem.pairs.apart, problem.pairs.elsewhere)
+        flags_of(pairs, len(steps)) for pairs in (problem.pairs.apart, problem.pairs.elsewhere)
     )
     own = track.piece, track.moves, apart
     parts = [_MovedPoints(track.poses, scatter, kinds, fees, dstate, *own)]
@@ -199,14 +198,6 @@ def _parts(problem: Problem, track: _LinearTrack, visit: NDArray[np.int_]) -> li
         own = track.piece[first], moves, is_in @ away @ is_in.T > 0
         parts.append(_MovedPoints(points, scatter, alike, free, place, *own))
     return parts
-
-
-def _flags(pairs: Earlier, steps: int) -> NDArray[np.bool_]:
-    """Flag pairs of steps in a matrix, (steps, steps)."""
-    flags = np.zeros((steps, steps), dtype=bool)
-    for j, others in pairs.items():
-        flags[j, list(others)] = flags[list(others), j] = True
-    return flags
 
 
 @dataclass(frozen=True, eq=False)

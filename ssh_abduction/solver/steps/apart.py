@@ -32,6 +32,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ssh_abduction.theory.pairs import Earlier
+
 # If the same actions lead from two steps to an excluded pair, these two are excluded, too. This is
 # computed in a matrix of steps x steps (64 MB at most) for at most this many steps. In longer
 # traces, only the pairs that evidence names are excluded.
@@ -193,6 +195,14 @@ def clique(apart: Matrix, seen: Sequence[int]) -> list[int]:
         steps = np.flatnonzero(shown == view)
         found += [int(steps[i]) for i in _greedy_clique(apart[np.ix_(steps, steps)])]
     return sorted(found)
+
+
+def flags_of(pairs: Earlier, steps: int) -> Matrix:
+    """Flag pairs of steps in a symmetric matrix, (steps, steps)."""
+    flags = np.zeros((steps, steps), dtype=bool)
+    for j, others in pairs.items():
+        flags[j, list(others)] = flags[list(others), j] = True
+    return flags
 
 
 def large_clique(apart: Matrix) -> list[int]:
