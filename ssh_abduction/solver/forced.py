@@ -33,7 +33,7 @@ from scipy.sparse.csgraph import connected_components
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.misfit import Misfit
-from ssh_abduction.solver.steps.apart import clique, flags_of, grown_clique
+from ssh_abduction.solver.steps.apart import apart_matrix, clique, grown_clique
 from ssh_abduction.solver.steps.chart import Chart, FramedChart
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.evidence import Equality
@@ -116,7 +116,7 @@ class Visits:
         links = np.stack([none[1:], np.array(log.actions, dtype=int), none[1:]], 1)
         apart = Chart.of_steps(log, steps).apart()[None]
         place = np.array(ssh_map.dstate_at)
-        away = flags_of(log.pairs.elsewhere, steps)
+        away = apart_matrix(log.pairs.elsewhere, steps)
         return cls(np.arange(steps), none, np.array(log.seen), place, links, apart, away)
 
     def lacking(self, first: int, second: int) -> Visits:

@@ -46,7 +46,7 @@ from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.equations import Equations, spreads_of
 from ssh_abduction.solver.facilities import Array, Facilities
 from ssh_abduction.solver.fit import Poses
-from ssh_abduction.solver.steps.apart import flags_of, large_clique
+from ssh_abduction.solver.steps.apart import apart_matrix, large_clique
 from ssh_abduction.theory.settle import Problem
 
 # The share of the error of position that is counted in the problem of places.
@@ -179,7 +179,7 @@ def _parts(problem: Problem, track: _LinearTrack, visit: NDArray[np.int_]) -> li
     weights = np.array([1 - PLACES * has_places] * 2 + [1.0])
     scatter = track.scatter / weights
     apart, away = (
-        flags_of(pairs, len(steps)) for pairs in (problem.pairs.apart, problem.pairs.elsewhere)
+        apart_matrix(pairs, len(steps)) for pairs in (problem.pairs.apart, problem.pairs.elsewhere)
     )
     own = track.piece, track.moves, apart
     parts = [_MovedPoints(track.poses, scatter, kinds, fees, dstate, *own)]

@@ -197,7 +197,7 @@ def clique(apart: Matrix, seen: Sequence[int]) -> list[int]:
     return sorted(found)
 
 
-def flags_of(pairs: Earlier, steps: int) -> Matrix:
+def apart_matrix(pairs: Earlier, steps: int) -> Matrix:
     """Flag pairs of steps in a symmetric matrix, (steps, steps)."""
     flags = np.zeros((steps, steps), dtype=bool)
     for j, others in pairs.items():
