@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from courses import counts_of
 from logs import name_of, sidecar
+from threadpoolctl import threadpool_limits
 from visited import truth_of
 
 from perception.places.closures import uncertainty
@@ -51,7 +52,8 @@ def best_of(trace: Trace) -> SSHMap | None:
     """Return the first map of the beam; None if it has none."""
     problem = settle(trace, BARE)
     beam = Beam(problem, Log(trace, problem.theory, problem.pairs), WIDTH)
-    return next(beam.maps(), None)
+    with threadpool_limits(1, user_api="blas"):  # more threads only wait for each other
+        return next(beam.maps(), None)
 
 
 def pairs_of(log: Path, trace: Trace, drift: float | None) -> Iterator[dict[str, int]]:
