@@ -29,15 +29,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from ssh_abduction.checker import (
-    clashes,
-    coherence,
-    evidence,
-    regions,
-    sides,
-    stars,
-    topological,
-)
+from ssh_abduction.checker import clashes, coherence, evidence, regions, sides, stars, topological
 from ssh_abduction.checker.reading import Check, Reading
 from ssh_abduction.data.errors import MapError, brief
 from ssh_abduction.data.maps import SSHMap
