@@ -397,8 +397,7 @@ def _with_noise(inside: NDArray[np.bool_], labels: NDArray[np.intp]) -> NDArray[
 
 def _count_parameter(clusterer: Any) -> str | None:
     """The name of the setting for the number of clusters; None if the clusterer chooses it."""
-    settings = clusterer.get_params()
-    if settings.get("n_clusters") is not None:
+    if clusterer.get_params().get("n_clusters") is not None:
         return "n_clusters"
     return (
         "n_components" if isinstance(clusterer, GaussianMixture | BayesianGaussianMixture) else None

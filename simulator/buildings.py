@@ -95,8 +95,7 @@ class Building:
         openings = tuple(_opening(plan, door) for door in plan.doors)
         for opening in openings:
             walls = _cut(walls, opening)
-        jambs = [_jambs(opening) for opening in openings]
-        return cls(plan, np.vstack([walls, *jambs]), openings)
+        return cls(plan, np.vstack([walls, *[_jambs(opening) for opening in openings]]), openings)
 
     def world(self) -> World:
         """Make a world with the walls of the building."""

@@ -200,8 +200,7 @@ class _Corrected:
     def nearest(self, visit: int, some: range) -> list[int]:
         """List the MATCHES visits of a range that are nearest to a visit, in ascending order."""
         far = np.hypot(*(self._places[some.start : some.stop] - self._places[visit]).T)
-        kept = np.argsort(far, kind="stable")[:MATCHES] + some.start
-        return sorted(kept.tolist())
+        return sorted((np.argsort(far, kind="stable")[:MATCHES] + some.start).tolist())
 
 
 def seen_from(first: Array, last: Array) -> Array:

@@ -115,8 +115,7 @@ def describe_drive(log: RobotLog, begin: int = 0, unseen: bool | None = None) ->
 def _about_seam(log: RobotLog, scan: int, begin: int, what: str) -> str:
     """Describe a scan at which a second drive may begin."""
     where = f"{what} before scan {begin + scan} (line or message {log.scans[scan].line})"
-    far = math.dist(log.scans[scan - 1].odometry[:2], log.scans[scan].odometry[:2])
-    if far <= jumps.FAR:
+    if math.dist(log.scans[scan - 1].odometry[:2], log.scans[scan].odometry[:2]) <= jumps.FAR:
         return (
             f"{where}, while the odometry goes on. If the file holds two drives, cut it there and "
             "map each part."

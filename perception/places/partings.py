@@ -244,8 +244,7 @@ def _links(
             np.flatnonzero(np.abs(drive.ways - way) <= REACH) for way in (one.first, one.last)
         )
         theirs = one.moved(drive.middles[last])
-        far = cdist(drive.middles[first], theirs)
-        for i, j in zip(*np.nonzero(far <= AGREED), strict=True):
+        for i, j in zip(*np.nonzero(cdist(drive.middles[first], theirs) <= AGREED), strict=True):
             off = theirs[j] - drive.middles[first[i]]
             links[int(first[i])].append((int(last[j]), one.turn, off))
             links[int(last[j])].append((int(first[i]), -one.turn, points_turned(-one.turn, -off)))

@@ -282,8 +282,7 @@ def with_ways_in_order(visit: Visit) -> Visit:
     """The visit with its ways in counterclockwise order."""
     order = sorted(range(len(visit.ways)), key=lambda k: visit.ways[k].bearing)
     arrived, left = (None if k is None else order.index(k) for k in (visit.arrived, visit.left))
-    ways = tuple(visit.ways[k] for k in order)
-    return replace(visit, ways=ways, arrived=arrived, left=left)
+    return replace(visit, ways=tuple(visit.ways[k] for k in order), arrived=arrived, left=left)
 
 
 def taken(ways: list[Way], bearing: float) -> int:

@@ -86,8 +86,7 @@ def _length(log: RobotLog) -> tuple[float, list[str]]:
         )
 
     # Matching cannot correct metres that are too large to be true.
-    possible = [unit for unit in UNITS if unit != "metres" or usual <= FAR_OFF]
-    found = min(possible, key=off)
+    found = min([unit for unit in UNITS if unit != "metres" or usual <= FAR_OFF], key=off)
     if found == "metres" or off(found) > UNLIKE:
         return 1.0, []
     count = UNITS[found]

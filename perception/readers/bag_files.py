@@ -122,8 +122,7 @@ def _of_folder(path: Path, folder: Path, stack: ExitStack) -> Files:
             "*.mcap, *.db3 or *.bag, got none of these; name a file"
         )
     # Without metadata.yaml, only names show which files belong together.
-    drives = {_drive(part) for part in parts}
-    if len(drives) > 1:
+    if len({_drive(part) for part in parts}) > 1:
         names = ", ".join(named(part.name) for part in parts[:4]) + (
             ", …" if len(parts) > 4 else ""
         )

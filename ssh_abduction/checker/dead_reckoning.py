@@ -60,8 +60,7 @@ class ErrorFilter:
         self.broken = np.zeros(size, dtype=int)  # number of missing displacements so far
         self.sigma = np.array([odometry.scale, drift])
         # at both ends of a loop the robot may be off the pose of the dstate
-        ends = np.diag([odometry.offset, odometry.offset, odometry.facing])
-        self.at_end = ends**2
+        self.at_end = np.diag([odometry.offset, odometry.offset, odometry.facing]) ** 2
         for t in range(1, size):
             if t % FEW == 0:
                 look_at_clock()
@@ -103,8 +102,7 @@ class ErrorFilter:
 
     def new_until(self, end: int) -> Array:
         """For each step, return the covariance at `end` of the noise up to it, (end + 1, 9)."""
-        steps = np.arange(end + 1)
-        onward = self.onward(steps, np.full(end + 1, end))
+        onward = self.onward(np.arange(end + 1), np.full(end + 1, end))
         covariance: Array = (onward @ self.white[: end + 1] @ onward.swapaxes(-1, -2)).reshape(
             -1, 9
         )

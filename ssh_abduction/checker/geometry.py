@@ -117,8 +117,7 @@ def refused_returns(trace: Trace, ssh_map: SSHMap, theory: Theory) -> Iterator[R
     """
     if not trace.has_displacements:
         return
-    drifts = Drifts(trace)
-    for returns, square, most in _refused(trace, ssh_map, theory, drifts):
+    for returns, square, most in _refused(trace, ssh_map, theory, Drifts(trace)):
         yield Refused(returns, tuple(_closing(trace, i, j) for i, j, _ in returns), square, most)
 
 

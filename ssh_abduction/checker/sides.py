@@ -119,8 +119,7 @@ def _conflicts(m: Reading) -> list[Conflict]:
     """Find the places whose sides contradict another axiom."""
     right = branches_right_of(m, partial(_ahead, m))
     disjoint = _both_sides(m, right) if "sides_disjoint" in m.axioms else ()
-    between = _on_and_beside(m, right) if "path_between_sides" in m.axioms else ()
-    return [*disjoint, *between]
+    return [*disjoint, *(_on_and_beside(m, right) if "path_between_sides" in m.axioms else ())]
 
 
 def _both_sides(m: Reading, right: _Right) -> Iterator[Conflict]:

@@ -68,8 +68,7 @@ def gateways_by_drive(m: Reading) -> Iterator[tuple[int, str, list[tuple[Opening
     for i, label, step in zip(m.steps, m.map.dstate_at, m.trace.steps, strict=False):
         s = m.states.get(label)
         if s and s.place is not None and step.openings and (k := heading_of(s)) is not None:
-            here = seen.setdefault((s.place, len(names)), [])
-            here.append((_rotated(step.openings, k), i))
+            seen.setdefault((s.place, len(names)), []).append((_rotated(step.openings, k), i))
         if step.action and step.action.kind == "start":
             names.append(step.action.name)
     for (place, drive), found in sorted(seen.items()):

@@ -27,8 +27,7 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    trace = Trace.load(options.trace)
-    text = encoding.program(settle(trace, theory_of(options)))
+    text = encoding.program(settle(Trace.load(options.trace), theory_of(options)))
     if sys.stdout.isatty():  # escape control characters, which a terminal would obey
         text = "".join(f"{printable(line)}\n" for line in text.rstrip("\n").split("\n"))
     print(text, end="")

@@ -71,8 +71,7 @@ def run(options: argparse.Namespace) -> int:
     print(printable(found.sentence))
     if found.legs:
         called = listing.maps[found.map - 1].called
-        legs = "; ".join(leg.in_words(called) for leg in found.legs)
-        print(printable(f"by regions: {legs}"))
+        print(printable(f"by regions: {'; '.join(leg.in_words(called) for leg in found.legs)}"))
     if found.moves:
         chosen = listing.maps[found.map - 1]
         rows = [

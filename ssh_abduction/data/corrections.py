@@ -392,8 +392,7 @@ class Corrections:
 
 def direction_in_words(way: float) -> str:
     """Say a direction: ahead, right, back, left, or degrees clockwise from ahead."""
-    names = {degrees: name for name, degrees in DIRECTIONS.items()}
-    return names.get(way, f"{way:g}")
+    return {degrees: name for name, degrees in DIRECTIONS.items()}.get(way, f"{way:g}")
 
 
 def checked_corrections(value: object) -> Corrections:

@@ -242,8 +242,7 @@ class _CorrectionsReader:
             raise self._wrong(where, f"{', '.join(DIRECTIONS)}, or degrees", value) from None
 
     def _step(self, value: object, where: str) -> str:
-        text = self._text(value, where)
-        drive, colon, number = text.rpartition(":")
+        drive, colon, number = self._text(value, where).rpartition(":")
         if not (drive and colon and number.isascii() and number.isdecimal()):
             raise self._wrong(where, "a drive, a colon and a step, such as monday:12", value)
         return f"{drive}:{int(number)}"

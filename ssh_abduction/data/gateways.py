@@ -257,8 +257,7 @@ def frames_that_fit(
     ]
     made = tuple((a, b, actions) for *_, a, b, actions in sorted(found_turns, key=lambda t: t[:2]))
     headings = tuple(sight.dstate.heading for sight in sights) if as_shown else None
-    drives = len({sight.drive for sight in sights})
-    for most in range(MOST_CLOSED * max(drives - 1, 0) + 1):
+    for most in range(MOST_CLOSED * max(len({sight.drive for sight in sights}) - 1, 0) + 1):
         found = _fitted(tuple(sights), headings, made, frozenset(axioms), most)
         if found is not None:
             return list(found)
@@ -344,8 +343,7 @@ def _closed(read: Turned) -> frozenset[int]:
 
 def _changes(closed: Mapping[int, frozenset[int]]) -> float:
     """Count how often gateways open or close from each drive to the next; inf if too often."""
-    in_order = [closed[drive] for drive in sorted(closed)]
-    counts = [len(a ^ b) for a, b in pairwise(in_order)]
+    counts = [len(a ^ b) for a, b in pairwise([closed[drive] for drive in sorted(closed)])]
     return sum(counts) if max(counts, default=0) <= MOST_CLOSED else math.inf
 
 

@@ -233,8 +233,7 @@ class SSHMap:
         for one, other in pairs:
             beside[one].append(other)
             beside[other].append(one)
-        found = parts(sorted(beside), beside.__getitem__)
-        return tuple(tuple(sorted(piece)) for piece in found)
+        return tuple(tuple(sorted(piece)) for piece in parts(sorted(beside), beside.__getitem__))
 
     @property
     def floors(self) -> tuple[tuple[int, ...], ...]:

@@ -114,8 +114,7 @@ def right_of(regions: Iterable[Region], path: int, direction: int) -> tuple[int,
     Returns:
         The ids of the places, ascending.
     """
-    found = {q for r in regions if (path, direction) in r.bounds for q in r.places}
-    return tuple(sorted(found))
+    return tuple(sorted({q for r in regions if (path, direction) in r.bounds for q in r.places}))
 
 
 def regions_at(regions: Iterable[Region], place: int) -> tuple[Region, ...]:

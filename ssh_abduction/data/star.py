@@ -201,8 +201,7 @@ class Star:
     @property
     def too_near(self) -> tuple[float, float] | None:
         """The bearings of two gateways whose spreads overlap; None if there are none."""
-        seen = [gateway for gateway in self.gateways if gateway.open]
-        for a, b in combinations(seen, 2):
+        for a, b in combinations([gateway for gateway in self.gateways if gateway.open], 2):
             if abs((a.bearing - b.bearing + 180) % 360 - 180) <= a.spread + b.spread:
                 return a.bearing, b.bearing
         return None

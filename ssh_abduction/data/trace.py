@@ -386,8 +386,7 @@ class Trace:
         head = self.steps[: a_whole_number("steps", steps, TraceError, 1)]
         if head:
             head = (*head[:-1], replace(head[-1], action=None))
-        kept = closures_among(self.closures, range(len(head)))
-        return replace(self, steps=head, closures=kept)
+        return replace(self, steps=head, closures=closures_among(self.closures, range(len(head))))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Trace:

@@ -83,19 +83,20 @@ def svg_text(
     )
 
 
+def circle(x: float, y: float, radius: float, fill: str, stroke: str, width: object = 2) -> str:
+    """Draw a circle with a line of a colour and width around it."""
+    spot = {"cx": f"{x:.1f}", "cy": f"{y:.1f}", "r": f"{radius:.1f}"}
+    return element("circle", **spot, fill=fill, stroke=stroke, stroke_width=width)
+
+
 def fault_mark(x: float, y: float, title: str, size: float = 1.0) -> str:
     """Make a red diamond with an exclamation mark and a title, which shows a fault of a map.
 
     At size 1 it is 16 units across.
     """
     u = 8 * size
-    diamond = element(
-        "path",
-        d=f"M{x:.1f},{y - u:.1f} l{u:.1f},{u:.1f} l{-u:.1f},{u:.1f} l{-u:.1f},{-u:.1f} Z",
-        fill=ALARM,
-        stroke="white",
-        stroke_width=1.5,
-    )
+    way = f"M{x:.1f},{y - u:.1f} l{u:.1f},{u:.1f} l{-u:.1f},{u:.1f} l{-u:.1f},{-u:.1f} Z"
+    diamond = element("path", d=way, fill=ALARM, stroke="white", stroke_width=1.5)
     return titled(title, diamond, svg_text(x, y, "!", "white", 11 * size, "bold"), class_="fault")
 
 

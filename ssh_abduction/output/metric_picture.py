@@ -18,6 +18,7 @@ from ssh_abduction.output.drawing import (
     COLOURS,
     Point,
     at,
+    circle,
     element,
     fault_mark,
     faults_in_words,
@@ -110,21 +111,8 @@ class _Picture:
             fault_mark(*self.along(self.map.dstates[s], END), said, self.unit)
             for s, said in faults_in_words(self.map).items()
         ]
-        return page(
-            [
-                *bands,
-                *lines,
-                *ellipses,
-                *arrows,
-                *dots,
-                *labels,
-                *floors,
-                *faults,
-                *self.scale_bar(),
-            ],
-            self.points,
-            MARGIN,
-        )
+        marks = bands + lines + ellipses + arrows + dots + labels + floors + faults
+        return page([*marks, *self.scale_bar()], self.points, MARGIN)
 
     def on_page(self, pose: Pose) -> Point:
         """Convert the position of a pose to a point of the page."""
@@ -145,17 +133,9 @@ class _Picture:
     def dot(self, x: float, y: float, site: int) -> str:
         """Draw the dot of a site at a point. It is white where the robot was first, else black."""
         is_first = site == _site(self.map.dstates[self.map.dstate_at[0]])
-        circle = element(
-            "circle",
-            cx=f"{x:.1f}",
-            cy=f"{y:.1f}",
-            r=f"{DOT * self.unit:.1f}",
-            fill="white" if is_first else "#222",
-            stroke="#222",
-            stroke_width=f"{1.8 * self.unit:.1f}",
-        )
+        fill, width = "white" if is_first else "#222", f"{1.8 * self.unit:.1f}"
         title = place_title(self.map, site) if site >= 0 else f"dstate {-1 - site}"
-        return titled(title, circle)
+        return titled(title, circle(x, y, DOT * self.unit, fill, "#222", width))
 
     def ellipse(self, spot: Point, spread: tuple[float, float, float]) -> list[str]:
         """Draw the ellipse of a covariance (xx, xy, yy) in m²; nothing if too small or large."""
@@ -167,20 +147,10 @@ class _Picture:
         upright = math.hypot(rx * math.sin(angle), ry * math.cos(angle))
         x, y = spot
         self.points += [(x - across, y - upright), (x + across, y + upright)]
-        mark = element(
-            "ellipse",
-            cx=f"{x:.1f}",
-            cy=f"{y:.1f}",
-            rx=f"{rx:.2f}",
-            ry=f"{ry:.2f}",
-            transform=f"rotate({-math.degrees(angle):.2f} {x:.1f} {y:.1f})",
-            fill="#000",
-            fill_opacity=0.04,
-            stroke="#777",
-            stroke_width=1,
-            stroke_dasharray="4 3",
-        )
-        return [mark]
+        shape = {"cx": f"{x:.1f}", "cy": f"{y:.1f}", "rx": f"{rx:.2f}", "ry": f"{ry:.2f}"}
+        turned = f"rotate({-math.degrees(angle):.2f} {x:.1f} {y:.1f})"
+        style = {"fill": "#000", "fill_opacity": 0.04, "stroke": "#777", "stroke_width": 1}
+        return [element("ellipse", **shape, transform=turned, **style, stroke_dasharray="4 3")]
 
     def arrow(self, s: DState) -> str:
         """Draw the arrow of a dstate along its heading. That of the first dstate is black."""
@@ -193,14 +163,10 @@ class _Picture:
         degrees = math.degrees(pose.heading)
         shaft = f"M{BEGIN * u:.1f},0 H{END * u - 6 * u:.1f}"
         head = f"M{END * u:.1f},0 l{-9 * u:.1f},{-5 * u:.1f} v{10 * u:.1f} Z"
+        style = {"fill": colour, "stroke": colour, "stroke_width": f"{2.2 * u:.1f}"}
+        turned = placed(self.on_page(pose), -degrees)
         mark = element(
-            "path",
-            d=f"{shaft} {head}",
-            fill=colour,
-            stroke=colour,
-            stroke_width=f"{2.2 * u:.1f}",
-            stroke_linejoin="round",
-            transform=placed(self.on_page(pose), -degrees),
+            "path", d=f"{shaft} {head}", **style, stroke_linejoin="round", transform=turned
         )
         where = f"at {pose.x:.1f}, {pose.y:.1f} m, heading {degrees:.0f}°"
         return titled(f"dstate {s.id}: {s.shown}, {where}", mark)
@@ -264,9 +230,7 @@ class _Picture:
                 for left, top, right, bottom in self.boxes
             ):
                 self.keep_clear(x - w, y - h, x + w, y + h)
-                return [
-                    svg_text(x, y, label, colour, size=self.size(size), weight=weight, halo=True)
-                ]
+                return [svg_text(x, y, label, colour, self.size(size), weight, halo=True)]
         return []
 
     def size(self, size: float) -> float:
@@ -280,16 +244,11 @@ class _Picture:
     def place_labels(self, spots: Mapping[int, Point]) -> list[str]:
         """Draw the numbers of places beside their dots, where there is room."""
         marks = []
+        bearings = [k * math.pi / 4 for k in (-1, 1, 3, 5, 0, 2, 4, 6)]
+        ways = [(far * self.unit, bearing) for far in (17, 22, 30) for bearing in bearings]
         for place in self.map.places:
             x, y = spots[place]
-            around = [
-                (
-                    x + far * self.unit * math.cos(k * math.pi / 4),
-                    y + far * self.unit * math.sin(k * math.pi / 4),
-                )
-                for far in (17, 22, 30)
-                for k in (-1, 1, 3, 5, 0, 2, 4, 6)
-            ]
+            around = [(x + far * math.cos(angle), y + far * math.sin(angle)) for far, angle in ways]
             name = self.map.name_of("place", place)
             label = str(place) if name is None else f"{place} {name}"
             marks += self.label(label, around, "#000", 15, "bold")
@@ -327,25 +286,21 @@ class _Picture:
                 far = math.dist((ax, ay), (bx, by)) or 1.0
                 ux, uy = (bx - ax) / far, (by - ay) / far
                 for share in (0.5, 0.6, 0.4):
+                    x, y = ax + (bx - ax) * share, ay + (by - ay) * share
                     for side in (1, -1):
                         away = side * (12 + 18 * abs(uy)) * self.unit
-                        beside.append(
-                            (ax + (bx - ax) * share - uy * away, ay + (by - ay) * share + ux * away)
-                        )
-            marks += self.label(
-                self.map.called("path", path.id), beside, COLOURS[path.id % len(COLOURS)], 12
-            )
+                        beside.append((x - uy * away, y + ux * away))
+            name, colour = self.map.called("path", path.id), COLOURS[path.id % len(COLOURS)]
+            marks += self.label(name, beside, colour, 12)
         return marks
 
     def link_labels(self) -> list[str]:
         """Draw the actions of links at the middle of their curves, where there is room."""
-        return [
-            mark
-            for (ax, ay), (mx, my), (bx, by), names in self.curves()
-            for mark in self.label(
-                names, [((ax + 2 * mx + bx) / 4, (ay + 2 * my + by) / 4)], "#777", 10
-            )
-        ]
+        marks = []
+        for (ax, ay), (mx, my), (bx, by), names in self.curves():
+            middle = (ax + 2 * mx + bx) / 4, (ay + 2 * my + by) / 4
+            marks += self.label(names, [middle], "#777", 10)
+        return marks
 
     def scale_bar(self) -> list[str]:
         """Draw a scale bar of 1, 2 or 5 times a power of ten metres, below the map on the left."""

@@ -15,6 +15,7 @@ from ssh_abduction.output.drawing import (
     RADIUS,
     Point,
     at,
+    circle,
     element,
     fault_mark,
     faults_in_words,
@@ -75,25 +76,14 @@ def _topological(ssh_map: SSHMap, found: Layout) -> tuple[list[str], list[Point]
         marks += _path_name(ssh_map, path, spots)
     for place, (x, y) in spots.items():
         number = svg_text(x, y, str(place), "#222", size=15, weight="bold")
-        marks.append(titled(place_title(ssh_map, place), _circle(x, y, "#222"), number))
+        marks.append(
+            titled(place_title(ssh_map, place), circle(x, y, RADIUS, "white", "#222"), number)
+        )
         if (name := ssh_map.name_of("place", place)) is not None:
             marks.append(svg_text(x, y + NAME, name, "#222", size=12, weight="bold"))
         marks += _dstates(ssh_map, place, (x, y), found)
     bands, points = region_marks(ssh_map, spots, 3 * RADIUS)
     return bands + lines + marks, [*spots.values(), *points]
-
-
-def _circle(x: float, y: float, colour: str) -> str:
-    """Draw the circle of a place or dstate."""
-    return element(
-        "circle",
-        cx=f"{x:.1f}",
-        cy=f"{y:.1f}",
-        r=RADIUS,
-        fill="white",
-        stroke=colour,
-        stroke_width=2,
-    )
 
 
 def _path(ssh_map: SSHMap, path: MapPath, spots: dict[int, Point]) -> list[str]:
@@ -121,16 +111,10 @@ def _path_name(ssh_map: SSHMap, path: MapPath, spots: dict[int, Point]) -> list[
     (ax, ay), (bx, by) = a, b = spots[p], spots[q]
     mx, my, angle = (ax + bx) / 2, (ay + by) / 2, math.degrees(math.atan2(by - ay, bx - ax))
     far = 26 / (math.dist(a, b) or 1.0)
-    colour = COLOURS[path.id % len(COLOURS)]
+    colour, name = COLOURS[path.id % len(COLOURS)], ssh_map.called("path", path.id)
     return [
         element("path", d="M-7,-6 L7,0 L-7,6 Z", fill=colour, transform=placed((mx, my), angle)),
-        svg_text(
-            mx - (by - ay) * far,
-            my + (bx - ax) * far,
-            ssh_map.called("path", path.id),
-            colour,
-            halo=True,
-        ),
+        svg_text(mx - (by - ay) * far, my + (bx - ax) * far, name, colour, halo=True),
     ]
 
 
@@ -189,7 +173,7 @@ def _causal(ssh_map: SSHMap, found: Layout) -> tuple[list[str], list[Point]]:
         marks.append(svg_text(mx - ux * 12, my - uy * 12, names, "#555", halo=True))
     for s in ssh_map.dstates:
         x, y = spots[s.id]
-        marks.append(_circle(x, y, COLOURS[0]))
+        marks.append(circle(x, y, RADIUS, "white", COLOURS[0]))
         marks.append(svg_text(x, y, f"x{s.id}", "#222", weight="bold"))
         view = str(s.shown)
         label = view if len(view) <= LONGEST_LABEL else f"…{view[1 - LONGEST_LABEL :]}"

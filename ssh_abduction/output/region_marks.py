@@ -54,15 +54,8 @@ def banded(ssh_map: SSHMap, width: float) -> list[tuple[Region, float]]:
 
 def band(region: Region, ways: Sequence[str], width: float) -> str:
     """Draw one band along these ways (data of SVG paths), with the region as its title."""
-    mark = element(
-        "path",
-        d=" ".join(ways),
-        fill="none",
-        stroke=BAND,
-        stroke_width=f"{width:.1f}",
-        stroke_linecap="round",
-        stroke_linejoin="round",
-    )
+    style = {"stroke_width": f"{width:.1f}", "stroke_linecap": "round", "stroke_linejoin": "round"}
+    mark = element("path", d=" ".join(ways), fill="none", stroke=BAND, **style)
     return titled(str(region), mark, class_="region", opacity=OPACITY)
 
 

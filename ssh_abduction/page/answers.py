@@ -44,6 +44,5 @@ def solved_with(
     At most `maps` are listed; None lists all. `known`, `limit` and `watch` are as in
     `pair_explained`.
     """
-    start = Start(known=known)
-    search = Search(trace, theory, max_maps=maps, time_limit=limit, _start=start)
+    search = Search(trace, theory, max_maps=maps, time_limit=limit, _start=Start(known=known))
     return search.solution(tuple(search))

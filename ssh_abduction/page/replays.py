@@ -228,8 +228,7 @@ def drawn_images(trace: Trace) -> dict[str, Any] | None:
     if -(-most // every) < min(FEWEST, most):
         _warn_of_too_many(len(known))
         return None
-    finite = [image[np.isfinite(image) & (image > 0)] for image in known]
-    ranges = np.concatenate(finite)
+    ranges = np.concatenate([image[np.isfinite(image) & (image > 0)] for image in known])
     reach = float(np.percentile(ranges, FAR)) if len(ranges) else 1.0
     return {
         "kind": "ranges",

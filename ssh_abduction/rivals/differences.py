@@ -259,8 +259,7 @@ def _changes(table: Table, sort: Sort) -> Iterable[Change]:
 
 def _groups(classes: Sequence[int], ones: Sequence[int]) -> list[list[int]]:
     """Group the classes that a map has as one, from its row in `Table.ones`. Skip those at NONE."""
-    groups = gathered((ones[c], c) for c in classes if ones[c] != NONE)
-    return list(groups.values())
+    return list(gathered((ones[c], c) for c in classes if ones[c] != NONE).values())
 
 
 def _named_links(ssh_map: SSHMap, steps: Sequence[int]) -> set[Link]:

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
 from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import coo_array
 
-from ssh_abduction.data.groups import gathered, reached
+from ssh_abduction.data.groups import gathered, parts, reached
 from ssh_abduction.rivals.stances import StanceMove
 
 T = TypeVar("T")
@@ -119,50 +118,27 @@ def shortest_flow(
         np.r_[np.full(m, float(size)), np.ones(size)],
     )
     for _ in range(rounds):
-        found = milp(
-            costs,
-            constraints=rules,
-            integrality=np.ones(m + size),
-            bounds=bounds,
-            options={"time_limit": patience},
-        )
+        limit, whole = {"time_limit": patience}, np.ones(m + size)
+        found = milp(costs, constraints=rules, integrality=whole, bounds=bounds, options=limit)
         if found.x is None:
             return None
         times = np.round(found.x[:m]).astype(int)
         used = [move for move, n in zip(moves, times, strict=True) if n]
-        parts = _parts_cut_off(used, start)
-        if not parts:
+        if not (cut_off := _parts_cut_off(used, start)):
             break
-        for part in parts:
-            entering = [
-                k for k, move in enumerate(moves) if move.target in part and move.source not in part
-            ]
-            rules.append(
-                LinearConstraint(
-                    coo_array(
-                        (np.ones(len(entering)), ([0] * len(entering), entering)), (1, m + size)
-                    ).tocsr(),
-                    1,
-                    np.inf,
-                )
-            )
-    near = reached_from([move for move, n in zip(moves, times, strict=True) if n], start)
+        for part in cut_off:
+            entering = [float(x.target in part and x.source not in part) for x in moves]
+            rules.append(LinearConstraint(np.r_[entering, np.zeros(size)][None], 1, np.inf))
+    near = reached_from(used, start)
     return [int(n) if move.source in near else 0 for move, n in zip(moves, times, strict=True)]
 
 
 def _parts_cut_off(used: Sequence[StanceMove], start: int) -> list[set[int]]:
     """Find the connected parts of a flow without its start, as sets of stances (place, heading)."""
     near = reached_from(used, start)
-    left = [move for move in used if move.source not in near]
-    parts: list[set[int]] = []
-    while left:
-        part = reached_from(
-            [*left, *(replace(move, source=move.target, target=move.source) for move in left)],
-            left[0].source,
-        )
-        parts.append(part)
-        left = [move for move in left if move.source not in part]
-    return parts
+    left = [(move.source, move.target) for move in used if move.source not in near]
+    beside = gathered([*left, *((target, source) for source, target in left)])
+    return [set(part) for part in parts(beside, beside.__getitem__)]
 
 
 def nearest_of(

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from perception.places.importing import Imported
 from perception.readers.scans import Pose, RobotLog
 from ssh_abduction.data.drives import Drive, drives_of
-from ssh_abduction.data.groups import firsts
+from ssh_abduction.data.groups import firsts, gathered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import displacement_between, moved
 from ssh_abduction.output.drawing import ALARM, COLOURS, escaped, page, svg_text, titled
@@ -150,8 +150,7 @@ class _Sheet:
             turns.append(poses[visit.scan][2] - track[visit.scan][2])
         extent = np.ptp(np.concatenate([walls, [pose[:2] for pose in poses]]), axis=0).max()
         unit = min(METRE, LARGEST / max(float(extent), 1.0))
-        bounds = (0, *imported.starts, len(log))
-        return cls(poses, turns, spots, walls, unit, is_corrected, bounds)
+        return cls(poses, turns, spots, walls, unit, is_corrected, (0, *imported.starts, len(log)))
 
     def drive_of(self, scan: int) -> int:
         """The index of the drive of a scan."""
@@ -324,13 +323,8 @@ def _walls(log: RobotLog, poses: Sequence[Pose]) -> Array:
     for scan, pose in zip(log.scans, poses, strict=True):
         x, y, heading = moved(pose, scan.laser.mount)
         near = np.isfinite(scan.ranges) & (scan.ranges < min(DRAWN, scan.laser.reach))
-        angles = heading + scan.laser.bearings[near]
-        found.append(
-            np.stack(
-                [x + scan.ranges[near] * np.cos(angles), y + scan.ranges[near] * np.sin(angles)],
-                axis=1,
-            )
-        )
+        far, angles = scan.ranges[near], heading + scan.laser.bearings[near]
+        found.append(np.stack([x + far * np.cos(angles), y + far * np.sin(angles)], axis=1))
     cells = np.rint(np.concatenate(found) / GRAIN).astype(int)
     kept, counts = np.unique(cells, axis=0, return_counts=True)
     return np.asarray(kept[counts > (1 if len(log) > 100 else 0)] * GRAIN)
@@ -347,8 +341,7 @@ def laid_over(poses: Sequence[Pose], imported: Imported, ssh_map: SSHMap | None)
     Without a map, no places are shared.
     """
     drives = drives_of(imported.trace)
-    bounds = [0, *imported.starts, len(poses)]
-    own = [np.array(poses[a:b]) for a, b in pairwise(bounds)]
+    own = [np.array(poses[a:b]) for a, b in pairwise([0, *imported.starts, len(poses)])]
     spots = _spots(poses, imported)
     laid: dict[int, Array] = {0: own[0]}
     while len(laid) < len(drives):
@@ -379,16 +372,10 @@ def _next(
     drives: Sequence[Drive], ssh_map: SSHMap | None, laid: Sequence[int]
 ) -> tuple[int, list[tuple[int, int]]]:
     """Choose the drive that shares most places with the `laid` ones, with pairs of common steps."""
-    known: dict[object, list[int]] = defaultdict(list)
-    for k in laid:
-        for t in range(drives[k].first, drives[k].stop):
-            known[_station(ssh_map, t)].append(t)
+    steps = [range(drive.first, drive.stop) for drive in drives]
+    known = gathered((_station(ssh_map, t), t) for k in laid for t in steps[k])
     pairs = {
-        k: [
-            (other, t)
-            for t in range(drives[k].first, drives[k].stop)
-            for other in known.get(_station(ssh_map, t), ())
-        ]
+        k: [(other, t) for t in steps[k] for other in known.get(_station(ssh_map, t), ())]
         for k in range(len(drives))
         if k not in laid
     }

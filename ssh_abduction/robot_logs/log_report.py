@@ -141,9 +141,8 @@ def _ladder(rungs: Sequence[Rung]) -> str:
     for rung in rungs:
         cost = rung.solution.cost
         counts = (cost.dstates, cost.places, cost.paths) if cost else ("–", "–", "–")
-        rows.append(
-            (rung.name, rung.solution.status.value, *counts, f"{rung.solution.seconds.total:.1f} s")
-        )
+        time = f"{rung.solution.seconds.total:.1f} s"
+        rows.append((rung.name, rung.solution.status.value, *counts, time))
     return _table(("evidence", "status", "dstates", "places", "paths", "time"), rows)
 
 
@@ -153,10 +152,7 @@ def _doubts(solution: Solution) -> str:
     if not doubts:
         return _paragraph(f"None: the first map has no join with a probability below {SURE:g}.")
     places = place_of_steps(solution.maps[0])
-    rows = [
-        (first, second, places[second], f"{probability:.2f}")
-        for first, second, probability in doubts
-    ]
+    rows = [(first, second, places[second], f"{share:.2f}") for first, second, share in doubts]
     return _table(("step", "and step", "place", "probability"), rows)
 
 
@@ -174,17 +170,11 @@ def _faults(solution: Solution) -> str:
 
 def _settings(run: Mapping[str, Any]) -> str:
     """Make the table of the settings: what counts as a place, and the theory."""
-    theory = ", ".join(
-        f"{name} {value}"
-        for name, value in run["theory"].items()
-        if value not in (None, False, [], 0)
-    )
+    told = ((n, value) for n, value in run["theory"].items() if value not in (None, False, [], 0))
+    theory = ", ".join(f"{name} {value}" for name, value in told)
+    why = "where the free space forks, or the robot turned, began or ended"
     rows = [
-        (
-            "places",
-            "junctions, turning points, ends",
-            "where the free space forks, or the robot turned, began or ended",
-        ),
+        ("places", "junctions, turning points, ends", why),
         ("width", f"{run['width']:g} m", "of the robot; it cannot pass narrower parts"),
         ("theory", theory, "which axioms hold, and what is minimised"),
     ]
@@ -234,18 +224,10 @@ def _visits(imported: Imported, solution: Solution) -> str:
             else f"{entry.bearing:g}°{'' if entry.open else '?'}"
             for entry in step.star or ()
         )
-        rows.append(
-            (
-                t,
-                step.extra["visit"],
-                step.extra["scan"],
-                "?" if step.view is None else step.view,
-                star,
-                step.action.name if step.action else "",
-                state.id if state else "–",
-                "–" if state is None or state.place is None else state.place,
-            )
-        )
+        seen = (step.extra["visit"], step.extra["scan"], "?" if step.view is None else step.view)
+        place = "–" if state is None or state.place is None else state.place
+        action = step.action.name if step.action else ""
+        rows.append((t, *seen, star, action, state.id if state else "–", place))
     return _table(("step", "visit", "scan", "view", "star", "action", "dstate", "place"), rows)
 
 

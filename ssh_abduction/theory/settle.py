@@ -120,8 +120,7 @@ def settle(trace: Trace, theory: Theory | None = None, known: Problem | None = N
     settled = replace(settled, prefer=prefer)
     for i, step in enumerate(trace.steps):
         settled.require(step, trace.at(i))
-    evidence = evidence_of(settled, known.evidence if known else ())
-    problem = Problem(trace, settled, evidence)
+    problem = Problem(trace, settled, evidence_of(settled, known.evidence if known else ()))
     if displacement == "use" and not settled.returns:
         problem = problem.changed(theory=replace(settled, returns=count_returns(problem)))
     return problem

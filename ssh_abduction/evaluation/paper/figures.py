@@ -232,8 +232,7 @@ def draw_map(path: str | Path, ssh_map: SSHMap) -> None:
     Places are at the poses of the map if it has poses. Otherwise a layout is computed.
     """
     _pyplot()
-    figure = plot(ssh_map).figure
-    _save(figure, path)
+    _save(plot(ssh_map).figure, path)
 
 
 def draw_spread(path: str | Path, spread: Sequence[Sequence[float]]) -> None:
