@@ -44,47 +44,20 @@ _HOMES = {  # package: the names that are exported from it
 }
 
 # Names of version 0.1.0. Each still works in this version, with a warning that gives its new home.
-_MOVED = {
-    "Action": "data.Action",
-    "Backbone": "solver.Backbone",
-    "Belief": "online.Belief",
-    "Bound": "solver.Bound",
-    "Certificate": "solver.Certificate",
-    "Chances": "online.Chances",
-    "Comparison": "rivals.Comparison",
-    "Cost": "solver.Cost",
-    "DState": "data.DState",
-    "Difference": "rivals.Difference",
-    "Evaluation": "evaluation.Evaluation",
-    "Experiment": "rivals.Experiment",
-    "Exploration": "online.Exploration",
-    "Fit": "data.Fit",
-    "Level": "solver.Level",
-    "Listing": "rivals.Listing",
-    "LocaliserError": "data.LocaliserError",
-    "MapError": "data.MapError",
-    "MapEvaluation": "evaluation.MapEvaluation",
-    "Move": "online.Move",
-    "Odometry": "data.Odometry",
-    "Page": "page.Page",
-    "Path": "data.MapPath",
-    "Pose": "data.Pose",
-    "Progress": "solver.Progress",
-    "RangeError": "data.RangeError",
-    "Route": "online.Route",
-    "Rung": "evaluation.ladder.Rung",
-    "SSHError": "data.AbductionError",
-    "Search": "solver.Search",
-    "SolverError": "data.SolverError",
-    "Speedups": "theory.Speedups",
-    "Status": "solver.Status",
-    "Step": "data.Step",
-    "TheoryError": "data.TheoryError",
-    "TraceError": "data.TraceError",
-    "VisitsEvaluation": "evaluation.VisitsEvaluation",
-    "difference": "rivals.difference",
-    "evaluate_visits": "evaluation.evaluate_visits",
-    "ladder": "evaluation.ladder.ladder",
+_MOVED = {"Path": "data.MapPath", "SSHError": "data.AbductionError"} | {
+    name: f"{home}.{name}"
+    for home, names in {
+        "data": "Action DState Fit LocaliserError MapError Odometry Pose RangeError SolverError "
+        "Step TheoryError TraceError",
+        "evaluation": "Evaluation MapEvaluation VisitsEvaluation evaluate_visits",
+        "evaluation.ladder": "Rung ladder",
+        "online": "Belief Chances Exploration Move Route",
+        "page": "Page",
+        "rivals": "Comparison Difference Experiment Listing difference",
+        "solver": "Backbone Bound Certificate Cost Level Progress Search Status",
+        "theory": "Speedups",
+    }.items()
+    for name in names.split()
 }
 
 __all__ = [

@@ -109,28 +109,20 @@ def with_doubted_returns(ssh_map: SSHMap, trace: Trace, margin: int) -> SSHMap:
         numbers.setdefault(pair, len(numbers)) for pair in zip(at, ssh_map.dstate_at, strict=True)
     )
     places: dict[Copy, int] = {}
+    off_paths = [replace(s, path=None, direction=None) for s in ssh_map.dstates]
+    links = {
+        (one, action.name, other)
+        for (one, other), action in zip(pairwise(labels), trace.actions, strict=True)
+        if not action.starts
+    }
     return replace(
         ssh_map,
         dstate_at=labels,
         dstates=tuple(
-            replace(
-                ssh_map.dstates[label],
-                id=n,
-                place=places.setdefault(copy, n),
-                path=None,
-                direction=None,
-            )
+            replace(off_paths[label], id=n, place=places.setdefault(copy, n))
             for (copy, label), n in numbers.items()
         ),
-        links=tuple(
-            sorted(
-                {
-                    (one, action.name, other)
-                    for (one, other), action in zip(pairwise(labels), trace.actions, strict=True)
-                    if not action.starts
-                }
-            )
-        ),
+        links=tuple(sorted(links)),
         places=tuple(places.values()),
         paths=(),
     )

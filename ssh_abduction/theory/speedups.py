@@ -51,11 +51,9 @@ class Speedups:
 
     def __post_init__(self) -> None:
         for name in SPEEDUPS:
-            if not isinstance(getattr(self, name), bool):
-                raise SolverError(
-                    f"speedups: {name}: expected true or false, got {brief(getattr(self, name))}"
-                    "; take one of them"
-                )
+            if not isinstance(value := getattr(self, name), bool):
+                wrong = f"speedups: {name}: expected true or false, got {brief(value)}"
+                raise SolverError(f"{wrong}; take one of them")
 
     def __repr__(self) -> str:
         return shortly(self)
@@ -71,21 +69,16 @@ class Speedups:
         Raises:
             SolverError: A name is unknown.
         """
+        expected = f"speedups: expected names out of {', '.join(SPEEDUPS)}, got"
         if not isinstance(names, Iterable):
-            raise SolverError(
-                f"speedups: expected names out of {', '.join(SPEEDUPS)}, got {brief(names)}"
-                "; take some of these"
-            )
+            raise SolverError(f"{expected} {brief(names)}; take some of these")
         off = [name for name in (names.split(",") if isinstance(names, str) else names) if name]
         for name in off:
             if name in REMOVED:
                 text = f"speedups: {name} is removed, as it gained nothing; leave it out"
                 warnings.warn(text, DeprecationWarning, stacklevel=2)
             elif name not in SPEEDUPS:
-                raise SolverError(
-                    f"speedups: expected names out of {', '.join(SPEEDUPS)}, got {brief(name)}"
-                    "; take some of these"
-                )
+                raise SolverError(f"{expected} {brief(name)}; take some of these")
         return cls(**dict.fromkeys((name for name in off if name not in REMOVED), False))
 
     def that_hold_for(self, theory: Theory) -> Speedups:
@@ -110,6 +103,8 @@ def checked_speedups(value: object) -> Speedups:
 
 
 SPEEDUPS = tuple(f.name for f in fields(Speedups))
+EVERY: Final = None
+NOTHING: frozenset[str] = frozenset()
 # Speed-ups of version 0.1.0 that gained nothing.
 REMOVED = ("from_below", "apart", "small_cores", "watched", "one_by_one", "threads")
 
@@ -133,9 +128,9 @@ class Speedup:
     name: str
     switch: str
     sentence: str
-    suits: Callable[[Theory], bool]
-    rests_on: frozenset[str]
-    keeps: Callable[[], frozenset[str]] | None
+    suits: Callable[[Theory], bool] = lambda theory: True
+    rests_on: frozenset[str] = NOTHING
+    keeps: Callable[[], frozenset[str]] | None = EVERY
 
     def holds_for(self, theory: Theory) -> bool:
         """Whether it changes no answer for a theory. `star` must not be auto."""
@@ -144,13 +139,6 @@ class Speedup:
             and not self.rests_on & theory.given_up
             and (self.keeps is EVERY or theory.demands <= self.keeps())
         )
-
-
-EVERY: Final = None
-
-
-def _any_theory(theory: Theory) -> bool:
-    return True
 
 
 def _keeps_headings(theory: Theory) -> bool:
@@ -214,7 +202,6 @@ GATEWAYS = frozenset(
         "gateway_end",
     }
 )
-NOTHING: frozenset[str] = frozenset()
 # The start of a drive is an action that occurs once and is neither travel nor turn.
 DRIVES = "the field several_drives"
 # A lift leads to one dstate, as any action. It is neither travel nor turn.
@@ -270,7 +257,6 @@ TABLE = (
         "Begin with few names for paths, and add names when they are too few.",
         _has_paths,
         TRAVELS_AND_TURNS,
-        EVERY,
     ),
     Speedup(
         "named dstates",
@@ -357,7 +343,6 @@ TABLE = (
         "Find steps that are pairwise distinct, or such segments of paths. Give each its own name.",
         lambda theory: not theory.unknown_views and not theory.changed,
         CAUSAL,
-        EVERY,
     ),
     Speedup(
         "sides",
@@ -366,48 +351,32 @@ TABLE = (
         "forbid, path by path.",
         _has_frames,
         FRAMES,
-        EVERY,
     ),
     Speedup(
         "lazy",
         "lazy",
         "Give clingo only some links, or visits, at first. Add others when an answer breaks them.",
-        _any_theory,
-        NOTHING,
-        EVERY,
     ),
     Speedup(
         "core_guided",
         "core_guided",
         "Raise the lower bound by unsat cores, instead of improving a map step by step.",
-        _any_theory,
-        NOTHING,
-        EVERY,
     ),
     Speedup(
         "processes",
         "processes",
         "While a robot drives, with faults: use a second process, if there are two processors.",
-        _any_theory,
-        NOTHING,
-        EVERY,
     ),
     Speedup(
         "annealed",
         "annealed",
         "If clingo takes long, search for a map near a guess. The checker judges this map.",
-        _any_theory,
-        NOTHING,
-        EVERY,
     ),
     Speedup(
         "greedy",
         "greedy",
         "Make a map without clingo, by sketches or by a beam of hypotheses about the "
         "displacements. The checker judges this map.",
-        _any_theory,
-        NOTHING,
-        EVERY,
     ),
     Speedup(
         "certain sketches",
@@ -432,8 +401,6 @@ TABLE = (
         "Stars as patterns: if clingo takes long, search for a map in which places have frames. "
         "The checker judges this map.",
         lambda theory: theory.star == "pattern" and row("visits").holds_for(theory.with_frames()),
-        NOTHING,
-        EVERY,
     ),
 )
 
