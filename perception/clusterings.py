@@ -80,14 +80,10 @@ def single(fitted: Any, images: NDArray[np.float64], trim: float) -> tuple[Any, 
     labels = cluster_labels(fitted, images)
     inside = labels != NOISE
     k = len(set(labels[inside].tolist()))
-    measures = (
-        (
-            cluster_quality(images[inside], labels[inside]),
-            trimmed_quality(images[inside], labels[inside], trim),
-        )
-        if inside.any()
-        else (math.nan, math.nan)
-    )
+    measures = math.nan, math.nan
+    if inside.any():
+        some = images[inside], labels[inside]
+        measures = cluster_quality(*some), trimmed_quality(*some, trim)
     return fitted, Tried(k, {k: measures[0]}, {k: measures[1]}, {k: labels})
 
 

@@ -122,14 +122,8 @@ def warn_of_doubts(labels: ArrayLike, sure: ArrayLike, quality: float) -> None:
             f"{len(doubtful)} of {len(of)} images fit no view, or a view that "
             f"was rarely seen (image {named})"
         )
-        warnings.warn(
-            (
-                f"{text}: their views may be wrong, and so may the map; check whether something "
-                "stood in front of the laser"
-            ),
-            ImageWarning,
-            2,
-        )
+        text += ": their views may be wrong, and so may the map; check whether something stood in "
+        warnings.warn(text + "front of the laser", ImageWarning, 2)
     if quality < 1:
         text = (
             f"views overlap (M is {quality:.2f}, below 1): some images of two views are nearer to "

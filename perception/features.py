@@ -152,16 +152,10 @@ def _permuted(images: Floats, second: NDArray[np.bool_], seed: int) -> Floats:
     order = np.argsort(second, kind="stable")
     known, asked = order[::2], order[1::2]
     model = KNeighborsClassifier(1, algorithm="brute").fit(images[known], second[known])
-    return np.asarray(
-        permutation_importance(
-            model,
-            images[asked],
-            second[asked],
-            scoring=_margin,
-            n_repeats=SHUFFLED,
-            random_state=seed,
-        ).importances_mean
+    found = permutation_importance(
+        model, images[asked], second[asked], scoring=_margin, n_repeats=SHUFFLED, random_state=seed
     )
+    return np.asarray(found.importances_mean)
 
 
 def _margin(model: Any, images: Floats, second: NDArray[np.bool_]) -> float:

@@ -62,13 +62,8 @@ def images_held(trace: Trace) -> list[NDArray[np.float64] | None]:
                 f"{trace.at(i)}: image: expected an index below {len(table)}, got {image}; "
                 f"{trace.images} has no more"
             )
-        rows.append(
-            None
-            if image is None
-            else table[image]
-            if isinstance(image, int)
-            else np.array(image, dtype=float)
-        )
+        row = table[image] if isinstance(image, int) else np.array(image, dtype=float)
+        rows.append(None if image is None else row)
     return rows
 
 

@@ -82,13 +82,8 @@ class Odometer:
             )
         usual = Odometer()
         share = along / usual.along
-        return replace(
-            self,
-            along=along,
-            across=usual.across * share,
-            heading=usual.heading * share,
-            turning=usual.turning * share,
-        )
+        scaled = {kind: getattr(usual, kind) * share for kind in ("across", "heading", "turning")}
+        return replace(self, along=along, **scaled)
 
     def parameters(self) -> dict[str, float]:
         """Return all attributes as a dict from name to value, for logs."""
@@ -129,21 +124,11 @@ class Odometer:
         ):
             way, cos, sin = np.hypot(ahead, left), np.cos(start[2]), np.sin(start[2])
             # Jacobians of the next pose by this pose and by the motion.
-            by_pose = np.array(
-                [
-                    [1.0, 0.0, -sin * ahead - cos * left],
-                    [0.0, 1.0, cos * ahead - sin * left],
-                    [0.0, 0.0, 1.0],
-                ]
-            )
+            by_pose = np.eye(3)
+            by_pose[:2, 2] = -sin * ahead - cos * left, cos * ahead - sin * left
             by_motion = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-            noise = np.diag(
-                [
-                    self.along**2 * way,
-                    self.across**2 * way,
-                    self.heading**2 * way + self.turning**2 * abs(turned),
-                ]
-            )
+            heading = self.heading**2 * way + self.turning**2 * abs(turned)
+            noise = np.diag([self.along**2 * way, self.across**2 * way, heading])
             found[number + 1] = (
                 by_pose @ found[number] @ by_pose.T + by_motion @ noise @ by_motion.T
             )

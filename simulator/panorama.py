@@ -195,14 +195,8 @@ class Camera:
                     f"{brief(getattr(self, name))}; change it"
                 )
         an_instance("camera.paint", self.paint, Paint, SimulatorError, mend="make one with Paint()")
-        hours = tuple(
-            a_list(
-                "camera.hours",
-                self.hours,
-                SimulatorError,
-                what="the hours at which a run begins and ends",
-            )
-        )
+        what = "the hours at which a run begins and ends"
+        hours = tuple(a_list("camera.hours", self.hours, SimulatorError, what=what))
         if len(hours) != 2:
             raise SimulatorError(
                 "camera.hours: expected two, at which a run begins and ends, got "

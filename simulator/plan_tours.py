@@ -83,13 +83,8 @@ def tour(
     a_whole_number("steps", steps, SimulatorError, 0, MOST_STEPS, what="a number of actions")
     a_whole_number("seed", seed, SimulatorError)
     if odometry is not None:
-        an_instance(
-            "odometry",
-            odometry,
-            Odometry,
-            SimulatorError,
-            mend="make one with Odometry(), or leave it out",
-        )
+        mend = "make one with Odometry(), or leave it out"
+        an_instance("odometry", odometry, Odometry, SimulatorError, mend=mend)
     a_number("scale", scale, SimulatorError, -1, 1, what="a share")
     a_number("bend", bend, SimulatorError, -1, 1, what="radians per metre")
     plan = plan.told_apart(apart)

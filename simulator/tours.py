@@ -71,23 +71,12 @@ def simulate(
         SimulatorError: The route cannot be driven.
     """
     if every is not None:
-        a_number(
-            "every",
-            every,
-            SimulatorError,
-            above=0,
-            what="a number of metres",
-            mend="leave it out for images at dstates",
-        )
+        mend, what = "leave it out for images at dstates", "a number of metres"
+        a_number("every", every, SimulatorError, above=0, what=what, mend=mend)
     a_flag("stars", stars, SimulatorError)
     if camera is not None:
-        an_instance(
-            "camera",
-            camera,
-            Camera,
-            SimulatorError,
-            mend="make one with Camera(), or leave it out for ranges",
-        )
+        mend = "make one with Camera(), or leave it out for ranges"
+        an_instance("camera", camera, Camera, SimulatorError, mend=mend)
     an_instance("world", world, World, SimulatorError, mend="take World.named or World.load")
     if every is not None and world.lifts:
         raise SimulatorError(
@@ -210,13 +199,8 @@ def _driver(
         ("tolerance", tolerance, Tolerance),
     ):
         if given is not None:
-            an_instance(
-                name,
-                given,
-                kind,
-                SimulatorError,
-                mend=f"make one with {kind.__name__}(), or leave it out",
-            )
+            mend = f"make one with {kind.__name__}(), or leave it out"
+            an_instance(name, given, kind, SimulatorError, mend=mend)
     if world.lifts and world.angles == "any":
         raise SimulatorError(
             f"{world.name}: lifts: expected a world whose streets meet at right angles, got one "
@@ -299,14 +283,8 @@ def _evenly(
             )
             truth = {"dstate": spot, "pose": [round(v, 4) for v in driver.robot.pose]}
             image = eye.image(driver, driver.look(STILL), leg)
-            logged.append(
-                Step(
-                    image=image,
-                    action=Action.of("travel"),
-                    displacement=log.displacement(),
-                    truth=truth,
-                )
-            )
+            travel, onward = Action.of("travel"), log.displacement()
+            logged.append(Step(image=image, action=travel, displacement=onward, truth=truth))
             due += every
 
     driver.on_travel = look
@@ -336,14 +314,7 @@ def _truth(world: World, pose: Sequence[float]) -> dict[str, object]:
     """The truth about a pose: the pose, and the nearest true dstate if the world has any."""
     found = world.nearest(pose)
     where = {"pose": [round(float(v), 5) for v in pose]}
-    return (
-        {
-            "dstate": found.name,
-            "place": found.place,
-            "path": found.path,
-            "direction": found.direction,
-            **where,
-        }
-        if found
-        else dict(where)
-    )
+    if not found:
+        return dict(where)
+    named = {"dstate": found.name, "place": found.place, "path": found.path}
+    return {**named, "direction": found.direction, **where}

@@ -143,13 +143,8 @@ class World:
             ("dstates", TrueDState),
             ("lifts", Lift),
         ):
-            members = all_instances(
-                f"world.{name}",
-                getattr(self, name),
-                kind,
-                SimulatorError,
-                mend="read a world with World.load",
-            )
+            mend, some = "read a world with World.load", getattr(self, name)
+            members = all_instances(f"world.{name}", some, kind, SimulatorError, mend=mend)
             object.__setattr__(self, name, members)
         for name in ("places", "via"):
             for place, point in an_object(

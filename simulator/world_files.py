@@ -335,10 +335,5 @@ class WorldReader:
         if not all(isinstance(text, str) for text in texts):
             raise self.wrong(name, "texts for name, place and path", value)
         label, place, path = map(str, texts)
-        return TrueDState(
-            label,
-            place,
-            path,
-            int(value["direction"]),
-            self.pose(value.get("pose"), f"{name}.pose"),
-        )
+        pose = self.pose(value.get("pose"), f"{name}.pose")
+        return TrueDState(label, place, path, int(value["direction"]), pose)

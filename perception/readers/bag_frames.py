@@ -141,13 +141,8 @@ def mount_of(
     chain = ancestors(frames, frame)
     parents = [parent_of(frames, child).parent for child in chain]
     # If no transform leads to the robot's frame, the child of the odometry's frame is the robot.
-    top = (
-        parents.index(base)
-        if base in parents
-        else parents.index(odom) - 1
-        if odom in parents
-        else None
-    )
+    top = parents.index(odom) - 1 if odom in parents else None
+    top = parents.index(base) if base in parents else top
     if top is None:
         assumed["mount"] = (f"{assumed['mount']} " if "mount" in assumed else "") + (
             f"No transform leads from the robot ({base or 'a frame without a name'}) to its laser "

@@ -328,11 +328,5 @@ def _measured(
         raise Damaged(f"expected a first angle and a step in radians, got {first:g} and {step:g}")
     if is_flipped:
         first, step = -first, -step
-    return ranges, laser_of(
-        first,
-        step,
-        len(ranges),
-        reach if reach > 0 else math.inf,
-        mount,
-        nearest if 0 < nearest < math.inf else 0.0,
-    )
+    reach, nearest = reach if reach > 0 else math.inf, nearest if 0 < nearest < math.inf else 0.0
+    return ranges, laser_of(first, step, len(ranges), reach, mount, nearest)

@@ -173,14 +173,8 @@ def _scans(
             if tag != kind.encode():
                 odometer.read_line(tag, tokens)
             elif (line := scan_line(tokens)) is not None:
-                waiting.append(
-                    Scan(
-                        *_measured(line, mount, reach, fov),
-                        *odometer.pose_of(line),
-                        line.time,
-                        number,
-                    )
-                )
+                seen, pose = _measured(line, mount, reach, fov), odometer.pose_of(line)
+                waiting.append(Scan(*seen, *pose, line.time, number))
         except Damaged as damage:
             odometer.skip_line(tag)
             waiting.append(Damage(number, str(damage)))

@@ -239,13 +239,8 @@ def _messages(
                     moved(scan.corrected, displacement_between(scan.odometry, (0.0, 0.0, 0.0))),
                 ),
             )
-        yield (
-            "/odom",
-            time,
-            make.odometry(
-                scan.odometry, np.zeros((3, 3)) if covariances is None else covariances[number]
-            ),
-        )
+        covariance = np.zeros((3, 3)) if covariances is None else covariances[number]
+        yield "/odom", time, make.odometry(scan.odometry, covariance)
         yield "/scan", time, make.scan(scan.ranges, laser)
 
 

@@ -71,13 +71,8 @@ class _Claims:
         theory: Theory,
         proven: int,
     ) -> None:
-        self.answer, self.maps, self.steps, self.theory, self.proven = (
-            answer,
-            maps,
-            steps,
-            theory,
-            proven,
-        )
+        self.answer, self.maps, self.steps = answer, maps, steps
+        self.theory, self.proven = theory, proven
         self.counts = [_counts(ssh_map) for ssh_map in maps]
         self.first = next(iter(theory.priorities), None)
         self.is_optimal = answer.get("status") == "optimal"

@@ -92,13 +92,8 @@ def bearing_changes(m: Reading) -> Iterator[tuple[int, int, int, str, str]]:
     for found in changes_of(*_sights_of(m), m.axioms):
         was, now = (names[drive] for drive in found.drives)
         is_open, was_open = (("closed", "open"), ("open", "closed"))[found.is_open]
-        yield (
-            found.place,
-            found.bearing,
-            found.step,
-            f"{was_open} on {was}",
-            f"{is_open} on {now}",
-        )
+        seen = f"{was_open} on {was}", f"{is_open} on {now}"
+        yield found.place, found.bearing, found.step, *seen
 
 
 def _gateways(name: str, m: Reading) -> Found:

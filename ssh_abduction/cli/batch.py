@@ -198,14 +198,9 @@ class SolveQuestion(FileQuestion):
     ) -> SolveAnswer:
         """Make the answer for a solution: its line, exit code and warnings."""
         if self.json:
-            line = json_line(
-                {
-                    "trace": path,
-                    **answer_opening(search),
-                    "maps": [written_map(*given) for given in maps],
-                    **answer_ending(search, solution, explanation, len(maps), backbone),
-                }
-            )
+            written = [written_map(*given) for given in maps]
+            ending = answer_ending(search, solution, explanation, len(maps), backbone)
+            line = json_line({"trace": path, **answer_opening(search), "maps": written, **ending})
         else:
             line = f"{named(path)}: {headline(solution, search.count, explanation)}"
         warnings = tuple(

@@ -247,13 +247,10 @@ class MapQuestion(FileQuestion):
         told_paths = (
             f"{counted(cost.paths, 'paths')}, " if cost and paths_mean_something(solution) else ""
         )
-        found = (
-            "no map"
-            if cost is None
-            else (
-                f"{counted(cost.places, 'places')}, {told_paths}{counted(cost.dstates, 'dstates')}"
-            )
-        )
+        found = "no map"
+        if cost is not None:
+            dstates = counted(cost.dstates, "dstates")
+            found = f"{counted(cost.places, 'places')}, {told_paths}{dstates}"
         how = (
             f"{solution.status.value}, {solution.weighed.sentence}"
             if solution.weighed
@@ -270,13 +267,8 @@ class MapQuestion(FileQuestion):
             f"{counted(len(log), 'scans')}, {done.imported.track.way[-1]:.0f} m; {total:.1f} s"
         )
         code = interrupted_code() if done.interrupted else exit_code(solution)
-        return MapAnswer(
-            number,
-            line,
-            code,
-            (*log.warnings, *done.notes, *solution.warnings),
-            tuple(files.items()),
-        )
+        notes = (*log.warnings, *done.notes, *solution.warnings)
+        return MapAnswer(number, line, code, notes, tuple(files.items()))
 
     def _given_up(self, number: int, path: str) -> MapAnswer:
         """Make the answer for a log that was interrupted before anything was known."""

@@ -63,13 +63,9 @@ class SavedMap:
         said = load_corrections(beside) if beside.is_file() else Corrections()
         said.check_drives(known)
         drives = {**said.drives, **{name: str(mark) for name, mark in known.items()}}
-        return cls(
-            listing.maps[listing.number(str(number))],
-            listing.drives,
-            file,
-            replace(said, drives=drives),
-            isinstance(theory, dict) and theory.get("star") == "frame",
-        )
+        ssh_map = listing.maps[listing.number(str(number))]
+        is_framed = isinstance(theory, dict) and theory.get("star") == "frame"
+        return cls(ssh_map, listing.drives, file, replace(said, drives=drives), is_framed)
 
     def save(self, corrections: Corrections) -> Path:
         """Write the corrections beside the map, after a check. Returns their file.

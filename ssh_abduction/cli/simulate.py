@@ -253,13 +253,8 @@ def scans_of(drive: RecordedDrive) -> Iterator[Scan]:
     laser = LaserScanner(
         float(BEARINGS[0]), float(BEARINGS[1] - BEARINGS[0]), BEAMS, drive.laser.reach
     )
-    rows = zip(
-        drive.ranges,
-        drive.odometry.tolist(),
-        drive.poses.tolist(),
-        drive.times.tolist(),
-        strict=True,
-    )
+    told = (drive.odometry.tolist(), drive.poses.tolist(), drive.times.tolist())
+    rows = zip(drive.ranges, *told, strict=True)
     for line, (ranges, odometry, pose, time) in enumerate(rows, 1):
         yield Scan(ranges, laser, tuple(odometry), tuple(pose), time, line)
 

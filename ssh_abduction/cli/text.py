@@ -182,24 +182,13 @@ def describe_backbone(backbone: Backbone, trace: Trace) -> str:
     names = named_steps(drives_of(trace), len(trace))
     for t, number in zip(names, backbone.dstates.always, strict=True):
         steps.setdefault(number, []).append(t)
+    views = [[v for t in some if (v := trace.steps[t].view) is not None] for some in steps.values()]
     rows = [
-        [
-            next((view for t in some if (view := trace.steps[t].view) is not None), "?"),
-            stretches(some),
-        ]
-        for some in steps.values()
+        [seen[0] if seen else "?", stretches(some)]
+        for seen, some in zip(views, steps.values(), strict=True)
     ]
-    parts = [
-        table(
-            [
-                "view",
-                "steps at one dstate in all minimal maps"
-                if backbone.proven
-                else "steps at one dstate in all maps found",
-            ],
-            rows,
-        )
-    ]
+    maps = "minimal maps" if backbone.proven else "maps found"
+    parts = [table(["view", f"steps at one dstate in all {maps}"], rows)]
     for sort, pairs in (
         ("one dstate", backbone.dstates.sometimes),
         ("at one place", backbone.places.sometimes if backbone.places else ()),

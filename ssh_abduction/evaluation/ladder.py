@@ -165,13 +165,8 @@ def ladder(
     a_count_of_maps(max_maps, SolverError)
     a_flag("stars", stars, TheoryError)
     if known is not None:
-        an_instance(
-            "known",
-            known,
-            Solution,
-            MapError,
-            mend="give what solve returned for this trace, or leave it out",
-        )
+        mend = "give what solve returned for this trace, or leave it out"
+        an_instance("known", known, Solution, MapError, mend=mend)
     if under_way is not None:
         an_instance(
             "under_way", under_way, UnderWay, SolverError, mend="give an UnderWay, or leave it out"

@@ -129,15 +129,9 @@ class Argument:
             if supposed
             else None
         )
+        links = tuple(self._checked_links())
         return Derivation(
-            self._piece.steps,
-            first,
-            second,
-            self._one,
-            tuple(self._checked_links()),
-            inferences,
-            supposition,
-            summary,
+            self._piece.steps, first, second, self._one, links, inferences, supposition, summary
         )
 
     # Which conclusions follow from the links, in which order

@@ -300,14 +300,8 @@ class Explorer:
         solution = self.solution
         unique = _is_unique(solution)
         rival = next(iter(self._doubts.twins.values()), None)
-        return Exploration(
-            len(self.trace) - 1,
-            self._ending(unique),
-            unique,
-            self._is_true(unique),
-            solution,
-            rival,
-        )
+        ending, is_true = self._ending(unique), self._is_true(unique)
+        return Exploration(len(self.trace) - 1, ending, unique, is_true, solution, rival)
 
     def _ending(self, unique: bool) -> Ending:
         """Say why the exploration ended, or would end now. `unique`: all minimal maps are alike."""

@@ -73,14 +73,8 @@ class ExtendedMap:
                 looks.setdefault(label, observation(trace.steps[t], theory))
         shows = tuple(looks.get(s.id, (s.view, None)) for s in ssh_map.dstates)
         links = {(s, action): x for s, action, x in ssh_map.links}
-        return cls(
-            ssh_map,
-            ssh_map.dstate_at,
-            shows,
-            links,
-            ssh_map.faults,
-            Cost.of(ssh_map).preferred_by(theory),
-        )
+        cost = Cost.of(ssh_map).preferred_by(theory)
+        return cls(ssh_map, ssh_map.dstate_at, shows, links, ssh_map.faults, cost)
 
     @property
     def here(self) -> int:
@@ -103,13 +97,9 @@ class ExtendedMap:
         if len(links) < len(self.links):
             links = tuple(sorted((s, action, x) for (s, action), x in self.links.items()))
         faults = tuple(sorted(self.faults, key=lambda fault: (fault.step, fault.kind)))
+        labels, dstates = self.labels, (*known, *new)
         return replace(
-            self.map,
-            dstate_at=self.labels,
-            dstates=(*known, *new),
-            links=links,
-            faults=faults,
-            fit=None,
+            self.map, dstate_at=labels, dstates=dstates, links=links, faults=faults, fit=None
         )
 
     def contradiction(self, action: str, seen: Seen) -> int | None:

@@ -69,18 +69,10 @@ def svg_text(
     halo: bool = False,
 ) -> str:
     """Make a label that is centred at a point. A white halo makes it readable on top of lines."""
-    return element(
-        "text",
-        escaped(label),
-        x=f"{x:.1f}",
-        y=f"{y:.1f}",
-        font_size=f"{size:g}",
-        font_weight=weight,
-        fill=colour,
-        **({"stroke": "white", "stroke_width": 3, "paint_order": "stroke"} if halo else {}),
-        text_anchor="middle",
-        dominant_baseline="central",
-    )
+    style = {"x": f"{x:.1f}", "y": f"{y:.1f}", "font_size": f"{size:g}", "font_weight": weight}
+    outline = {"stroke": "white", "stroke_width": 3, "paint_order": "stroke"} if halo else {}
+    centred = {"text_anchor": "middle", "dominant_baseline": "central"}
+    return element("text", escaped(label), **style, fill=colour, **outline, **centred)
 
 
 def circle(x: float, y: float, radius: float, fill: str, stroke: str, width: object = 2) -> str:

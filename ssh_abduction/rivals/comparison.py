@@ -357,14 +357,8 @@ def _others(here: Listing, there: Listing) -> Others:
     only_there = tuple(
         j for j, ssh_map in enumerate(there.maps, 1) if ssh_map.renumbered() not in shared
     )
-    return Others(
-        len(there.maps),
-        pairs,
-        tuple(i for i, j in both.items() if not j),
-        only_there,
-        best,
-        there.source,
-    )
+    only_here = tuple(i for i, j in both.items() if not j)
+    return Others(len(there.maps), pairs, only_here, only_there, best, there.source)
 
 
 def _check_backbone(shared: Backbone, listed: Backbone, listing: Listing) -> None:

@@ -164,12 +164,9 @@ def _pair(
     excluded = 0
     for here in _visits(one, placings):
         for there in _visits(other, placings):
+            weighed = list(zip(weights, placings, strict=True))
             joins = (
-                DriveJoin(
-                    i,
-                    j,
-                    math.fsum(w for w, at in zip(weights, placings, strict=True) if at[i] == at[j]),
-                )
+                DriveJoin(i, j, math.fsum(w for w, at in weighed if at[i] == at[j]))
                 for i, j in product(here, there)
             )
             join = max(joins, key=lambda join: join.share)

@@ -146,15 +146,9 @@ def next_experiment(
     laboratory = Laboratory(rivals, trace, theory, extra, can, implied, watch)
     plan = laboratory.plan()
     watch.stop()
-    return Experiment(
-        len(rivals),
-        laboratory.alike,
-        laboratory.predictions(plan.actions),
-        plan,
-        _sharing(rivals),
-        complete,
-        laboratory.stopped,
-    )
+    predictions, shared = laboratory.predictions(plan.actions), _sharing(rivals)
+    stopped = laboratory.stopped
+    return Experiment(len(rivals), laboratory.alike, predictions, plan, shared, complete, stopped)
 
 
 class Laboratory:
@@ -237,13 +231,11 @@ class Laboratory:
                 seen.append(int(self._table.sights[machine, state]))
             found.setdefault(tuple(seen), []).extend(group)
         looks = self._sights.seen
-        return (
-            tuple(
-                Prediction(_numbers(group), tuple(looks[k] for k in seen))
-                for seen, group in found.items()
-            )
-            if actions
-            else ()
+        if not actions:
+            return ()
+        return tuple(
+            Prediction(_numbers(group), tuple(looks[k] for k in seen))
+            for seen, group in found.items()
         )
 
     def _plan_for(self, machines: Sequence[int], start: Row) -> ExperimentPlan:
@@ -320,13 +312,8 @@ class Laboratory:
         expects = tuple(
             Expectation(_numbers(group), consequence) for consequence, group in said.items()
         )
-        return Untried(
-            tuple(self._actions[a].name for a in walk.way(row)),
-            self._actions[action].name,
-            expects,
-            worst,
-            -pairs,
-        )
+        way = tuple(self._actions[a].name for a in walk.way(row))
+        return Untried(way, self._actions[action].name, expects, worst, -pairs)
 
     def _say(
         self, machines: Sequence[int], states: Sequence[int], action: int

@@ -71,13 +71,9 @@ Can: TypeAlias = Callable[[Seen], Iterable[str]]
 
 def _entry(entry: Any) -> Any:
     """Convert an entry of a star for JSON. An open opening becomes 1, a closed one 0."""
-    return (
-        entry.to_json()
-        if hasattr(entry, "to_json")
-        else int(entry)
-        if isinstance(entry, bool)
-        else entry
-    )
+    if hasattr(entry, "to_json"):
+        return entry.to_json()
+    return int(entry) if isinstance(entry, bool) else entry
 
 
 def _star_text(star: Sequence[Any]) -> str:

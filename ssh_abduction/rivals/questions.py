@@ -142,14 +142,10 @@ def questions_of(
                     sorted(t for k in together[heads[side]] for t in steps_by_class[k])
                     for side in (c, d)
                 ]
-                stand = (
-                    [
-                        tuple(sorted({p for t in side if (p := places[t]) is not None}))
-                        for side in sides
-                    ]
-                    if places
-                    else []
-                )
+                stand = [
+                    tuple(sorted({p for t in side if (p := places[t]) is not None}))
+                    for side in (sides if places else ())
+                ]
                 question = Question(
                     sort,
                     first=int(table.firsts[c]),

@@ -106,13 +106,8 @@ class Table:
     def shared(self) -> Backbone:
         """Find what these maps share: which steps are one in all of them, in some, or in none."""
         found = {sort: self._shared(ones) for sort, ones in self.ones.items()}
-        return Backbone(
-            found["dstates"],
-            found.get("places"),
-            found.get("paths"),
-            found.get("courses"),
-            proven=False,
-        )
+        places, paths, courses = (found.get(sort) for sort in ("places", "paths", "courses"))
+        return Backbone(found["dstates"], places, paths, courses, proven=False)
 
     def _shared(self, ones: Ints) -> Shared:
         """Find which pairs of steps all maps, or only some maps, join in one sort."""

@@ -382,10 +382,11 @@ def map_log(
     if with_ladder and not mapping.interrupted:
         begin, stars = time.process_time(), chosen.star != "none"
         share = (left - seconds["maps"]) / len(list(rungs(trace, chosen, stars)))
+        most = min(max(share, LEAST_RUNG), RUNG)
         climbed += ladder(
             trace,
             chosen,
-            time_limit=min(max(share, LEAST_RUNG), RUNG),
+            time_limit=most,
             max_maps=1,
             stars=stars,
             known=solution,

@@ -200,13 +200,8 @@ class Theory:
                 *(count for count in self.without_faults().priorities if count != "dstates"),
             )
         if prefer == AUTO:
-            prefer = (
-                ("dstates",)
-                if self.level == "causal"
-                else WITH_DISPLACEMENTS
-                if self.displacement == "use"
-                else PREFERRED
-            )
+            prefer = WITH_DISPLACEMENTS if self.displacement == "use" else PREFERRED
+            prefer = ("dstates",) if self.level == "causal" else prefer
         if self.boundary == "defeasible" and "excuses" not in prefer:
             return ("excuses", *prefer)
         return prefer
@@ -255,14 +250,8 @@ class Theory:
         displacements.
         """
         own = [axiom.name for rules in self.rules for axiom in rules.axioms]
-        return (
-            *(
-                a.name
-                for a in encodings.axioms()
-                if a.name not in self.without and a.holds_in(vars(self))
-            ),
-            *own,
-        )
+        left = (a for a in encodings.axioms() if a.name not in self.without)
+        return (*(a.name for a in left if a.holds_in(vars(self))), *own)
 
     @cached_property
     def hard(self) -> frozenset[str]:

@@ -126,17 +126,13 @@ class Roads:
                 )
             stops, ends = _places(ssh_map, drawn), _streets(ssh_map)
         else:
+            where = [
+                (ssh_map.name_of("place", s.place), *_regions_at(ssh_map, s.place))
+                for s in ssh_map.dstates
+            ]
+            views = [() if s.view is None else (s.view,) for s in ssh_map.dstates]
             stops = tuple(
-                Stop(
-                    s.id,
-                    x,
-                    y,
-                    heading or 0.0,
-                    () if s.view is None else (s.view,),
-                    s.floor,
-                    ssh_map.name_of("place", s.place),
-                    *_regions_at(ssh_map, s.place),
-                )
+                Stop(s.id, x, y, heading or 0.0, views[s.id], s.floor, *where[s.id])
                 for s, (x, y, heading) in zip(ssh_map.dstates, drawn.dstates, strict=True)
             )
             # Sort in reverse, so that the first action by name remains if several join two dstates.

@@ -429,13 +429,8 @@ def chi_squares(closing: Array, covariance: Array) -> tuple[Array, Array]:
 def vectors_turned(vectors: Array, angles: Array) -> Array:
     """Turn vectors, ... x 2, counterclockwise by angles in radians."""
     cos, sin = np.cos(angles), np.sin(angles)
-    return np.stack(
-        [
-            cos * vectors[..., 0] - sin * vectors[..., 1],
-            sin * vectors[..., 0] + cos * vectors[..., 1],
-        ],
-        axis=-1,
-    )
+    x, y = vectors[..., 0], vectors[..., 1]
+    return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
 
 def _quarter_turned(vectors: Array) -> Array:

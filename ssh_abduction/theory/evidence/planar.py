@@ -268,15 +268,8 @@ def _groups(shown: _Shown, turns: bool) -> tuple[dict[int, int], dict[int, int],
                 if y not in group:
                     group[y], slot[y] = first, (slot[x] + quarters) % SLOTS
                     queue.append(y)
-    return (
-        group,
-        slot,
-        all(
-            (slot[y] - slot[x] - quarters) % SLOTS == 0
-            for x, ys in links.items()
-            for y, quarters in ys
-        ),
-    )
+    drawn = ((x, y, quarters) for x, ys in links.items() for y, quarters in ys)
+    return group, slot, all((slot[y] - slot[x] - quarters) % SLOTS == 0 for x, y, quarters in drawn)
 
 
 def _can_draw_sided(shown: _Shown, crossing: bool) -> bool:
