@@ -21,7 +21,7 @@ from instances import maze
 from truth import NOISE
 
 import ssh_abduction.checker.geometry
-import ssh_abduction.solver.fit
+import ssh_abduction.solver.geometry.fit
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.data import Odometry
 from ssh_abduction.solver import Status
@@ -33,7 +33,7 @@ BEGINS = (
     (displacement.Displacement, "refuse"),
     (displacement.Displacement, "count_returns"),
     (ssh_abduction.checker.geometry, "refused_returns"),
-    (ssh_abduction.solver.fit, "fit"),
+    (ssh_abduction.solver.geometry.fit, "fit"),
 )
 
 

@@ -40,8 +40,8 @@ from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.engines.framed import FramedEngine
 from ssh_abduction.solver.engines.frameless import FramelessEngine
 from ssh_abduction.solver.engines.stepwise import StepEngine
-from ssh_abduction.solver.sharing import Backbone, Shared
-from ssh_abduction.solver.writing import summary_of
+from ssh_abduction.solver.solution.sharing import Backbone, Shared
+from ssh_abduction.solver.solution.writing import summary_of
 
 ACES3 = "examples/aces3-route.jsonl"
 LIMIT = 100  # seconds: a search that does not end is a failure, not a hang

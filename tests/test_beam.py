@@ -25,9 +25,9 @@ from ssh_abduction.explain.no_map import explain
 from ssh_abduction.robot_logs.log_maps import PATHS
 from ssh_abduction.runtime.clock import heeding
 from ssh_abduction.solver import Search, Status
+from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.guesses.beam import Beam
 from ssh_abduction.solver.guesses.completing import completed
-from ssh_abduction.solver.misfit import Misfit
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import settle
 

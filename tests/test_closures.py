@@ -28,7 +28,7 @@ from ssh_abduction.data.odometry import (
     moved,
 )
 from ssh_abduction.explain import explain_pair
-from ssh_abduction.solver.fit import Poses
+from ssh_abduction.solver.geometry.fit import Poses
 from ssh_abduction.solver.guesses.beam import Beam
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import settle

@@ -37,7 +37,7 @@ from ssh_abduction.rivals.table import Table
 from ssh_abduction.solver import find_backbone
 from ssh_abduction.solver import search as searching
 from ssh_abduction.solver.map_list import Priced
-from ssh_abduction.solver.sharing import Backbone, Sharing
+from ssh_abduction.solver.solution.sharing import Backbone, Sharing
 
 FREE_PLACES = Theory(star="none", prefer=("dstates", "places", "paths"))
 
@@ -416,7 +416,7 @@ def test_the_map_that_closes_best_stays_first() -> None:
     trace = maze(3, 3, steps=40, seed=4242, stars=True, follow=True, odometry=None).trace
     maps = solve(trace, max_maps=None).maps
     fitted = [replace(m, fit=Fit(float(len(maps) - i), 3, 0.5)) for i, m in enumerate(maps)]
-    from ssh_abduction.solver.ranking import in_order
+    from ssh_abduction.solver.geometry.ranking import in_order
 
     ordered = in_order(fitted, [len(fitted)])
     assert [m.fit and m.fit.chi2 for m in ordered] == sorted(m.fit.chi2 for m in fitted if m.fit)

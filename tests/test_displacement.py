@@ -24,9 +24,9 @@ from ssh_abduction.checker.dead_reckoning import ErrorFilter
 from ssh_abduction.checker.geometry import _square_together
 from ssh_abduction.data import DState, Odometry, TheoryError
 from ssh_abduction.solver.asp.facts.answer_maps import causal_map
-from ssh_abduction.solver.fit import Poses, fit
-from ssh_abduction.solver.linear import as_dense, least_squares, system_solved
-from ssh_abduction.solver.ranking import noise_warning, units_warning
+from ssh_abduction.solver.geometry.fit import Poses, fit
+from ssh_abduction.solver.geometry.linear import as_dense, least_squares, system_solved
+from ssh_abduction.solver.geometry.ranking import noise_warning, units_warning
 from ssh_abduction.theory.evidence import pairs_of
 from ssh_abduction.theory.evidence.displacement import Displacement
 from ssh_abduction.theory.evidence.loops import Loops

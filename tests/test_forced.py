@@ -1,4 +1,4 @@
-"""Joins that every cheap map has, and the bound that follows (solver/forced.py)."""
+"""Joins that every cheap map has, and the bound that follows (solver/costs/forced.py)."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from ssh_abduction import Solution, Theory, Trace, solve
 from ssh_abduction.data import Odometry
 from ssh_abduction.data.map_parts import DState
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.solver.forced import Forcing
-from ssh_abduction.solver.misfit import Misfit
+from ssh_abduction.solver.costs.forced import Forcing
+from ssh_abduction.solver.costs.misfit import Misfit
+from ssh_abduction.solver.solution.weighed import Weighed
 from ssh_abduction.solver.steps.log import Log
-from ssh_abduction.solver.weighed import Weighed
 from ssh_abduction.theory.settle import settle
 
 EQUAL = 1e-6

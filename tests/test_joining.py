@@ -16,10 +16,10 @@ from ssh_abduction import SSHMap, Theory, Trace, explain_pair, solve
 from ssh_abduction.checker.checker import violations
 from ssh_abduction.data import Closure, Odometry, Step, together
 from ssh_abduction.data.star import Gateway, Star
-from ssh_abduction.solver.estimating import doubt_of
+from ssh_abduction.solver.costs.estimating import doubt_of
+from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.guesses.joint_maps import Joining
 from ssh_abduction.solver.guesses.sights import Sights
-from ssh_abduction.solver.misfit import Misfit
 from ssh_abduction.solver.search import Search
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory import theory

@@ -22,10 +22,11 @@ from ssh_abduction.data.errors import TheoryError
 from ssh_abduction.data.maps import Fault
 from ssh_abduction.data.odometry import in_words
 from ssh_abduction.explain.no_map import explain
-from ssh_abduction.solver import Misfit, Search, weighing
+from ssh_abduction.solver import Misfit, Search
+from ssh_abduction.solver.costs import weighing
+from ssh_abduction.solver.costs.wrong_displacements import search_jumps
 from ssh_abduction.solver.front import fault_front
 from ssh_abduction.solver.guesses.outliers import wrong_displacements
-from ssh_abduction.solver.jumps import search_jumps
 from ssh_abduction.theory import Speedups
 from ssh_abduction.theory.evidence.displacement import jumped
 from ssh_abduction.theory.settle import settle

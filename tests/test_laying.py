@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from onto import walks
 
 from ssh_abduction import Solution, Trace, check, solve
-from ssh_abduction.solver import Status, onto
+from ssh_abduction.solver import Status
+from ssh_abduction.solver.drives import onto
 
 
 def test_drives_are_laid_on_the_map_one_by_one() -> None:

@@ -22,7 +22,7 @@ from ssh_abduction.data.drives import starts_of, together
 from ssh_abduction.data.errors import SolverError, TraceError
 from ssh_abduction.solver import Status, choosing
 from ssh_abduction.solver.asp.limits import Watch
-from ssh_abduction.solver.digest import Digest
+from ssh_abduction.solver.drives.digest import Digest
 from ssh_abduction.theory import Speedups
 
 

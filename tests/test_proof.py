@@ -22,7 +22,7 @@ from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.cli import main
 from ssh_abduction.data import MapError
 from ssh_abduction.solver import Search
-from ssh_abduction.solver.recorded import Support
+from ssh_abduction.solver.solution.recorded import Support
 from ssh_abduction.solver.steps.apart import Continuations
 from ssh_abduction.solver.steps.log import Log
 

@@ -1,4 +1,4 @@
-"""Lower bounds on clusterings (solver/facilities.py) and on costs of logs (solver/scatter.py)."""
+"""Lower bounds on clusterings (facilities.py) and on costs of logs (scatter.py)."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.data.drives import together
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.solver.choosing import READABLE
-from ssh_abduction.solver.facilities import Facilities
-from ssh_abduction.solver.misfit import Misfit
-from ssh_abduction.solver.scatter import is_for, least_cost
+from ssh_abduction.solver.costs.facilities import Facilities
+from ssh_abduction.solver.costs.misfit import Misfit
+from ssh_abduction.solver.costs.scatter import is_for, least_cost
 from ssh_abduction.theory.pairs import NO_PAIRS
 from ssh_abduction.theory.settle import Problem, settle
 

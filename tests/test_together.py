@@ -48,10 +48,10 @@ from ssh_abduction.data.drives import fingerprints_of, named_steps, pieces_in_wo
 from ssh_abduction.explain import explain_trace
 from ssh_abduction.rivals import Listing, compare, difference, joins_of_drives
 from ssh_abduction.solver import choosing, prefixes
-from ssh_abduction.solver.fit import Poses
+from ssh_abduction.solver.costs.misfit import Misfit
+from ssh_abduction.solver.geometry.fit import Poses
 from ssh_abduction.solver.guesses.beam import Beam
 from ssh_abduction.solver.guesses.pieces import Pieces, headings_by_turn
-from ssh_abduction.solver.misfit import Misfit
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import settle
 

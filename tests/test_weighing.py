@@ -22,11 +22,12 @@ from ssh_abduction.checker.misfit import false_costs, misfit
 from ssh_abduction.data import MapError, Odometry, SolverError, TheoryError
 from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.fields import FieldReader
-from ssh_abduction.solver import Search, Status, beams, weighing
-from ssh_abduction.solver.estimating import estimated
-from ssh_abduction.solver.fit import Poses, fit
-from ssh_abduction.solver.misfit import Misfit
-from ssh_abduction.solver.weighed import Rival, Weighed
+from ssh_abduction.solver import Search, Status
+from ssh_abduction.solver.costs import beams, weighing
+from ssh_abduction.solver.costs.estimating import estimated
+from ssh_abduction.solver.costs.misfit import Misfit
+from ssh_abduction.solver.geometry.fit import Poses, fit
+from ssh_abduction.solver.solution.weighed import Rival, Weighed
 from ssh_abduction.theory.settle import settle
 
 EQUAL = 1e-6

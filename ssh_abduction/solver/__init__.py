@@ -22,20 +22,36 @@ if TYPE_CHECKING:
     )
     from ssh_abduction.solver.asp.rules import check_rules
     from ssh_abduction.solver.asp.workers import end_all, in_process
+    from ssh_abduction.solver.costs.estimating import maps_apart
+    from ssh_abduction.solver.costs.misfit import Misfit
     from ssh_abduction.solver.entry import find_backbone, solve
-    from ssh_abduction.solver.estimating import maps_apart
     from ssh_abduction.solver.front import Front, Point, fault_front
+    from ssh_abduction.solver.geometry.fit import fit
+    from ssh_abduction.solver.geometry.ranking import Ranking
     from ssh_abduction.solver.guesses.gated import sketch_beyond, sketches_of
     from ssh_abduction.solver.guesses.tree import Sketch
     from ssh_abduction.solver.judging import InternalError, Judging
-    from ssh_abduction.solver.misfit import Misfit
     from ssh_abduction.solver.obeying import obeyed, with_kept_apart, with_names
-    from ssh_abduction.solver.ranking import Ranking
-    from ssh_abduction.solver.recorded import drives_in, joins_in, theory_in, trace_in, warnings_in
     from ssh_abduction.solver.regions import find_regions, with_regions
-    from ssh_abduction.solver.result import Solution
     from ssh_abduction.solver.search import Search
-    from ssh_abduction.solver.sharing import SORTS, Backbone, Shared, Sharing, Sort, stretches
+    from ssh_abduction.solver.solution.recorded import (
+        drives_in,
+        joins_in,
+        theory_in,
+        trace_in,
+        warnings_in,
+    )
+    from ssh_abduction.solver.solution.result import Solution
+    from ssh_abduction.solver.solution.sharing import (
+        SORTS,
+        Backbone,
+        Shared,
+        Sharing,
+        Sort,
+        stretches,
+    )
+    from ssh_abduction.solver.solution.weighed import EQUAL, Weighed, probability_in_words
+    from ssh_abduction.solver.solution.writing import ending, opening, summary_of, written_map
     from ssh_abduction.solver.start import Limits, Start
     from ssh_abduction.solver.steps.certificate import RESTS_ON, Certificate
     from ssh_abduction.solver.steps.log import Outcome, observation
@@ -49,8 +65,6 @@ if TYPE_CHECKING:
         Status,
         cost_as_counted,
     )
-    from ssh_abduction.solver.weighed import EQUAL, Weighed, probability_in_words
-    from ssh_abduction.solver.writing import ending, opening, summary_of, written_map
 
 _HOMES = {  # module: the names that this package exports from it
     "asp": ("facts", "workers"),
@@ -59,23 +73,24 @@ _HOMES = {  # module: the names that this package exports from it
     "asp.workers": ("end_all", "in_process"),
     "asp.rules": ("check_rules",),
     "entry": ("find_backbone", "solve"),
-    "estimating": ("maps_apart",),
+    "costs.estimating": ("maps_apart",),
     "front": ("Front", "Point", "fault_front"),
     "guesses.gated": ("sketch_beyond", "sketches_of"),
     "guesses.tree": ("Sketch",),
     "judging": ("InternalError", "Judging"),
-    "misfit": ("Misfit",),
+    "costs.misfit": ("Misfit",),
     "obeying": ("obeyed", "with_kept_apart", "with_names"),
-    "ranking": ("Ranking",),
-    "recorded": ("drives_in", "joins_in", "theory_in", "trace_in", "warnings_in"),
+    "geometry.fit": ("fit",),
+    "geometry.ranking": ("Ranking",),
+    "solution.recorded": ("drives_in", "joins_in", "theory_in", "trace_in", "warnings_in"),
     "regions": ("find_regions", "with_regions"),
-    "result": ("Solution",),
+    "solution.result": ("Solution",),
     "search": ("Search",),
     "start": ("Limits", "Start"),
-    "sharing": ("SORTS", "Backbone", "Shared", "Sharing", "Sort", "stretches"),
+    "solution.sharing": ("SORTS", "Backbone", "Shared", "Sharing", "Sort", "stretches"),
     "steps.certificate": ("RESTS_ON", "Certificate"),
     "steps.log": ("Outcome", "observation"),
-    "weighed": ("EQUAL", "Weighed", "probability_in_words"),
+    "solution.weighed": ("EQUAL", "Weighed", "probability_in_words"),
     "values": (
         "Bound",
         "Cost",
@@ -86,7 +101,7 @@ _HOMES = {  # module: the names that this package exports from it
         "Status",
         "cost_as_counted",
     ),
-    "writing": ("ending", "opening", "summary_of", "written_map"),
+    "solution.writing": ("ending", "opening", "summary_of", "written_map"),
 }
 __all__ = [
     "EQUAL",
@@ -131,6 +146,7 @@ __all__ = [
     "fault_front",
     "find_backbone",
     "find_regions",
+    "fit",
     "has_processors",
     "in_process",
     "joins_in",

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.solver.geometry.ranking import in_order, noise_warning, units_warning
 from ssh_abduction.solver.parts import Parts
-from ssh_abduction.solver.ranking import in_order, noise_warning, units_warning
-from ssh_abduction.solver.recorded import Support
-from ssh_abduction.solver.result import Solution
+from ssh_abduction.solver.solution.recorded import Support
+from ssh_abduction.solver.solution.result import Solution
 from ssh_abduction.solver.steps.certificate import Basis
 from ssh_abduction.solver.values import Cost, Effort, Grounding, Level, Seconds, cost_as_counted
 from ssh_abduction.theory.evidence import said_by

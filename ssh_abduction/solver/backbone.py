@@ -36,7 +36,7 @@ from ssh_abduction.solver.engines.base import Engine, LabellingEngine, Task
 from ssh_abduction.solver.engines.doubts import Doubt, Settled
 from ssh_abduction.solver.engines.stepwise import StepEngine, paths_needed
 from ssh_abduction.solver.judging import Judging
-from ssh_abduction.solver.sharing import Backbone, Sharing
+from ssh_abduction.solver.solution.sharing import Backbone, Sharing
 from ssh_abduction.solver.steps.log import Outcome, Replay
 from ssh_abduction.theory.evidence import Equality
 

@@ -25,14 +25,14 @@ from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.limits import LimitError, Watch, check_limit
 from ssh_abduction.solver.backbone import prove_backbone
 from ssh_abduction.solver.choosing import READABLE, labelling_engine, may_name
+from ssh_abduction.solver.drives.onto import Solving, solve_onto
 from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.obeying import obeyed, with_kept_apart, with_names
-from ssh_abduction.solver.onto import Solving, solve_onto
-from ssh_abduction.solver.result import Solution
 from ssh_abduction.solver.search import Search
-from ssh_abduction.solver.sharing import Backbone, Sharing
+from ssh_abduction.solver.solution.result import Solution
+from ssh_abduction.solver.solution.sharing import Backbone, Sharing
 from ssh_abduction.solver.start import Limits
 from ssh_abduction.solver.values import Progress
 from ssh_abduction.theory.settle import Problem

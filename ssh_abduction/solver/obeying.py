@@ -19,7 +19,7 @@ from ssh_abduction.data.errors import named
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.star import parse_star, with_gateway
 from ssh_abduction.data.trace import Trace, checked_trace
-from ssh_abduction.solver.result import Solution
+from ssh_abduction.solver.solution.result import Solution
 from ssh_abduction.solver.values import Status
 from ssh_abduction.theory.theory import Theory, checked_theory
 

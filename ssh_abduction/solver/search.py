@@ -38,11 +38,11 @@ from ssh_abduction.solver.fallback import (
     late_clash,
     overtime,
 )
+from ssh_abduction.solver.geometry.ranking import Ranking
 from ssh_abduction.solver.map_list import Priced, by_count, listed
 from ssh_abduction.solver.parts import Parts
-from ssh_abduction.solver.ranking import Ranking
-from ssh_abduction.solver.result import Solution
-from ssh_abduction.solver.sharing import Backbone
+from ssh_abduction.solver.solution.result import Solution
+from ssh_abduction.solver.solution.sharing import Backbone
 from ssh_abduction.solver.stages import Stages
 from ssh_abduction.solver.start import ANEW, Limits, Start
 from ssh_abduction.solver.values import Bound, Cost, Grounding, Progress, Status
@@ -58,7 +58,7 @@ REASONING = 5.0
 # After a limit, the cost of the best map may take at least this many seconds.
 LEAST_WEIGHING = 0.2
 if TYPE_CHECKING:
-    from ssh_abduction.solver.weighing import Weighing
+    from ssh_abduction.solver.costs.weighing import Weighing
 
 COUNTED = (
     "weigh: maps are counted instead of weighed, as the trace has no displacements whose misfit "
@@ -130,7 +130,7 @@ class Search:
         self._answer = Answer(self._parts)
         self._weighing: Weighing | None = None
         if self.theory.weigh == "cost":
-            from ssh_abduction.solver.weighing import Weighing  # loads numpy
+            from ssh_abduction.solver.costs.weighing import Weighing  # loads numpy
 
             self._weighing = Weighing(self._parts)
             self._reasons = False  # what clingo proves about minimal maps is about counts

@@ -17,7 +17,7 @@ import clingo
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.facts import further_rules, path_reader
-from ssh_abduction.solver.sharing import Sort
+from ssh_abduction.solver.solution.sharing import Sort
 
 Answer = TypeVar("Answer")
 # A sort of thing (such as "places"), two steps or dstates, and a claim: they share a thing of this

@@ -3,7 +3,7 @@
 A *hypothesis* says at which dstate and place each step so far is. It has the joint Gaussian
 distribution of the positions of its places, the headings of its dstates, and the errors that all
 displacements share. Its cost in nats is the prices of its dstates and places, plus half of the
-chi-square of its returns, as for a map (`solver/weighing.py`).
+chi-square of its returns, as for a map (`solver/costs/weighing.py`).
 
 Each drive, and each stretch after a lift, begins a *piece* with a frame of its own (`pieces.py`).
 At any step, this piece may be joined to others.

@@ -1,8 +1,8 @@
 """Lay new drives on the map of old drives, without a search of the old steps.
 
 The solver does not get the old drives. It gets a *digest*: a trace in which each link of their map
-occurs once (`solver/digest.py`). The displacements of the old drives are fitted to their map. The
-fit gives the joint Gaussian distribution of the poses, and each link of the digest gets the
+occurs once (`solver/drives/digest.py`). The displacements of the old drives are fitted to the map.
+The fit gives the joint Gaussian distribution of the poses, and each link of the digest gets the
 displacement between the poses of its ends. `joint_maps.py` then joins the pieces of the map and the
 new drives.
 """
@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.solver.fit import Poses
+from ssh_abduction.solver.geometry.fit import Poses
 from ssh_abduction.solver.guesses.joint_maps import Joining
 from ssh_abduction.solver.guesses.overlaying import Part
 from ssh_abduction.solver.guesses.sights import Sights

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.solver.equations import spreads_of
+from ssh_abduction.solver.geometry.equations import spreads_of
 from ssh_abduction.solver.guesses.reckoning import BLUR, Hypothesis, conditioned
 from ssh_abduction.solver.guesses.sights import Sight, Sights
 from ssh_abduction.solver.steps.log import Log

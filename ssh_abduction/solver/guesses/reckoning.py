@@ -22,8 +22,8 @@ from ssh_abduction.data.drives import frames_of
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.solver.equations import noises, spreads_of
-from ssh_abduction.solver.fit import Poses
+from ssh_abduction.solver.geometry.equations import noises, spreads_of
+from ssh_abduction.solver.geometry.fit import Poses
 from ssh_abduction.solver.guesses.pieces import Pieces, closed
 
 Array: TypeAlias = NDArray[np.float64]

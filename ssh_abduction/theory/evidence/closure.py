@@ -4,7 +4,7 @@ A *closure* is the relative pose of two steps, measured by matching what the rob
 If the local maps of two visits match with an offset that is far from zero, within the covariance of
 the match and of the middles of places, then the visits are not at one place. The axiom `closure`
 demands this for each closure alone. Closures together with displacements count in the misfit
-(`solver/fit.py`).
+(`solver/geometry/fit.py`).
 
 *How often a true map is rejected.* The probability `reject` is divided among the returns that may
 be true, as for displacements.

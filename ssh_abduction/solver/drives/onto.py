@@ -36,16 +36,16 @@ from ssh_abduction.data.words import counted
 from ssh_abduction.runtime.clock import heeding
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.choosing import READABLE
-from ssh_abduction.solver.digest import Digest
+from ssh_abduction.solver.drives.digest import Digest
+from ssh_abduction.solver.drives.laying import can_lay, laid, unproven
 from ssh_abduction.solver.guesses.gated import sketch_beyond
 from ssh_abduction.solver.guesses.mended import first_contradiction
 from ssh_abduction.solver.judging import Judging
-from ssh_abduction.solver.laying import can_lay, laid, unproven
 from ssh_abduction.solver.obeying import obeyed, with_names
-from ssh_abduction.solver.recorded import Support
-from ssh_abduction.solver.result import Solution
+from ssh_abduction.solver.solution.recorded import Support
+from ssh_abduction.solver.solution.result import Solution
+from ssh_abduction.solver.solution.weighed import Weighed
 from ssh_abduction.solver.values import Cost, Level, Status
-from ssh_abduction.solver.weighed import Weighed
 from ssh_abduction.theory.fields import ASSERTIONS
 from ssh_abduction.theory.settle import Problem, settle
 from ssh_abduction.theory.speedups import Speedups

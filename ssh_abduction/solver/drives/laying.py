@@ -16,17 +16,17 @@ from ssh_abduction.data.drives import drives_of, starts_of, together
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.asp.limits import Watch
-from ssh_abduction.solver.digest import Digest
-from ssh_abduction.solver.estimating import doubt_of, rival_of
+from ssh_abduction.solver.costs.estimating import doubt_of, rival_of
+from ssh_abduction.solver.drives.digest import Digest
+from ssh_abduction.solver.geometry.ranking import Ranking, noise_warning, units_warning
 from ssh_abduction.solver.guesses.completing import completed
 from ssh_abduction.solver.judging import Judging
-from ssh_abduction.solver.ranking import Ranking, noise_warning, units_warning
-from ssh_abduction.solver.recorded import Support
 from ssh_abduction.solver.regions import Deriving
-from ssh_abduction.solver.result import Solution
+from ssh_abduction.solver.solution.recorded import Support
+from ssh_abduction.solver.solution.result import Solution
+from ssh_abduction.solver.solution.weighed import Weighed
 from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.solver.values import Bound, Cost, Effort, Seconds, Status, nats_of
-from ssh_abduction.solver.weighed import Weighed
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.theory import Theory
 

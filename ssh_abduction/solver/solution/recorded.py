@@ -17,9 +17,9 @@ from ssh_abduction.data.errors import MapError, TheoryError
 from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.trace_file import read_trace
+from ssh_abduction.solver.solution.weighed import Weighed
 from ssh_abduction.solver.steps.certificate import Basis, Certificate
 from ssh_abduction.solver.values import Bound, Cost, Effort, Grounding, Level, Seconds
-from ssh_abduction.solver.weighed import Weighed
 from ssh_abduction.theory.fields import COUNTS
 from ssh_abduction.theory.theory import Theory
 

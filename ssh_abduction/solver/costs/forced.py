@@ -32,7 +32,7 @@ from scipy.sparse.csgraph import connected_components
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import look_at_clock
-from ssh_abduction.solver.misfit import Misfit
+from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.steps.apart import apart_matrix, clique, grown_clique
 from ssh_abduction.solver.steps.chart import Chart, FramedChart
 from ssh_abduction.solver.steps.log import Log

@@ -10,12 +10,12 @@ from ssh_abduction.data.drives import drives_of, with_fingerprints
 from ssh_abduction.data.map_file import SOLUTION_FORMAT, VERSION
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.solver.sharing import Backbone
+from ssh_abduction.solver.solution.sharing import Backbone
 from ssh_abduction.solver.values import Cost, Status
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
-    from ssh_abduction.solver.result import Solution
+    from ssh_abduction.solver.solution.result import Solution
 
 
 def summary_of(solution: Solution, count: int, backbone: Backbone | None) -> str:

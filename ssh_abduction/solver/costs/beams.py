@@ -12,7 +12,7 @@ from ssh_abduction.solver.asp.limits import StageTimeError
 from ssh_abduction.solver.candidates import SKETCH_SHARE
 from ssh_abduction.solver.guesses.beam import Beam
 from ssh_abduction.solver.parts import Parts
-from ssh_abduction.solver.weighed import EQUAL
+from ssh_abduction.solver.solution.weighed import EQUAL
 
 # The widths of the beams, and the share of the time after which each of them ends. The beam without
 # axioms ends at the share BREAKING.

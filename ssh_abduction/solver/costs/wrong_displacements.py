@@ -14,7 +14,7 @@ from collections.abc import Callable
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.candidates import Candidates
-from ssh_abduction.solver.weighed import EQUAL
+from ssh_abduction.solver.solution.weighed import EQUAL
 from ssh_abduction.theory.evidence.displacement import jumped
 
 # End after the neighbours of this many sets in turn had no map that costs less than the best one.

@@ -43,9 +43,9 @@ from scipy.sparse.csgraph import connected_components
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
-from ssh_abduction.solver.equations import Equations, spreads_of
-from ssh_abduction.solver.facilities import Array, Facilities
-from ssh_abduction.solver.fit import Poses
+from ssh_abduction.solver.costs.facilities import Array, Facilities
+from ssh_abduction.solver.geometry.equations import Equations, spreads_of
+from ssh_abduction.solver.geometry.fit import Poses
 from ssh_abduction.solver.steps.apart import apart_matrix, large_clique
 from ssh_abduction.theory.settle import Problem
 

@@ -2,9 +2,9 @@
 
 A *return* is two steps that a map has at one place or dstate. The misfit of a set of returns is the
 least chi-square of the displacements and closures, given that the two steps of each return have one
-pose (for a dstate) or one position (for a place, `solver/fit.py`). More returns leave less freedom.
-So a set of returns never has a smaller misfit than a part of the set, and a map never has a smaller
-misfit than a set of its returns.
+pose (for a dstate) or one position (for a place, `solver/geometry/fit.py`). More returns leave less
+freedom. So a set of returns never has a smaller misfit than a part of the set, and a map never has
+a smaller misfit than a set of its returns.
 
 Places that drives have in common cost a price (`theory/overlap.py`), and more returns never lower
 it. So twice this price is a part of the misfit.
@@ -22,7 +22,7 @@ from typing import TypeAlias
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.engines.refusing import minimal_part
-from ssh_abduction.solver.fit import Poses
+from ssh_abduction.solver.geometry.fit import Poses
 from ssh_abduction.solver.values import Cost, nats_of
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.evidence.displacement import jumped

@@ -1,7 +1,7 @@
 """Fit poses to the dstates of a map, so that they agree best with the trace's displacements.
 
 >>> from ssh_abduction import Theory, Trace, solve
->>> from ssh_abduction.solver.fit import fit
+>>> from ssh_abduction.solver.geometry.fit import fit
 >>> square = [(10, 0, 0), (0, 0, 1.5708)] * 4
 >>> trace = Trace.from_steps("abababab" + "a", ["travel", "left"] * 4, displacements=square)
 >>> ssh_map = solve(trace, Theory.causal()).maps[0]
@@ -35,8 +35,8 @@ from threadpoolctl import threadpool_limits
 from ssh_abduction.data.maps import Fit, Pose, SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
-from ssh_abduction.solver.equations import Equations
-from ssh_abduction.solver.linear import (
+from ssh_abduction.solver.geometry.equations import Equations
+from ssh_abduction.solver.geometry.linear import (
     as_dense,
     inverse,
     least_squares,

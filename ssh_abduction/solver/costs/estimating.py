@@ -18,14 +18,14 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import heeding, look_at_clock
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.guesses.completing import completed
+from ssh_abduction.solver.solution.weighed import CHANCE, Rival
 from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.solver.values import Cost, nats_of
-from ssh_abduction.solver.weighed import CHANCE, Rival
 from ssh_abduction.theory.evidence.displacement import jumped
 from ssh_abduction.theory.settle import Problem
 
 if TYPE_CHECKING:
-    from ssh_abduction.solver.misfit import Misfit  # loads numpy
+    from ssh_abduction.solver.costs.misfit import Misfit  # loads numpy
 
 # The dstate and the place of each step, numbered by first visit.
 Course: TypeAlias = tuple[tuple[int, ...], tuple[int, ...]]
@@ -65,7 +65,7 @@ def doubt_of(problem: Problem, best: SSHMap) -> str | None:
     free = [k for k, _ in enumerate(drives) if not overlap.is_tied(k)]
     if len(drives) < 2 or not free or not best.places or not overlap.near:
         return None
-    from ssh_abduction.solver.ranking import Ranking  # loads numpy
+    from ssh_abduction.solver.geometry.ranking import Ranking  # loads numpy
 
     fit = (best if best.fit else Ranking(problem.trace).fitted(best)).fit
     assert fit is not None

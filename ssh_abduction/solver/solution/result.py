@@ -25,8 +25,8 @@ from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.output import cards
 from ssh_abduction.solver.asp.limits import Stop
-from ssh_abduction.solver.ranking import weights
-from ssh_abduction.solver.recorded import (
+from ssh_abduction.solver.geometry.ranking import weights
+from ssh_abduction.solver.solution.recorded import (
     Recorded,
     Support,
     bound_in,
@@ -36,12 +36,18 @@ from ssh_abduction.solver.recorded import (
     theory_in,
     trace_in,
 )
-from ssh_abduction.solver.sharing import Backbone, Sharing
+from ssh_abduction.solver.solution.sharing import Backbone, Sharing
+from ssh_abduction.solver.solution.weighed import Weighed
+from ssh_abduction.solver.solution.writing import (
+    ending,
+    opening,
+    summary_of,
+    written_map,
+    written_trace,
+)
 from ssh_abduction.solver.steps.certificate import Certificate
 from ssh_abduction.solver.steps.noise import LEAST, Noise
 from ssh_abduction.solver.values import Bound, Cost, Effort, Level, Seconds, Status, cost_as_counted
-from ssh_abduction.solver.weighed import Weighed
-from ssh_abduction.solver.writing import ending, opening, summary_of, written_map, written_trace
 from ssh_abduction.theory.theory import Theory
 
 

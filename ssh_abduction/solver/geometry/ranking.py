@@ -46,7 +46,7 @@ class Ranking:
 
     def fitted(self, ssh_map: SSHMap) -> SSHMap:
         """Return the same map with its field `fit`: the poses, and how well they agree."""
-        from ssh_abduction.solver.fit import fit  # loads scipy
+        from ssh_abduction.solver.geometry.fit import fit  # loads scipy
 
         key = ssh_map.dstate_at, tuple(s.place for s in ssh_map.dstates), jumped(ssh_map)
         if key not in self._known:

@@ -1,0 +1,1 @@
+"""Add new drives to the map of old drives."""

@@ -1,0 +1,1 @@
+"""The answer for one trace as plain values, their JSON and their words."""
