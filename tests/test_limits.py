@@ -425,6 +425,19 @@ def test_a_busy_machine_has_a_map_when_the_limit_is_long_over(
         assert len(solution.maps) == 1
 
 
+def test_a_limit_while_the_last_maps_are_ranked_leaves_a_complete_list(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def over(search: Search) -> bool:
+        search._parts.known.stopped = "time limit"
+        return True
+
+    monkeypatch.setattr(Search, "over", over)
+    trace = Trace.from_steps("aba", ["travel"] * 2, displacements=[(5.0, 0.0, 0.0)] * 2)
+    solution = solve(trace, Theory(weigh="count"))
+    assert (solution.complete, solution.stopped) == (True, None)
+
+
 def test_who_is_ended_writes_the_best_map(room: str, tmp_path: Path) -> None:
     program = """
 import sys, time

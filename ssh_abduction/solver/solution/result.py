@@ -42,6 +42,7 @@ from ssh_abduction.solver.solution.writing import (
     ending,
     opening,
     summary_of,
+    table_of_maps,
     written_map,
     written_trace,
 )
@@ -111,7 +112,7 @@ class Solution(MapSequence):
         parts += [cards.paragraph(f"warning: {warning}") for warning in warnings]
         if self.count > 1:
             title = f"{counted(self.count, 'maps')}; the first is shown below"
-            parts.append(cards.folded(title, _table_of_maps(self)))
+            parts.append(cards.folded(title, table_of_maps(self)))
         if self.maps:
             parts.append(cards.map_card(self.maps[0]))
         elif self.partial is not None:
@@ -485,18 +486,3 @@ def _check_steps(
                 f"{where}: steps: expected maps of a trace of {len(trace)} steps, got {steps}; "
                 "give the trace from which these maps were made"
             )
-
-
-def _table_of_maps(solution: Solution) -> str:
-    """Return an HTML table with a row for each map: its counts, and perhaps its chi-square."""
-    costs = solution.costs
-    chi2 = [ssh_map.fit.chi2 if ssh_map.fit else None for ssh_map in solution.maps]
-    columns: dict[str, list[object]] = {"map": [*range(1, solution.count + 1)]}
-    columns |= {
-        name: [getattr(cost, name) for cost in costs]
-        for name in ("dstates", "places", "paths", "excuses", "faults")
-    }
-    columns |= {"chi-square": ["" if chi is None else f"{chi:.1f}" for chi in chi2]}
-    # Columns of zeros are left out.
-    shown = {name: column for name, column in columns.items() if any(column)}
-    return cards.html_table([*shown], zip(*shown.values(), strict=True), "maps")

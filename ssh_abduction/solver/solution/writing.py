@@ -10,6 +10,7 @@ from ssh_abduction.data.drives import drives_of, with_fingerprints
 from ssh_abduction.data.map_file import SOLUTION_FORMAT, VERSION
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.output import cards
 from ssh_abduction.solver.solution.sharing import Backbone
 from ssh_abduction.solver.values import Cost, Status
 from ssh_abduction.theory.theory import Theory
@@ -124,3 +125,18 @@ def ending(solution: Solution, count: int, backbone: Backbone | None) -> dict[st
     if recorded is not None and recorded.explanation is not None:
         end["explanation"] = dict(recorded.explanation)
     return end
+
+
+def table_of_maps(solution: Solution) -> str:
+    """Return an HTML table with a row for each map: its counts, and perhaps its chi-square."""
+    costs = solution.costs
+    chi2 = [ssh_map.fit.chi2 if ssh_map.fit else None for ssh_map in solution.maps]
+    columns: dict[str, list[object]] = {"map": [*range(1, solution.count + 1)]}
+    columns |= {
+        name: [getattr(cost, name) for cost in costs]
+        for name in ("dstates", "places", "paths", "excuses", "faults")
+    }
+    columns |= {"chi-square": ["" if chi is None else f"{chi:.1f}" for chi in chi2]}
+    # Columns of zeros are left out.
+    shown = {name: column for name, column in columns.items() if any(column)}
+    return cards.html_table([*shown], zip(*shown.values(), strict=True), "maps")
