@@ -438,6 +438,22 @@ def test_a_limit_while_the_last_maps_are_ranked_leaves_a_complete_list(
     assert (solution.complete, solution.stopped) == (True, None)
 
 
+def test_ctrl_c_while_an_object_is_deleted_ends_the_search() -> None:
+    """Python only prints exceptions in `__del__`. Clingo's programs have one."""
+
+    class Slow:
+        def __del__(self) -> None:
+            raise KeyboardInterrupt
+
+    before = sys.unraisablehook
+    search = Search(rectangle(8))
+    for _ in search:
+        slow = Slow()
+        del slow
+    assert search.stopped == "interrupted"
+    assert sys.unraisablehook is before
+
+
 def test_who_is_ended_writes_the_best_map(room: str, tmp_path: Path) -> None:
     program = """
 import sys, time

@@ -27,7 +27,14 @@ from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.runtime.threads import one_thread
 from ssh_abduction.solver.answer import Answer
-from ssh_abduction.solver.asp.limits import LimitError, StageTimeError, Stop, Watch, now
+from ssh_abduction.solver.asp.limits import (
+    LimitError,
+    StageTimeError,
+    Stop,
+    Watch,
+    keeping_interrupts,
+    now,
+)
 from ssh_abduction.solver.asp.rules import check_rules
 from ssh_abduction.solver.fallback import (
     CLASHING,
@@ -250,12 +257,13 @@ class Search:
     def _given(self, ranking: Ranking | None) -> Iterator[SSHMap]:
         """Yield the maps. `ranking` sorts maps of one cost; None keeps their order."""
         drives, late = drives_of(self.trace), partial(overtime, self._parts)
-        for cost, level in groupby(self._found(), key=lambda priced: priced[1]):
-            maps = (ssh_map for ssh_map, _ in level)
-            for ssh_map in ranking.ranked(maps, self.over, late) if ranking else maps:
-                complete = _with_names(ssh_map, self.trace, drives)
-                self._answer.take_down(complete, cost)
-                yield complete
+        with keeping_interrupts(self.interrupt):
+            for cost, level in groupby(self._found(), key=lambda priced: priced[1]):
+                maps = (ssh_map for ssh_map, _ in level)
+                for ssh_map in ranking.ranked(maps, self.over, late) if ranking else maps:
+                    complete = _with_names(ssh_map, self.trace, drives)
+                    self._answer.take_down(complete, cost)
+                    yield complete
 
     def _found(self) -> Iterator[Priced]:
         """Run the search, and yield each map with its preferred counts as it is found."""
