@@ -448,6 +448,7 @@ def test_a_worker_stops_when_the_client_goes(traces: Path, scheduler_here: str) 
     ] == [0]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux forgets the peak of memory")
 def test_memory_is_counted_for_each_trace(traces: Path) -> None:
     command = shlex.join(

@@ -285,6 +285,7 @@ def test_an_answer_is_never_worse_than_the_known_maps(trace: Trace, within: int)
     assert (search.status, search.cost) == (Status.FEASIBLE, solution.cost)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("trace", "within"), [(SQUARE, 8)])
 def test_known_maps_change_no_answer_that_is_proven(trace: Trace, within: int) -> None:
     anew, known = Search(trace, within=within), solve(trace, within=within + 1).maps

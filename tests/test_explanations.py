@@ -62,6 +62,7 @@ def test_four_right_turns_that_odometry_contradicts_are_explained() -> None:
     assert explain(TURNS, Theory(displacement="none")) is None
 
 
+@pytest.mark.slow
 def test_two_returns_that_cannot_both_be() -> None:
     """Two asserted returns are refused together, but not alone.
 

@@ -224,6 +224,7 @@ def test_the_map_of_a_simulated_tower_is_true(theory: Theory) -> None:
     assert len(ssh_map.floors) == 2
 
 
+@pytest.mark.slow
 def test_signs_at_the_lifts_tell_three_floors_apart() -> None:
     """Without signs, the third floor may be the first one, if the robot came by the second."""
     tower = World.named("tower-3")

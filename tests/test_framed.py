@@ -460,6 +460,7 @@ def test_when_time_is_over_there_is_a_map_and_a_bound() -> None:
     assert check(walk.trace, solution.maps[0], Theory.topological()) == ()
 
 
+@pytest.mark.slow
 def test_a_maze_half_explored_is_mapped() -> None:
     """Few views distinguish little, so order and sides matter."""
     trace = maze(10, 10, steps=4000, seed=2, stars=True).trace.prefix(145)

@@ -122,6 +122,7 @@ def test_speedups_change_no_map_of_a_robot_that_was_carried_away() -> None:
     assert plain.maps == solution.maps
 
 
+@pytest.mark.slow
 def test_the_checker_believes_what_the_map_believes() -> None:
     trace, solution = circuit(18, (9,)), carried()
     best = solution.maps[0]

@@ -15,6 +15,7 @@ from ssh_abduction.solver import Status
 from ssh_abduction.solver.drives import onto
 
 
+@pytest.mark.slow
 def test_drives_are_laid_on_the_map_one_by_one() -> None:
     """The method was developed on seed 0."""
     known = list(walks(6, 100, 4, seed=300))

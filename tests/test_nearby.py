@@ -254,6 +254,7 @@ def test_a_guess_at_the_beginning_of_a_long_trace_goes_on_if_it_can(
     assert min(len(set(labels)) for labels in found or [range(fewest)]) == fewest
 
 
+@pytest.mark.slow
 def test_of_a_long_trace_clingo_is_given_some_links_at_a_time() -> None:
     """The simplest links come first, and the search may end before clingo has all. The map is a
     guess, or from clingo."""

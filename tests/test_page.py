@@ -59,6 +59,7 @@ def content(route: Trace, rivals: Solution) -> dict[str, Any]:
     return content_of(rivals, route)
 
 
+@pytest.mark.slow
 def test_overview_counts_the_maps_that_have_each_place(
     route: Trace, rivals: Solution, content: dict[str, Any]
 ) -> None:

@@ -116,7 +116,7 @@ def unsure(seed: int) -> Trace:
     )
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(
     ("drawn", "misread"), [(off_its_places, 0.0), (in_pieces, 0.0), (unsure, 0.4), (unsure, 1.5)]
 )

@@ -206,6 +206,7 @@ def test_a_name_of_a_region_stands_everywhere(
     assert "expected a region of the map" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_first_map_costs_no_more_than_a_known_one() -> None:
     """No time is left for a search, and a map without one has more places."""
     trace = Trace.load(ACES3)

@@ -44,7 +44,7 @@ def test_solver_and_checker_agree_with_the_brute_force(data: st.DataObject) -> N
     agree(hidden(trace, steps), data.draw(theories(trace), label="theory"))
 
 
-@settings(max_examples=13)
+@settings(max_examples=6)
 @given(st.data())
 def test_hiding_a_view_never_raises_the_cost(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=5), label="trace")
