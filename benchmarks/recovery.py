@@ -1,7 +1,7 @@
 """What one fault does to a driving robot: steps until its map is certain again, and right.
 
     python benchmarks/recovery.py [--only PATTERN] [--seeds 20] [--first 800] [--limit 0.5]
-                                  [--out RESULTS.jsonl]
+                                  [--without SPEEDUP] [--out RESULTS.jsonl]
 
 Each run has one fault, at a random step that is not among the first or last five. Steps are counted
 from the step at which the fault becomes visible: the step with the wrong view, or the first step
@@ -48,6 +48,7 @@ from ssh_abduction import OnlineMapper, SSHMap, Theory, Trace
 from ssh_abduction.online.hypotheses import ExtendedMap
 from ssh_abduction.solver import Cost
 from ssh_abduction.solver.asp.facts import answer_maps
+from ssh_abduction.theory.speedups import Speedups
 
 COLUMNS = (
     "noticed",
@@ -143,6 +144,9 @@ def main() -> None:
         help="seconds the robot drives between two steps (default 0.05)",
     )
     parser.add_argument(
+        "--without", nargs="*", default=(), metavar="SPEEDUP", help="switch these speed-ups off"
+    )
+    parser.add_argument(
         "--out", type=Path, metavar="RESULTS.jsonl", help="file for the result of each run"
     )
     options = parser.parse_args()
@@ -150,7 +154,7 @@ def main() -> None:
     for name, (make, theory) in FAMILIES.items():
         if re.search(options.only, name):
             records = [
-                run(make(seed), theory, options.limit, options.drive, seed)
+                run(make(seed), theory, options.limit, options.drive, seed, options.without)
                 for seed in range(options.first, options.first + options.seeds)
             ]
             print(f"| {name} | {' | '.join(cells(records))} |", flush=True)
@@ -161,7 +165,14 @@ def main() -> None:
                     )
 
 
-def run(case: Case, theory: Theory, limit: float, drive: float = 0.0, seed: int = 0) -> Record:
+def run(
+    case: Case,
+    theory: Theory,
+    limit: float,
+    drive: float = 0.0,
+    seed: int = 0,
+    without: Sequence[str] = (),
+) -> Record:
     """Give a trace with one fault to a mapper, step by step.
 
     Args:
@@ -170,6 +181,7 @@ def run(case: Case, theory: Theory, limit: float, drive: float = 0.0, seed: int 
         limit: Seconds that a step may take.
         drive: Seconds that the robot drives between two steps.
         seed: Seed of the case, for the record.
+        without: Speed-ups that are off.
 
     Returns:
         A dict with the step at which the fault shows, the steps until the mapper noticed it and was
@@ -177,7 +189,13 @@ def run(case: Case, theory: Theory, limit: float, drive: float = 0.0, seed: int 
     """
     trace = case.walk.trace
     shown = min([*case.wrong, *case.misseen, *(t + 1 for t in case.jumps)])
-    mapper = OnlineMapper(trace.views[0], theory, star=trace.steps[0].star, time_limit=limit)
+    mapper = OnlineMapper(
+        trace.views[0],
+        theory,
+        star=trace.steps[0].star,
+        time_limit=limit,
+        speedups=Speedups.without(without),
+    )
     noticed = again = None
     right_again = False
     milliseconds = []
