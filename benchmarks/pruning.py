@@ -134,8 +134,6 @@ TRIALS = (
     *_ended("greedy", "maze 6x6 n=10000", "full maze 10x10 n=4000", limit=SHORT),
     *_timed("threads", QUICK_MAZE, FEW_SEEN, MACHINE, clock="wall"),
     *_timed("threads", "full maze 10x10 n=200", "full maze 5x5 n=1600", CORRIDORS, limit=LONGER),
-    *_timed("processes", STARS, FEW_SEEN, clock="wall"),
-    *_ended("processes", "full maze 10x10 n=400", clock="wall"),
 )
 # The speed-ups that can be measured. Removed ones keep their trials above, for the stored results.
 SWITCHES = tuple(
