@@ -28,8 +28,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import TypeAlias
 
 from ssh_abduction.data.star import Openings
-from ssh_abduction.runtime.clock import look_at_clock
-from ssh_abduction.theory.planarity import can_be_drawn, clockwise_orders, is_planar
+from ssh_abduction.runtime.clock import each_looking, look_at_clock
+from ssh_abduction.theory.planarity import can_be_drawn
 
 # A dstate, and 1 (ahead) or -1 (behind).
 Arm: TypeAlias = tuple[int, int]
@@ -92,13 +92,7 @@ class Edges:
                     if not (distinct and k in faced.values())
                 ]
                 headings = [
-                    faced
-                    for faced in headings
-                    if all(
-                        (faced[s] + q - faced[x]) % 4 == 0
-                        for s, q, x in turns
-                        if {s, x} <= faced.keys()
-                    )
+                    faced for faced in headings if all(_is_turned(faced, turn) for turn in turns)
                 ]
             # headings that differ by a rotation of the place are one option
             found: dict[tuple[int, ...], Option] = {}
@@ -160,9 +154,8 @@ class Edges:
         }
         ends = [choose(edge, key=repr) for edge in edges for choose in (min, max)]
         orders = {
-            p: clockwise_orders(
-                sorted({arm for arms in sequences[p] for arm in arms}, key=repr),
-                lambda order, p=p: all(_goes_round(order, some) for some in sequences[p]),  # type: ignore[misc]
+            p: _orders(
+                sorted({arm for arms in sequences[p] for arm in arms}, key=repr), sequences[p]
             )
             for p in self._at
         }
@@ -178,8 +171,7 @@ class Edges:
         )
 
     def _gateways(self) -> dict[Arm, Arm] | None:
-        """Find the arms (ahead of a dstate, or behind it) that are one gateway: a dict from each
-        arm to the arm that represents it.
+        """Find the arms that are one gateway: a dict from each arm to the arm that represents it.
 
         A turn around faces what was behind. A gateway leads to one gateway, so if two arms are one,
         the arms at their far ends are one. None if a gateway leads to two places.
@@ -212,7 +204,10 @@ class Edges:
         return one
 
     def _some_option_draws(self, options: list[list[Option]]) -> bool:
-        """Choose an option place by place, and tell whether some choice makes a drawing."""
+        """Tell whether one option can be chosen for each place so that they make a drawing.
+
+        Options are chosen place by place. A partial choice that makes no drawing is not extended.
+        """
         settled = {arm: k for some in options if len(some) == 1 for arm, k in some[0].items()}
         others = sorted((some for some in options if len(some) != 1), key=len)
         if not self._is_drawing(settled):
@@ -231,7 +226,7 @@ class Edges:
         return False
 
     def _is_drawing(self, position: Option) -> bool:
-        """Tell whether travels whose two arms (gateways at their ends) are placed can be drawn.
+        """Tell whether a drawing exists for the travels whose arms both have a position.
 
         Each gateway has to be joined to one other, and V - E + F = 2 for each connected part.
         """
@@ -240,23 +235,87 @@ class Edges:
             for s, t in self.travels
             if (s, 1) in position and (t, -1) in position
         }
-        # An edge that leads back to its own gateway gets an extra place at its other end.
-        ends = [(*edge, None)[:2] for edge in joined]
-        around: dict[object, list[tuple[int, int]]] = defaultdict(list)
-        for number, edge in enumerate(ends):
-            for end, gateway in enumerate(edge, 2 * number):
-                place, slot = gateway or (("beyond", number), 0)
-                around[place].append((slot, end))
-        gateways = [gateway for edge in joined for gateway in edge]
-        return len(set(gateways)) == len(gateways) and is_planar(
-            {place: tuple(end for _, end in sorted(here)) for place, here in around.items()}
-        )
+        beyond: dict[tuple[int, int], tuple[int, int]] = {}
+        for edge in joined:
+            first, *_, last = *edge, *edge
+            for here, there in ((first, last), (last, first)):
+                if beyond.setdefault(here, there) != there:
+                    return False
+        around: dict[int, list[tuple[int, int]]] = defaultdict(list)
+        for gateway in sorted(beyond):
+            around[gateway[0]].append(gateway)
+        # the next gateway counterclockwise
+        after = {
+            gateway: gateways[i - 1]
+            for gateways in around.values()
+            for i, gateway in enumerate(gateways)
+        }
+        # an edge that leads back to its own gateway gets an extra place at its other end
+        places = len(around) + sum(len(edge) == 1 for edge in joined)
+        faces = _cycles({gateway: after[other] for gateway, other in beyond.items()})
+        return places - len(joined) + faces == 2 * _parts(around, beyond)
+
+
+def _cycles(following: Mapping[tuple[int, int], tuple[int, int]]) -> int:
+    """Count the cycles of a permutation."""
+    left, cycles = set(following), 0
+    while left:
+        cycles += 1
+        here = left.pop()
+        while (here := following[here]) in left:
+            left.remove(here)
+    return cycles
+
+
+def _parts(
+    around: Mapping[int, Sequence[tuple[int, int]]],
+    beyond: Mapping[tuple[int, int], tuple[int, int]],
+) -> int:
+    """Count the connected parts of a drawing."""
+    left, parts = set(around), 0
+    while left:
+        parts += 1
+        queue = [left.pop()]
+        while queue:
+            new = {beyond[gateway][0] for gateway in around[queue.pop()]} & left
+            left -= new
+            queue.extend(new)
+    return parts
+
+
+def _is_turned(faced: Mapping[int, int], turn: tuple[int, int, int]) -> bool:
+    """Tell whether headings fit a turn. They do if one of its two headings is not chosen yet."""
+    s, quarters, t = turn
+    return s not in faced or t not in faced or (faced[s] + quarters - faced[t]) % 4 == 0
 
 
 def _goes_round(order: Sequence[Arm], sequence: Sequence[Arm]) -> bool:
-    """Whether gateways, all different, have the cyclic order of those that `order` has."""
+    """Whether a sequence has distinct gateways that `order` has in the same cyclic order.
+
+    Gateways that are not in `order` yet do not count.
+    """
     there = [order.index(gateway) for gateway in sequence if gateway in order]
     return (
         len(set(sequence)) == len(sequence)
         and sum(j < i for i, j in zip(there, [*there[1:], *there[:1]], strict=True)) <= 1
     )
+
+
+def _orders(gateways: Sequence[Arm], sequences: Sequence[Sequence[Arm]]) -> list[tuple[Arm, ...]]:
+    """List all clockwise orders of gateways that agree with sequences known to be clockwise.
+
+    Orders that differ by a rotation are listed once: each starts with the first gateway.
+    """
+    orders: list[tuple[Arm, ...]] = [()]
+    for gateway in gateways:
+        longer = (
+            (*order[:gap], gateway, *order[gap:])
+            for order in orders
+            for gap in range(min(1, len(order)), len(order) + 1)
+        )
+        orders = [
+            order
+            for order in each_looking(longer)
+            if all(_goes_round(order, some) for some in sequences)
+        ]
+    return orders
