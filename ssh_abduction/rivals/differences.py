@@ -48,7 +48,7 @@ class Change:
     """Steps that two maps group differently, by dstate, place, path or course.
 
     Attributes:
-        sort: What the steps are gathered by: "dstates", "places", "paths" or "courses".
+        sort: What the steps are grouped by: "dstates", "places", "paths" or "courses".
         first: The groups of steps in the first map, sorted by first step.
         other: The groups of the same steps in the other map.
         first_none: The steps that are at no place, or along no path, in the first map.
@@ -286,9 +286,9 @@ def _size(ssh_map: SSHMap) -> tuple[int, int, int, int]:
 
 def _groups_in_words(groups: Sequence[Steps], none: Steps) -> str:
     """Put into words how one map groups steps: "groups steps 0–1 | 2 and leaves out step 5"."""
-    gathered = f"groups {_steps(sum(map(len, groups)))} {' | '.join(map(stretches, groups))}"
+    grouped = f"groups {_steps(sum(map(len, groups)))} {' | '.join(map(stretches, groups))}"
     left = f"leaves out {_steps(len(none))} {stretches(none)}"
-    return " and ".join(([gathered] if groups else []) + ([left] if none else []))
+    return " and ".join(([grouped] if groups else []) + ([left] if none else []))
 
 
 def _steps(count: int) -> str:

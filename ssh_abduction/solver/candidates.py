@@ -174,8 +174,7 @@ class Candidates:
                     return
 
     def sketch_least(self) -> bool:
-        """Offer a sketch (a map without a search) with no more dstates than pairwise distinct
-        steps.
+        """Offer a map without a search that has only as many dstates as pairwise distinct steps.
 
         No map has fewer dstates. Such a sketch exists if the robot drives there and back and most
         views are different. Clingo then only has to find the fewest places and paths. Returns

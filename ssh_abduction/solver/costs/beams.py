@@ -18,7 +18,7 @@ from ssh_abduction.solver.solution.weighed import EQUAL
 # axioms ends at the share BREAKING.
 WIDTHS, BREAKING = {1: 0.7, 4: 0.6, 16: 0.7}, 0.8
 # If displacements may be wrong, all beams end at the share JUMPED. Then the best map is often one
-# that they drop, and `jumps.py` looks for it.
+# that they drop, and `wrong_displacements.py` looks for it.
 JUMPED = 0.4
 # Joining the maps of drives ends after the share JOINING.
 JOINING = 0.5
