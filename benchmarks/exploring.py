@@ -6,7 +6,7 @@
 
 All strategies begin in the same world at the same dstate (distinctive state: a place and a heading
 there). A robot *has the map* after a number of steps if it has done every travel, and if all
-minimal maps of these steps have the true dstates and, if the theory has places, the true places.
+minimal maps of these steps have the true dstates. If the theory has places, these must be true too.
 Maps that differ only in paths count as one. The number is searched after the drive: growing
 prefixes are solved, beginning with the step at which everything was visited, and then the interval
 is halved. The explorer also says itself when it is done.

@@ -1,8 +1,8 @@
 """Compute the misfit of a map to displacements and closures, by plain least squares from several
 starts. This is slow, and independent of the package.
 
-The unknowns are the position of each place (of each dstate where there are no places), the heading
-of each dstate, how far the robot is off at each step, the scale and the drift.
+The unknowns are the position of each place, the heading of each dstate, how far the robot is off at
+each step, the scale and the drift. In maps without places, each dstate has a position.
 """
 
 from __future__ import annotations

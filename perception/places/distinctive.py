@@ -51,8 +51,8 @@ PASSING, LEFT = 0.75, 0.5
 # AGREED has to show it.
 BESIDE, AGREED = 3.0, 0.5
 # A visit is final at most this many metres after its end, if scans are at most 0.5 m apart. This is
-# WINDOW (its local map is complete), LIFE and GAP (its chain ends), twice STAY and TURNING (no
-# visit or turn nearby can change it), and 5 m for the spacing of scans and milestones.
+# the sum of WINDOW (its local map is complete), LIFE and GAP (its chain ends), and twice STAY and
+# TURNING (no visit or turn nearby can change it). The spacing of scans and milestones adds 5 m.
 DELAY = 125.0
 
 

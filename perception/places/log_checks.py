@@ -40,11 +40,12 @@ RUNS_BACK = 0.05
 # A robot returns if it comes near a point where it was before, and drove at least AWAY metres in
 # between. Near is within NEAR metres, plus DRIFT metres for each metre driven in between.
 NEAR, DRIFT, AWAY = 3.0, 0.02, 15.0
-# A scan contradicts the scans before it if less than the share POORLY of its points matches, and
-# more than the share INTRUDING of the points of either side lies in the free space of the other, at
-# least MARGIN metres from walls. BESIDE scans on each side are compared. In good logs, scans that
-# match so badly have at most 27 % of their points there. The share INTRUDING_RARELY suffices if
-# the share that matches is more than WORSE below the RARELY-th percentile of the log.
+# Points of a scan intrude if they lie in the free space of the other scans, at least MARGIN metres
+# from walls. A scan contradicts the scans before it if two things hold: less than the share POORLY
+# of its points matches, and more than the share INTRUDING of either side intrudes. BESIDE scans on
+# each side are compared. In good logs, at most 27 % of the points of scans that match so badly
+# intrude. The share INTRUDING_RARELY suffices if the share that matches is more than WORSE below
+# the RARELY-th percentile of the log.
 INTRUDING, MARGIN, POORLY, BESIDE = 0.3, 0.4, 0.6, 3
 INTRUDING_RARELY, WORSE, RARELY = 0.15, 0.25, 1.0
 # Beams that meet walls are at most this many metres long, in the median of a log. Good logs have up

@@ -105,10 +105,10 @@ def second_map(
 ) -> SecondMap | None:
     """Solve the trace with the runner-up's views. Return the result if its maps differ.
 
-    Return None if the trace has no runner-up, or if one of its maps puts the same steps at the
-    same dstates and places as one of `maps`, the minimal maps of the chosen views. The search
-    takes `limit` seconds, at most SECONDS. `memory` is in MiB, as in `solve`. Raises TraceError
-    if the views of the runner-up are malformed.
+    `maps` are the minimal maps of the chosen views. Return None if the trace has no runner-up, or
+    if one of its maps puts the same steps at the same dstates and places as one of `maps`. The
+    search takes `limit` seconds, at most SECONDS. `memory` is in MiB, as in `solve`. Raises
+    TraceError if the views of the runner-up are malformed.
     """
     other = runner_up(trace)
     if other is None:

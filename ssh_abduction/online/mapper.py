@@ -16,8 +16,8 @@ new action at the robot's dstate. The map *predicts* the new step if the dstate 
 link shows what is seen. If that dstate shows something else, the map *contradicts* the step. If
 there is no such link, the step is *unknown* to the map.
 
-*Claim.* If some map of M predicts the step, and no map of M has no link for it, then the maps of M
-that predict the step are exactly the minimal maps of the longer trace.
+*Claim.* Suppose that some map of M predicts the step, and that the step is unknown to no map of M.
+Then the maps of M that predict the step are exactly the minimal maps of the longer trace.
 
 *Proof.* By (1) of the claim in `solver/prefixes.py`, no map of the longer trace costs less than c.
 A map that predicts the step costs c, by (2). Conversely let F be a minimal map of the longer trace.

@@ -32,9 +32,9 @@ from ssh_abduction.output.layout import Layout, drawable_poses, layout, travelle
 from ssh_abduction.output.metric_picture import metric_svg
 from ssh_abduction.output.region_marks import place_title, region_marks
 
-# Distances in units of the page. SPACING is between neighbouring places, DSTATE from the centre of
-# a place to the name of a dstate, LANE from the line of a path to the marks of its dstates, NAME
-# from the centre of a place to the name that a person gave it.
+# Distances in units of the page. SPACING is between neighbouring places. DSTATE is from the centre
+# of a place to the name of a dstate, and NAME to the name that a person gave it. LANE is from the
+# line of a path to the marks of its dstates.
 SPACING, DSTATE, LANE, NAME = 130.0, 38.0, 9.0, 22.0
 # The largest number of characters of a view below a dstate. A longer view is cut at the beginning,
 # because long names often begin alike.

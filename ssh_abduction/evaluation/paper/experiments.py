@@ -381,8 +381,8 @@ def _driven(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[Any]]:
     """Simulate all tours in the rectangle with this notch.
 
-    Return for each of the n steps the mean pose at its true dstate, (n, 3), the offset of its own
-    pose from this mean, (n, 3), and the name of the dstate, (n,).
+    Return three arrays of one row a step: the mean pose at its true dstate, (n, 3); the offset of
+    its own pose from this mean, (n, 3); and the name of the dstate, (n,).
     """
     trace = simulate(notched(notch), EXPERIMENTS["notched-rectangle"].tours, seed)
     truth = true_dstates(trace)

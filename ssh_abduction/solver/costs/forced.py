@@ -410,9 +410,9 @@ class Forcing:
     ) -> tuple[Ints, float, list[tuple[tuple[int, int], float]]]:
         """Add all joins that every map of a cost below `most` has, without branches.
 
-        Returns the class of each visit, a lower bound on the cost of maps with these joins, and the
-        other joins of the best map, each with a lower bound on the cost of maps without it, the
-        highest first. `known` has prices of maps that lack joins, and gets more.
+        Returns the class of each visit, and a lower bound on the cost of maps with these joins.
+        Third come the other joins of the best map. Each has a lower bound on the cost of maps
+        without it, the highest first. `known` has prices of maps that lack joins, and gets more.
         """
         while True:
             look_at_clock()

@@ -1,10 +1,10 @@
 """The misfit of a map to the displacements, and small sets of returns that cause a misfit.
 
-A *return* is two steps that a map has at one place or dstate. The misfit of a set of returns is the
-least chi-square of the displacements and closures, given that the two steps of each return have one
-pose (for a dstate) or one position (for a place, `solver/geometry/fit.py`). More returns leave less
-freedom. So a set of returns never has a smaller misfit than a part of the set, and a map never has
-a smaller misfit than a set of its returns.
+A *return* is two steps that a map has at one place or dstate. Two steps at one dstate have one
+pose, and two steps at one place have one position. The misfit of a set of returns is the least
+chi-square of the displacements and closures that these allow (`solver/geometry/fit.py`). More
+returns leave less freedom. So a set of returns never has a smaller misfit than a part of the set,
+and a map never has a smaller misfit than a set of its returns.
 
 Places that drives have in common cost a price (`theory/overlap.py`), and more returns never lower
 it. So twice this price is a part of the misfit.

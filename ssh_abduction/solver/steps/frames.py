@@ -93,9 +93,9 @@ def rotation_bits(first: Frame, then: Frame, shift: int) -> int:
 def may_face(first: Frame, then: Frame, shift: int) -> list[str]:
     """List how the robot may face in the later frame, compared to the earlier one.
 
-    Slots that the trace declares opposite belong to one path, at any angle. So the robot may face
-    the same way ("alike") if it faces the same direction of such a path in both frames, and the
-    opposite way ("opposite") if it faces opposite directions of it. Arguments are as for
+    Slots that the trace declares opposite belong to one path, at any angle. If the robot faces the
+    same direction of such a path in both frames, it may face the same way ("alike"). If it faces
+    opposite directions of it, it may face the opposite way ("opposite"). Arguments are as for
     `rotation_bits`.
     """
     found = rotation_bits(first, then, shift)

@@ -1,8 +1,8 @@
 """Closures as evidence.
 
 A *closure* is the relative pose of two steps, measured by matching what the robot saw around them.
-If the local maps of two visits match with an offset that is far from zero, within the covariance of
-the match and of the middles of places, then the visits are not at one place. The axiom `closure`
+The local maps of two visits may match with an offset that is far from zero, by the covariance of
+the match and of the middles of places. Then the visits are not at one place. The axiom `closure`
 demands this for each closure alone. Closures together with displacements count in the misfit
 (`solver/geometry/fit.py`).
 
