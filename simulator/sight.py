@@ -78,7 +78,7 @@ class WallPositions:
 
 
 def sight(image: Array, reach: float, farthest: float) -> WallPositions:
-    """Find the walls in an image, (180,) metres from right to left.
+    """Find the walls in an image: 180 ranges in metres, from right to left.
 
     `reach` is half the width of a corridor. The range `farthest` means that nothing was seen.
     """

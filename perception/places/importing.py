@@ -276,7 +276,7 @@ def tracked(
 
 
 def _noted(message: str, notes: Sequence[str]) -> LogError:
-    """Make an error with notes. Its text leaves them out, as the user has already seen them."""
+    """Make an error that carries notes. They are not in its text, as they were already printed."""
     error = LogError(message)
     for note in notes:
         error.add_note(note)

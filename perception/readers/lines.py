@@ -116,7 +116,7 @@ class Piped:
         return self._head.read(size) or self._rest.read(size)
 
     def readline(self, size: int = -1) -> bytes:
-        """Read a line, at most `size` bytes. The first bytes end with a line."""
+        """Read a line, at most `size` bytes. The bytes read in advance are whole lines."""
         return self._head.readline(size) or self._rest.readline(size)
 
 

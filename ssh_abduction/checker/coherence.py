@@ -1,4 +1,4 @@
-"""Check that a map fits its trace, and that its numbers fit each other."""
+"""Check that a map fits its trace, and that its fields are consistent with each other."""
 
 from __future__ import annotations
 

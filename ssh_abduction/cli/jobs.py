@@ -136,5 +136,5 @@ def final_code(codes: Sequence[int], asked: int, stop: StopFlag, files: str) -> 
 def solved_in_worker(
     number: int, path: str, question: FileQuestion, content: Any, given_up: Callable[[], bool]
 ) -> Any:
-    """Answer a question about one file in a process. The content is None if not yet loaded."""
+    """In a worker process, answer a question about one file. Content None: not loaded yet."""
     return question.answer(number, path, content, given_up)

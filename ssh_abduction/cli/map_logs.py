@@ -42,8 +42,8 @@ def add_parser(verbs: Verbs) -> None:
     parser.add(
         "--time-limit S",
         "seconds for the search (default: a twentieth of the time that the robot drove, less the "
-        "time for the import, but at least 30). Without this option, a search that has no map by "
-        "then may take up to 64 times as long",
+        "time for the import, but at least 30). Without this option, a search that has no map "
+        "after this time goes on, for up to 64 times this time",
         type=float,
     )
     parser.add_setting(
@@ -70,8 +70,8 @@ def add_parser(verbs: Verbs) -> None:
     add_theory(
         parser,
         default=(
-            "topological, but without the axioms of stars, sides and paths, which a log does not "
-            "show reliably"
+            "topological, but without the axioms of stars, sides and paths, as logs do not show "
+            "these reliably"
         ),
     )
 

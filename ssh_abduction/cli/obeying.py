@@ -98,7 +98,7 @@ class Obeying:
         return with_names(self.corrections, solution, self.trace)
 
     def finished(self, solution: Solution, limit: float | None) -> Solution:
-        """Add the names, and warnings of drives that a corrected gateway keeps apart."""
+        """Add names, and warn of drives that share no place because of a corrected gateway."""
 
         def find(trace: Trace, theory: Theory, seconds: float) -> Solution:
             return solve(trace, theory, max_maps=1, time_limit=seconds)

@@ -105,7 +105,7 @@ def add_limits(parser: Parser, printed: str, seconds: float | None = None) -> No
     """Add the options that limit a search.
 
     Args:
-        printed: What the verb prints at a limit.
+        printed: What the command prints at a limit.
         seconds: The default time limit; None for no limit.
     """
     default = "" if seconds is None else f" (default: {seconds:g}; inf for no limit)"

@@ -42,8 +42,8 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.add(
         "--by",
-        "what to minimise (default: actions). Routes for actions and metres have only moves that "
-        "the robot did before. Routes for places have all moves along the paths of the map",
+        "what to minimise (default: actions). With actions or metres, a route uses only moves "
+        "that the robot has made. With places, it may use any move along a path of the map",
         choices=("actions", "places", "metres"),
         default="actions",
     )

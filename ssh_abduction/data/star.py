@@ -103,7 +103,9 @@ class Frame:
         return len(self.bearings)
 
     def nth(self, turn: str | None, number: int) -> int | None:
-        """Return the slot of the n-th gateway to a side, from 1; None if there are fewer.
+        """Return the slot (index) of the n-th gateway on a side; None if there are fewer.
+
+        n counts from 1.
 
         "right" counts clockwise. A gateway straight ahead is not counted.
         """

@@ -170,8 +170,8 @@ class Relations:
     def _near(self, time: float | None) -> tuple[int, Displacement] | None:
         """Find the node nearest to a moment, and the displacement from the node to the moment.
 
-        The displacement is a share of the relation to the node on the other side of the moment. It
-        is zero if there is no such relation but the node is near in time. None if no node is near.
+        The displacement is interpolated between the nodes before and after the moment. It is zero
+        if their relation is unknown but the node is near in time. None if no node is near.
         """
         if time is None:
             return None

@@ -194,7 +194,7 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
         if not (true >= 0).any():
             raise LearnerError(
                 "traces: expected steps whose dstate follows from the map, got none; "
-                "score a trace of the same world"
+                "give traces of the building that was mapped"
             )
         return float(np.mean(found[true >= 0] == true[true >= 0]))
 

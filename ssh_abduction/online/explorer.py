@@ -205,8 +205,8 @@ class Explorer:
             )
         if theory is not None and checked_theory(theory).has_faults:
             raise TheoryError(
-                "theory: expected a theory without faults, as a contradiction ends an "
-                "exploration, got misread or slipped; leave them out"
+                "theory: expected a theory without faults, got misread or slipped; leave them "
+                "out, as an exploration ends at the first contradiction"
             )
         self._robot, self._time_limit, self._max_maps = robot, time_limit, max_maps
         first = self._look()

@@ -56,9 +56,9 @@ def content_of(
 ) -> dict[str, Any]:
     """Make the content of the page as a dict for JSON.
 
-    The trace tells actions and images, if known. `run` is a run of a robot that was localised
-    in the maps, to be replayed. `called` has file names and flags for the commands that the
-    page shows; None for placeholders. Raises MapError if the maps are not of one trace, or not
+    Actions and images come from the trace, if it is known. `run` is a run of a robot that was
+    localised in the maps, to be replayed. `called` has file names and flags for the commands that
+    the page shows; None for placeholders. Raises MapError if the maps are not of one trace, or not
     of this one, and TraceError if the header of the trace describes its images wrongly.
     """
     listing = Listing.of(source)

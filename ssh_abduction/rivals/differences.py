@@ -48,7 +48,8 @@ class Change:
     """Steps that two maps group differently, by dstate, place, path or course.
 
     Attributes:
-        sort: What the steps are grouped by: "dstates", "places", "paths" or "courses".
+        sort: What the steps are grouped by: "dstates", "places", "paths" or "courses" (a path and
+            the direction along it).
         first: The groups of steps in the first map, sorted by first step.
         other: The groups of the same steps in the other map.
         first_none: The steps that are at no place, or along no path, in the first map.

@@ -28,8 +28,8 @@ class Parts:
     """The objects that all stages of one search share.
 
     Attributes:
-        speedups: The speed-ups that the caller has on. `task.speedups` has only the ones that hold
-            for the theory.
+        speedups: The speed-ups that the caller has switched on. `task.speedups` has only those
+            of them that hold for the theory.
         watch: The clock of the search, with its limits.
         task: The trace and theory, as engines see them.
         known: What is known about the maps of the trace so far.

@@ -1,10 +1,10 @@
 """A user's own rules, written with the predicates of the encodings.
 
 >>> from ssh_abduction.theory.rules import Rules
->>> text = "% @axiom(brief) No dstate is seen again later.\\n#program step(t)."
+>>> text = "% @axiom(brief) No dstate is seen again after step 9.\\n#program step(t)."
 >>> rules = Rules("own.lp", text + "\\nviolation(brief,t) :- same(I,t), t > 9.")
 >>> [axiom.sentence for axiom in rules.axioms]
-['No dstate is seen again later.']
+['No dstate is seen again after step 9.']
 """
 
 from __future__ import annotations

@@ -64,8 +64,8 @@ class Theory:
             and paths).
         boundary: Whether the axioms about left and right of a path hold. none: they do not. strict:
             without exception. defeasible: with exceptions for pairs of paths, each at a cost.
-        symmetric_sides: Whether two paths always cross where the robot turns from one onto the
-            other: each path then continues on both sides of the other path.
+        symmetric_sides: Whether two paths cross wherever the robot turns from one onto the other,
+            so that each has parts on both sides of the other.
         path_order: Order of the places of a path. partial: some pairs may stay unordered. total:
             every two places are ordered.
         next_place: Whether a travel leads to the next place of its path, with no place between.
@@ -108,8 +108,8 @@ class Theory:
             their misfit to the displacements. auto: cost if displacements are used, dstates come
             first in `prefer`, and there are no excuses.
         prices: Three numbers: the prices of a dstate, a place and a path in nats (natural
-            logarithms of odds). A fault costs its cost in dstates times the price of a dstate. Used
-            only if maps are compared by cost.
+            logarithms of odds). A fault costs its `misread`, `slipped`, `jumped` or `changed`,
+            times the price of a dstate. Used only if maps are compared by cost.
     """
 
     level: Literal["causal", "topological"] = "topological"

@@ -105,7 +105,7 @@ class Watch:
         on_tick: Callable[[], None] = lambda: None,
         clock: Callable[[], float] | None = None,
     ) -> None:
-        """Set the limits in seconds and MiB. The clock, `now` by default, stands until `start`.
+        """Set the limits in seconds and MiB. The clock does not run until `start`.
 
         `check` calls `on_tick` every TICK seconds, to report progress.
         """

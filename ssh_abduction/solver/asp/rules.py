@@ -37,7 +37,7 @@ ALLOWED = {
     ast.ASTType.Comment,
 }
 EXAMPLE = (
-    "% @axiom(brief) No dstate is seen again later.\n#program step(t).\n"
+    "% @axiom(brief) No dstate is seen again after 10 steps.\n#program step(t).\n"
     "violation(brief,t) :- same(I,t), t-I > 10."
 )
 

@@ -143,10 +143,11 @@ class Facilities:
     def _members(
         self, shares: Array, centres: Array, kinds: NDArray[np.int_]
     ) -> tuple[Array, NDArray[np.bool_], Array]:
-        """Find the points that pay less at each of m facilities than their share.
+        """For each of m facilities, find the points that pay less there than their share.
 
         Returns:
-            The offsets of all points, (m, n, d), which points these are, and what all pay, (m, n).
+            The offsets of the n points from each facility, (m, n, d), whether a point pays less
+            than its share, (m, n), and what it pays, (m, n).
         """
         off = self.offsets(centres)
         pays = np.einsum("mnd,nd->mn", off**2, 0.5 / self.variances) + self._more(kinds)

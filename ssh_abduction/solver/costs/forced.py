@@ -388,8 +388,9 @@ class Forcing:
     ) -> bool:
         """Add joins that every map of a cost below `most` has. Tell whether there is no such map.
 
-        `joins` has those to begin with. `known` has prices of maps that lack joins, and gets more.
-        Up to `branches` joins at a time are assumed to be lacking.
+        `joins` has those to begin with. `known` maps a join to a lower bound on the cost of maps
+        without it. New bounds are added to it. Up to `branches` joins at a
+        time are assumed to be lacking.
         """
         while True:
             joins, low, worth = self._grown(visits, joins, most, known)
@@ -408,11 +409,11 @@ class Forcing:
     def _grown(
         self, visits: Visits, joins: Ints, most: float, known: dict[tuple[int, int], float]
     ) -> tuple[Ints, float, list[tuple[tuple[int, int], float]]]:
-        """Add all joins that every map of a cost below `most` has, without branches.
+        """Add joins that every map of a cost below `most` has, as far as bounds alone show them.
 
         Returns the class of each visit, and a lower bound on the cost of maps with these joins.
         Third come the other joins of the best map. Each has a lower bound on the cost of maps
-        without it, the highest first. `known` has prices of maps that lack joins, and gets more.
+        without it, the highest first. `known` maps a join to such a bound. New ones are added.
         """
         while True:
             look_at_clock()

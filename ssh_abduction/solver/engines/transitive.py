@@ -101,6 +101,6 @@ def apart_yet_joined(
 
 
 def _in_order(*visits: tuple[int, int]) -> Three:
-    """Sort visits at one place. Their given slots are the same direction of the place."""
+    """Sort visits at one place. The slots given with them are one direction at the place."""
     (i, a), (j, b), (k, c) = sorted(visits)
     return i, j, k, (b - a) % 4, (c - b) % 4

@@ -83,7 +83,8 @@ class _Transitions:
 
         `states` has the possible states of each visit, an array of visits x states, padded with -1.
         Padding gets an extra last row or column of the table, where all probabilities are 0.
-        Returns indices for `likely`, visits (without the last) x states x states of the next visit.
+        Returns an index array into `likely`, of shape (visits - 1, states, states of the next
+        visit).
         """
         rows = self.rows(states[:-1], self._visits[:, None])
         rows[states[:-1] < 0] = self._states * self._actions

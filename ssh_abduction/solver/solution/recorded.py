@@ -78,13 +78,13 @@ class Support:
             certificate needs, or if the solution was read from a file.
         odometry_warning: A sentence that warns of wrong odometry; None if there is nothing to warn
             of.
-        weigh_warning: A sentence that says why maps were counted though they should be weighed;
+        weigh_warning: A sentence that says why maps were compared by counts instead of costs;
             None if there is nothing to say.
         weighed: The costs in nats and the rival maps, if maps were compared by cost; else None.
         recorded: The certificate and warnings of the file, if the solution was read from a file;
             else None.
         onto: The names of the old drives whose map had to be kept; empty if there are none.
-        kept_apart: Sentences that warn of drives that a corrected gateway keeps apart.
+        kept_apart: Warnings that two drives share no place because of a corrected gateway.
     """
 
     basis: Basis | None = None

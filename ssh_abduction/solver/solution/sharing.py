@@ -390,7 +390,7 @@ def _name(dstate: DState, sort: Sort) -> Hashable:
 
 
 def _differing_in_words(sort: Sort, shared: Shared, steps: Sequence[int]) -> str:
-    """Say in which steps maps differ, for one sort. `steps` has the names of steps."""
+    """Say at which steps maps differ in dstates, places or another sort. `steps` has the names."""
     if len(shared.differing) == len(shared.sometimes) == 1:
         one = {
             "dstates": "one dstate",

@@ -68,7 +68,7 @@ def _pairs(stretches: tuple[int, ...], lifted: tuple[int, ...]) -> Pairs:
 
 
 def _meetings(ssh_map: SSHMap) -> Iterator[Equality]:
-    """Yield each step at a known dstate or place, with the first step there."""
+    """Yield each step where the robot is back at a dstate or place, with the first step there."""
     dstates: dict[int, int] = {}
     places: dict[int, int] = {}
     for t, label in enumerate(ssh_map.dstate_at):

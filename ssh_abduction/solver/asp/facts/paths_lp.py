@@ -200,7 +200,7 @@ def settled_labels(labels: Iterable[tuple[int, int]]) -> str:
 
 
 def open_labels(labels: Sequence[int]) -> str:
-    """Return rules whose answers are sets of labels of nodes that no paths fit."""
+    """Return rules. Each answer is a set of labels of nodes for which no paths are possible."""
     return "\n".join(
         [
             *(f"{{ is({node},{label}) }}." for node, label in enumerate(labels)),
