@@ -165,5 +165,5 @@ def test_an_error_without_advice_is_found() -> None:
         ("ssh_abduction/cli/route.py", "solve with --theory topological, or take --by metres", []),
     ],
 )
-def test_what_is_wrong_advice(path: str, text: str, bad: list[str]) -> None:
+def test_wrong_finds_options_that_the_verb_lacks(path: str, text: str, bad: list[str]) -> None:
     assert wrong(path, text) == bad

@@ -98,7 +98,7 @@ def agrees(backbone: Backbone, keys: set[Key], steps: int) -> None:
 
 @settings(max_examples=6)
 @given(st.data())
-def test_the_backbone_is_what_the_brute_force_says(data: st.DataObject) -> None:
+def test_backbone_equals_the_brute_force(data: st.DataObject) -> None:
     """The backbone comes from a complete list, or from one map of a list that was cut off. The
     first prefixes are too short."""
     trace = data.draw(traces(max_steps=6), label="trace")
@@ -136,7 +136,7 @@ SHARED = (
 )
 
 
-def test_reasoning_from_one_map_says_what_the_whole_list_says() -> None:
+def test_backbone_from_one_map_equals_that_of_all_maps() -> None:
     every, first = aces.solution(), aces.solution(max_maps=1)
     assert every.summary == f"4 minimal maps: {SHARED}"
     backbone = find_backbone(first)
@@ -165,7 +165,7 @@ def walk(world: Streets, place: str, steps: int, seed: int) -> Trace:
     ("frame_after", "engine"),
     [pytest.param(60.0, StepEngine, marks=pytest.mark.slow), (0.0, FramelessEngine)],
 )
-def test_every_engine_leaves_what_it_takes_to_reason(frame_after: float, engine: type) -> None:
+def test_each_engine_can_prove_the_backbone_from_one_map(frame_after: float, engine: type) -> None:
     """32 maps that also differ in dstates. A prefix of the readable encodings finds them, or labels
     that are settled before places and paths."""
     trace, theory = walk(TWO_BLOCKS, "a1", 50, 1), Theory(boundary="none", prefer=("dstates",))
@@ -184,7 +184,7 @@ def test_every_engine_leaves_what_it_takes_to_reason(frame_after: float, engine:
 
 
 @pytest.mark.slow
-def test_a_maze_with_stars_is_reasoned_about_by_its_labels() -> None:
+def test_backbone_of_a_maze_with_stars_comes_from_its_labels() -> None:
     """Seven maps in three labellings."""
     trace = maze(5, 5, steps=100, seed=1, stars=True).trace
     every, search = (
@@ -199,7 +199,7 @@ def test_a_maze_with_stars_is_reasoned_about_by_its_labels() -> None:
     assert "7 minimal maps: the dstates of steps 80, 83–84, 97 and 99–100 differ" in every.summary
 
 
-def test_what_is_listed_is_not_taken_for_proven_where_time_is_over() -> None:
+def test_interrupted_list_leaves_the_backbone_unproven() -> None:
     trace = Trace.load(ACES3)
     search = Search(trace, Theory(star="none"), max_maps=2, _start=Start(reasons=True))
     found = []
@@ -215,7 +215,7 @@ def test_what_is_listed_is_not_taken_for_proven_where_time_is_over() -> None:
     )
 
 
-def test_a_share_of_the_time_is_kept_for_reasoning_where_the_list_does_not_end() -> None:
+def test_endless_list_leaves_time_to_prove_the_backbone() -> None:
     theory = Theory(boundary="none", path_order="partial", prefer=())
     search = Search(
         rectangle(14), theory, max_maps=None, time_limit=1000, _start=Start(reasons=True)
@@ -234,7 +234,7 @@ def test_a_share_of_the_time_is_kept_for_reasoning_where_the_list_does_not_end()
     assert summary_of(solution, count, solution.backbone) == f"{listed}: {found}"
 
 
-def test_a_solution_is_a_value(tmp_path: Path) -> None:
+def test_solution_is_a_plain_value(tmp_path: Path) -> None:
     """A solution survives pickle, copies and files, and finds a backbone only if asked."""
     solution = aces.solution(max_maps=1)
     solution.save(tmp_path / "maps.json")
@@ -253,7 +253,7 @@ def test_a_solution_is_a_value(tmp_path: Path) -> None:
     assert find_backbone(replace(loaded, shared=backbone)) is backbone
 
 
-def test_a_backbone_that_cannot_be_found_in_time_is_not_proven() -> None:
+def test_find_backbone_without_time_returns_the_unproven_backbone() -> None:
     solution = aces.solution(max_maps=1)
     assert find_backbone(solution, time_limit=1e-9) == solution.backbone
 
@@ -269,7 +269,7 @@ def test_a_backbone_needs_the_trace(tmp_path: Path) -> None:
     assert find_backbone(loaded, Trace.load(ACES3)) is not None
 
 
-def test_while_the_robot_drives_the_backbone_is_that_of_the_maps_listed() -> None:
+def test_online_backbone_is_that_of_the_listed_maps() -> None:
     mapper = OnlineMapper("end", time_limit=None)
     for action, view in [
         ("travel", "hall"),
@@ -292,14 +292,14 @@ def test_the_summary_is_a_sentence(theory: Theory, summary: str) -> None:
     assert aces.solution(theory).summary == summary
 
 
-def test_nothing_is_shared_where_no_map_is_proven_minimal() -> None:
+def test_no_backbone_without_a_proven_minimal_map() -> None:
     solution = solve(Trace.load(ACES3), time_limit=1e-9)
     assert solution.status is Status.FEASIBLE
     assert solution.backbone is None
     assert solution.summary == "a map that is not proven minimal"
 
 
-def test_the_shell_tells_the_backbone_where_the_list_is_cut_off(
+def test_solve_prints_the_backbone_of_a_cut_list(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = str(tmp_path / "trace.jsonl")
@@ -328,13 +328,13 @@ def test_the_shell_tells_the_backbone_where_the_list_is_cut_off(
     assert cut["backbone"]["places"]["sometimes"] == [[0, 4], [1, 4]]
 
 
-def test_a_backbone_writes_a_thousand_pairs_and_counts_all() -> None:
+def test_backbone_writes_1000_pairs_and_counts_all() -> None:
     pairs = tuple((0, t) for t in range(1, 1501))
     told = Shared((*range(1501),), pairs).to_dict([0, 1])
     assert (told["always"], len(told["sometimes"]), told["pairs"]) == ([0, 1], 1000, 1500)
 
 
-def test_maps_that_differ_in_directions_along_paths_alone_are_told_apart() -> None:
+def test_difference_finds_maps_that_differ_only_in_directions() -> None:
     trace = maze(3, 3, steps=40, seed=4242, stars=True, follow=True, odometry=Odometry()).trace
     solution = solve(trace, Theory(weigh="count"), max_maps=None)
     pairs = [

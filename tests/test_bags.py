@@ -75,7 +75,7 @@ def test_packed_logs_are_read_whatever_their_name(tmp_path: Path, format: str, e
 
 
 @pytest.mark.parametrize("ending", PACK)
-def test_packed_lines_that_end_too_early_say_what_unpacks_the_rest(
+def test_cut_packed_log_is_an_error_that_names_the_command_to_unpack(
     tmp_path: Path, ending: str
 ) -> None:
     write_carmen(tmp_path / "a.log", SCANS)
@@ -87,7 +87,7 @@ def test_packed_lines_that_end_too_early_say_what_unpacks_the_rest(
         read_log(tmp_path / "a.log")
 
 
-def test_other_bytes_after_packed_lines_are_said_to_be_damage(tmp_path: Path) -> None:
+def test_bytes_after_a_packed_log_are_refused_as_damage(tmp_path: Path) -> None:
     write_carmen(tmp_path / "a.log", SCANS)
     (tmp_path / "a.log").write_bytes(gzip.compress((tmp_path / "a.log").read_bytes()) + b"more")
     with pytest.raises(LogError, match=r"but after line \d+ they are damaged \("):
@@ -109,7 +109,7 @@ def test_the_intact_part_of_a_cut_bag_is_read_with_a_note(
 
 
 @pytest.mark.parametrize("format", ["ros1", "mcap"])
-def test_a_chunk_that_was_packed_and_cut_is_read_up_to_the_cut(tmp_path: Path, format: str) -> None:
+def test_cut_compressed_chunk_is_read_up_to_the_cut(tmp_path: Path, format: str) -> None:
     """Recorders pack many messages in a chunk; the last chunk is the one that is cut."""
     from rosbags import rosbag1, rosbag2
     from rosbags.interfaces import Connection
@@ -176,7 +176,7 @@ def parts(folder: Path, ending: str, count: int = 3) -> None:
         (".bag", ""),
     ],
 )
-def test_parts_without_metadata_that_can_be_used_are_one_drive(
+def test_bag_parts_without_usable_metadata_are_read_as_one_drive(
     tmp_path: Path, ending: str, metadata: str | None
 ) -> None:
     parts(tmp_path / "drive", ending)
@@ -190,7 +190,7 @@ def test_parts_without_metadata_that_can_be_used_are_one_drive(
     assert ("metadata.yaml cannot be used" in notes(log)) == (metadata is not None)
 
 
-def test_one_part_that_is_named_alone_is_said_to_be_one(tmp_path: Path) -> None:
+def test_single_bag_part_is_read_with_a_note_about_other_parts(tmp_path: Path) -> None:
     parts(tmp_path / "drive", ".db3")
     log = read_log(tmp_path / "drive" / "drive_0.db3")
     assert len(log) == len(SCANS) // 3
@@ -202,7 +202,7 @@ def test_one_part_that_is_named_alone_is_said_to_be_one(tmp_path: Path) -> None:
     assert "These parts are not there: 0" in notes(read_log(tmp_path / "drive_1.db3"))
 
 
-def test_a_part_that_is_damaged_or_packed_costs_no_other(tmp_path: Path) -> None:
+def test_damaged_bag_part_is_left_out_and_the_others_are_read(tmp_path: Path) -> None:
     parts(tmp_path / "drive", ".db3")
     first, second, _ = sorted((tmp_path / "drive").iterdir())
     (tmp_path / "drive" / "drive_0.db3.zstd").write_bytes(PACK["zst"](first.read_bytes()))
@@ -227,7 +227,7 @@ def test_a_folder_of_several_drives_is_refused(tmp_path: Path) -> None:
         read_log(tmp_path)
 
 
-def test_metadata_that_leaves_a_part_out_is_said(tmp_path: Path) -> None:
+def test_note_says_that_metadata_omits_a_bag_part(tmp_path: Path) -> None:
     write_bag(tmp_path / "drive", SCANS)
     shutil.copy(tmp_path / "drive" / "drive.db3", tmp_path / "drive" / "drive_1.db3")
     log = read_log(tmp_path / "drive")
@@ -242,7 +242,7 @@ def full(*_: Any, **__: Any) -> Any:
     raise OSError(errno.ENOSPC, "No space left on device")
 
 
-def test_no_room_for_a_copy_is_one_clear_error(
+def test_full_disk_while_unpacking_is_a_clear_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "a.mcap.gz").write_bytes(gzip.compress(written(tmp_path, "mcap").read_bytes()))
@@ -258,7 +258,7 @@ def test_no_room_for_a_copy_is_one_clear_error(
 
 
 @pytest.mark.parametrize("name", ["drive", "drive.mcap", "drive.bag"])
-def test_a_bag_on_a_full_disk_is_one_clear_error_and_no_file(
+def test_full_disk_while_writing_a_bag_leaves_no_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     from rosbags import rosbag1, rosbag2
@@ -335,9 +335,7 @@ BROKEN: dict[str, Callable[[float], float]] = {
 @pytest.mark.parametrize(
     ("what", "topic"), [*((what, "scan") for what in BROKEN), ("10 s back from midway", "odom")]
 )
-def test_clocks_that_part_are_found_and_the_times_of_recording_used(
-    tmp_path: Path, what: str, topic: str
-) -> None:
+def test_recording_times_replace_broken_header_times(tmp_path: Path, what: str, topic: str) -> None:
     broken = BROKEN[what]
     log = clocks(tmp_path, *((broken, true) if topic == "scan" else (true, broken)), true)
     assert off(log) < 0.1
@@ -355,7 +353,7 @@ def test_clocks_that_part_are_found_and_the_times_of_recording_used(
         (lambda t: 10 * math.ceil(t / 10), "were recorded in 12 bursts, each of up to 9.5 s"),
     ],
 )
-def test_times_of_recording_that_are_worse_are_not_used(
+def test_header_times_are_used_if_recording_times_are_worse(
     tmp_path: Path, recorded: Callable[[float], float], said: str
 ) -> None:
     log = clocks(tmp_path, true, true, recorded)
@@ -364,7 +362,7 @@ def test_times_of_recording_that_are_worse_are_not_used(
     assert ("The times in the headers are used." in notes(log)) == bool(said)
 
 
-def test_if_both_clocks_are_broken_it_is_said(tmp_path: Path) -> None:
+def test_note_says_that_both_clocks_are_broken(tmp_path: Path) -> None:
     log = clocks(tmp_path, BROKEN["10 s back from midway"], true, lambda t: 10 * math.ceil(t / 10))
     assert "The times of recording are no better" in notes(log)
 
@@ -384,7 +382,7 @@ def two_lasers(m: Messages, *topics: str) -> list[tuple[str, float, Any]]:
     return found
 
 
-def test_each_scan_is_mounted_as_its_own_frame_says(tmp_path: Path) -> None:
+def test_each_scan_has_the_mount_of_its_own_frame(tmp_path: Path) -> None:
     log = read_log(bag(tmp_path / "one", lambda m: two_lasers(m, "/scan")))
     assert [round(scan.laser.mount[2], 3) for scan in log.scans] == [3.142, 0.0] * 4
     assert "The scans are of several frames (4 of rear, 4 of front)" in notes(log)
@@ -397,9 +395,7 @@ def test_each_scan_is_mounted_as_its_own_frame_says(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("topic", ["/tf_static", "/tf"])
-def test_of_two_transforms_to_a_laser_the_later_one_is_used_and_it_is_said(
-    tmp_path: Path, topic: str
-) -> None:
+def test_later_of_two_laser_transforms_is_used_with_a_note(tmp_path: Path, topic: str) -> None:
     def messages(m: Messages) -> list[tuple[str, float, Any]]:
         mounts: list[Pose] = [(0.2, 0.0, 0.0), (0.2, 0.0, 0.001), (0.2, 0.0, math.pi)]
         return [
@@ -419,7 +415,7 @@ def test_of_two_transforms_to_a_laser_the_later_one_is_used_and_it_is_said(
     )
 
 
-def test_a_transform_that_is_repeated_contradicts_nothing(tmp_path: Path) -> None:
+def test_repeated_equal_transform_gives_no_note(tmp_path: Path) -> None:
     def messages(m: Messages) -> list[tuple[str, float, Any]]:
         return [
             *[
@@ -521,7 +517,7 @@ def alternate(m: Messages, kind: str) -> list[tuple[str, float, Any]]:
         ("parents", ""),
     ],
 )
-def test_odometry_of_several_sources_is_that_of_one_and_it_is_said(
+def test_odometry_of_two_publishers_is_read_from_one_with_a_note(
     tmp_path: Path, kind: str, said: str
 ) -> None:
     log = read_log(bag(tmp_path / "bag", lambda m: alternate(m, kind)))
@@ -535,7 +531,9 @@ def test_odometry_of_several_sources_is_that_of_one_and_it_is_said(
     assert said in notes(log)
 
 
-def test_import_takes_several_topics(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_import_reads_several_scan_topics(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = bag(tmp_path / "two", lambda m: two_lasers(m, "/front", "/rear"))
     assert (
         main(

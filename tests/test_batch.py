@@ -137,7 +137,9 @@ def without_seconds(text: str) -> str:
 
 
 @pytest.mark.usefixtures("without_processes")
-def test_each_trace_has_its_line_in_order(traces: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_batch_prints_one_line_a_trace_in_order(
+    traces: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert (
         main(
             [
@@ -169,7 +171,7 @@ def test_each_trace_has_its_line_in_order(traces: Path, capsys: pytest.CaptureFi
 
 
 @pytest.mark.usefixtures("without_processes")
-def test_a_line_says_what_the_single_trace_says(
+def test_batch_line_equals_the_output_of_a_single_trace(
     traces: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for words in (["impossible.jsonl"], ["slow.jsonl", "--time-limit", "1e-9"]):
@@ -180,7 +182,7 @@ def test_a_line_says_what_the_single_trace_says(
 
 
 @pytest.mark.usefixtures("without_processes")
-def test_json_lines_are_the_single_objects(
+def test_batch_json_lines_equal_single_json_objects(
     traces: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     paths = ["impossible.jsonl", "quick.jsonl"]
@@ -201,7 +203,9 @@ def test_json_lines_are_the_single_objects(
 
 
 @pytest.mark.usefixtures("without_processes")
-def test_a_warning_names_its_trace_once(traces: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_batch_warning_names_its_trace_once(
+    traces: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     steps = [*rectangle(40).steps[:-1], replace(rectangle(40).steps[-1], view="v2")]
     replace(rectangle(40), steps=tuple(steps)).save("noisy.jsonl")
     main(["solve", "noisy.jsonl", "quick.jsonl", "--time-limit", "1e-9"])
@@ -235,7 +239,7 @@ def test_results_are_the_same_with_processes_and_dask(
         ("slow impossible", 30),
     ],
 )
-def test_the_worst_exit_code(
+def test_batch_returns_the_worst_exit_code(
     paths: str, code: int, traces: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     limit = ["--time-limit=1e-9", "--set=without_speedups=greedy"] if code == 30 else []
@@ -243,7 +247,7 @@ def test_the_worst_exit_code(
     assert (capsys.readouterr().err == "") == (code != 1)
 
 
-def test_wrong_choices_are_one_line(
+def test_wrong_batch_options_are_one_line_errors(
     traces: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(cluster_jobs, "PATIENCE", 0.5)
@@ -282,7 +286,7 @@ def test_wrong_choices_are_one_line(
         assert re.fullmatch(rf"ssh-abduction: {message}\n", err)
 
 
-def test_a_scheduler_without_workers(
+def test_scheduler_without_workers_is_an_error(
     traces: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from distributed import LocalCluster
@@ -296,7 +300,7 @@ def test_a_scheduler_without_workers(
     )
 
 
-def test_a_cluster_whose_workers_are_gone_is_waited_for_as_long_as_the_limit(
+def test_cluster_without_workers_warns_and_ends_at_the_limit(
     traces: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from distributed import Client, LocalCluster
@@ -334,7 +338,7 @@ def test_a_cluster_whose_workers_are_gone_is_waited_for_as_long_as_the_limit(
 
 
 @pytest.mark.parametrize(("limit", "ends"), [(None, None), (5, 10), (25, 25)])
-def test_how_long_a_cluster_may_have_no_worker(
+def test_cluster_may_lack_workers_for_the_given_time(
     limit: float | None, ends: float | None, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A worker is there for 40 s, and comes back once, after 100 s."""
@@ -357,7 +361,7 @@ def test_how_long_a_cluster_may_have_no_worker(
     )
 
 
-def test_without_the_extra(
+def test_missing_dask_is_a_clear_error(
     traces: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
@@ -365,7 +369,7 @@ def test_without_the_extra(
     assert capsys.readouterr().err.endswith("; pip install 'ssh-abduction[cluster]'\n")
 
 
-def test_an_unexpected_error_becomes_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unexpected_error_becomes_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     def load(path: str) -> Trace:
         raise MemoryError("no room for\nso many steps")
 
@@ -393,7 +397,7 @@ def test_only_the_trace_whose_process_is_killed_is_lost(traces: Path, scheduler:
 
 
 @pytest.mark.slow
-def test_where_a_worker_is_killed_all_logs_are_mapped_and_none_twice(
+def test_all_logs_are_mapped_once_after_a_worker_is_killed(
     tmp_path: Path,
     scheduler: str,
     monkeypatch: pytest.MonkeyPatch,
@@ -431,7 +435,7 @@ def test_where_a_worker_is_killed_all_logs_are_mapped_and_none_twice(
     }
 
 
-def test_a_worker_stops_when_the_client_goes(traces: Path, scheduler_here: str) -> None:
+def test_worker_stops_when_the_client_disconnects(traces: Path, scheduler_here: str) -> None:
     theory = Theory.topological().replace(boundary="none", path_order="partial", prefer=())
     endless = SolveQuestion(
         theory, limit=1000, maps=0, memory=None, speedups=Speedups(), json=False
@@ -450,7 +454,7 @@ def test_a_worker_stops_when_the_client_goes(traces: Path, scheduler_here: str) 
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux forgets the peak of memory")
-def test_memory_is_counted_for_each_trace(traces: Path) -> None:
+def test_memory_limit_applies_to_each_trace(traces: Path) -> None:
     command = shlex.join(
         [
             sys.executable,
@@ -471,7 +475,7 @@ def test_memory_is_counted_for_each_trace(traces: Path) -> None:
     assert [line.get("stopped") for line in lines] == [None, "memory limit", None]
 
 
-def test_ctrl_c_prints_what_waited_for_its_turn(
+def test_ctrl_c_prints_finished_answers_that_waited_for_their_turn(
     traces: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def answers(*_: object) -> Iterator[SolveAnswer]:
@@ -495,7 +499,7 @@ def test_ctrl_c_prints_what_waited_for_its_turn(
     [("1", os.killpg), ("2", os.kill)],
     ids=["1", "2, from another program"],
 )
-def test_ctrl_c_ends_the_processes(
+def test_ctrl_c_ends_the_processes_and_prints_their_maps(
     jobs: str, send: Callable[[int, int], None], traces: Path
 ) -> None:
     """What was found for unfinished traces is printed, whether the signal reaches all processes, as
@@ -531,7 +535,7 @@ def test_ctrl_c_ends_the_processes(
 @pytest.mark.parametrize(
     "seen", [False, True], ids=["results to a pipe", "results to the terminal"]
 )
-def test_the_bar_is_on_the_terminal(seen: bool, traces: Path) -> None:
+def test_progress_bar_is_shown_on_a_terminal(seen: bool, traces: Path) -> None:
     import pty
 
     master, slave = pty.openpty()

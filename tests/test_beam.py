@@ -46,18 +46,18 @@ def test_the_first_map_of_a_maze_is_true(seed: int) -> None:
 
 
 @pytest.mark.parametrize("stars", [True, False])
-def test_the_map_of_aces3_is_among_those_of_a_beam(stars: bool) -> None:
+def test_beam_finds_the_true_map_of_aces3(stars: bool) -> None:
     (known,) = truth.aces3([700], DRIFTING)
     theory = Theory.topological() if stars else Theory(star="none")
     assert any(truth.is_true(ssh_map, known) for ssh_map in maps_of(known.trace, theory, 16))
 
 
-def test_a_causal_map_needs_no_places() -> None:
+def test_beam_finds_the_true_causal_map() -> None:
     (known,) = truth.mazes(3, 40, [700], DRIFTING)
     assert truth.is_true(maps_of(known.trace, Theory.causal(), 4)[0], known)
 
 
-def test_gateways_at_any_angles(tmp_path: Path) -> None:
+def test_beam_finds_the_true_map_with_gateways_at_any_angles(tmp_path: Path) -> None:
     """A room with one gateway ends a path, so the axioms force some returns."""
     plan = plan_of(tmp_path, xml())
     known = truth.with_truth("ring", tour(plan, 60, 5, DRIFTING.odometry))
@@ -65,7 +65,7 @@ def test_gateways_at_any_angles(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("looks", [150, 400])
-def test_a_beam_that_did_not_end_begins_a_map(looks: int) -> None:
+def test_interrupted_beam_gives_a_map_with_new_dstates_for_the_rest(looks: int) -> None:
     """The steps that the beam reached are joined, and all others are new."""
     (known,) = truth.mazes(5, 120, [700], DRIFTING)
     search = Search(known.trace, Theory(star="none"))
@@ -88,7 +88,7 @@ def test_a_beam_that_did_not_end_begins_a_map(looks: int) -> None:
     assert check(known.trace, search.best, search.theory) == ()
 
 
-def test_a_dstate_that_leads_elsewhere_is_no_dead_end() -> None:
+def test_narrow_beam_tells_dstates_at_one_place_apart() -> None:
     """The robot drives along a corridor twice, and stops halfway at the second time only.
 
     Both times it begins at one place, and nothing but the next displacement shows that it begins at
@@ -143,7 +143,7 @@ def test_all_maps_of_a_beam_satisfy_the_axioms(data: st.DataObject) -> None:
         assert check(trace, ssh_map, theory) == ()
 
 
-def test_a_search_that_is_stopped_gives_the_map_of_least_cost() -> None:
+def test_stopped_search_returns_the_true_map_of_the_beam() -> None:
     """Without the beam, the best map after this time has more places.
 
     The limit is of processor time, so that other processes do not shorten the search.
@@ -155,7 +155,7 @@ def test_a_search_that_is_stopped_gives_the_map_of_least_cost() -> None:
     assert truth.is_true(solution.maps[0], known)
 
 
-def test_a_broad_beam_and_a_small_misfit_make_sure() -> None:
+def test_broad_beam_and_small_misfit_raise_confidence() -> None:
     (known,) = truth.mazes(3, 30, [701], DRIFTING)
     weighing = Search(known.trace)._weighing
     assert weighing is not None
@@ -170,7 +170,7 @@ def test_a_broad_beam_and_a_small_misfit_make_sure() -> None:
     assert f"(not proven: no map costs less than {least} % of this one)" in weighed.sentence
 
 
-def test_a_cheaper_map_that_breaks_axioms_makes_unsure() -> None:
+def test_cheaper_map_that_breaks_axioms_lowers_confidence() -> None:
     """Travels lead around a ring without a turn, and a path is no circle."""
     ring = Trace.from_steps("abcdabcd", ["travel"] * 7, displacements=[(10, 0, math.pi / 2)] * 7)
     weighed = solve(ring, time_limit=5).weighed
@@ -180,14 +180,14 @@ def test_a_cheaper_map_that_breaks_axioms_makes_unsure() -> None:
     assert "a map that breaks axioms costs" in weighed.sentence
 
 
-def test_an_action_cannot_lead_to_two_dstates() -> None:
+def test_completion_refuses_an_action_that_leads_to_two_dstates() -> None:
     trace = Trace.from_steps("abab", ["travel", "around", "travel"])
     theory = settle(trace, Theory(boundary="none")).theory
     assert completed(trace, theory, [0, 1, 0, 2], [0, 1, 1], [0.0, 0.0, math.pi]) is None
 
 
 @pytest.mark.parametrize("seed", [203])
-def test_the_cost_of_a_hypothesis_with_floors_is_that_of_its_map(seed: int) -> None:
+def test_beam_cost_with_floors_equals_the_cost_of_the_map(seed: int) -> None:
     """The headings err by degrees. So equations that stay linear would miss by many nats."""
     (known,) = floors.towers(2, 60, [seed])
     problem = settle(known.trace, Theory())
@@ -217,14 +217,14 @@ def test_stars_and_headings_at_a_place_fit(stars: str, facing: list[float], fits
     assert (completed(trace, theory, [0, 1], [0, 0], facing) is not None) == fits
 
 
-def test_a_path_is_no_circle() -> None:
+def test_completion_refuses_a_circular_path() -> None:
     trace = Trace.from_steps("abca", ["travel", "travel", "travel"])
     theory = settle(trace, Theory(boundary="none", star="none")).theory
     assert completed(trace, theory, [0, 1, 2, 0], [0, 1, 2], [0.0] * 3) is None
     assert completed(trace, theory, [0, 1, 2, 3], [0, 1, 2, 3], [0.0] * 4) is not None
 
 
-def test_two_steps_that_clash_end_the_search_at_once() -> None:
+def test_beam_stops_at_once_if_two_steps_clash() -> None:
     """After the turn at step 1, the place has other openings."""
     cross, three = [0.0, 90.0, 180.0, 270.0], [0.0, 120.0, 240.0]
     go, left = (5.0, 0.0, 0.0), (0.0, 0.0, math.pi / 2)

@@ -25,7 +25,7 @@ from ssh_abduction import Trace
 
 
 @pytest.mark.parametrize("jumps", [False, True])
-def test_the_truth_is_right_and_costs_its_states_and_faults(jumps: bool) -> None:
+def test_true_explanation_costs_its_states_and_faults(jumps: bool) -> None:
     for make, seed in product(
         (
             lambda s: machine(s, jumps=jumps),
@@ -42,14 +42,14 @@ def test_the_truth_is_right_and_costs_its_states_and_faults(jumps: bool) -> None
         assert not Explanation.of(case.walk.trace, range(len(case.walk.trace))).is_true(case)
 
 
-def test_labels_are_laid_over_the_trace_anew() -> None:
+def test_refined_labels_merge_mistaken_labels() -> None:
     """At first a wrong view, and a step with a mistaken label, have labels of their own."""
     case = rectangle_of_five(0, steps=100, wrong=2)
     labels = [f"odd {t}" if t in (*case.wrong, 50) else s for t, s in enumerate(case.walk.truth)]
     assert refined(case.walk.trace, labels).is_true(case)
 
 
-def test_where_the_wrong_view_is_the_label_does_not_count() -> None:
+def test_label_at_a_misread_step_is_not_judged() -> None:
     walk = Walk(Trace.from_steps("abababab", ["on"] * 7), (0, 1) * 4)
     case = misread(Walk(Trace.from_steps("ab" * 10, ["on"] * 19), (0, 1) * 10), 1, 0)
     labels = [2 if t in case.wrong else s for t, s in enumerate(case.walk.truth)]
@@ -59,7 +59,9 @@ def test_where_the_wrong_view_is_the_label_does_not_count() -> None:
 
 
 @pytest.mark.parametrize("name", PEERS)
-def test_a_peer_finds_the_faults_of_a_rectangle(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_peer_finds_the_faults_of_a_rectangle(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     if not PEERS[name].installed:
         pytest.skip(f"{name} is not installed")
     monkeypatch.setattr(fault_peers, "CLONES", (3,))
@@ -68,7 +70,7 @@ def test_a_peer_finds_the_faults_of_a_rectangle(name: str, monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("case", [sized(3, 5, 4, 100, jumps=1), sized(3, 5, 4, 100, wrong=1)])
-def test_maxsat_needs_no_more_faults_than_the_truth(case: Case) -> None:
+def test_maxsat_finds_at_most_as_many_faults_as_the_truth(case: Case) -> None:
     if not PEERS["RC2"].installed:
         pytest.skip("python-sat is not installed")
     explanation = PEERS["RC2"].explain(case, 10)
@@ -78,7 +80,7 @@ def test_maxsat_needs_no_more_faults_than_the_truth(case: Case) -> None:
 
 
 @pytest.mark.slow
-def test_a_cell_says_what_came_of_it_and_ends_at_its_limit() -> None:
+def test_benchmark_cell_has_its_result_and_ends_at_the_limit() -> None:
     found = faults.measured("rectangle n=400, 4 jumps", faults.TOLD, 500, 20, 4096)
     assert (
         found.items()
@@ -97,7 +99,7 @@ def test_a_cell_says_what_came_of_it_and_ends_at_its_limit() -> None:
     assert (late["status"], late["cpu"]) == ("timeout", 0.2)
 
 
-def test_a_row_of_the_table() -> None:
+def test_fault_table_row_shows_its_cells() -> None:
     family = next(iter(FAMILIES))
     common = {
         "family": family,

@@ -38,12 +38,12 @@ def test_the_beam_model_sums_to_one(expected: float) -> None:
     )
 
 
-def test_the_beam_model_expects_what_is_there_and_people_before_it() -> None:
+def test_beam_model_prefers_the_wall_then_people_before_it() -> None:
     log = BeamModel().log_likelihood(np.array([3.0, 1.0, 5.0]), np.array(3.0))
     assert log[0] > log[1] > log[2]
 
 
-def test_the_ranges_of_a_grid_are_those_of_the_world() -> None:
+def test_ranges_of_a_grid_equal_those_of_the_world() -> None:
     """To within two cells, away from walls. A beam along a wall meets a cell of it too early."""
     chosen = np.array([i for i, at in enumerate(grid().centres) if WORLD.clearance(*at) > 0.3])
     exact = Laser().exact(WORLD, np.column_stack([grid().centres[chosen], np.zeros(len(chosen))]))[
@@ -55,7 +55,7 @@ def test_the_ranges_of_a_grid_are_those_of_the_world() -> None:
     assert grid().free.sum() == pytest.approx(4 * 2 / 0.1**2, rel=0.1)
 
 
-def test_the_histogram_is_brute_force_bayes() -> None:
+def test_histogram_filter_equals_brute_force_bayes() -> None:
     """A tiny grid. Its belief is computed again by a sum over all pairs of poses, each with a
     Gaussian of the displacement."""
     tiny = Grid.of(WORLD, 0.5)
@@ -128,7 +128,7 @@ def _brute_likelihood(tiny: Grid, model: BeamModel, pose: int, image: np.ndarray
 
 
 @pytest.mark.parametrize("kind", [Histogram, Particles])
-def test_a_robot_that_is_localised_stays_so_and_one_that_is_carried_is_found(kind: type) -> None:
+def test_filters_track_a_robot_and_find_a_kidnapped_one(kind: type) -> None:
     """In a room that is not symmetric, along a square, and then from somewhere else."""
     world = replace(
         WORLD,
@@ -156,7 +156,7 @@ def test_a_robot_that_is_localised_stays_so_and_one_that_is_carried_is_found(kin
         assert belief.mass((0.3, 0.3, 0.0), 0.2, 0.1) < 0.05
 
 
-def test_what_looks_alike_stays_undecided() -> None:
+def test_histogram_keeps_both_ends_of_a_symmetric_room() -> None:
     """In a plain rectangle each end keeps half of the belief, however long the robot drives."""
     world = rectangle(0.0).world
     belief = Histogram(Grid.of(world))
@@ -173,7 +173,7 @@ def test_what_looks_alike_stays_undecided() -> None:
     "make",
     [lambda: rectangle(0.03), taylor_hall, lambda: comb(3), lambda: ring(True), lambda: maze(3, 1)],
 )
-def test_a_scene_is_explored_and_its_moves_lead_where_they_say(make: object) -> None:
+def test_scene_route_tries_all_moves_and_returns_to_its_start(make: object) -> None:
     scene: Scene = make()  # type: ignore[operator]
     start, route = scene.explore
     here, tried = start, set()
@@ -190,7 +190,7 @@ def test_a_scene_is_explored_and_its_moves_lead_where_they_say(make: object) -> 
     ] == at[1:]
 
 
-def test_localised_means_sure_and_right_for_five_steps() -> None:
+def test_localised_means_five_sure_and_right_steps() -> None:
     def judged(good: str) -> Judged:
         return Judged(
             "", tuple(c in "ra" for c in good), tuple(c in "sa" for c in good), 0, 0, 0.0, 0.0
@@ -204,7 +204,7 @@ def test_localised_means_sure_and_right_for_five_steps() -> None:
 
 
 @pytest.mark.slow
-def test_a_run_compares_all_methods_and_can_be_saved(
+def test_grid_benchmark_compares_all_methods_and_is_saved(
     monkeypatch: pytest.MonkeyPatch, tmp_path: object, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(grid_localisation, "STEPS", 4)

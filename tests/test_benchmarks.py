@@ -54,7 +54,7 @@ def tiny(seed: int) -> Trace:
 
 
 @pytest.mark.parametrize("name", PEERS)
-def test_a_peer_explains_the_trace_with_as_few_states_as_it_promises(name: str) -> None:
+def test_each_peer_finds_as_few_states_as_it_promises(name: str) -> None:
     peer = PEERS[name]
     if not peer.installed:
         pytest.skip(f"{name} is not installed")
@@ -70,14 +70,14 @@ def test_the_plain_encoding_agrees_with_the_solver() -> None:
         assert PEERS["plain.lp"].find(tiny(seed)).states(tiny(seed)) == fewest(tiny(seed)), seed
 
 
-def test_a_machine_that_shows_something_else_is_found_out() -> None:
+def test_states_refuses_a_machine_with_other_views() -> None:
     trace = Trace.from_steps(["a", "b", "a"], ["travel", "travel"])
     right = Machine(0, lambda state, _: 1 - state, lambda state: "ab"[state])
     wrong = Machine(0, lambda state, _: min(state + 1, 1), lambda state: "ab"[state])
     assert (right.states(trace), wrong.states(trace)) == (2, None)
 
 
-def test_words_ask_for_the_view_bit_by_bit() -> None:
+def test_peer_words_ask_for_a_view_bit_by_bit() -> None:
     words = Words(Trace.from_steps(["a", "b", "c", "b"], ["travel", "right", "travel"]))
     assert [list(words.at(t)) for t in (0, 2)] == [
         [([], False), (["2"], False)],
@@ -85,14 +85,14 @@ def test_words_ask_for_the_view_bit_by_bit() -> None:
     ]
 
 
-def test_small_traces_are_those_of_the_tables() -> None:
+def test_conformance_cases_hold_the_table_traces() -> None:
     found = conformance.cases()
     assert len(found) > 200
     assert {theory.level for _, theory in found} == {"causal", "topological"}
     assert 0 < conformance.milliseconds(*found[0]) < 1000
 
 
-def test_a_cell_has_all_its_fields() -> None:
+def test_benchmark_cell_has_all_fields() -> None:
     ours = bench.run("ssh-abduction", SUITE["full aces3"], 0, 100, 4096)
     assert ours.keys() == ALWAYS | MEASURED | OURS
     assert (ours["status"], ours["dstates"], ours["proven"], ours["images"], ours["theory"]) == (
@@ -107,7 +107,7 @@ def test_a_cell_has_all_its_fields() -> None:
     assert (theirs["status"], theirs["dstates"], theirs["true_dstates"]) == ("ok", 4, 8)
 
 
-def test_a_cell_ends_at_its_limit() -> None:
+def test_benchmark_cell_ends_at_its_limit() -> None:
     late = bench.run("plain.lp", SUITE["maze 5x5 n=1600"], 0, 0.5, 4096)
     assert (late["status"], late["seconds"]) == ("timeout", 0.5)
     assert 0 < late["cpu"] < 1
@@ -161,7 +161,9 @@ def results(*cells: dict[str, Any]) -> dict[str, Any]:
         ),
     ],
 )
-def test_a_row_of_the_table(ours: dict[str, Any], theirs: dict[str, Any], row: str) -> None:
+def test_benchmark_table_row_shows_its_cells(
+    ours: dict[str, Any], theirs: dict[str, Any], row: str
+) -> None:
     found = table.times(
         results(
             cell("ssh-abduction", **{"memory": 7, "dstates": 4, "proven": True, **ours}),
@@ -171,7 +173,7 @@ def test_a_row_of_the_table(ours: dict[str, Any], theirs: dict[str, Any], row: s
     assert row in re.sub(" +", " ", found)
 
 
-def test_many_seeds_show_the_median_and_how_many_were_solved() -> None:
+def test_table_shows_the_median_and_number_solved_of_many_seeds() -> None:
     seconds = (1, 3, 10)
     cells = [
         cell(
@@ -188,7 +190,7 @@ def test_many_seeds_show_the_median_and_how_many_were_solved() -> None:
     assert "3.0 s (2 of 3)" in table.times(results(*cells))
 
 
-def test_answers_that_contradict_each_other_are_named() -> None:
+def test_contradicting_benchmark_answers_are_named() -> None:
     proven, fewer, bound = (
         cell("a", dstates=4, proven=True),
         cell("b", dstates=3, proven=False),
@@ -206,7 +208,7 @@ def test_answers_that_contradict_each_other_are_named() -> None:
 
 
 @pytest.mark.parametrize("path", STORED, ids=lambda path: path.name)
-def test_a_stored_run_has_its_fields_and_no_contradiction(path: Path) -> None:
+def test_stored_run_has_all_fields_and_no_contradiction(path: Path) -> None:
     run = json.loads(path.read_text())
     assert run.keys() == {"date", "limit", "memory", "seeds", "machine", "packages", "cells"}
     assert run["machine"].keys() == {"cpu", "cores", "memory", "system", "python"}
@@ -236,7 +238,7 @@ def stored(page: str, name: str) -> Path:
 
 
 @pytest.mark.parametrize("name", readme.PAGES)
-def test_each_table_shows_a_stored_run(name: str) -> None:
+def test_each_table_in_docs_equals_its_stored_run(name: str) -> None:
     text = readme.PAGES[name].read_text()
     run = json.loads(stored(text, name).read_text())
     assert readme.rewritten(text, name, run, stored(text, name)) == text
@@ -255,13 +257,13 @@ def test_each_table_shows_a_stored_run(name: str) -> None:
         ("dstates", {}, {"dstates": None}, 1),
     ],
 )
-def test_what_a_speedup_gains(
+def test_pruning_ratio_of_a_speedup(
     measure: str, base: dict[str, Any], without: dict[str, Any], ratio: float
 ) -> None:
     assert pruning.ratio(measure, 10, base, without) == ratio
 
 
-def test_a_speedup_stays_that_gains_on_two_families() -> None:
+def test_speedup_stays_if_it_gains_on_two_families() -> None:
     assert pruning.verdict([[1, 1.5, 9], [1, 1, 1], [math.inf, 2, 0]]) == "stays"
     assert pruning.verdict([[1, 1.4, 9], [1, 1, 1], [math.inf, 2, 0]]) == "**goes**"
     assert pruning.verdict([[1, 1.4, 9], [1, 1, 1]]) == "not measured yet"
@@ -276,14 +278,14 @@ def test_each_speedup_is_tried_on_three_families() -> None:
     assert {trial.family for trial in pruning.TRIALS} <= set(INSTANCES)
 
 
-def test_seconds_of_the_processor_are_what_a_search_is_limited_by() -> None:
+def test_benchmark_limit_counts_processor_time() -> None:
     late = bench.run("ssh-abduction", SUITE["maze 8x8 n=4000"], 0, 0.5, 4096, "cpu")
     assert late["status"] == "timeout"
     assert late["seconds"] == pytest.approx(late["cpu"], abs=0.1)
     assert 0.3 < late["seconds"] < 5
 
 
-def test_following_is_no_speedup_of_a_user_and_can_be_left_out() -> None:
+def test_following_is_switched_off_though_users_cannot() -> None:
     script = (
         "from cell import all_but; from ssh_abduction.solver.engines.small_maps import SmallMaps "
         "as E; print(all_but('following'), list(E.from_beginning(E)))"
@@ -299,7 +301,7 @@ def test_following_is_no_speedup_of_a_user_and_can_be_left_out() -> None:
     assert said.stdout == f"{Speedups()} []\n"
 
 
-def test_the_picture_of_growth_is_drawn_from_the_run(tmp_path: Path) -> None:
+def test_growth_picture_is_drawn_from_the_stored_run(tmp_path: Path) -> None:
     picture = tmp_path / "growth.png"
     import plot  # loads matplotlib
 

@@ -118,7 +118,7 @@ def test_notched_rectangle(
         assert triple(rectangle(6), theory) == (*at_six, 1)
 
 
-def test_stars_separate_what_views_do_not() -> None:
+def test_stars_tell_places_apart_that_views_do_not() -> None:
     """The ends of two travels look alike; their stars have one opening and two."""
     stars = [(1, 0, 0, 0), (0, 0, 1, 0), (1, 0, 0, 0), (0, 1, 1, 0), (1, 1, 0, 0)]
     trace = Trace.from_steps("aaaaa", ["travel", "around", "travel", "right"], stars=stars)
@@ -128,7 +128,7 @@ def test_stars_separate_what_views_do_not() -> None:
     )
 
 
-def test_frames_know_headings() -> None:
+def test_frames_tell_headings_apart() -> None:
     """After a turn right the opening ahead is on the left. The pattern is the same, and fits no
     other heading."""
     ahead, left, back, right = (1, 0, 0, 0), (0, 0, 0, 1), (0, 0, 1, 0), (0, 1, 0, 0)
@@ -153,7 +153,7 @@ def test_every_map_is_listed_once(theory: Theory) -> None:
         assert len(keys) == len(set(keys))
 
 
-def test_key_numbers_by_first_visit() -> None:
+def test_key_numbers_dstates_by_first_visit() -> None:
     dstates = (
         DState(0, "b", 5, 8, -1),
         DState(1, "a", 9, 8, -1),

@@ -56,23 +56,23 @@ def driven(
 
 
 @pytest.mark.parametrize("factor", [0.1, 1.0, 6.0])
-def test_closures_tell_how_precise_a_track_is(factor: float) -> None:
+def test_calibration_estimates_the_precision_of_a_track(factor: float) -> None:
     found = [factor_of(*driven(factor, seed)) for seed in range(10)]
     assert factor / 2 <= np.median(found) <= factor * 2
     assert factor / 4 < min(found) <= max(found) < factor * 4
 
 
-def test_a_steady_drift_is_no_part_of_the_covariances() -> None:
+def test_calibration_ignores_a_steady_drift() -> None:
     found = [factor_of(*driven(1.0, seed, drift=0.0005)) for seed in range(10)]
     assert np.median(found) == pytest.approx(1.0, rel=0.5)
 
 
-def test_a_wrong_closure_counts_little() -> None:
+def test_one_wrong_closure_hardly_changes_the_calibration() -> None:
     right, one_wrong = (factor_of(*driven(0.1, seed=3, wrong=wrong)) for wrong in (0, 1))
     assert one_wrong <= 2 * right
 
 
-def test_a_track_without_closures_stays_as_it_is() -> None:
+def test_track_without_closures_keeps_its_covariances() -> None:
     track, visits, closings = driven(4.0, seed=0)
     assert (calibrated(track, visits, []).covariances == track.covariances).all()
     assert (calibrated(track, visits, closings).covariances[1, 0, 0]) > STATED[0] ** 2

@@ -32,7 +32,7 @@ def rows(tree: ET.Element) -> list[list[str]]:
     return [["".join(cell.itertext()) for cell in row] for row in tree.iter("tr")]
 
 
-def test_a_solution_shows_the_first_map_and_what_all_share() -> None:
+def test_card_of_a_solution_shows_its_first_map_and_backbone() -> None:
     solution = aces.solution()
     tree, text = shown(solution)
     assert "optimal: 19 dstates, 10 places, 4 paths; 4 minimal maps" in text
@@ -46,7 +46,7 @@ def test_a_solution_shows_the_first_map_and_what_all_share() -> None:
     assert len(solution._repr_html_()) < 60_000
 
 
-def test_a_map_shows_its_dstates() -> None:
+def test_card_of_a_map_lists_its_dstates() -> None:
     (ssh_map,) = solve(rectangle(20)).maps
     tree, text = shown(ssh_map)
     assert text.startswith("SSHMap: 8 dstates, 4 places, 4 paths; 21 steps")
@@ -55,7 +55,7 @@ def test_a_map_shows_its_dstates() -> None:
     assert len(rows(tree)) == 9
 
 
-def test_a_trace_shows_its_first_steps() -> None:
+def test_card_of_a_trace_lists_its_first_steps() -> None:
     tree, text = shown(ACES)
     assert rows(tree)[0] == ["step", "view", "star", "action"]
     assert rows(tree)[1] == ["0", "open-ahead-right-back", "1, 1, 1, 0", "travel"]
@@ -88,7 +88,7 @@ def test_a_trace_shows_its_first_steps() -> None:
         (rectangle(20), {"theory": Theory.causal().replace(misread=1.5)}, "optimal: 4 dstates", 1),
     ],
 )
-def test_every_kind_of_answer_is_shown(
+def test_every_kind_of_answer_has_a_card(
     trace: Trace, choices: dict[str, Any], said: str, drawn: int
 ) -> None:
     solution = solve(trace, **choices)
@@ -97,7 +97,7 @@ def test_every_kind_of_answer_is_shown(
     assert len(list(tree.iter(f"{SVG}svg"))) == drawn
 
 
-def test_an_unknown_answer_shows_the_best_map_of_the_first_steps() -> None:
+def test_card_of_an_unknown_answer_shows_the_map_of_a_prefix() -> None:
     search = Search(ACES)
     search._parts.known.partial = solve(ACES[:10])[0]
     text = shown(search.solution())[1]
@@ -105,7 +105,7 @@ def test_an_unknown_answer_shows_the_best_map_of_the_first_steps() -> None:
     assert "the best map of the first 10 steps:" in text
 
 
-def test_to_show_a_solution_takes_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_card_of_a_solution_starts_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
     solution = aces.solution(max_maps=2)
     monkeypatch.setattr(
         "ssh_abduction.solver.backbone.prove_backbone", lambda *_: pytest.fail("it searched")
@@ -113,7 +113,7 @@ def test_to_show_a_solution_takes_no_search(monkeypatch: pytest.MonkeyPatch) -> 
     assert "at least 2 minimal maps" in shown(solution)[1]
 
 
-def test_what_is_said_of_faults_and_of_displacements() -> None:
+def test_cards_show_faults_and_displacements() -> None:
     seen = [f"v{t % 4}" if t != 9 else "v0" for t in range(25)]
     trace = Trace.from_steps(seen, ["right", "travel"] * 12)
     assert (
@@ -129,7 +129,7 @@ def test_what_is_said_of_faults_and_of_displacements() -> None:
     )
 
 
-def test_nothing_that_a_trace_says_becomes_html() -> None:
+def test_cards_escape_html_in_texts_of_a_trace() -> None:
     trace = Trace.from_steps(
         [SCRIPT, "b", SCRIPT],
         [{"name": SCRIPT, "kind": "travel"}, "around"],
@@ -145,7 +145,7 @@ def test_nothing_that_a_trace_says_becomes_html() -> None:
         assert not list(tree.iter("script"))
 
 
-def test_a_large_map_is_not_drawn_and_its_table_is_cut() -> None:
+def test_card_of_a_large_map_has_no_drawing_and_a_cut_table() -> None:
     dstates = tuple(DState(i, f"v{i}") for i in range(DRAWN + 1))
     large = SSHMap(
         tuple(range(DRAWN + 1)), dstates, tuple((i, "travel", i + 1) for i in range(DRAWN))

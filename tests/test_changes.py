@@ -126,7 +126,7 @@ def solved_as(trace: Trace, theory: Theory, costs: dict[Key, tuple[float, ...]])
 
 @settings(max_examples=15)
 @given(st.data())
-def test_the_solver_lists_the_maps_with_changes_of_the_brute_force(data: st.DataObject) -> None:
+def test_maps_with_changes_equal_the_brute_force(data: st.DataObject) -> None:
     trace = data.draw(drives_with_stars(), label="trace")
     price = data.draw(st.sampled_from([0.5, 1.0, 2.0]), label="price")
     boundary: Any = data.draw(st.sampled_from(["none", "strict"]), label="boundary")
@@ -157,9 +157,7 @@ def drives_at_bearings(draw: st.DrawFn) -> Trace:
 
 @settings(max_examples=6)
 @given(drives_at_bearings(), st.sampled_from([0.5, 1.0, 2.0]))
-def test_maps_with_changes_at_bearings_are_those_of_the_brute_force(
-    trace: Trace, price: float
-) -> None:
+def test_maps_with_changes_at_bearings_equal_the_brute_force(trace: Trace, price: float) -> None:
     theory = Theory(changed=price, star="gateways", boundary="none")
     on = frozenset(settle(trace, theory).theory.axioms)
     bare = theory.replace(changed=0.0, star="none")
@@ -174,7 +172,7 @@ def test_maps_with_changes_at_bearings_are_those_of_the_brute_force(
     solved_as(trace, theory, costs)
 
 
-def test_a_change_has_a_name_and_a_place(
+def test_change_of_a_gateway_has_a_sentence_and_a_place(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     solution = solve([MONDAY, TUESDAY], Theory(changed=1.5))
@@ -203,7 +201,7 @@ def test_a_change_has_a_name_and_a_place(
         SSHMap.from_dict(data)
 
 
-def test_explain_says_what_changed_and_what_it_costs(
+def test_explain_names_a_change_and_its_cost(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Without changes the stars of place 0 differ, so no two steps are joined."""
@@ -226,14 +224,14 @@ def test_explain_says_what_changed_and_what_it_costs(
     assert json.loads(capsys.readouterr().out)["changes"] == [*said]
 
 
-def test_without_a_price_nothing_changes() -> None:
+def test_no_changes_without_a_price() -> None:
     (ssh_map, *_) = solve([MONDAY, TUESDAY]).maps
     assert len(ssh_map.dstates) == 8
     (ssh_map,) = solve([MONDAY, TUESDAY[:1]], Theory(changed=1.5)).maps[:1]
     assert [fault.kind for fault in ssh_map.faults] in ([], ["changed"])
 
 
-def test_nothing_changes_within_a_drive() -> None:
+def test_no_changes_within_one_drive() -> None:
     """The place of step 0 has a way to the right, and that of step 3 has none."""
     trace = replace(MONDAY, steps=(*MONDAY.steps[:3], replace(MONDAY.steps[3], star=(0, 0, 1, 0))))
     for changed in (0.0, 1.5):
@@ -271,7 +269,9 @@ def test_the_checker_judges_changes(faults: tuple[Fault, ...], said: str) -> Non
         ({"changed": 1.5, "star": "none"}, "read by star=frame or gateways, got"),
     ],
 )
-def test_theories_that_know_no_gateways_are_refused(theory: dict[str, Any], said: str) -> None:
+def test_changes_are_refused_for_theories_without_gateways(
+    theory: dict[str, Any], said: str
+) -> None:
     with pytest.raises(TheoryError, match=said):
         solve([MONDAY, TUESDAY], Theory(**theory))
     with pytest.raises(TheoryError, match="got level=causal"):
@@ -279,7 +279,7 @@ def test_theories_that_know_no_gateways_are_refused(theory: dict[str, Any], said
 
 
 @pytest.mark.slow
-def test_the_beam_finds_changes_of_drives_with_displacements() -> None:
+def test_beam_finds_changes_between_drives_with_displacements() -> None:
     """On Tuesday there is no way to the right at the first end of a corridor.
 
     The beam is the only engine: the trace is longer than the readable encodings take.
@@ -309,7 +309,7 @@ def test_the_beam_finds_changes_of_drives_with_displacements() -> None:
     assert check(solution.trace, ssh_map, Theory(changed=0.5)) == ()
 
 
-def test_the_beam_finds_two_changes_where_a_drive_starts() -> None:
+def test_beam_finds_two_changes_at_the_start_of_a_drive() -> None:
     """On Tuesday the first end of a corridor looks like the other end, as two ways are closed."""
     there = ["travel", "travel", "travel", "around"]
     moved = [(5.0, 0.0, 0.0)] * 3 + [(0.0, 0.0, math.pi)]
@@ -342,7 +342,7 @@ def at_bearings(name: str, stars: list[Any]) -> Trace:
     return Trace.from_steps("abcd", ["travel", "around", "travel"], stars=stars, name=name)
 
 
-def test_a_change_at_a_bearing_has_a_name_and_a_place(tmp_path: Path) -> None:
+def test_change_at_a_bearing_has_a_sentence_and_a_place(tmp_path: Path) -> None:
     """Gateways of three drives: one closes on Tuesday, and opens again on Wednesday."""
     closed = [(0, 120.5), (180,), (0,), (180, 300)]
     names = "monday", "tuesday", "wednesday"
@@ -375,7 +375,7 @@ def test_a_change_at_a_bearing_has_a_name_and_a_place(tmp_path: Path) -> None:
     assert {"gateway_frame"} <= {v.axiom for v in check(trace, ssh_map, Theory())}
 
 
-def test_a_path_leads_on_by_a_gateway_that_is_closed_on_a_drive() -> None:
+def test_path_goes_through_a_gateway_that_is_closed_on_one_drive() -> None:
     """The second drive starts where the gateway ahead is closed, and comes by it later."""
     go = ["around", "travel", "travel"]
     monday = Trace.from_steps("xabc", go, stars=[(180,), (0,), (0, 180), (180,)], name="monday")
@@ -386,7 +386,7 @@ def test_a_path_leads_on_by_a_gateway_that_is_closed_on_a_drive() -> None:
     assert [fault.bearing for fault in ssh_map.faults] == [0]
 
 
-def test_three_changes_at_one_place_are_too_many() -> None:
+def test_three_changes_do_not_join_two_places() -> None:
     four = at_bearings("monday", [(0, 60, 120, 240), *THREE[1:3], (60, 180, 240, 300)])
     one = at_bearings("tuesday", [(0,), *THREE[1:3], (180,)])
     (ssh_map, *_) = solve([four, one], Theory(changed=0.1, star="gateways")).maps

@@ -342,7 +342,7 @@ def test_every_axiom_has_a_check() -> None:
     assert list(AXIOMS) == AXIOM_NAMES
 
 
-def test_what_is_said_of_a_map_does_not_depend_on_the_maps_before() -> None:
+def test_verdict_on_a_map_does_not_depend_on_earlier_maps() -> None:
     """Dstates that differ only in their heading are equal, but fit other gateways."""
     of_gateways = [name for name in AXIOM_NAMES if name.startswith("gateway")]
     for name in (*of_gateways, *reversed(of_gateways)):
@@ -350,7 +350,7 @@ def test_what_is_said_of_a_map_does_not_depend_on_the_maps_before() -> None:
 
 
 @pytest.mark.parametrize("name", AXIOM_NAMES)
-def test_a_map_that_breaks_an_axiom_is_told_its_name(name: str) -> None:
+def test_checker_names_the_axiom_that_a_map_breaks(name: str) -> None:
     broken = BROKEN[name]
     found = broken.check()
     assert names(found) == {name} | broken.also
@@ -362,7 +362,7 @@ def test_a_map_that_breaks_an_axiom_is_told_its_name(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", AXIOM_NAMES)
-def test_an_axiom_left_out_is_not_checked(name: str) -> None:
+def test_checker_ignores_an_axiom_that_is_left_out(name: str) -> None:
     broken = BROKEN[name]
     found = broken.check(broken.theory.replace(without=(name,)))
     assert names(found) <= broken.also
@@ -371,18 +371,18 @@ def test_an_axiom_left_out_is_not_checked(name: str) -> None:
 
 
 @pytest.mark.parametrize("left_out", ["travel_orders", "order_asymmetric", "order_transitive"])
-def test_a_ring_needs_all_axioms_of_the_order(left_out: str) -> None:
+def test_circular_path_is_allowed_without_one_order_axiom(left_out: str) -> None:
     assert BROKEN["order_transitive"].check(TOPOLOGICAL.replace(without=(left_out,))) == ()
 
 
 @pytest.mark.parametrize("order", ["partial", "total"])
-def test_a_ring_is_one_in_both_kinds_of_order(order: str) -> None:
+def test_circular_path_is_refused_in_total_and_partial_order(order: str) -> None:
     found = BROKEN["order_transitive"].check(TOPOLOGICAL.replace(path_order=order))
     assert names(found) == {"travel_orders", "order_asymmetric", "order_transitive"}
     assert {v.steps for v in found if v.axiom == "order_transitive"} == {(0, 1, 2, 3)}
 
 
-def test_the_witness_steps_and_words() -> None:
+def test_checker_message_names_the_witness_steps() -> None:
     (violation,) = BROKEN["deterministic"].check()
     message = "'right' in dstate 0 leads to dstate 1 at step 0, and to dstate 2 at step 2."
     assert violation == Violation("deterministic", (0, 1, 2, 3), message)
@@ -390,7 +390,7 @@ def test_the_witness_steps_and_words() -> None:
 
 @pytest.mark.parametrize("listed", ["021", "201"])
 @pytest.mark.parametrize("order", ["partial", "total"])
-def test_partial_order_is_the_least_one(order: str, listed: str) -> None:
+def test_partial_order_follows_from_travels_only(order: str, listed: str) -> None:
     """A turn at place 2 leads onto path 0 in direction -.
 
     Place 0 is ahead there only if the list decides, and not a travel.
@@ -408,7 +408,7 @@ def test_partial_order_is_the_least_one(order: str, listed: str) -> None:
     assert names(forked.check()) == (broken if (order, listed) == ("total", "021") else set())
 
 
-def test_an_order_that_goes_against_a_travel_is_flagged_in_a_partial_order_too() -> None:
+def test_partial_order_against_a_travel_is_refused() -> None:
     assert names(BROKEN["travel_orders"].check(TOPOLOGICAL.replace(path_order="partial"))) == {
         "travel_orders"
     }
@@ -553,7 +553,7 @@ MUTATIONS = {
 
 
 @pytest.mark.parametrize("name", MUTATIONS)
-def test_a_mutated_map_is_flagged(name: str) -> None:
+def test_checker_refuses_each_mutated_map(name: str) -> None:
     original, mutant, expected = MUTATIONS[name]
     found = check(original.trace, mutant, original.theory)
     assert expected in names(found)
@@ -569,14 +569,14 @@ def test_a_mutated_map_is_flagged(name: str) -> None:
         "a view changed",
     ],
 )
-def test_what_no_axiom_says_is_left_to_coherence(name: str) -> None:
+def test_incoherent_map_breaks_coherence_without_axioms(name: str) -> None:
     original, mutant, _ = MUTATIONS[name]
     bare = original.theory.replace(without=tuple(AXIOM_NAMES))
     assert names(check(original.trace, mutant, bare)) == {COHERENCE}
 
 
 @pytest.mark.parametrize("excused", [(0, 1), ((0,),), ((0, 9),), ((None, None),), (None,)])
-def test_malformed_excuses_are_flagged(excused: tuple[object, ...]) -> None:
+def test_checker_refuses_malformed_excuses(excused: tuple[object, ...]) -> None:
     original = CORRECT["lens, excused"]
     assert COHERENCE in names(check(HALF, replace(original.map, excused=excused), original.theory))
 
@@ -656,7 +656,9 @@ def mutants(draw: st.DrawFn) -> tuple[Case, SSHMap]:
 
 @settings(max_examples=75)
 @given(mutants(), THEORIES | st.none())
-def test_a_mutated_map_never_raises(mutant: tuple[Case, SSHMap], theory: Theory | None) -> None:
+def test_checker_never_raises_on_a_mutated_map(
+    mutant: tuple[Case, SSHMap], theory: Theory | None
+) -> None:
     original, m = mutant
     theory = theory or original.theory
     for violation in check(original.trace, m, theory):
@@ -752,7 +754,7 @@ def listings(trace, labels, views, places, courses) -> Iterator[SSHMap]:
     ],
     ids=["sides and total order", "neither"],
 )
-def test_the_notched_rectangle_has_as_many_maps_as_the_theory_says(
+def test_checker_counts_the_maps_of_the_notched_rectangle(
     theory: Theory, numbers: list[int]
 ) -> None:
     counts = [
@@ -765,7 +767,7 @@ def test_the_notched_rectangle_has_as_many_maps_as_the_theory_says(
     assert counts == numbers
 
 
-def test_a_long_trace_is_checked_in_its_stride() -> None:
+def test_checker_reads_a_long_trace_once() -> None:
     """The checker never walks a corridor of 3,000 places once for each step or pair of places."""
     circuits = 400
     trace = seen("v0 R v1 T v2 R v3 T " * (2 * circuits) + "v0")

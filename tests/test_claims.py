@@ -59,7 +59,7 @@ CHOICES = [
         ("comb", "-n 2"),
     ],
 )
-def test_what_solve_prints_is_true(
+def test_check_accepts_the_claims_of_solve(
     tour: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = str(tmp_path / "trace.jsonl")
@@ -221,7 +221,7 @@ def test_check_names_each_false_claim(
 @pytest.mark.parametrize(
     ("part", "value"), [("chi2", 0.0), ("dof", 0), ("p", 1.0), ("scale", 0.5), ("bend", -1.0)]
 )
-def test_a_false_fit_is_named(
+def test_check_names_a_false_fit(
     part: str, value: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = str(tmp_path / "trace.jsonl")
@@ -239,7 +239,7 @@ def test_a_false_fit_is_named(
         assert f"maps[0].{next(iter(change))}: expected" in out
 
 
-def test_maps_that_are_not_equally_good_are_named(
+def test_check_names_maps_that_are_not_equally_good(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = str(tmp_path / "trace.jsonl")
@@ -256,7 +256,7 @@ def test_maps_that_are_not_equally_good_are_named(
     )
 
 
-def test_a_map_under_other_numbers_is_the_same_map(
+def test_check_recognises_a_renumbered_map(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     data = json.loads(aces.answer())

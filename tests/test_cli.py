@@ -41,7 +41,7 @@ def saved(trace: Trace, folder: Path) -> str:
     return str(path)
 
 
-def test_solve_prints_the_maps_and_what_tells_them_apart(
+def test_solve_prints_the_maps_and_their_differences(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert main(["solve", ACES]) == 0
@@ -51,7 +51,7 @@ def test_solve_prints_the_maps_and_what_tells_them_apart(
     assert "path 0: places" in out
 
 
-def test_json_is_the_contract(solved: Path) -> None:
+def test_json_of_solve_has_the_documented_fields(solved: Path) -> None:
     data = json.loads(solved.read_text())
     assert (data["status"], data["complete"], data["count"], data["steps"]) == (
         "optimal",
@@ -73,7 +73,7 @@ def test_json_is_the_contract(solved: Path) -> None:
     assert [SSHMap.from_dict(m).to_dict() for m in data["maps"]] == data["maps"]
 
 
-def test_a_few_of_many_maps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_max_maps_cuts_the_list(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     route = saved(drive(*TOURS["comb"]), tmp_path)
     flags = [
         "--set",
@@ -89,7 +89,7 @@ def test_a_few_of_many_maps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert (data["count"], len(data["maps"]), data["complete"]) == (5, 5, False)
 
 
-def test_every_field_of_a_theory_is_a_flag(
+def test_set_accepts_every_field_of_a_theory(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     flags = [
@@ -142,7 +142,7 @@ def test_every_field_of_a_theory_is_a_flag(
     assert Theory.from_dict(json.loads(capsys.readouterr().out)["theory"]) == expected
 
 
-def test_an_impossible_trace_says_which_axioms_clash_where(
+def test_solve_names_the_clashing_axioms_and_steps(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     trace = Trace.from_steps("xyabcd", ["right", "travel", "travel", "around", "around"])
@@ -167,7 +167,9 @@ def test_an_impossible_trace_says_which_axioms_clash_where(
     assert {"axiom": "functional_view", "steps": [5]} in data["explanation"]["clashes"]
 
 
-def test_nothing_in_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_solve_without_time_prints_a_sketch_or_unknown(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = saved(drive(*TOURS["comb"]), tmp_path)
     assert main(["solve", path, "--time-limit", "1e-9"]) == 10
     assert capsys.readouterr().out.startswith("feasible (time limit): ")
@@ -178,7 +180,9 @@ def test_nothing_in_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert json.loads(capsys.readouterr().out)["status"] == "unknown"
 
 
-def test_a_map_without_proof(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_solve_prints_a_map_without_proof(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     from test_solver import too_hard
 
     path = saved(too_hard(), tmp_path)
@@ -193,7 +197,7 @@ def test_a_map_without_proof(tmp_path: Path, capsys: pytest.CaptureFixture[str])
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals")
-def test_ctrl_c_prints_what_is_known(tmp_path: Path) -> None:
+def test_ctrl_c_prints_the_maps_found_so_far(tmp_path: Path) -> None:
     path = saved(rectangle(12), tmp_path)
     flags = [
         "--set",
@@ -223,7 +227,7 @@ def test_ctrl_c_prints_what_is_known(tmp_path: Path) -> None:
     assert data["count"] == len(data["maps"]) > 0
 
 
-def test_ctrl_c_while_the_end_is_printed_leaves_it_whole(
+def test_ctrl_c_during_output_leaves_it_complete(
     room: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from ssh_abduction.cli import solve as verb
@@ -238,12 +242,12 @@ def test_ctrl_c_while_the_end_is_printed_leaves_it_whole(
     assert json.loads(capsys.readouterr().out)["complete"]
 
 
-def test_check_accepts_what_solve_found(solved: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_accepts_the_maps_of_solve(solved: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", str(solved), ACES]) == 0
     assert capsys.readouterr().out == "4 of 4 maps satisfy the 27 axioms\n"
 
 
-def test_check_names_the_axiom_that_fails(solved: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_names_the_broken_axiom(solved: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data = json.loads(solved.read_text())
     data["maps"][1]["dstates"][3]["place"] = 0
     solved.write_text(json.dumps(data))
@@ -253,7 +257,9 @@ def test_check_names_the_axiom_that_fails(solved: Path, capsys: pytest.CaptureFi
     assert out.endswith("3 of 4 maps satisfy the 27 axioms\n")
 
 
-def test_check_under_another_theory(solved: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_judges_under_another_theory(
+    solved: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert (
         main(["check", str(solved), ACES, "--theory", "topological", "--set", "next_place=true"])
         == 20
@@ -261,7 +267,7 @@ def test_check_under_another_theory(solved: Path, capsys: pytest.CaptureFixture[
     assert "next_place" in capsys.readouterr().out
 
 
-def test_flags_are_laid_over_the_theory_of_the_file(
+def test_flags_override_the_theory_of_the_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     route = saved(drive(*TOURS["tee"]), tmp_path)
@@ -281,7 +287,7 @@ def test_flags_are_laid_over_the_theory_of_the_file(
         assert message in capsys.readouterr().err
 
 
-def test_a_count_of_one_has_a_singular_noun(
+def test_count_of_one_has_a_singular_noun(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = saved(Trace.from_steps("a", []), tmp_path)
@@ -296,7 +302,7 @@ def test_a_count_of_one_has_a_singular_noun(
     assert "at least 1 dstate: no two of 1 step" in capsys.readouterr().out
 
 
-def test_the_bound_of_an_answer_without_maps(
+def test_check_bound_accepts_an_answer_without_maps(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], solved: Path
 ) -> None:
     bare = tmp_path / "bare.json"
@@ -314,7 +320,7 @@ def test_the_bound_of_an_answer_without_maps(
     assert "at least 19 dstates, if clingo is right" in capsys.readouterr().out
 
 
-def test_check_takes_one_saved_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_reads_one_saved_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     trace = rectangle(8)
     (ssh_map,) = solve(trace).maps
     ssh_map.save(tmp_path / "map.json")
@@ -323,7 +329,7 @@ def test_check_takes_one_saved_map(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "1 of 1 maps satisfy the 21 axioms" in capsys.readouterr().out
 
 
-def test_show(solved: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_show_draws_and_exports_a_map(solved: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["show", str(solved)]) == 0
     assert capsys.readouterr().out.count("path 0: places") == 4
     assert main(["show", str(solved), "--map", "2"]) == 0
@@ -384,7 +390,7 @@ BAD_INPUT = {
 
 @pytest.mark.parametrize("case", BAD_INPUT)
 @pytest.mark.parametrize("verb", ["solve", "facts"])
-def test_bad_input_is_one_line(
+def test_bad_trace_is_a_one_line_error(
     verb: str, case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "t.jsonl"
@@ -409,7 +415,7 @@ def test_bad_input_is_one_line(
     ],
 )
 @pytest.mark.parametrize("verb", ["show", "check"])
-def test_bad_maps_are_one_line(
+def test_bad_maps_file_is_a_one_line_error(
     verb: str, text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "maps.json"
@@ -420,7 +426,7 @@ def test_bad_maps_are_one_line(
     assert re.fullmatch(rf"ssh-abduction: {re.escape(str(path))}[^\n]+\n", captured.err)
 
 
-def test_contradicting_choices_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_contradicting_options_are_a_one_line_error(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["solve", ACES, "--theory", "causal", "--set", "boundary=strict"]) == 1
     assert capsys.readouterr().err.startswith(
         "ssh-abduction: boundary: expected none with level=causal"
@@ -436,7 +442,7 @@ def test_setting_level_causal_gives_the_causal_preset(
     assert re.sub(r"\d\.\d\d s", "", alone) == re.sub(r"\d\.\d\d s", "", capsys.readouterr().out)
 
 
-def test_wrong_usage_is_2(capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_usage_ends_with_exit_code_2(capsys: pytest.CaptureFixture[str]) -> None:
     for words in ([], ["solve"], ["dance"], ["solve", ACES, "--set", "boundary=soft"]):
         with pytest.raises(SystemExit) as stop:
             main(words)
@@ -444,7 +450,7 @@ def test_wrong_usage_is_2(capsys: pytest.CaptureFixture[str]) -> None:
     capsys.readouterr()
 
 
-def test_strange_names_stay_on_their_line(
+def test_control_characters_in_names_are_escaped(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "two\nlines"
@@ -463,7 +469,7 @@ def test_strange_names_stay_on_their_line(
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
-def test_output_that_cannot_be_written(room: str) -> None:
+def test_output_that_cannot_be_written_is_a_one_line_error(room: str) -> None:
     for target in ("> /dev/full", ">&-"):
         done = subprocess.run(
             f"{sys.executable} -m ssh_abduction solve {room} --json {target}",
@@ -496,11 +502,11 @@ def printed_in(letters: str, *words: str, given: bytes = b"") -> bytes:
     return out.buffer.getvalue()  # type: ignore[attr-defined, no-any-return]
 
 
-def test_characters_that_a_terminal_lacks_are_replaced(room: str) -> None:
+def test_unprintable_characters_are_replaced_on_the_terminal(room: str) -> None:
     assert b"right ? 1" in printed_in("ascii", "solve", room)
 
 
-def test_standard_input_and_a_reader_that_leaves(room: str) -> None:
+def test_verbs_read_standard_input_and_survive_a_closed_pipe(room: str) -> None:
     trace = Path(room).read_bytes()
     command = [sys.executable, "-m", "ssh_abduction", "solve", "-"]
     done = subprocess.run(command, input=trace, capture_output=True, check=True)
@@ -552,7 +558,7 @@ def test_progress_shows_on_a_terminal(tmp_path: Path) -> None:
         assert part in text
 
 
-def test_what_programs_read_is_utf_8_on_every_terminal(tmp_path: Path) -> None:
+def test_machine_output_is_utf_8_on_every_terminal(tmp_path: Path) -> None:
     """Otherwise different views would look equal."""
     path = saved(Trace.from_steps(["日本", "中国", "Küche"], ["travel", "travel"]), tmp_path)
 
@@ -584,13 +590,15 @@ def test_what_programs_read_is_utf_8_on_every_terminal(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_wrong_usage(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_usage_names_the_wrong_option(
+    words: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit, match="2"):
         main(words)
     assert message in capsys.readouterr().err
 
 
-def test_errors_say_what_mends_them(
+def test_error_messages_say_how_to_mend_the_input(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], solved: Path
 ) -> None:
     many, none, taken = tmp_path / "many.jsonl", tmp_path / "none.json", tmp_path / "taken"
@@ -623,7 +631,7 @@ def test_errors_say_what_mends_them(
         assert err.count("\n") == 1
 
 
-def test_a_closed_standard_error_is_no_error(
+def test_closed_standard_error_does_not_stop_the_answer(
     room: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Messages are dropped if stderr is closed. The answer is printed."""
@@ -636,7 +644,7 @@ def test_a_closed_standard_error_is_no_error(
     assert "nosuch" not in out
 
 
-def test_an_answer_without_a_map_keeps_the_maps_of_a_file(
+def test_failed_solve_keeps_the_maps_of_the_old_file(
     room: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     clash = Trace.from_steps("xyabcd", ["right", "travel", "travel", "around", "around"])
@@ -652,7 +660,7 @@ def test_an_answer_without_a_map_keeps_the_maps_of_a_file(
         assert maps.read_text() == good
 
 
-def test_an_error_is_json_too(
+def test_error_is_printed_as_json(
     room: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for words in (["solve", "nosuch"], ["check", "nosuch", room], ["solve", room, "-n", "-1"]):

@@ -95,7 +95,7 @@ def test_long_computations_check_the_limits(name: str) -> None:
         LONG[name]()
 
 
-def test_limits_within_limits_are_all_heeded() -> None:
+def test_nested_limits_are_all_checked() -> None:
     calls: list[str] = []
     with heeding(lambda: calls.append("outer")), heeding(lambda: calls.append("inner")):
         look_at_clock()
@@ -104,7 +104,7 @@ def test_limits_within_limits_are_all_heeded() -> None:
     assert len(calls) == 2
 
 
-def test_a_limit_holds_for_the_generator_and_not_for_its_caller() -> None:
+def test_limit_of_a_generator_does_not_reach_its_caller() -> None:
     def made() -> object:
         look_at_clock()
         yield 1
@@ -118,7 +118,9 @@ def test_a_limit_holds_for_the_generator_and_not_for_its_caller() -> None:
 @pytest.mark.parametrize(
     ("steps", "wrong", "stars"), [(60, 0, False), (60, 6, False), (100, 13, False), (60, 6, True)]
 )
-def test_there_is_a_map_when_the_time_is_over(steps: int, wrong: int, stars: bool) -> None:
+def test_solve_returns_a_consistent_map_at_the_time_limit(
+    steps: int, wrong: int, stars: bool
+) -> None:
     """The checker refuses sketches with wrong returns, as displacements contradict them."""
     trace = driven(maze(4, 4, steps=steps, seed=steps, stars=stars).trace, wrong)
     with patch.multiple(fallback, OVERTIME=100.0):
@@ -128,12 +130,14 @@ def test_there_is_a_map_when_the_time_is_over(steps: int, wrong: int, stars: boo
 
 
 @pytest.mark.parametrize(("seconds", "fits"), [(100.0, [True, False]), (0.0, [False, False])])
-def test_only_the_first_map_gets_poses_after_the_limit(seconds: float, fits: list[bool]) -> None:
+def test_only_the_first_map_gets_poses_after_the_time_limit(
+    seconds: float, fits: list[bool]
+) -> None:
     found = ranking.Ranking(DRIVEN).ranked(iter([MAP, MAP]), lambda: True, lambda: seconds)
     assert [bool(ssh_map.fit) for ssh_map in found] == fits
 
 
-def test_a_sketch_that_the_checker_refuses_is_not_the_last_one() -> None:
+def test_solve_tries_another_sketch_if_the_checker_refuses_one() -> None:
     trace = driven(maze(3, 3, steps=60, seed=1).trace, 4)
     theory = settle(trace).theory
     assert check(trace, sketched(trace, theory), theory)
@@ -141,7 +145,7 @@ def test_a_sketch_that_the_checker_refuses_is_not_the_last_one() -> None:
         assert solve(trace, time_limit=1e-6).maps
 
 
-def test_no_sketch_takes_all_the_time() -> None:
+def test_each_sketch_gets_a_share_of_the_time() -> None:
     """The first sketch uses all of its time. The others still get their share."""
     trace = driven(maze(3, 3, steps=60, seed=1).trace, 4)
     tried = []
@@ -160,7 +164,7 @@ def test_no_sketch_takes_all_the_time() -> None:
     assert len(tried) == len(Sketch.all_of(trace.steps[0], settle(trace).theory))
 
 
-def test_a_certificate_is_written_without_a_look_at_each_pair() -> None:
+def test_certificate_is_written_without_comparing_each_pair() -> None:
     """Of 3,000 steps that show different views no pair needs a word."""
     trace = Trace.from_steps([*range(3000), 0, 1], ["travel"] * 3000 + ["right"])
     asked = []

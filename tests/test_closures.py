@@ -60,7 +60,7 @@ def test_closures_are_written_and_read(tmp_path: Path) -> None:
     assert not trace.without_displacements().closures
 
 
-def test_a_part_of_a_trace_keeps_the_closures_between_its_steps() -> None:
+def test_slice_of_a_trace_keeps_closures_between_its_steps() -> None:
     trace = closed(1, 9, (0.05, 0.0, 0.1))
     assert not trace.prefix(9).closures
     assert trace.prefix(10) == trace
@@ -84,7 +84,7 @@ def test_a_part_of_a_trace_keeps_the_closures_between_its_steps() -> None:
         ([{}, {}], r"closures\[1\]: steps: expected each pair once, got 0 and 1 twice; "),
     ],
 )
-def test_a_malformed_closure_is_named(tmp_path: Path, closures: Any, said: str) -> None:
+def test_malformed_closure_is_an_error(tmp_path: Path, closures: Any, said: str) -> None:
     good = {"steps": [0, 1], "displacement": [0, 0, 0], "covariance": TIGHT}
     if isinstance(closures, list):
         is_part = closures[0] == {"steps": [0, 1]}
@@ -98,7 +98,7 @@ def test_a_malformed_closure_is_named(tmp_path: Path, closures: Any, said: str) 
 
 @settings(max_examples=10)
 @given(st.data())
-def test_solver_checker_and_plain_least_squares_have_one_misfit(data: st.DataObject) -> None:
+def test_misfit_with_closures_equals_plain_least_squares(data: st.DataObject) -> None:
     trace = data.draw(
         traces(max_steps=5, closures=True).filter(lambda trace: trace.closures), label="trace"
     )
@@ -116,7 +116,7 @@ def test_solver_checker_and_plain_least_squares_have_one_misfit(data: st.DataObj
 
 
 @pytest.mark.parametrize(("offset", "costs"), [(0.0, False), (1.0, True)])
-def test_a_closure_says_how_far_apart_two_steps_are(offset: float, costs: bool) -> None:
+def test_joining_steps_against_a_closure_raises_the_misfit(offset: float, costs: bool) -> None:
     trace, apart = closed(1, 9, (0.0, offset, 0.0)), list(range(10))
     more = Poses(trace, [*apart[:9], 1], apart[:9]).misfit() - Poses(trace, apart, apart).misfit()
     assert (more > 30) is costs
@@ -124,7 +124,7 @@ def test_a_closure_says_how_far_apart_two_steps_are(offset: float, costs: bool) 
 
 
 @pytest.mark.parametrize("offset", [0.0, 3.0])
-def test_a_closure_decides_between_maps_that_odometry_allows(offset: float) -> None:
+def test_closure_decides_between_maps_that_odometry_allows(offset: float) -> None:
     """Odometry with 2 m of noise cannot tell whether the robot is back."""
     noise = ((4.0, 0.0, 0.0), (0.0, 4.0, 0.0), (0.0, 0.0, 0.01))
     trace = Trace.from_steps(
@@ -144,14 +144,14 @@ def test_a_closure_decides_between_maps_that_odometry_allows(offset: float) -> N
         assert pinned.theory.without == ("closure",)
 
 
-def test_a_sentence_names_the_offset() -> None:
+def test_closure_sentence_names_the_offset() -> None:
     trace = closed(1, 9, (0.05, 0.05, 0.0))
     theory = Theory.topological().replace(star="none", boundary="none")
     sentences = " ".join(explain_pair(trace, 1, 9, theory).sentences)
     assert "the local maps of steps 1 and 9 match with an offset of 0.07 m" in sentences
 
 
-def test_distances_of_poses_are_those_of_an_exact_closure() -> None:
+def test_fitted_poses_keep_the_distance_of_an_exact_closure() -> None:
     exact = tuple(tuple(row) for row in (np.eye(3) * 1e-4).tolist())
     trace = closed(1, 9, (0.0, 2.0, 0.0), exact)  # type: ignore[arg-type]
     labels = list(range(10))
@@ -161,13 +161,13 @@ def test_distances_of_poses_are_those_of_an_exact_closure() -> None:
     )
 
 
-def test_an_argument_cites_the_match() -> None:
+def test_explanation_cites_the_closure() -> None:
     explained = explain_pair(closed(0, 8, (0.0, 3.0, 0.0)), 0, 8, Theory.causal())
     assert explained.verdict.value == "different"
     assert "the local maps of steps 0 and 8 match with an offset of 3.00 m" in str(explained)
 
 
-def test_the_beam_counts_closures_as_a_map_does() -> None:
+def test_beam_cost_with_closures_equals_the_cost_of_the_map() -> None:
     """The equations of a hypothesis are linear. So its cost is nearly that of its map."""
     (known,) = truth.mazes(4, 24, [701], truth.Noise(Odometry(**truth.NOISE)))
     steps = range(len(known.trace))
@@ -198,7 +198,7 @@ def _beam(trace: Trace) -> Beam:
     return Beam(problem, Log(trace, problem.theory, problem.pairs), 16)
 
 
-def test_a_joint_trace_has_the_closures_of_its_drives() -> None:
+def test_joint_trace_has_the_closures_of_its_drives() -> None:
     drives = [replace(closed(1, 9, (x, 0.0, 0.0)), name=f"drive {x}") for x in (0.0, 0.1)]
     drives[1] = drives[1].with_views("b" * 10)
     with pytest.warns(UserWarning, match="no view in common"):

@@ -82,7 +82,7 @@ products = st.lists(
 
 @settings(max_examples=75)
 @given(relations | products)
-def test_choices_are_the_finest_division_that_brute_force_finds(rows: list[list[bool]]) -> None:
+def test_choices_equal_the_finest_division_by_brute_force(rows: list[list[bool]]) -> None:
     table = np.array(rows, dtype=bool)
 
     def is_product(division: list[list[int]]) -> bool:
@@ -100,7 +100,7 @@ def test_choices_are_the_finest_division_that_brute_force_finds(rows: list[list[
 
 @settings(max_examples=50)
 @given(relations)
-def test_deciding_questions_tell_all_apart_and_none_is_superfluous(rows: list[list[bool]]) -> None:
+def test_deciding_questions_are_a_minimal_set_that_separates_maps(rows: list[list[bool]]) -> None:
     table = np.array(rows, dtype=bool)
     chosen = deciding(table.T, len(rows))
 
@@ -205,7 +205,7 @@ def naive_differing(maps: Sequence[SSHMap]) -> dict[str, set[int]]:
 
 @settings(max_examples=12)
 @given(st.data())
-def test_what_is_said_of_maps_is_so_in_the_explicit_list(data: st.DataObject) -> None:
+def test_comparison_is_true_of_the_listed_maps(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=6), label="trace")
     maps = solve(trace, data.draw(theories(trace), label="theory"), max_maps=60, time_limit=10).maps
     if not maps:
@@ -262,7 +262,7 @@ def with_free_places() -> Solution:
     return solve(aces.route(18), FREE_PLACES, max_maps=None)
 
 
-def test_maps_that_differ_in_places_alone() -> None:
+def test_compare_finds_maps_that_differ_only_in_places() -> None:
     solution = with_free_places()
     found = compare(solution)
     assert (
@@ -275,7 +275,7 @@ def test_maps_that_differ_in_places_alone() -> None:
     holds_of(found, solution.maps)
 
 
-def test_maps_that_differ_in_paths_alone_say_which_stretches_are_one_path() -> None:
+def test_compare_names_segments_of_maps_that_differ_only_in_paths() -> None:
     solution = solve(maze(5, 5, steps=100, seed=1, stars=True).trace, max_maps=None)
     maps = [m for m in solution.maps if m.labels == solution.maps[0].labels]
     found = compare(maps)
@@ -286,7 +286,7 @@ def test_maps_that_differ_in_paths_alone_say_which_stretches_are_one_path() -> N
     holds_of(found, maps)
 
 
-def test_independent_choices_are_factors() -> None:
+def test_compare_splits_independent_choices_into_factors() -> None:
     solution = solve(aces.route(18), Theory(prefer=("dstates",)), max_maps=None)
     found = compare(solution)
     assert found.product == "6 = 2 x 3"
@@ -320,7 +320,7 @@ def of_streets(rng: random.Random, count: int, dstates: int, steps: int) -> list
     return maps
 
 
-def test_maps_of_all_kinds_are_compared_whatever_they_are_of() -> None:
+def test_backbone_by_arrays_equals_that_of_absorbed_maps() -> None:
     """Arrays give the same backbone as absorbing one map after the other.
 
     This also holds if dstates, places and paths differ in every map.
@@ -333,7 +333,7 @@ def test_maps_of_all_kinds_are_compared_whatever_they_are_of() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_ids_do_not_depend_on_how_things_are_numbered(seed: int) -> None:
+def test_map_ids_do_not_depend_on_numbering(seed: int) -> None:
     rng = random.Random(seed)
     maps = aces.solution().maps
     assert len({m.id for m in maps}) == len(maps)
@@ -381,7 +381,7 @@ seed=3).trace, Theory.causal())):
 """
 
 
-def test_ids_and_their_order_are_the_same_in_each_run() -> None:
+def test_map_ids_and_their_order_are_reproducible() -> None:
     there = subprocess.run(
         [sys.executable, "-c", LISTS],
         env={"PYTHONHASHSEED": "4242", "PYTHONPATH": "."},
@@ -395,7 +395,7 @@ def test_ids_and_their_order_are_the_same_in_each_run() -> None:
     assert there.count("[") == 2
 
 
-def test_a_list_is_in_order_whatever_order_maps_are_found_in(
+def test_maps_are_listed_in_one_order_however_they_are_found(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     usual = with_free_places()
@@ -412,7 +412,7 @@ def test_a_list_is_in_order_whatever_order_maps_are_found_in(
     assert again.cost == usual.cost
 
 
-def test_the_map_that_closes_best_stays_first() -> None:
+def test_map_with_the_least_misfit_is_listed_first() -> None:
     trace = maze(3, 3, steps=40, seed=4242, stars=True, follow=True, odometry=None).trace
     maps = solve(trace, max_maps=None).maps
     fitted = [replace(m, fit=Fit(float(len(maps) - i), 3, 0.5)) for i, m in enumerate(maps)]
@@ -435,7 +435,7 @@ def file_of(tmp_path: Path) -> Callable[..., Path]:
     return written_by
 
 
-def test_the_shell_prints_what_python_says(
+def test_compare_in_the_shell_prints_the_result_of_python(
     file_of: Callable[..., Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = file_of()
@@ -462,7 +462,7 @@ def test_the_shell_prints_what_python_says(
 
 
 @pytest.mark.slow
-def test_where_not_all_are_listed_the_backbone_says_what_all_share(
+def test_compare_uses_the_backbone_of_a_cut_list(
     file_of: Callable[..., Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     cut, every = file_of("-n", "2", name="cut.json"), file_of()
@@ -485,14 +485,14 @@ def test_where_not_all_are_listed_the_backbone_says_what_all_share(
     assert python.shared == found.shared
 
 
-def test_a_search_that_was_stopped_says_as_far_as_was_found_out() -> None:
+def test_compare_says_that_a_stopped_list_may_lack_maps() -> None:
     maps = aces.solution().maps
     listing = Listing(maps[:2], minimal=2, complete=False, stopped="time limit")
     assert compare(listing).sentence.endswith("as far as is known: other maps may differ in more")
     assert compare(maps[:1]).sentence == "1 map"
 
 
-def test_causal_maps_and_maps_with_faults() -> None:
+def test_compare_reads_causal_maps_and_maps_with_faults() -> None:
     causal = solve(maze(5, 5, steps=60, seed=3).trace, Theory.causal(), max_maps=None)
     found = compare(causal)
     assert set(found.variants) == {"dstates"}
@@ -515,7 +515,7 @@ def test_causal_maps_and_maps_with_faults() -> None:
     )
 
 
-def test_larger_maps_are_told_from_minimal_ones(
+def test_compare_separates_minimal_from_larger_maps(
     file_of: Callable[..., Path], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     aces.route(16).save(tmp_path / "trace.jsonl")
@@ -566,7 +566,7 @@ def edited(path: Path, change: Callable[[dict[str, object]], object]) -> Path:
         (lambda d: d.update(levels=[]), "levels: expected a list"),
     ],
 )
-def test_files_that_are_not_what_they_should_be(
+def test_compare_refuses_edited_files(
     file_of: Callable[..., Path],
     capsys: pytest.CaptureFixture[str],
     change: Callable[[dict[str, object]], object],
@@ -578,7 +578,7 @@ def test_files_that_are_not_what_they_should_be(
     assert error.count("\n") == 1
 
 
-def test_maps_of_other_traces_are_refused(
+def test_compare_refuses_maps_of_other_traces(
     file_of: Callable[..., Path], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     path = file_of()
@@ -626,7 +626,7 @@ def test_maps_of_other_traces_are_refused(
         difference(maps[0], others[0])
 
 
-def test_the_backbone_survives_files_also_where_pairs_are_left_out() -> None:
+def test_backbone_without_all_pairs_survives_a_round_trip() -> None:
     maps = of_streets(random.Random(3), 6, 60, 90)
     sharing = Sharing()
     for ssh_map in maps:
@@ -639,7 +639,7 @@ def test_the_backbone_survives_files_also_where_pairs_are_left_out() -> None:
         assert again.sorts[sort].always == shared.always
 
 
-def test_json_streams_what_is_too_much_to_hold(
+def test_json_streams_maps_that_exceed_memory(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     held = json.loads(aces.answer())
@@ -650,7 +650,7 @@ def test_json_streams_what_is_too_much_to_hold(
     assert streamed["count"] == held["count"] == len(streamed["maps"])
 
 
-def test_one_map_has_nothing_to_be_told_apart_from() -> None:
+def test_comparison_of_one_map_is_empty() -> None:
     found = compare(solve(written("a T b")))
     assert (found.sentence, found.choices, found.deciding, found.product) == (
         "1 minimal map",
@@ -661,7 +661,7 @@ def test_one_map_has_nothing_to_be_told_apart_from() -> None:
     assert list(compared(found)) == []
 
 
-def test_dstates_along_no_path_are_no_contradiction() -> None:
+def test_compare_accepts_dstates_along_no_path() -> None:
     """Steps of one dstate in the listed maps, but along no path, are along one path in no map."""
     trace = Trace.from_steps("bbaabaa", ["travel", "left", "left", "left", "around", "around"])
     solution = solve(trace, max_maps=2)

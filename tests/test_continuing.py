@@ -25,7 +25,7 @@ CAUSAL = Theory.causal()
 
 @settings(max_examples=30)
 @given(traces(max_steps=30), st.data())
-def test_the_result_is_a_map(trace: Trace, data: st.DataObject) -> None:
+def test_continued_labels_are_a_consistent_map(trace: Trace, data: st.DataObject) -> None:
     """The given map may be wrong, and few steps may settle a link. Evidence is left out."""
     trace = trace.without_displacements()
     beginning = trace.prefix(data.draw(st.integers(1, len(trace))))
@@ -44,7 +44,7 @@ def test_the_result_is_a_map(trace: Trace, data: st.DataObject) -> None:
 
 
 @pytest.mark.parametrize(("steps", "kept"), [(500, False), (800, True), (1200, True)])
-def test_a_map_that_lacks_links_leads_to_a_map_of_all_steps(steps: int, kept: bool) -> None:
+def test_map_without_some_links_is_continued_to_all_steps(steps: int, kept: bool) -> None:
     """The labels are kept if the map says enough; else a wrong link is settled and forgotten."""
     walk = maze(4, 4, steps=6000, seed=1)
     known, log = numbered(walk.truth[:steps]), Log(walk.trace, CAUSAL)
@@ -58,12 +58,12 @@ def test_a_map_that_lacks_links_leads_to_a_map_of_all_steps(steps: int, kept: bo
     assert len(set(thin)) <= len(set(walk.truth))
 
 
-def test_a_map_of_too_few_steps_is_given_up() -> None:
+def test_map_of_too_few_steps_is_not_continued() -> None:
     walk = maze(4, 4, steps=6000, seed=1)
     assert labels_continued(Log(walk.trace, CAUSAL), numbered(walk.truth[:10])) is None
 
 
-def test_a_map_with_all_links_is_only_replayed() -> None:
+def test_map_with_all_links_is_replayed() -> None:
     """Known links are followed without a prediction."""
     walk = maze(3, 3, steps=2000, seed=0)
     log = Log(walk.trace, CAUSAL)

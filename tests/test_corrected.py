@@ -49,7 +49,7 @@ def maps_of(trace: Trace, theory: Theory, speedups: Speedups) -> set[object]:
 
 @settings(max_examples=10)
 @given(broken_traces(), st.sampled_from(["none", "strict"]), st.booleans())
-def test_nothing_is_known_of_where_an_action_led_that_slipped(
+def test_maps_of_traces_with_slipped_actions_equal_the_brute_force(
     trace: Trace, boundary: str, framed: bool
 ) -> None:
     theory = Theory(boundary=boundary, star="frame" if framed and trace.has_stars else "none")  # type: ignore[arg-type]
@@ -60,7 +60,7 @@ def test_nothing_is_known_of_where_an_action_led_that_slipped(
 
 @settings(max_examples=6)
 @given(st.data())
-def test_maps_of_mended_traces_are_those_of_the_plain_encodings(data: st.DataObject) -> None:
+def test_maps_of_corrected_traces_equal_those_of_plain_encodings(data: st.DataObject) -> None:
     """If everything is proven, the maps are the same.
 
     Stars may be misread, and actions may slip.

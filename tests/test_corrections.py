@@ -68,7 +68,7 @@ def solving(folder: Path, *names: str) -> list[str]:
     return ["solve", *files, "--together", "-o", str(folder / "building" / "maps.json")]
 
 
-def test_a_file_says_what_was_written(tmp_path: Path) -> None:
+def test_corrections_survive_a_round_trip(tmp_path: Path) -> None:
     said = (
         Corrections(MARKS)
         .with_name("Küche: 2", "place", "monday:1")
@@ -83,7 +83,7 @@ def test_a_file_says_what_was_written(tmp_path: Path) -> None:
     assert from_yaml(to_yaml(noted)) == noted
 
 
-def test_a_name_is_moved_and_a_gateway_changes_its_mind() -> None:
+def test_new_name_or_gateway_replaces_the_old_one() -> None:
     said = Corrections(MARKS).with_name("hall", "place", "monday:1")
     assert [n.name for n in said.with_name("kitchen", "place", "monday:1").names] == ["kitchen"]
     with pytest.raises(
@@ -117,7 +117,7 @@ def test_a_name_is_moved_and_a_gateway_changes_its_mind() -> None:
         ("same: [\n", "expected YAML, got"),
     ],
 )
-def test_a_wrong_file_is_refused(text: str, said: str | None) -> None:
+def test_malformed_corrections_are_refused(text: str, said: str | None) -> None:
     if said is None:
         assert not read(text)
         return
@@ -126,7 +126,7 @@ def test_a_wrong_file_is_refused(text: str, said: str | None) -> None:
     assert str(error.value).startswith("c.yaml: ")
 
 
-def test_a_file_of_another_version_is_refused(tmp_path: Path) -> None:
+def test_corrections_of_another_version_are_refused(tmp_path: Path) -> None:
     for wrong in ("version: 2", "version: true"):
         with pytest.raises(MapError, match=r"version: expected 1 .*, got"):
             from_yaml(HEAD.replace("version: 1", wrong))
@@ -136,7 +136,9 @@ def test_a_file_of_another_version_is_refused(tmp_path: Path) -> None:
         load_corrections(tmp_path)
 
 
-def test_a_file_of_another_map_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_corrections_of_another_map_are_refused(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     said = Corrections(MARKS).with_name("kitchen", "place", "monday:1")
     with pytest.raises(MapError, match=r"written for, 'monday', 'tuesday', got round"):
         solve(ROUND, corrections=said)
@@ -166,9 +168,7 @@ def test_names_of_another_map_are_not_shown(
     assert "kitchen" not in told.out
 
 
-def test_what_a_person_says_is_obeyed_at_each_later_solve(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_solve_obeys_recorded_corrections(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     building = str(folder / "building")
     assert main(["name", building, "p1", "kitchen"]) == 0
     assert main(["correct", building, "--different", "monday:1,tuesday:0"]) == 0
@@ -194,9 +194,7 @@ def test_what_a_person_says_is_obeyed_at_each_later_solve(
     assert json.loads(capsys.readouterr().out)["theory"]["different"] == [[1, 4]]
 
 
-def test_a_place_is_renamed_by_any_step_at_it(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_any_step_at_a_place_renames_it(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     building = str(folder / "building")
     # Monday ends at the place where it began.
     assert main(["name", building, "monday:0", "hall"]) == 0
@@ -206,7 +204,7 @@ def test_a_place_is_renamed_by_any_step_at_it(
 
 
 @pytest.mark.parametrize("name", ["5", "p4", "place 4", "path2", "region 0"])
-def test_a_name_that_reads_as_a_number_is_refused(
+def test_name_that_looks_like_a_number_is_refused(
     name: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["name", str(folder / "building"), "p1", name]) == 1
@@ -214,7 +212,7 @@ def test_a_name_that_reads_as_a_number_is_refused(
     assert not (folder / "building" / "corrections.yaml").exists()
 
 
-def test_a_name_stays_at_its_steps_when_places_get_other_numbers() -> None:
+def test_name_follows_its_steps_if_places_are_renumbered() -> None:
     """Solved after Tuesday, the place that Monday first sees has another number."""
     said = Corrections(MARKS).with_name("start", "place", "monday:0")
     (first,) = solve(JOINT, corrections=said)
@@ -227,7 +225,7 @@ def test_a_name_stays_at_its_steps_when_places_get_other_numbers() -> None:
     assert [n.text for n in third.names] == ["start"]
 
 
-def test_sentences_that_contradict_a_trace_are_reported(
+def test_solve_reports_corrections_that_contradict_the_trace(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     building = str(folder / "building")
@@ -273,7 +271,7 @@ def test_gateways_are_opened_and_closed(folder: Path, capsys: pytest.CaptureFixt
 
 @pytest.mark.filterwarnings("ignore:traces 1 and 2 have the same steps")
 @pytest.mark.parametrize("onto", [False, True])
-def test_a_later_drive_that_saw_the_gateway_as_before_is_warned_of(
+def test_warning_if_a_later_drive_contradicts_a_gateway_correction(
     onto: bool,
     folder: Path,
     capsys: pytest.CaptureFixture[str],
@@ -328,7 +326,7 @@ def test_a_later_drive_that_saw_the_gateway_as_before_is_warned_of(
     assert "it contradicts" not in warned("monday", "strange")
 
 
-def test_verbs_with_the_recorded_trace_obey_what_was_said_of_its_stars(
+def test_verbs_apply_star_corrections_to_the_recorded_trace(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """On Tuesday the robot overlooked a gateway at the corner. The map of both drives has it."""
@@ -361,7 +359,7 @@ def test_verbs_with_the_recorded_trace_obey_what_was_said_of_its_stars(
     assert "the file belongs to another map" in capsys.readouterr().err
 
 
-def test_directions_on_the_map_are_those_of_its_drawing(
+def test_north_in_a_correction_is_north_of_the_drawing(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(solving(folder, "round")) == 0
@@ -383,7 +381,7 @@ def test_directions_on_the_map_are_those_of_its_drawing(
         assert told in capsys.readouterr().err
 
 
-def test_a_star_without_a_gateway() -> None:
+def test_correction_can_leave_a_star_without_gateways() -> None:
     assert with_gateway((1, None, 0, 0), 90.0, is_open=True) == (1, 1, 0, 0)
     bearings = (0.0, Gateway(120.0, opposite=2), Gateway(240.0, opposite=1))
     assert with_gateway(bearings, 3.0, is_open=False) == (
@@ -407,7 +405,7 @@ def named_map() -> SSHMap:
     return ssh_map
 
 
-def test_names_stand_in_all_that_is_made_of_a_map(
+def test_names_are_in_all_exports_of_a_map(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     ssh_map = named_map()
@@ -440,7 +438,7 @@ def test_names_stand_in_all_that_is_made_of_a_map(
     assert capsys.readouterr().out.count("(kitchen)") > 3
 
 
-def test_pairs_of_steps_are_those_of_a_theory() -> None:
+def test_corrections_of_pairs_become_fields_of_the_theory() -> None:
     """There is one mechanism: the fields of a theory."""
     said = Corrections(MARKS).with_pair("elsewhere", "tuesday:1", "monday:0")
     assert solve(JOINT, corrections=said).theory.elsewhere == ((0, 5),)
@@ -449,7 +447,9 @@ def test_pairs_of_steps_are_those_of_a_theory() -> None:
     assert drives_of(JOINT)[1].fingerprint is None
 
 
-def test_steps_said_to_be_at_one_place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_correction_same_place_keeps_only_maps_that_agree(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     trace = Trace.from_steps("abcd", ["travel", "right", "travel"], name="walk")
     theory = Theory(boundary="none", prefer=("dstates",))
     every = solve(trace, theory, max_maps=None).maps
@@ -484,7 +484,7 @@ def test_steps_said_to_be_at_one_place(tmp_path: Path, capsys: pytest.CaptureFix
         ("same", "same", ["same"]),
     ],
 )
-def test_the_opposite_of_what_was_said_replaces_it(first: str, then: str, left: list[str]) -> None:
+def test_opposite_correction_replaces_the_old_one(first: str, then: str, left: list[str]) -> None:
     said = Corrections(MARKS).with_pair(first, "monday:0", "tuesday:1")
     said = said.with_pair(first, "monday:2", "tuesday:1")
     changed = said.with_pair(then, "tuesday:1", "monday:0")

@@ -16,17 +16,17 @@ TRACE = Trace.from_steps("aba", ["travel", "travel"])
 
 
 @pytest.mark.parametrize("name", ssh_abduction._MOVED)
-def test_old_names_are_the_new_ones(name: str) -> None:
+def test_old_names_give_the_new_objects_with_a_warning(name: str) -> None:
     with pytest.warns(DeprecationWarning, match=f"ssh_abduction.{name} is deprecated; use"):
         value = getattr(ssh_abduction, name)
     assert value.__name__ == ssh_abduction._MOVED[name].rpartition(".")[2]
 
 
-def test_the_new_names_are_few() -> None:
+def test_package_exports_15_to_20_names() -> None:
     assert 15 <= len(ssh_abduction.__all__) <= 20
 
 
-def test_old_parameters_work() -> None:
+def test_old_parameters_work_with_a_warning() -> None:
     with pytest.warns(DeprecationWarning, match="is deprecated; use") as caught:
         found = solve(TRACE, Theory.causal(), limit=100, maps=0, memory=10_000)  # type: ignore[call-arg]
     assert found == solve(TRACE, Theory.causal(), time_limit=100, max_maps=None)
@@ -47,7 +47,7 @@ def test_old_parameters_work() -> None:
         (["facts", "--path-order=partial"], ["facts", "--set", "path_order=partial"]),
     ],
 )
-def test_old_flags_work(
+def test_old_flags_work_with_a_warning(
     old: list[str], new: list[str], room: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     old, new = [old[0], room, *old[1:]], [new[0], room, *new[1:]]
@@ -76,7 +76,7 @@ def test_old_flags_work(
         ("simulate -o drive.jsonl", "--images panoramas", "images=panoramas"),
     ],
 )
-def test_flags_that_are_settings_now_mean_the_same(verb: str, old: str, new: str) -> None:
+def test_old_flags_equal_their_settings(verb: str, old: str, new: str) -> None:
     before = parser().parse_args([*verb.split(), "file", *old.split()])
     after = parser().parse_args([*verb.split(), "file", "--set", new])
     (note,) = vars(before).pop("notes")
@@ -85,7 +85,7 @@ def test_flags_that_are_settings_now_mean_the_same(verb: str, old: str, new: str
     assert note.endswith(f"is deprecated; write --set {new}")
 
 
-def test_the_flags_are_few() -> None:
+def test_shell_has_at_most_50_flags() -> None:
     flags = {
         name
         for each in (parser(), *parser().verbs.values())
@@ -124,7 +124,7 @@ def test_a_theory_is_read_from_a_file(
     assert "mine.toml: boundary: expected one of" in capsys.readouterr().err
 
 
-def test_counts_of_a_search_are_read_by_their_old_names() -> None:
+def test_old_names_of_search_counts_warn_and_work() -> None:
     solution = solve(TRACE)
     for name in ("prefix", "grounding", "evidence"):
         with pytest.warns(DeprecationWarning, match=f"use Solution.effort.{name}"):

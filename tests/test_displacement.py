@@ -72,7 +72,7 @@ def circuit(
 
 @settings(max_examples=5)
 @given(st.data())
-def test_solver_and_checker_agree_with_matrices_written_out(data: st.DataObject) -> None:
+def test_refused_returns_equal_matrices_written_out(data: st.DataObject) -> None:
     trace = data.draw(traces().filter(lambda trace: trace.has_displacements), label="trace")
     theory = data.draw(theories(trace, fixed=("displacement",)), label="theory")
     agree(trace, theory)
@@ -85,7 +85,7 @@ def test_solver_and_checker_agree_with_matrices_written_out(data: st.DataObject)
     st.sampled_from([1.0, 2.0, 3.0]),
     st.sampled_from([0.0, 0.01]),
 )
-def test_sets_of_two_are_those_of_matrices_written_out(
+def test_refused_pairs_of_returns_equal_matrices_written_out(
     seed: int, corners: int, noise: float, bend: float
 ) -> None:
     """Labels that need not be of a map. Every second step is at one of few dstates, so many returns
@@ -115,7 +115,7 @@ def test_sets_of_two_are_those_of_matrices_written_out(
     }
 
 
-def test_covariances_of_closings_are_those_of_many_noisy_drives() -> None:
+def test_covariance_of_a_loop_equals_that_of_simulated_drives() -> None:
     """The noise is small, so the first order is exact enough."""
     little = Odometry(
         along=0.0005,
@@ -150,7 +150,7 @@ def square() -> Solution:
     return solve(circuit(4, 5, 1.0))
 
 
-def test_a_square_whose_corners_look_alike_is_a_square() -> None:
+def test_displacements_tell_equal_corners_of_a_square_apart() -> None:
     alone = solve(circuit(4, 5, 1.0).without_displacements())
     assert (alone.cost.dstates, alone.cost.places) == (6, 3)  # type: ignore[union-attr]
     solution = square()
@@ -162,7 +162,7 @@ def test_a_square_whose_corners_look_alike_is_a_square() -> None:
 
 
 @pytest.mark.parametrize("corners", [3, 5, 6])
-def test_polygons_are_told_by_displacements_alone(corners: int) -> None:
+def test_displacements_tell_corners_of_polygons_apart(corners: int) -> None:
     trace = circuit(corners, 2 * corners + 1, 1.0, seed=corners)
     solution = solve(trace, Theory.causal())
     assert solution.maps[0].labels == tuple(step % (2 * corners) for step in range(len(trace)))
@@ -172,7 +172,7 @@ def test_polygons_are_told_by_displacements_alone(corners: int) -> None:
 @pytest.mark.parametrize(
     ("scale", "bend"), [(0.1, 0.0), (0.0, math.radians(0.2)), (-0.1, -math.radians(0.2))]
 )
-def test_errors_that_repeat_are_estimated_along(scale: float, bend: float) -> None:
+def test_fit_estimates_scale_and_drift(scale: float, bend: float) -> None:
     trace = circuit(5, 16, 1.0, 1, Odometry(heading=0.001, turning=0.01, angle=0.005), scale, bend)
     solution = solve(trace, Theory.causal())
     found = solution.maps[0]
@@ -194,7 +194,7 @@ def test_errors_that_repeat_are_estimated_along(scale: float, bend: float) -> No
 
 @settings(max_examples=5)
 @given(st.data())
-def test_the_jacobian_of_a_fit_is_right(data: st.DataObject) -> None:
+def test_jacobian_of_the_fit_equals_finite_differences(data: st.DataObject) -> None:
     trace = data.draw(traces().filter(lambda trace: trace.has_displacements), label="trace")
     problem = Poses.of_map(
         trace, solve(trace, Theory.causal().replace(displacement="none")).maps[0]
@@ -221,7 +221,7 @@ def test_dense_and_sparse_systems_have_one_solution() -> None:
         assert system_solved(matrix, added, right) == pytest.approx(np.arange(5.0))
 
 
-def test_fits_of_true_maps_are_as_likely_as_they_say() -> None:
+def test_p_values_of_true_maps_are_plausible() -> None:
     """Of 60 true maps about half have a p-value above one half. At most very few have one below a
     thousandth."""
     chances = []
@@ -236,7 +236,7 @@ def true_circuit(trace: Trace, corners: int) -> SSHMap:
     return causal_map([step % (2 * corners) for step in range(len(trace))], trace)
 
 
-def test_poses_are_where_the_dstates_are() -> None:
+def test_fitted_poses_are_near_the_true_dstates() -> None:
     trace = circuit(4, 8, 0.3, 2)
     found = fit(trace, true_circuit(trace, 4))
     at = [(pose.x, pose.y) for pose in found.poses]
@@ -249,7 +249,7 @@ def test_poses_are_where_the_dstates_are() -> None:
 
 
 @pytest.mark.parametrize(("factor", "said"), [(0.3, "too loose"), (3.0, "too tight"), (1.0, None)])
-def test_a_noise_model_that_is_off_is_noticed(factor: float, said: str | None) -> None:
+def test_warning_if_the_noise_model_is_wrong(factor: float, said: str | None) -> None:
     trace = circuit(5, 30, factor, 4)
     ssh_map = true_circuit(trace, 5)
     warning = noise_warning(replace(ssh_map, fit=fit(trace, ssh_map)), trace)
@@ -264,7 +264,7 @@ def test_a_noise_model_that_is_off_is_noticed(factor: float, said: str | None) -
     )
 
 
-def test_a_map_that_never_comes_back_says_nothing_about_noise() -> None:
+def test_no_noise_warning_for_a_map_without_returns() -> None:
     """Turns on the spot fit exactly. A chi-square of 0 for them is no sign of too much noise."""
     trace = Trace.from_steps(
         "abcd", ["travel", "right", "travel"], displacements=[(5, 0, 0), (0, 0, -1.57), (5, 0, 0)]
@@ -275,7 +275,7 @@ def test_a_map_that_never_comes_back_says_nothing_about_noise() -> None:
     assert solution.warnings == ()
 
 
-def test_kilometres_are_noticed() -> None:
+def test_warning_if_noise_exceeds_all_motion() -> None:
     """A warning comes if the noise of the odometry hides all motion, also if wheels report none. It
     does not come for a small robot with small noise."""
     trace = circuit(4, 9)
@@ -302,7 +302,7 @@ def test_kilometres_are_noticed() -> None:
     assert units_warning(Trace.from_steps("ab", ["right"], displacements=[(0.0, 0.0, 1.0)])) is None
 
 
-def test_the_map_that_closes_best_comes_first_and_rivals_have_weights() -> None:
+def test_maps_are_sorted_by_misfit_and_have_weights() -> None:
     trace = circuit(4, 6, 1.0)
     theory = Theory.causal().replace(prefer=(), joint=1, reject=1e-9)
     solution = solve(trace, theory, max_maps=None)
@@ -313,7 +313,7 @@ def test_the_map_that_closes_best_comes_first_and_rivals_have_weights() -> None:
     assert list(solution.weights) == sorted(solution.weights, reverse=True)
 
 
-def test_steps_without_displacements_cut_what_is_known() -> None:
+def test_missing_displacement_cuts_dead_reckoning() -> None:
     trace = circuit(4, 5, 1.0)
     cut = replace(
         trace,
@@ -328,7 +328,7 @@ def test_steps_without_displacements_cut_what_is_known() -> None:
     assert solve(cut).complete
 
 
-def test_displacements_may_be_left_out_or_asked_for() -> None:
+def test_theory_can_ignore_or_require_displacements() -> None:
     trace = circuit(4, 9, 1.0)
     assert (
         solve(trace, Theory(displacement="none")).cost == solve(trace.without_displacements()).cost
@@ -347,7 +347,7 @@ def test_displacements_may_be_left_out_or_asked_for() -> None:
             Theory(**wrong)  # type: ignore[arg-type]
 
 
-def test_places_go_before_paths_where_displacements_are_used() -> None:
+def test_displacements_make_places_preferred_to_paths() -> None:
     trace = circuit(4, 9, 1.0)
     assert settle(trace, Theory()).theory.prefer == ("dstates", "places", "paths")
     assert settle(trace.without_displacements(), Theory()).theory.prefer == (
@@ -359,7 +359,7 @@ def test_places_go_before_paths_where_displacements_are_used() -> None:
     assert settle(trace, Theory.circumscriptive()).theory.prefer == ("paths", "places", "dstates")
 
 
-def test_the_checker_says_which_returns_are_refused() -> None:
+def test_checker_names_returns_that_displacements_refuse() -> None:
     trace = circuit(4, 9, 1.0)
     wrong = solve(trace, Theory(displacement="none")).maps[0]
     said = [
@@ -383,7 +383,7 @@ def test_maps_with_a_fit_survive_a_round_trip(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kept", ["travels", "turns", "most", "few"])
-def test_fits_of_true_maps_are_as_likely_where_displacements_are_missing(kept: str) -> None:
+def test_p_values_of_true_maps_are_plausible_without_turns(kept: str) -> None:
     """20 true maps without reported turns. Headings follow from places that stretches share, or
     stay unknown."""
     squares = freedom = above = 0.0
@@ -419,7 +419,7 @@ def test_fits_of_true_maps_are_as_likely_where_displacements_are_missing(kept: s
 
 @pytest.mark.parametrize(("offset", "facing"), [(0.0, 0.0), (0.3, 0.0), (0.3, 0.1)])
 @pytest.mark.parametrize("rows", [[(0, 2), (0, 4)], [(0, 4), (2, 4)]])
-def test_two_returns_with_a_common_end_fit_as_badly_as_their_map(
+def test_misfit_of_two_returns_with_a_common_end_equals_its_map(
     offset: float, facing: float, rows: list[tuple[int, int]]
 ) -> None:
     """The robot comes to one place three times. Evidence, checker and misfit judge it alike."""

@@ -66,7 +66,7 @@ CORRIDOR = (-8.0, -1.0, 8.0, 1.0)
         ),
     ],
 )
-def test_junctions_are_where_ways_part(patch: Patch, bearings: list[float]) -> None:
+def test_junctions_are_found_where_ways_meet(patch: Patch, bearings: list[float]) -> None:
     found = junctions(patch, ROOM)
     assert len(found) == bool(bearings)
     for junction in found:
@@ -108,7 +108,7 @@ MOUTH, MOUTH_OPPOSITE = (-4.0, 4.5), (4.0, -4.5)
         ),
     ],
 )
-def test_an_open_space_has_a_junction_in_front_of_each_door(
+def test_open_space_has_a_junction_at_each_door(
     patch: Patch, mouths: list[tuple[float, float]]
 ) -> None:
     found = [junction.middle for junction in junctions(patch, ROOM)]
@@ -117,7 +117,7 @@ def test_an_open_space_has_a_junction_in_front_of_each_door(
         assert min(math.dist(middle, mouth) for middle in found) < 0.4
 
 
-def test_junctions_amid_an_open_space_have_a_disc_as_wide_as_a_shore() -> None:
+def test_junction_in_a_hall_has_a_disc_of_limited_radius() -> None:
     """Ways from four sides also meet in the middle of a hall."""
     hall = patch_of((-4, -4, 4, 4), (-8, -1, 8, 1), (-1, -8, 1, 8))
     found = sorted(junctions(hall, ROOM), key=lambda junction: math.hypot(*junction.middle))
@@ -182,7 +182,7 @@ FORK: Segments = [
 ]
 
 
-def test_a_robot_visits_a_fork_each_time_that_it_passes_and_turns_around_at_a_dead_end() -> None:
+def test_find_visits_at_a_fork_and_at_a_turn_in_a_dead_end() -> None:
     log, track = log_of(FORK, [(1, 0), (18, 0), (10, 0), (10, 8)])
     _, fork, end, again, _ = find_visits(log, track)
     assert math.dist(fork.middle, (10, 0)) < 0.5
@@ -204,7 +204,7 @@ def test_a_robot_visits_a_fork_each_time_that_it_passes_and_turns_around_at_a_de
     assert abs(degrees(again, again.left) - 90) < 15
 
 
-def test_a_robot_turns_around_in_a_bow() -> None:
+def test_turning_in_a_bow_is_one_visit() -> None:
     bow = [(17.5, -0.6), (18, -0.2), (18, 0.2), (17.5, 0.6)]
     log, track = log_of(FORK, [(1, -0.6), *bow, (10, 0.6), (10, 8)])
     middles = [visit.middle for visit in find_visits(log, track)]
@@ -212,13 +212,13 @@ def test_a_robot_turns_around_in_a_bow() -> None:
     assert math.dist(middles[2], (18, 0)) < 0.5
 
 
-def test_a_robot_that_turns_around_in_a_disc_has_one_visit() -> None:
+def test_turning_inside_a_disc_is_one_visit() -> None:
     log, track = log_of(FORK, [(1, 0), (10.8, 0), (10, 0), (10, 8)])
     _, *visits, _ = find_visits(log, track)
     assert [round(float(visit.middle[0])) for visit in visits] == [10]
 
 
-def test_a_robot_that_turns_around_just_outside_of_a_disc_has_a_visit_there() -> None:
+def test_turning_outside_a_disc_is_a_visit_of_its_own() -> None:
     """The robot passes the fork, comes back from the east, and leaves to the north."""
     log, track = log_of(FORK, [(1, 0), (11.4, 0), (10, 0), (10, 8)])
     _, fork, end, again, _ = find_visits(log, track)
@@ -232,7 +232,7 @@ def test_a_robot_that_turns_around_just_outside_of_a_disc_has_a_visit_there() ->
     assert quarters == [[2, 0], [2, 2], [0, 1]]
 
 
-def test_successive_visits_to_one_place_are_one() -> None:
+def test_successive_visits_to_one_place_are_joined() -> None:
     """The robot leaves the disc to the east, and comes back and leaves to the north."""
     west, east, north = Way(-math.pi), Way(0.0), Way(math.pi / 2)
     middle = np.zeros(2)
@@ -243,7 +243,7 @@ def test_successive_visits_to_one_place_are_one() -> None:
     assert (stay.arrived, stay.left) == (0, 2)
 
 
-def test_a_wide_robot_has_fewer_ways() -> None:
+def test_wide_robot_has_fewer_ways() -> None:
     log, track = log_of(FORK, [(1, 0), (18, 0)])
     assert len(find_visits(log, track, 0.5)) == 3
     assert len(find_visits(log, track, 2.4)) == 2
@@ -257,7 +257,7 @@ def test_a_wide_robot_has_fewer_ways() -> None:
         pytest.param(1, 2, [], id="near each other"),
     ],
 )
-def test_a_drive_begins_and_ends_at_places(begin: float, end: float, middles: list[float]) -> None:
+def test_drive_begins_and_ends_with_a_visit(begin: float, end: float, middles: list[float]) -> None:
     log, track = log_of(FORK, [(begin, 0), (end, 0)])
     visits = find_visits(log, track)
     assert [float(visit.middle[0]) for visit in visits] == pytest.approx(middles, abs=0.5)

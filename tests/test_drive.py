@@ -43,7 +43,7 @@ def steps_of(poses: np.ndarray) -> list[tuple[float, float, float]]:
     return [displacement_between(tuple(a), tuple(b)) for a, b in pairwise(poses)]
 
 
-def test_an_odometer_errs_as_it_says() -> None:
+def test_odometer_errors_equal_its_stated_noise() -> None:
     """Noise grows with the square root of a motion, and the mean shows the systematic errors.
 
     Measured over many drives of 9 m straight ahead, and of two radians on the spot.
@@ -70,7 +70,7 @@ def test_an_odometer_errs_as_it_says() -> None:
     )  # The bend, in each metre.
 
 
-def test_an_exact_odometer_reads_the_way_itself() -> None:
+def test_exact_odometer_reports_true_motions() -> None:
     rng = np.random.default_rng(0)
     poses = np.cumsum(rng.normal(size=(50, 3)), axis=0)
     read = Odometer(0, 0, 0, 0).reading(poses, rng)
@@ -84,7 +84,7 @@ def test_a_wrong_odometer_names_its_field(field: str) -> None:
             Odometer(**{field: value})  # type: ignore[arg-type]
 
 
-def test_scans_are_taken_all_along() -> None:
+def test_scans_are_taken_at_even_distances() -> None:
     """Also within a long motion, the next scan is at most a fifth too late."""
     recorder = Recorder(every=0.3)
     for pose in (
@@ -111,7 +111,7 @@ def test_scans_are_taken_all_along() -> None:
         Recorder(every=0.0)
 
 
-def test_a_drive_of_a_world_says_where_the_robot_was() -> None:
+def test_truth_of_a_drive_lists_visits_and_dstates() -> None:
     drive = record(RECTANGLE, tours=2, seed=1)
     assert [visit["place"] for visit in drive.truth["visits"]] == ["A", "B", "C", "D"] * 2 + ["A"]
     for visit in drive.truth["visits"]:
@@ -129,7 +129,7 @@ def test_a_drive_of_a_world_says_where_the_robot_was() -> None:
     assert not np.array_equal(drive.odometry, again.odometry)
 
 
-def test_the_covariance_of_an_odometer_is_that_of_its_errors() -> None:
+def test_covariance_of_the_odometer_equals_that_of_its_errors() -> None:
     """The errors of many drives, in the odometer's own standard deviations, are independent.
 
     Each drive is along two sides of a square; the errors are those at its end.
@@ -192,7 +192,7 @@ def test_a_robot_drives_through_doors_from_room_to_room(ring: Building) -> None:
     assert len(set(rounds)) > 2
 
 
-def test_rounds_that_cannot_be_driven(ring: Building, tmp_path: Path) -> None:
+def test_rounds_that_cannot_be_driven_are_refused(ring: Building, tmp_path: Path) -> None:
     with pytest.raises(SimulatorError, match="through which the robot fits, got none"):
         record_plan(ring.plan, body=Body(radius=0.6))
     with pytest.raises(SimulatorError, match="tours: expected 1 or more"):
@@ -218,7 +218,7 @@ def test_rounds_that_cannot_be_driven(ring: Building, tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not SCHOOLS, reason="the school plans are not here")
-def test_a_school_can_be_driven() -> None:
+def test_plan_of_a_school_can_be_driven() -> None:
     """The robot drives through 30 doors of a school, hits nothing, and returns home."""
     drive = record_plan(
         Plan.load(next(path for path in SCHOOLS if "Sabadell" in path.name)), seed=0, metres=100.0
@@ -233,7 +233,9 @@ def test_a_school_can_be_driven() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "tours"), [("curved", 1), ("cluttered", 1), ("doors", 1)])
-def test_shipped_worlds_are_driven_off_their_walls_and_furniture(name: str, tours: int) -> None:
+def test_robot_visits_all_places_of_shipped_worlds_and_touches_nothing(
+    name: str, tours: int
+) -> None:
     """Each place is visited as often as the route says, also when the furniture has moved.
 
     The robot touches nothing.
@@ -249,7 +251,7 @@ def test_shipped_worlds_are_driven_off_their_walls_and_furniture(name: str, tour
     assert [step["action"] for step in drive.truth["steps"]] == [*world.route] * tours
 
 
-def test_walls_may_be_round_uneven_or_those_of_an_occupancy_map(tmp_path: Path) -> None:
+def test_world_walls_may_be_curved_or_from_an_occupancy_map(tmp_path: Path) -> None:
     cells = np.full((24, 44), 254, np.uint8)
     cells[[0, 1, -2, -1]] = cells[:, [0, 1, -2, -1]] = 0
     (tmp_path / "map.pgm").write_bytes(b"P5 44 24 255\n" + cells.tobytes())
@@ -314,7 +316,7 @@ def test_walls_may_be_round_uneven_or_those_of_an_occupancy_map(tmp_path: Path) 
         ({"route": ["a", ["b"]]}, r"route\[1\]: expected a place"),
     ],
 )
-def test_worlds_with_places_name_what_is_wrong(
+def test_errors_of_worlds_with_places_name_the_field(
     changes: dict[str, object], message: str, tmp_path: Path
 ) -> None:
     fields = {
@@ -329,7 +331,7 @@ def test_worlds_with_places_name_what_is_wrong(
         World.load(tmp_path / "world.json")
 
 
-def test_a_route_of_places_that_cannot_be_driven(tmp_path: Path) -> None:
+def test_blocked_route_of_places_is_refused(tmp_path: Path) -> None:
     fields = {
         "format": "ssh-world",
         "version": 1,
@@ -414,14 +416,14 @@ def test_a_route_of_places_that_cannot_be_driven(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_what_goes_wrong_is_told_with_its_cause(
+def test_failed_simulation_names_its_cause(
     world: World, body: Body | None, laser: Laser | None, message: str
 ) -> None:
     with pytest.raises(SimulatorError, match=message):
         simulate(world, tours=2, seed=0, body=body, laser=laser)
 
 
-def test_a_single_tour_that_does_not_return_is_a_warning() -> None:
+def test_single_tour_that_does_not_return_gives_a_warning() -> None:
     with pytest.warns(
         SimulatorWarning,
         match=r"expected it to end where it began, .*; it cannot be driven again from there",
@@ -432,7 +434,7 @@ def test_a_single_tour_that_does_not_return_is_a_warning() -> None:
 # Driving around things
 
 
-def test_a_way_leads_around_what_was_not_known() -> None:
+def test_driver_goes_around_an_unknown_obstacle() -> None:
     """The robot drives around an unknown box on the midline of a corridor, and continues."""
     walls = np.array([[0, 0, 12, 0], [12, 0, 12, 3], [12, 3, 0, 3], [0, 3, 0, 0.0]])
     box = np.array([[5, 1, 6, 1], [6, 1, 6, 2], [6, 2, 5, 2], [5, 2, 5, 1.0]])
@@ -458,7 +460,7 @@ def test_a_way_leads_around_what_was_not_known() -> None:
     assert max(abs(y - 1.5) for x, y in track if x < 3 or x > 8) < 0.3
 
 
-def test_a_way_that_is_closed_is_an_error() -> None:
+def test_driver_refuses_a_blocked_way() -> None:
     walls = np.array([[0, 0, 12, 0], [12, 0, 12, 3], [12, 3, 0, 3], [0, 3, 0, 0.0]])
     space = FreeSpace.of(walls, 0.2)
     way = space.way((1.0, 1.5), (11.0, 1.5))
@@ -489,9 +491,7 @@ def test_a_way_that_is_closed_is_an_error() -> None:
 # The verb
 
 
-def test_simulate_writes_logs_that_can_be_read(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_simulate_writes_readable_logs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "school.xml").write_text(xml())
     assert (
         main(
@@ -568,7 +568,7 @@ def test_a_bag_has_the_covariance_of_its_odometry(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_logs_that_cannot_be_simulated(
+def test_simulate_refuses_wrong_options_for_logs(
     arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["simulate", *arguments, "-o", "run.log"]) == 1

@@ -90,7 +90,7 @@ def with_rays_beyond(ranges: Array, beyond: Array) -> Array:
         (with_rays_beyond, 12.0),
     ],
 )
-def test_a_range_that_repeats_is_no_return(
+def test_repeating_range_counts_as_no_return(
     drive: tuple[Scan, ...], say: Callable[[Array, Array], Array], reach: float
 ) -> None:
     scans, notes = interpret_log(written(drive, say, reach), LaserOptions())
@@ -114,7 +114,7 @@ def test_a_range_that_repeats_is_no_return(
         (lambda ranges, _: ranges, 8.0),
     ],
 )
-def test_ranges_of_walls_stay_measurements(
+def test_ranges_of_walls_are_kept_without_a_note(
     drive: tuple[Scan, ...], say: Callable[[Array, Array], Array], reach: float
 ) -> None:
     scans, notes = interpret_log(written(drive, say, reach), LaserOptions())
@@ -125,14 +125,14 @@ def test_ranges_of_walls_stay_measurements(
         assert (true.ranges[~seen] >= SEES).all()
 
 
-def test_a_robot_that_stands_before_a_wall_sees_no_range_that_repeats(
+def test_standing_before_a_wall_gives_no_note_about_repeats(
     drive: tuple[Scan, ...],
 ) -> None:
     flat = replace(drive[0], ranges=np.full(180, 2.0))
     assert not any("repeat" in note for note in interpret_log([flat] * 200, LaserOptions())[1])
 
 
-def test_a_reach_of_nothing_is_that_of_the_largest_range(drive: tuple[Scan, ...]) -> None:
+def test_invalid_reach_becomes_the_largest_range(drive: tuple[Scan, ...]) -> None:
     scans, notes = interpret_log(
         written(drive, lambda ranges, beyond: np.where(beyond, np.inf, ranges), math.inf),
         LaserOptions(),
@@ -166,9 +166,7 @@ def test_zeros_at_random_are_unknown(drive: tuple[Scan, ...], value: float) -> N
 
 
 @pytest.mark.parametrize("meaning", MEANINGS)
-def test_what_the_user_says_of_zeros_is_obeyed_in_silence(
-    drive: tuple[Scan, ...], meaning: str
-) -> None:
+def test_zero_is_setting_is_obeyed_without_a_note(drive: tuple[Scan, ...], meaning: str) -> None:
     told = LaserOptions(zero_is=meaning, no_return=11.0)
     scans, notes = interpret_log(written(drive, constant(0.0)), told)
     assert notes == ()
@@ -206,12 +204,12 @@ def test_ranges_of_at_least_no_return_are_infinite(drive: tuple[Scan, ...]) -> N
         {"zero_is": 0},
     ],
 )
-def test_nonsense_about_the_laser_is_refused(told: dict[str, object]) -> None:
+def test_invalid_laser_options_are_refused(told: dict[str, object]) -> None:
     with pytest.raises(LogError, match=f"{next(iter(told))}: expected .*, got .*; name"):
         LaserOptions(**told)  # type: ignore[arg-type]
 
 
-def test_a_mount_for_several_lasers_is_refused(drive: tuple[Scan, ...]) -> None:
+def test_one_mount_for_several_lasers_is_refused(drive: tuple[Scan, ...]) -> None:
     second = [replace(scan, laser=replace(scan.laser, mount=(0.0, 0.0, math.pi))) for scan in drive]
     with pytest.raises(LogError, match="mount: expected the scans of one laser, got those of 2"):
         interpret_log([*drive, *second], LaserOptions(mount=(0, 0, 0)))
@@ -224,14 +222,12 @@ def doubt(scans: tuple[Scan, ...]) -> str:
     return disagreement(log, track) or ""
 
 
-def test_a_good_drive_is_not_doubted(coarse: tuple[Scan, ...]) -> None:
+def test_good_drive_gets_no_laser_warning(coarse: tuple[Scan, ...]) -> None:
     assert doubt(coarse) == ""
 
 
 @pytest.mark.parametrize("fov", [120.0, 270.0])
-def test_a_wrong_field_of_view_is_said_with_the_likely_one(
-    coarse: tuple[Scan, ...], fov: float
-) -> None:
+def test_warning_names_the_likely_field_of_view(coarse: tuple[Scan, ...], fov: float) -> None:
     """The true one is 180 degrees."""
     said = doubt(tuple(LaserOptions(fov=fov).placed(scan) for scan in coarse))
     (about,) = map(
@@ -241,18 +237,18 @@ def test_a_wrong_field_of_view_is_said_with_the_likely_one(
     assert re.search(r"\d+ m by scans, \d+ m by odometry; turns by scans are \d\.\d\d times", said)
 
 
-def test_a_laser_that_hangs_upside_down_is_said(coarse: tuple[Scan, ...]) -> None:
+def test_warning_names_a_laser_that_hangs_upside_down(coarse: tuple[Scan, ...]) -> None:
     assert "--set fov=180" in doubt(tuple(LaserOptions(fov=-180).placed(scan) for scan in coarse))
 
 
-def test_a_wrong_mount_is_said_with_the_likely_one(coarse: tuple[Scan, ...]) -> None:
+def test_warning_names_the_likely_mount(coarse: tuple[Scan, ...]) -> None:
     """The laser truly looks ahead."""
     said = doubt(tuple(LaserOptions(mount=(0, 0, 60.0)).placed(scan) for scan in coarse))
     (looks,) = map(float, re.findall(r"--set mount=0,0,(-?\d+)\)", said))
     assert abs(looks) <= 10
 
 
-def test_one_warning_is_enough_where_the_odometer_explains_it(coarse: tuple[Scan, ...]) -> None:
+def test_no_laser_warning_if_the_odometer_explains_it(coarse: tuple[Scan, ...]) -> None:
     """Odometry in a wrong unit, or none, already explains the disagreement."""
     lost = tuple(replace(scan, odometry=(0.0, 0.0, 0.0)) for scan in coarse)
     _, _, notes = tracked(RobotLog(lost, source="drive"))
@@ -261,7 +257,7 @@ def test_one_warning_is_enough_where_the_odometer_explains_it(coarse: tuple[Scan
 
 
 @pytest.mark.parametrize("verb", ["import", "map"])
-def test_both_verbs_show_all_notes_and_take_the_same_options(
+def test_import_and_map_share_notes_and_options(
     coarse: tuple[Scan, ...], verb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "dri\x1b[31mve.bag"  # A name that would colour a terminal.
@@ -308,9 +304,7 @@ def test_both_verbs_show_all_notes_and_take_the_same_options(
         assert "Scan matching and odometry" not in said
 
 
-def test_a_field_of_view_that_a_log_does_not_say_is_noted(
-    drive: tuple[Scan, ...], tmp_path: Path
-) -> None:
+def test_note_if_a_log_lacks_the_field_of_view(drive: tuple[Scan, ...], tmp_path: Path) -> None:
     """FLASER lines have no field of view; conventions cover 180 and 181 beams, not 150."""
     for beams, is_noted in ((180, False), (150, True)):
         path = tmp_path / "drive.log"
@@ -342,7 +336,7 @@ def test_a_field_of_view_that_a_log_does_not_say_is_noted(
         ["--set=mount=1,2,nan"],
     ],
 )
-def test_nonsense_in_the_shell_is_refused(
+def test_invalid_laser_settings_are_refused_in_the_shell(
     words: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as end:
@@ -352,7 +346,7 @@ def test_nonsense_in_the_shell_is_refused(
 
 
 @pytest.mark.parametrize("measured", [0, 4])
-def test_scans_that_measure_nothing_have_no_beams_beside(
+def test_scans_without_measurements_are_counted_in_the_note(
     coarse: tuple[Scan, ...], measured: int
 ) -> None:
     unseen = [replace(scan, ranges=np.full_like(scan.ranges, np.nan)) for scan in coarse[measured:]]

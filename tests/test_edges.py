@@ -58,13 +58,13 @@ def shuttle(courses: Sequence[Points], turns: Sequence[float] | None = None) -> 
         pytest.param([[], []], [0, 0], id="unknown courses"),
     ],
 )
-def test_travels_are_on_one_edge_if_their_courses_are_near(
+def test_travels_with_near_courses_share_an_edge(
     courses: Sequence[Points], edges: list[int]
 ) -> None:
     assert shuttle(courses) == edges
 
 
-def test_headings_and_lengths_of_the_map_may_be_a_little_off() -> None:
+def test_edges_tolerate_small_errors_of_heading_and_length() -> None:
     long = [(4.0, 0.5), (8.6, 0.3)]
     assert shuttle([AHEAD, long, AHEAD], [0.3, -0.3, 0.2, 0.0]) == [0, 0, 0]
 

@@ -111,7 +111,7 @@ def naive_pairs(said: Sequence[int], true: Sequence[Any]) -> tuple[float | None,
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_accuracy_and_pairs_are_those_that_are_counted_naively(seed: int) -> None:
+def test_accuracy_and_pairs_equal_naive_counts(seed: int) -> None:
     rng = random.Random(seed)
     steps = rng.randint(2, 12)
     labels = [rng.randrange(4) for _ in range(steps)]
@@ -136,7 +136,7 @@ def test_accuracy_and_pairs_are_those_that_are_counted_naively(seed: int) -> Non
 
 
 @pytest.mark.parametrize("seed", range(15))
-def test_edges_are_those_of_a_best_assignment(seed: int) -> None:
+def test_edge_scores_equal_the_best_assignment(seed: int) -> None:
     rng = random.Random(seed)
     said = [*(rng.randrange(4) for _ in range(10)), 3]
     true = [x if rng.random() < 0.6 else rng.randrange(4) for x in said]
@@ -145,7 +145,7 @@ def test_edges_are_those_of_a_best_assignment(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_names_make_no_difference(seed: int) -> None:
+def test_evaluation_does_not_depend_on_names(seed: int) -> None:
     rng = random.Random(seed)
     labels = [*(rng.randrange(6) for _ in range(15)), 5]
     truths = [rng.randrange(6) for _ in labels]
@@ -210,7 +210,7 @@ def test_a_map_is_isomorphic_to_itself_as_the_truth(tour: str) -> None:
         )
 
 
-def test_the_notched_rectangle() -> None:
+def test_evaluation_of_the_notched_rectangle() -> None:
     names = [f"x{i % 8}" for i in range(41)]
     trace = told(rectangle(40), [{"dstate": x, "place": "ABCD"[int(x[1]) // 2]} for x in names])
     found = evaluate(solve(trace).maps, trace)
@@ -231,7 +231,7 @@ def test_the_notched_rectangle() -> None:
     assert (causal.link_precision, causal.link_recall) == (3 / 4, 3 / 8)
 
 
-def test_the_route_that_a_robot_drove_has_no_true_map_among_the_minimal_ones() -> None:
+def test_no_minimal_map_of_the_aces_route_is_true() -> None:
     trace = Trace.load(ACES)
     found = evaluate(aces.solution().maps, trace)
     assert (len(found.maps), found.rank, found.steps) == (4, None, 23)
@@ -241,7 +241,7 @@ def test_the_route_that_a_robot_drove_has_no_true_map_among_the_minimal_ones() -
         assert each.accuracy == 19 / 23  # four steps are at a dstate that the map takes for another
 
 
-def test_precision_and_recall_of_edges_are_those_counted_by_hand() -> None:
+def test_precision_and_recall_of_edges_equal_hand_counts() -> None:
     # Truth: A – B – C – A, driven once around and back to B. The map takes C for A, so that it has
     # the edges A – B and A – A.
     trace = walk([{"place": p} for p in "ABCABA"])
@@ -250,7 +250,7 @@ def test_precision_and_recall_of_edges_are_those_counted_by_hand() -> None:
     assert found.link_precision is None  # the truth names no dstates
 
 
-def test_turns_are_no_edges() -> None:
+def test_evaluation_ignores_turns_as_edges() -> None:
     trace = told(
         Trace.from_steps("vvvv", ["right", "travel", "left"]), [{"place": p} for p in "AABB"]
     )
@@ -258,18 +258,18 @@ def test_turns_are_no_edges() -> None:
     assert (found.edge_precision, found.edge_recall) == (0, 0)  # the turns alone are right
 
 
-def test_steps_without_a_place_are_not_at_one_place() -> None:
+def test_steps_without_a_place_share_no_place() -> None:
     found = one(labelled([0, 0, 1, 1], [0, None]), walk([{"place": p} for p in "AABB"]))
     assert (found.place_precision, found.place_recall, found.places_right) == (1, 1 / 2, False)
 
 
-def test_links_without_truth_at_an_end_are_left_out() -> None:
+def test_evaluation_omits_links_without_truth() -> None:
     found = one(labelled([0, 1, 2, 0, 1]), walk(["a", "b", None, "a", "b"]))
     assert (found.accuracy, found.dstates, found.link_precision, found.link_recall) == (1, 2, 1, 1)
     assert one(labelled([0, 1, 2]), walk(["a", None, "b"])).link_recall is None
 
 
-def test_levels_are_told_apart() -> None:
+def test_evaluation_judges_dstates_places_and_paths_separately() -> None:
     truths = [{"dstate": i, "place": i // 2, "path": i % 2, "direction": 1} for i in range(4)]
     courses = [(0, 1), (1, 1), (0, 1), (1, 1)]
 
@@ -332,12 +332,12 @@ def test_levels_are_told_apart() -> None:
         ([{"path": "main", "direction": 1}, {"dstate": "x", "place": None}, None], (2, 1, None, 1)),
     ],
 )
-def test_the_forms_of_truth(truths: list[Any], counts: tuple[int | None, ...]) -> None:
+def test_truth_is_read_in_all_its_forms(truths: list[Any], counts: tuple[int | None, ...]) -> None:
     found = evaluate([], walk(truths))
     assert (found.steps, found.true_dstates, found.true_places, found.true_paths) == counts
 
 
-def test_ambiguity_is_of_dstates_and_not_of_steps() -> None:
+def test_ambiguity_counts_dstates_not_steps() -> None:
     seen = Trace.from_steps(["a", "a", "b", "c", "a", "b"], ["go"] * 5)
     assert (
         evaluate([], told(seen, ["u", "v", "w", "x", "u", "x"])).ambiguity == 2 / 6
@@ -347,7 +347,7 @@ def test_ambiguity_is_of_dstates_and_not_of_steps() -> None:
     assert evaluate([], told(blind, "uvwxux")).ambiguity is None
 
 
-def test_the_dict_of_an_evaluation_has_its_attributes() -> None:
+def test_to_dict_of_an_evaluation_has_its_attributes() -> None:
     found = evaluate([labelled([0, 1, 0])], walk(["a", "b", "a"]))
     assert (found.rank, len({found, replace(found)})) == (1, 1)
     data = found.to_dict()
@@ -393,12 +393,12 @@ def test_the_dict_of_an_evaluation_has_its_attributes() -> None:
         ),
     ],
 )
-def test_truth_that_cannot_be_used(truths: list[Any], message: str) -> None:
+def test_unusable_truth_is_refused(truths: list[Any], message: str) -> None:
     with pytest.raises(TraceError, match=f"^{re.escape(message)}"):
         evaluate([labelled([0, 1, 2])], walk(truths))
 
 
-def test_maps_that_cannot_be_used() -> None:
+def test_evaluate_refuses_malformed_maps() -> None:
     trace = walk("aba")
     with pytest.raises(
         MapError,
@@ -415,7 +415,7 @@ def test_maps_that_cannot_be_used() -> None:
         evaluate([], "trace.jsonl")  # type: ignore[arg-type]
 
 
-def test_evaluation_imports_nothing_that_infers() -> None:
+def test_evaluation_does_not_import_the_solver() -> None:
     program = "import sys, ssh_abduction.evaluation; print(*sys.modules)"
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT
@@ -436,7 +436,7 @@ def solved(tmp_path: Path) -> str:
     return str(tmp_path / "maps.json")
 
 
-def test_the_shell_prints_a_table(solved: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_evaluate_prints_a_table(solved: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["evaluate", solved, ACES]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "4 maps: none is the true one"
@@ -448,13 +448,13 @@ def test_the_shell_prints_a_table(solved: str, capsys: pytest.CaptureFixture[str
     assert len(lines) == 3 + 4
 
 
-def test_the_shell_prints_json(solved: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_evaluate_prints_json(solved: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["evaluate", solved, ACES, "--json"]) == 0
     trace = Trace.load(ACES)
     assert json.loads(capsys.readouterr().out) == evaluate(aces.solution().maps, trace).to_dict()
 
 
-def test_the_shell_says_which_map_is_true(
+def test_evaluate_prints_which_map_is_true(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     names = [f"x{i % 8}" for i in range(25)]
@@ -484,7 +484,7 @@ def test_the_shell_says_which_map_is_true(
     )
 
 
-def test_errors_of_the_shell_are_one_line(
+def test_evaluate_errors_are_one_line(
     solved: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bare, short, none = tmp_path / "bare.jsonl", tmp_path / "short.jsonl", tmp_path / "none.json"

@@ -43,7 +43,9 @@ def run(name: str, *words: str) -> str:
         ("adventure", Theory.causal(), (6, 0, 0), 1),
     ],
 )
-def test_example_traces(name: str, theory: Theory, counts: tuple[int, int, int], maps: int) -> None:
+def test_example_traces_have_the_documented_maps(
+    name: str, theory: Theory, counts: tuple[int, int, int], maps: int
+) -> None:
     trace = Trace.load(EXAMPLES / f"{name}.jsonl")
     solution = solve(trace, theory)
     assert solution.status is Status.OPTIMAL
@@ -65,7 +67,7 @@ def test_every_example_trace_is_tested() -> None:
     }
 
 
-def test_x0_and_x4_share_a_view_and_are_told_apart() -> None:
+def test_notched_rectangle_separates_x0_and_x4_with_one_view() -> None:
     trace = Trace.load(EXAMPLES / "notched-rectangle.jsonl")
     (ssh_map,) = solve(trace).maps
     assert len(trace) == 400
@@ -74,7 +76,7 @@ def test_x0_and_x4_share_a_view_and_are_told_apart() -> None:
 
 
 @pytest.mark.slow
-def test_demo(tmp_path: Path) -> None:
+def test_demo_prints_maps_and_writes_a_report(tmp_path: Path) -> None:
     out = run("demo.py", str(tmp_path))
     assert "fewest: 19 dstates, 10 places, 4 paths; 4 minimal maps" in out
     assert out.count("satisfies every axiom") == 4
@@ -85,14 +87,14 @@ def test_demo(tmp_path: Path) -> None:
     assert (tmp_path / "aces3-map.svg").read_text().startswith("<svg ")
 
 
-def test_adventure(tmp_path: Path) -> None:
+def test_adventure_maps_the_maze_and_writes_its_trace(tmp_path: Path) -> None:
     assert run("adventure.py").endswith("6 rooms, 1 minimal map(s)\nthe map is the maze\n")
     run("adventure.py", "--play", str(tmp_path / "again.jsonl"))
     assert (tmp_path / "again.jsonl").read_text() == (EXAMPLES / "adventure.jsonl").read_text()
 
 
 @pytest.mark.slow
-def test_the_notebook_tells_what_it_shows(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_notebook_cells_print_their_stored_output(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each cell prints and returns what is stored beside it. Drawings are not compared."""
     monkeypatch.setattr(streets, "WORK", 0)
     cells = json.loads((EXAMPLES / "story.ipynb").read_text(encoding="utf-8"))["cells"]

@@ -90,7 +90,7 @@ def argument() -> PairExplanation:
     return explain_pair(RECTANGLE, 4, 0)
 
 
-def test_the_argument_of_the_paper() -> None:
+def test_explain_pair_gives_the_argument_of_the_paper() -> None:
     """Steps 0 and 4 differ by the argument of Kuipers & Beeson 2002, section 4.2.
 
     x0 is at a place on the path that x1 and x2 define. x4 is at a place to the right of that path.
@@ -113,7 +113,7 @@ def test_the_argument_of_the_paper() -> None:
     assert all(link.violations for link in derivation.links)
 
 
-def test_without_any_one_axiom_the_rectangles_steps_may_be_one() -> None:
+def test_each_axiom_of_the_argument_is_needed() -> None:
     """The solver finds a map with step 0 = step 4 once any axiom of the argument is left out."""
     derivation = argument().derivation
     assert derivation is not None
@@ -125,7 +125,7 @@ def test_without_any_one_axiom_the_rectangles_steps_may_be_one() -> None:
 
 @settings(max_examples=5)
 @given(st.data())
-def test_verdicts_are_those_of_the_brute_force(data: st.DataObject) -> None:
+def test_verdicts_equal_the_brute_force(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=5, closures=True), label="trace")
     assume(len(trace) > 1)
     theory = data.draw(theories(trace), label="theory")
@@ -181,7 +181,7 @@ def compare(trace: Trace, theory: Theory, first: int, second: int) -> PairExplan
     return explanation
 
 
-def test_what_planarity_rules_out_is_ruled_out_by_the_links_that_are_named() -> None:
+def test_derivation_names_the_links_that_planarity_needs() -> None:
     """A derivation names the links that planarity needs.
 
     While axioms are left out, a dstate may be at two places and there is nothing to draw. Then
@@ -202,7 +202,7 @@ def test_what_planarity_rules_out_is_ruled_out_by_the_links_that_are_named() -> 
     assert "planar" in derivation.axioms
 
 
-def test_links_that_are_needed_once_more_are_named() -> None:
+def test_derivation_names_repeated_links() -> None:
     """The axiom at step 5 alone implies nothing about steps 0 and 3 without earlier links."""
     trace = Trace.from_steps("baabab", ["left"] * 5)
     derivation = explain_pair(trace, 0, 3, Theory.causal()).derivation
@@ -211,14 +211,14 @@ def test_links_that_are_needed_once_more_are_named() -> None:
     assert derivation.supposition == "steps 0 and 3 are one dstate"
 
 
-def test_a_long_trace_is_answered_from_few_steps() -> None:
+def test_derivation_in_a_long_trace_names_two_steps() -> None:
     far = explain_pair(RECTANGLE, 3, 396)
     assert far.derivation is not None
     assert far.derivation.steps == (3, 396)
     assert far.derivation.axioms == ("functional_view",)
 
 
-def test_what_a_rival_costs_that_lost() -> None:
+def test_explanation_states_the_cost_of_the_rival_in_dstates() -> None:
     explanation = explain_pair(RECTANGLE, 0, 8)
     assert explanation.sentences == (
         "steps 0 and 8 are one dstate in every minimal map",
@@ -229,7 +229,7 @@ def test_what_a_rival_costs_that_lost() -> None:
     assert other.cost == explanation.different.cost
 
 
-def test_what_a_join_costs_in_nats() -> None:
+def test_explanation_states_the_cost_of_a_join_in_nats() -> None:
     """A square whose loop closes some metres off."""
     told = []
     for off in (3, 6):
@@ -259,7 +259,7 @@ SQUARE = Trace.from_steps(
 
 
 @pytest.mark.parametrize(("trace", "within"), [(SQUARE, 16)])
-def test_an_answer_is_never_worse_than_the_known_maps(trace: Trace, within: int) -> None:
+def test_explain_pair_without_time_uses_known_maps(trace: Trace, within: int) -> None:
     """No time is left for any search, but the known maps are still there."""
     solution = solve(trace)
     known = solve(trace, within=within).maps
@@ -287,7 +287,7 @@ def test_an_answer_is_never_worse_than_the_known_maps(trace: Trace, within: int)
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("trace", "within"), [(SQUARE, 8)])
-def test_known_maps_change_no_answer_that_is_proven(trace: Trace, within: int) -> None:
+def test_known_maps_do_not_change_proven_answers(trace: Trace, within: int) -> None:
     anew, known = Search(trace, within=within), solve(trace, within=within + 1).maps
     search = Search(trace, within=within, _start=Start(known=known))
     assert {*search} == {*anew}
@@ -296,7 +296,7 @@ def test_known_maps_change_no_answer_that_is_proven(trace: Trace, within: int) -
     assert explain_pair(trace, *pair, known=known) == explain_pair(trace, *pair)
 
 
-def test_a_map_like_the_best_one_is_known_for_the_other_side() -> None:
+def test_explain_pair_without_time_finds_a_map_for_the_other_answer() -> None:
     """No time is left for any search, but a visit to a new place makes a map that is accepted."""
     solution = solve(SQUARE)
     assert solution.weighed
@@ -312,7 +312,7 @@ def test_a_map_like_the_best_one_is_known_for_the_other_side() -> None:
     )
 
 
-def test_known_maps_that_the_theory_forbids_are_ignored() -> None:
+def test_known_maps_that_break_the_theory_are_ignored() -> None:
     known = solve(SQUARE).maps
     theory = Theory(different=[(0, 8)])
     assert known[0].dstate_at[0] == known[0].dstate_at[8]
@@ -322,7 +322,7 @@ def test_known_maps_that_the_theory_forbids_are_ignored() -> None:
         explain_pair(SQUARE.prefix(9), 0, 8, known=known)
 
 
-def test_rivals_that_disagree_are_counted() -> None:
+def test_explanation_counts_rivals_that_disagree() -> None:
     """Turned back, travel may stop at the place before, or skip it (G1 of
     docs/explanation/theory.md)."""
     trace = Trace.from_steps(
@@ -341,7 +341,7 @@ def test_rivals_that_disagree_are_counted() -> None:
         assert explanation.same.maps == sum(m.labels[i] == m.labels[j] for m in maps)
 
 
-def test_one_in_every_map() -> None:
+def test_explain_pair_proves_steps_one_dstate_in_every_map() -> None:
     """A turn around, twice, leads back to where a travel came to."""
     trace = Trace.from_steps("aabab", ["travel", "around", "around", "travel"])
     explanation = explain_pair(trace, 1, 3, Theory(without=["functional_view"]))
@@ -353,7 +353,7 @@ def test_one_in_every_map() -> None:
 
 
 @pytest.mark.parametrize("trace", [IMPOSSIBLE, Trace.from_steps("aab", ["x", "x"], stars=None)])
-def test_mends_are_those_of_the_solver(trace: Trace) -> None:
+def test_mends_equal_the_changes_after_which_solve_finds_a_map(trace: Trace) -> None:
     theory = Theory.causal() if trace is not IMPOSSIBLE else Theory()
     theory = theory if trace is IMPOSSIBLE else theory.replace(same=[(0, 1)])
     explanation = explain_trace(trace, theory)
@@ -373,21 +373,21 @@ def test_mends_are_those_of_the_solver(trace: Trace) -> None:
         assert "same" in {mend.kind for mend in explanation.mends}
 
 
-def test_nothing_is_explained_of_a_trace_without_a_map() -> None:
+def test_explain_pair_of_an_impossible_trace_names_the_clash() -> None:
     explanation = explain_pair(IMPOSSIBLE, 0, 2)
     assert explanation.verdict is Verdict.NO_MAP
     assert explanation.clash == explain_trace(IMPOSSIBLE).clash
     assert "the trace has a map" in explain_trace(RECTANGLE.prefix(9)).sentences[0]
 
 
-def test_a_limit_leaves_what_is_known() -> None:
+def test_explain_pair_at_a_time_limit_is_unknown() -> None:
     explanation = explain_pair(RECTANGLE, 3, 399, time_limit=0.001)
     assert explanation.verdict is Verdict.UNKNOWN
     assert explanation.stopped == "time limit"
     assert not explanation.proven
 
 
-def test_the_shell_says_that_a_limit_ended_the_search(
+def test_explain_prints_that_the_time_limit_ended_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "trace.jsonl"
@@ -408,12 +408,12 @@ def test_the_shell_says_that_a_limit_ended_the_search(
         (True, 3, "got True"),
     ],
 )
-def test_steps_that_cannot_be_explained(first: int, second: int, said: str) -> None:
+def test_explain_refuses_wrong_steps(first: int, second: int, said: str) -> None:
     with pytest.raises(TraceError, match=said):
         explain_pair(RECTANGLE, first, second)
 
 
-def test_the_shell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_explain_prints_the_argument(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     impossible, rectangle = tmp_path / "impossible.jsonl", tmp_path / "rectangle.jsonl"
     IMPOSSIBLE.save(impossible)
     RECTANGLE.prefix(12).save(rectangle)
@@ -431,7 +431,7 @@ def test_the_shell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["explain", str(rectangle)]) == 0
 
 
-def test_maps_tell_the_theory_that_is_explained_by(
+def test_explain_uses_the_theory_of_the_maps(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     trace, maps = str(tmp_path / "impossible.jsonl"), tmp_path / "maps.json"
@@ -449,13 +449,13 @@ def test_maps_tell_the_theory_that_is_explained_by(
     assert "expected the theory that the maps were made with" in capsys.readouterr().err
 
 
-def test_keys_are_labels_first() -> None:
+def test_keys_begin_with_labels() -> None:
     """`compare` reads labels out of the keys of the brute force."""
     (ssh_map,) = solve(RECTANGLE.prefix(5)).maps
     assert key(ssh_map)[0] == ssh_map.labels
 
 
-def test_what_was_interrupted_is_said_so(
+def test_interrupted_explanation_says_so(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The verdict is known by then, and the axioms are not."""
