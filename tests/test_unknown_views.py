@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,7 @@ from ssh_abduction.data.errors import TraceError
 from ssh_abduction.output import to_dot, to_graphml, to_svg
 from ssh_abduction.rivals.comparison import compare
 from ssh_abduction.rivals.explore import next_experiment
+from ssh_abduction.solver import Status
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.speedups import TABLE
 
@@ -126,8 +128,26 @@ def test_a_null_is_unknown_and_a_missing_field_is_an_error(tmp_path: Path) -> No
         TraceError, match=r"3: view: expected a text .* or null where that was not logged"
     ):
         Trace.load(path)
+    unseen = Trace.from_steps([None, None], ["go"])
+    with pytest.raises(TraceError, match="view: expected one, got none in any step; give"):
+        solve(unseen)
+    steps = tuple(replace(step, image=(1.0, 2.0)) for step in unseen.steps)
     with pytest.raises(TraceError, match="view: expected one, got only an image; cluster"):
-        solve(Trace.from_steps([None, None], ["go"]))
+        solve(replace(unseen, steps=steps))
+
+
+def test_a_stretch_without_any_view_may_contradict_what_a_person_says(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trace = Trace.from_steps(["a", None, None], ["around", "travel"], name="monday")
+    solution = solve(trace, Theory(same=((1, 2),)), time_limit=1e-9)
+    assert (solution.status, len(solution.maps)) == (Status.UNSATISFIABLE, 0)
+    file, maps = str(tmp_path / "trace.jsonl"), str(tmp_path / "maps.json")
+    trace.save(file)
+    assert main(["solve", file, "-o", maps]) == 0
+    assert main(["correct", str(tmp_path), "--same", "monday:1,monday:2"]) == 0
+    assert main(["solve", file, "-o", maps]) == 20
+    assert "(monday:1 shows no view, monday:2 shows no view)" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

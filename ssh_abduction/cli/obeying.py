@@ -133,6 +133,8 @@ class Obeying:
     def _has_no_map(self, said: Corrections, stretch: range) -> bool:
         trace, theory = obeyed(said, self.as_seen, self.without)
         part = theory.of_steps(stretch.start, len(stretch))
+        # In these steps, every view may be unknown.
+        part = part.replace(unknown_views=None in trace.views)
         return explain(trace[stretch.start : stretch.stop], part) is not None
 
     def _seen(self, said: Said | Passage) -> str:
@@ -140,5 +142,6 @@ class Obeying:
         if isinstance(said, Passage):
             return ""
         drives = drives_of(self.trace)
-        seen = [self.trace.steps[step_of(drives, step)].view for step in said.steps]
+        views = [self.trace.steps[step_of(drives, step)].view for step in said.steps]
+        seen = ("no view" if view is None else view for view in views)
         return f" ({', '.join(f'{s} shows {v}' for s, v in zip(said.steps, seen, strict=True))})"

@@ -88,11 +88,8 @@ def settle(trace: Trace, theory: Theory | None = None, known: Problem | None = N
             f"{mend}"
         )
     views = set(trace.views)
-    if views == {None}:
-        raise TraceError(
-            f"{trace.at(0)}: view: expected one, got only an image; cluster the images into views "
-            "first (ssh-abduction cluster)"
-        )
+    if views == {None} and not theory.unknown_views:  # a part of a trace may have no view
+        raise _no_view(trace)
     settled = replace(
         theory,
         star=star,
@@ -139,6 +136,16 @@ def count_returns(problem: Problem) -> int:
 def displacement_of(problem: Problem) -> Displacement | None:
     """Return the evidence of displacements; None if the theory does not use it."""
     return next((e for e in problem.evidence if isinstance(e, Displacement)), None)
+
+
+def _no_view(trace: Trace) -> TraceError:
+    got, mend = "none in any step", "give the views that are known, or one view to all steps"
+    if any(step.image is not None for step in trace.steps):
+        got, mend = (
+            "only an image",
+            "cluster the images into views first (ssh-abduction cluster)",
+        )
+    return TraceError(f"{trace.at(0)}: view: expected one, got {got}; {mend}")
 
 
 def _weigh_of(theory: Theory, displacement: str) -> Literal["cost", "count"]:
