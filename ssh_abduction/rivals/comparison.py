@@ -71,8 +71,8 @@ class Choice:
     Attributes:
         questions: Some of the questions in `Comparison.deciding`.
         options: The ways in which maps answer these questions, the way of map 1 first.
-        differing: For each sort (faults, dstates, places, paths, courses) the steps whose grouping
-            depends on this choice and on no other.
+        differing: For each sort (faults, dstates, places, paths, courses), the steps whose grouping
+            depends on this choice and on no other. A course is a path with a direction.
     """
 
     questions: tuple[Question, ...]
@@ -135,7 +135,7 @@ class Others:
 class Comparison:
     """The result of `compare`: what maps of one trace share, and where they differ.
 
-    A sort is one of faults, dstates, places, paths and courses.
+    A sort is one of faults, dstates, places, paths and courses (paths with a direction).
 
     Attributes:
         ids: The ids of the maps.
@@ -151,10 +151,12 @@ class Comparison:
         choices: The independent choices. Each combination of their options is one listed map.
         together: For each sort, the steps whose grouping depends on several choices together.
         deciding: Questions that distinguish all listed maps, in the order in which to ask them. The
-            first ones distinguish all labelings. None is superfluous, but a smaller set may exist.
+            first ones distinguish all labelings (the dstates of all steps). None is superfluous,
+            but a smaller set may exist.
         sizes: Pairs of a size (numbers of dstates, places and paths) and the number of maps with
             this size.
-        fits: The least and the greatest chi-square; None if the maps have no fits.
+        fits: The least and the greatest chi-square of the maps; None if they were not fitted to
+            displacements.
         others: The comparison with another list; None if there is no other list.
         by_cost: Whether the maps were compared by their cost in nats, and not by counts.
     """
@@ -248,8 +250,8 @@ class Comparison:
 def compare(maps: Maps, other: Maps | None = None) -> Comparison:
     """Compare maps of one trace: what they share, where they differ, and which steps decide.
 
-    If a solution does not list all minimal maps, what these share is read from its backbone, which
-    may know more than the listed maps show.
+    If a solution does not list all minimal maps, its backbone tells what all of them share. The
+    listed maps may share more.
 
     Args:
         maps: A Solution, a Listing (`Listing.load` reads a file), or maps of one trace.
@@ -310,7 +312,7 @@ def compare(maps: Maps, other: Maps | None = None) -> Comparison:
 def _depending(
     asked: Sequence[AnsweredQuestion], options: Sequence[NDArray[np.intp]], table: Table
 ) -> tuple[list[dict[Matter, tuple[int, ...]]], dict[Matter, tuple[int, ...]]]:
-    """Find the steps that depend on each choice alone, and those that depend on several."""
+    """Find the steps whose grouping depends on each choice alone, and on several choices."""
     of_choice: list[dict[Matter, set[int]]] = [{} for _ in options]
     together: dict[Matter, set[int]] = {}
     sizes = [np.bincount(option) for option in options]
@@ -328,7 +330,7 @@ def _depending(
 
 
 def _in_order(steps: dict[Matter, set[int]]) -> dict[Matter, tuple[int, ...]]:
-    """Order steps by sort, causes before effects. List the steps of each sort ascending."""
+    """Sort the steps of each sort, and put the sorts in the order of `MATTERS`."""
     return {sort: tuple(sorted(steps[sort])) for sort in MATTERS if sort in steps}
 
 
@@ -337,7 +339,7 @@ def _choice(
     option: NDArray[np.intp],
     differing: dict[Matter, tuple[int, ...]],
 ) -> Choice:
-    """Make a choice of the questions `asked`, with the number of each map's `option`."""
+    """Make a choice of the questions `asked`. `option` numbers the option of each map."""
     members = members_of(option.tolist())
     options = [
         Option(tuple(bool(a.column[maps[0]]) for a in asked), tuple(i + 1 for i in maps))
@@ -379,7 +381,7 @@ def _check_backbone(shared: Backbone, listed: Backbone, listing: Listing) -> Non
 
 
 def _contradiction(claimed: Shared, seen: Shared, in_one: Sequence[int]) -> tuple[int, int] | None:
-    """Find two steps that are one by the backbone but not in a listed map, or vice versa."""
+    """Find two steps that the backbone joins but a listed map does not, or vice versa."""
     first_of: dict[int, int] = {}
     for t, number in enumerate(claimed.always):
         first = first_of.setdefault(number, t)

@@ -259,7 +259,7 @@ def _changes(table: Table, sort: Sort) -> Iterable[Change]:
 
 
 def _groups(classes: Sequence[int], ones: Sequence[int]) -> list[list[int]]:
-    """Group the classes that a map has as one, from its row in `Table.ones`. Skip those at NONE."""
+    """Group classes that a map joins. `ones` is its row in `Table.ones`; NONE is left out."""
     return list(gathered((ones[c], c) for c in classes if ones[c] != NONE).values())
 
 

@@ -51,8 +51,8 @@ class DriveJoin:
 class DrivePair:
     """The places that two drives share.
 
-    Take a place of one drive and a place of the other drive, in the first map. For each such pair
-    of places, only the most probable join (two steps at one place) is listed.
+    A join is two steps, one of each drive, at one place. Many joins may be about the same two
+    places of the first map. Only the most probable one of these is listed.
 
     Attributes:
         first: The name of the earlier drive.
@@ -130,7 +130,7 @@ def joins_of_drives(listing: Listing) -> tuple[DrivePair, ...]:
 
 
 def _placings(listing: Listing) -> tuple[list[_Placing], list[float], bool]:
-    """For each map, the place of each step; the weights of the maps; and whether all are listed."""
+    """Return the place of each step in each map, the weights of maps, and if all are listed."""
     weighed = listing.weighed
     if weighed is not None:
         at: list[_Placing] = [rival.places or rival.dstates for rival in weighed.rivals]

@@ -11,15 +11,16 @@
 
 Kuipers & Beeson (2002): "it may be necessary to search actively for the relevant experience, using
 homing sequences (Rivest & Schapire 1989) or the rehearsal procedure (Kuipers & Byun 1991)". Here
-each rival says where the robot is: at the dstate of the last step. So the first states of all
-machines are known, and the task is to find a distinguishing sequence, not a homing sequence.
+each rival says where the robot is: at the dstate of the last step. So if the maps are read as
+finite-state machines, their current states are known. The task is to find a distinguishing
+sequence, not a homing sequence.
 
 Known links
 -----------
-Each map predicts what is seen along its links. With `implied` it also predicts along links that the
-axioms imply: if places have frames, four right turns lead back (`rivals/consequences.py`). A
-sequence of actions is followed while all rivals that are left have each link. Once their
-predictions differ, the observation refutes some of them.
+Each map predicts what is seen along its links. With the option `implied`, it also predicts along
+links that the axioms imply: if places have frames, four right turns lead back
+(`rivals/consequences.py`). A sequence of actions is followed while all rivals that are left have
+each link. Once their predictions differ, the observation refutes some of them.
 
 *Two rivals.* The robot is at one dstate in each map. The two dstates are a joint state. A
 breadth-first search over joint states finds the fewest actions after which the predictions differ,
@@ -155,7 +156,7 @@ class Laboratory:
     """The search for a plan that distinguishes some rivals.
 
     A machine is a map as seen from the current dstate (`rivals/machines.py`). Rivals with equal
-    machines are one group. Machines have the numbers of their groups, from 0. Parameters as in
+    machines are one group. A group and its machine have the same number, from 0. Parameters as in
     `next_experiment`.
     """
 

@@ -39,9 +39,9 @@ from ssh_abduction.rivals.table import Bools
 def deciding(columns: Sequence[Bools] | Bools, maps: int, tiers: Sequence[int] = ()) -> list[int]:
     """Choose questions that distinguish all maps that can be distinguished; none is superfluous.
 
-    `columns` has, for each question, the answers of all maps. Earlier questions win ties. A
-    question is chosen only if no question of a lower tier distinguishes any more maps. By
-    default all have one tier. Return the indices of the questions, in the order of choice.
+    `columns` has, for each question, the answers of all maps. Earlier questions win ties. `tiers`
+    ranks the questions; by default all have one rank. A question is chosen only when those of lower
+    ranks distinguish no further maps. Return the indices of the questions, in the order of choice.
     """
     groups = np.zeros(maps, dtype=np.intp)
     # A question distinguishes ever fewer new pairs as others are chosen. So its pairs are counted
@@ -70,10 +70,10 @@ def deciding(columns: Sequence[Bools] | Bools, maps: int, tiers: Sequence[int] =
 
 
 def independent(columns: Sequence[Bools] | Bools) -> list[list[int]]:
-    """Divide questions into the finest independent choices, in the order of first questions.
+    """Divide questions into the finest independent choices.
 
     `columns` has the answers of all maps for each question. Maps with equal answers count once.
-    A choice is a list of indices.
+    A choice is a list of indices of questions. Choices are sorted by their first question.
     """
     if not len(columns):
         return []
@@ -90,10 +90,10 @@ def independent(columns: Sequence[Bools] | Bools) -> list[list[int]]:
 
 
 def options_of(columns: Sequence[Bools] | Bools, maps: int) -> NDArray[np.intp]:
-    """Number the options, the different combinations of answers, of each map: shape (maps,).
+    """Return the number of each map's option, of shape (maps,).
 
-    `columns` has the answers of all maps for each question. Options are numbered from 0 in the
-    order of the maps.
+    An option is a combination of answers. `columns` has the answers of all maps for each question.
+    Options are numbered from 0 in the order of the maps.
     """
     if not len(columns):
         return np.zeros(maps, dtype=np.intp)

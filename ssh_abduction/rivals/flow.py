@@ -134,7 +134,7 @@ def shortest_flow(
 
 
 def _parts_cut_off(used: Sequence[StanceMove], start: int) -> list[set[int]]:
-    """Find the connected parts of a flow without its start, as sets of stances (place, heading)."""
+    """Find the parts of a flow that `start` is not connected to, as sets of stances."""
     near = reached_from(used, start)
     left = [(move.source, move.target) for move in used if move.source not in near]
     beside = gathered([*left, *((target, source) for source, target in left)])

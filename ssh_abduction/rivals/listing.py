@@ -54,7 +54,7 @@ class Listing:
         backbone: What all minimal maps share, listed or not; None if unknown.
         source: The name of the list, for messages.
         weighed: The costs of the maps in nats, if they were compared by cost; else None.
-        by_minimality: The joins of the first map that rest on minimality alone, if known.
+        by_minimality: The joins of the first map that no axiom and no observation forces, if known.
         drives: The drives of a joint trace; empty if there is one drive.
         warnings: Sentences about what is suspicious in the trace, if known.
     """
@@ -153,7 +153,9 @@ class Listing:
         return cls.from_dict(read_json(path), where).named_beside(path)
 
     def named_beside(self, path: str | os.PathLike[str]) -> Listing:
-        """Return this listing with the names in the file of corrections beside a file of maps.
+        """Return this listing with the names that a person gave.
+
+        They are in the file of corrections beside the file of maps.
 
         Args:
             path: The file of the maps, or "-".
@@ -367,10 +369,10 @@ class PairInMap:
 
     Attributes:
         is_one_place: Whether the two steps are at one place.
-        probability: The probability that they are; None if maps were not compared by cost.
+        probability: The probability that they are; None if it is unknown, as without costs in nats.
         nats: The extra cost, in nats, of the best known map that contradicts `is_one_place`; None
             if no such map is known.
-        is_estimated: Whether that map was only estimated, so that it may break axioms.
+        is_estimated: Whether `nats` is an estimate: the map was not checked and may break axioms.
     """
 
     is_one_place: bool

@@ -293,7 +293,7 @@ class MachineTable:
                     self.ends[i, s, column[action]] = target
 
     def follow(self, group: Array, rows: Array, action: int) -> tuple[Array, Array]:
-        """Follow an action from joint states of machines, and return what is seen there, too.
+        """Follow an action from joint states. Return the joint states after it, and what is seen.
 
         `group` has the indices of the machines, (m,), and `rows` the state of each, (n, m).
         Both results are (n, m). Entries are UNKNOWN if the machine lacks the link.
@@ -367,10 +367,10 @@ class Walk:
             )
 
     def moves(self, layer: Layer) -> Iterator[tuple[int, int, Array, Array]]:
-        """Follow each action from the joint states of a layer, part by part.
+        """Follow each action from the joint states of a layer, some rows at a time.
 
-        Yield the first row of the part, the index of the action, the joint states after it,
-        and the numbers of what is seen there.
+        For each part of the layer and each action, yield the number of the first row of the part,
+        the index of the action, the joint states after it, and the numbers of what is seen there.
         """
         size = max(CHUNK // len(self.group), 1)
         for start in range(0, len(layer.rows), size):

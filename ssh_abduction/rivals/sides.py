@@ -142,7 +142,10 @@ def only_in(
 def _sides(
     maps: Sequence[SSHMap], steps: Sequence[int]
 ) -> dict[tuple[int, int], list[_Side | None]]:
-    """Find the side of a path in each map, by first steps at a place and along a path, if known."""
+    """Find the side of a path on which a place lies, in each map; None if unknown.
+
+    A key is the first step at the place and the first step along the path.
+    """
     beside = [
         {
             (path.id, d): {*right_of(m.regions or (), path.id, d)}
@@ -175,7 +178,10 @@ def _sides(
 def _side(
     right: dict[tuple[int, int], set[int]], place: int | None, course: tuple[int, int] | None
 ) -> _Side | None:
-    """The side of a course on which a place lies, by the places `right` of it; else None."""
+    """The side of a course on which a place lies; None if unknown.
+
+    `right` has the places to the right of each course (path and direction).
+    """
     if course is None:
         return None
     if place in right[course]:

@@ -38,7 +38,7 @@ class Table:
     Attributes:
         firsts: The first step of each class, shape (classes,).
         classes: The class of each step, shape (steps,).
-        steps: The numbers of all steps, which name their drives if there are several.
+        steps: The numbers of all steps. With several drives, a step prints with its drive's name.
         ones: For each sort that all maps have, an array of shape (maps, classes): the first class
             that is one with each class in each map; NONE if the class has no place, path or course.
     """
@@ -77,7 +77,7 @@ class Table:
         return len(np.unique(self.ones[sort], axis=0))
 
     def heads(self, sort: Sort) -> Ints:
-        """For each class, find the first class that all maps treat in the same way, (classes,).
+        """Return the first class that all maps treat like each class, of shape (classes,).
 
         Two classes are treated in the same way if in each map they are one, or both have no
         place, path or course.
@@ -133,7 +133,7 @@ class Table:
 
 
 def _common_classes(labelings: Sequence[Ints]) -> Ints:
-    """Number the steps, (steps,): those with equal labels in all labelings share one."""
+    """Return the class of each step, of shape (steps,): steps of a class have equal labels."""
     classes = labelings[0].astype(np.int64)
     for labels in labelings[1:]:
         _, classes = np.unique(classes * (int(labels.max()) + 1) + labels, return_inverse=True)

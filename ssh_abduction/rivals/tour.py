@@ -15,11 +15,11 @@ tried one by one. Expected ends of moves are guesses for the plan only. No concl
 them, and the robot plans again after each surprise.
 
 A map with the fewest dstates may merge places that only look alike. So the tour doubts each return
-to a place until enough is seen there. Suppose that an unknown move leads to a place, and the map
-says that it is an earlier one. Then the plan treats it as a new place, until this place and the
-doubted places beside it have more than `margin` dstates. Meanwhile the robot explores it. If they
-are two places, the robot sees something new. If they are one, it confirms the return. A travel back
-to where the robot came from is not doubted.
+to a place until enough is seen there. Suppose that by the map, an unknown move leads to an earlier
+place. Then the plan treats the end of the move as a new place. The robot explores the new place,
+until it has seen more than `margin` dstates there and at the doubted places beside it. If the new
+place is not the earlier one, the robot sees something new. Otherwise, it confirms the return. A
+travel back to where the robot came from is not doubted.
 """
 
 from __future__ import annotations
