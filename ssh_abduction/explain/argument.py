@@ -56,11 +56,11 @@ def derive(
     one: bool,
     stop: Callable[[], bool] = lambda: False,
 ) -> Derivation:
-    """Find an argument that two steps are one dstate in all maps (`one`), or in none.
+    """Find an argument that two steps are one dstate in all maps (if `one`), or else in none.
 
-    The steps of `piece` must suffice for the proof; the caller must have proved that they do.
-    The argument may cite displacements of the whole trace. `stop` is called now and then. If it
-    returns True, Interrupted is raised.
+    The caller must have proved that the steps of `piece` suffice for the proof. The argument may
+    cite displacements of the whole trace. `stop` is called now and then. If it returns True,
+    Interrupted is raised.
     """
     return Argument(piece, trace, first, second, one, stop).derivation()
 
@@ -70,7 +70,7 @@ class _Line:
     """A line of an argument: the conclusions that follow from its links and the lines before it.
 
     `group` has the links. A line without conclusions is the contradiction. A line that is
-    `supposed` holds only under the supposition.
+    `supposed` holds only if the opposite of what is to be shown is supposed.
     """
 
     group: tuple[tuple[str, int], ...]
@@ -189,7 +189,7 @@ class Argument:
     def _add(
         self, group: tuple[tuple[str, int], ...], known: frozenset[clingo.Symbol], supposed: bool
     ) -> None:
-        """Add a line if some known conclusions are new, perhaps under the supposition."""
+        """Add a line if some of the `known` conclusions are in no line yet."""
         new = known - self._born.keys()
         if new:
             self._born.update(dict.fromkeys(new, len(self._lines)))
@@ -382,7 +382,10 @@ class Argument:
             )
 
     def _map_without(self, link: tuple[str, int]) -> SSHMap:
-        """Find a map with the supposition and all links but this one, and most of SHOWN."""
+        """Find a map that satisfies the supposition and all links but this one.
+
+        The map also keeps the axioms SHOWN, at all steps or at as many as possible.
+        """
         supposed = [self._supposed]
         active = _active(other for other in self._links if other != link)
         for axiom in SHOWN:
@@ -403,5 +406,5 @@ class Argument:
 
 
 def _active(links: Iterable[tuple[str, int]]) -> list[clingo.Symbol]:
-    """Return the atoms that switch on some links."""
+    """Return the atoms that switch on these links."""
     return [facts.active(axiom, t) for axiom, t in links]

@@ -47,7 +47,7 @@ class _ModelMap(NamedTuple):
 class _ArgumentModel(NamedTuple):
     """A model that clingo found during an argument: its conclusions, and the links that it breaks.
 
-    `one` has the atoms of the pairs of steps that are one dstate in the model.
+    `one` has an atom for each pair of steps at one dstate of the model.
     """
 
     conclusions: frozenset[clingo.Symbol]
@@ -73,9 +73,9 @@ def _forget(_: clingo.Model) -> None:
 class Axioms:
     """The axioms of a piece of a trace, in clingo.
 
-    Some evidence can only judge a whole map. If it rejects a map of clingo, the reason is added as
-    a constraint, and clingo is asked again. Axioms that can be switched on and off (*relaxed*) have
-    an `active` atom for each step.
+    Some evidence, such as two returns together, can only judge a whole map. If it rejects a map
+    that clingo found, the reason is added as a constraint, and clingo is asked again. Axioms that
+    can be switched on and off (*relaxed*) have an `active` atom for each step.
     """
 
     def __init__(self, piece: Piece, stop: Callable[[], bool], *, relaxed: bool = False) -> None:
@@ -171,7 +171,7 @@ class Axioms:
     def tell_of(self, steps: Iterable[int]) -> None:
         """Set the steps that the conclusions of `consequences` are about.
 
-        The conclusions are those of encodings/derivation.lp.
+        The file encodings/derivation.lp defines the possible conclusions.
         """
         self._control.add("told_of", [], facts.told_of(steps))
         self._control.ground([("told_of", []), ("conclusions", [])])
@@ -300,8 +300,8 @@ class Axioms:
     ) -> tuple[str, Refusal] | None:
         """Find equalities of a model that some evidence rejects, with the axiom of the evidence.
 
-        If axioms are relaxed, a rejection counts only if its axiom is in `active` at the step of
-        `_judged_at`.
+        If axioms are relaxed, a rejection counts only if its axiom is active at the step that
+        `_judged_at` returns.
         """
         for evidence in self._evidence:
             if not self._pairs:
@@ -333,7 +333,7 @@ class Axioms:
     def _refused_together(
         self, displacement: Displacement, answer: _ModelMap, step: int
     ) -> Refusal | None:
-        """Find two returns, the later one to `step`, that displacements reject together."""
+        """Find two returns that displacements reject together. The later one ends at `step`."""
         if displacement.joint == 1:
             return None
         return displacement.returns_of(self._trace).refused_at(answer.labels, answer.places, step)

@@ -8,7 +8,8 @@
 (0, 3, 'functional_view')
 
 The explanation is a stretch of the trace (consecutive steps) that has no map, and a minimal set of
-axioms at steps that clash there. With fewer steps at either end the stretch has a map.
+pairs (axiom, step) that no map of the stretch satisfies. With fewer steps at either end, the
+stretch has a map.
 """
 
 from __future__ import annotations
@@ -49,9 +50,9 @@ class ClashingAxiom:
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """A stretch of the trace without a map, and a minimal set of axioms at steps that clash.
+    """A stretch of the trace without a map, and a minimal set of axioms that clash there.
 
-    The set is minimal: without any one of its axioms, even at only one step, the rest has a map.
+    The set is minimal: if one axiom is dropped at only one step, a map satisfies the rest.
 
     Attributes:
         first: The first step of the stretch.
@@ -179,8 +180,8 @@ def check_two_steps(trace: Trace, first: object, second: object) -> None:
 def shortest(longest: int, has_no_map: Callable[[int], bool]) -> int | None:
     """Find the least number of steps without a map, by doubling and bisection.
 
-    This is exact, because if some steps have no map, more steps have none either. None if even
-    the longest stretch has a map.
+    This is exact, because a longer stretch has no map if a shorter one has none. None if even the
+    longest stretch has a map.
     """
     short, long = 0, 1
     while not has_no_map(long):

@@ -270,7 +270,10 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
     def _keep(
         self, ssh_map: SSHMap, cost: Cost | None, nats: float | None, *, proven: bool = False
     ) -> None:
-        """Keep the cost of a map, perhaps `proven` to be its side's least, if it is the best."""
+        """Keep the cost of a map if the map is the best one so far, of its side or of all.
+
+        `proven` says whether this is proven to be the least cost of a map of its side.
+        """
         one = ssh_map.dstate_at[self.first] == ssh_map.dstate_at[self.second]
         before = self._sides[one]
         side = replace(before, possible=True, cost=cost, nats=nats, proven=proven)
@@ -289,7 +292,7 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
     # Few steps around the pair
 
     def _ask_pieces(self, one: bool, most: int) -> None:
-        """Find at most `most` steps that have no map in which the pair is `one`, or is not."""
+        """Find at most `most` steps around the pair that have no map of the side `one`."""
         for steps in self._pieces(most):
             piece = Piece.of(self.problem, steps)
             if not self._has_map(piece, one):
@@ -300,7 +303,7 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
     def _pieces(self, most: int) -> Iterator[list[int]]:
         """Yield lists of steps around the pair, from few to at most `most`.
 
-        A map of the trace, restricted to fewer steps, is a map of these steps. This may fail if
+        A map of the trace, restricted to fewer steps, is a map of these steps. This may be false if
         the theory has faults or rules of the user. Then only the whole trace is yielded, if short.
         """
         whole = range(len(self.trace))
@@ -328,12 +331,12 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
             width += 1 + width // 2
 
     def _has_map(self, piece: Piece, one: bool) -> bool:
-        """Tell whether a piece has a map in which the pair is one dstate (if `one`; else two)."""
+        """Tell whether a piece has a map of the side `one` of the pair."""
         pair = piece.steps.index(self.first), piece.steps.index(self.second)
         return Axioms(piece, self._over).consistent(assumed=[(facts.are_one(*pair), one)])
 
     def _shrunk(self, piece: Piece, one: bool) -> Piece:
-        """Drop steps at the ends of a piece while the rest has no map as in `_has_map`."""
+        """Drop steps at the ends of a piece while the rest has no map of the side `one`."""
         if self.theory.rules or self.theory.has_faults:
             return piece
         for t in (*piece.steps, *reversed(piece.steps)):
@@ -350,7 +353,7 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
     # The whole trace
 
     def _list_minimal_maps(self, settled: bool) -> None:
-        """List minimal maps (one if `settled`). Count those in which the steps are one dstate."""
+        """List minimal maps, or one if `settled`. Count those in which the steps are one dstate."""
         left = self._watch.left()
         seconds = (
             min(left, max(CONFIRMING, 0.0 if self.limit is None else self.limit / 10))

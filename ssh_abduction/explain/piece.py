@@ -46,7 +46,7 @@ class Piece:
 
     @staticmethod
     def of(problem: Problem, steps: Sequence[int]) -> Piece:
-        """Make the piece with these steps, ascending, of the trace of a problem."""
+        """Make the piece that has these steps, ascending, of the trace of a problem."""
         trace, theory = problem.trace, problem.theory
         kept: list[Step] = []
         for k, t in enumerate(steps):

@@ -118,7 +118,7 @@ class LimitedQuestion(ABC, Generic[_Answer]):
     def _changes_in_words(
         self, ssh_map: SSHMap, places: Collection[int | None], cost: Cost | None, nats: float | None
     ) -> tuple[str, ...]:
-        """Say which gateways at some places changed between drives, and what the changes cost."""
+        """Say which gateways at these places changed between drives, and what the changes cost."""
         changes = [f for f in ssh_map.faults if f.kind == "changed" and f.place in places]
         if not changes or cost is None:
             return ()
@@ -139,10 +139,10 @@ class LimitedQuestion(ABC, Generic[_Answer]):
 def changes_in_words(
     changes: Collection[Fault], cost: Cost, nats: float | None, without: Search
 ) -> list[str]:
-    """Say what changed, and what a map costs without changes.
+    """Say what changed in a map, and what the best map without changes costs.
 
-    `nats` is its cost in nats, if maps are weighed. `without` is an ended search for the best
-    map without any changes.
+    `cost` and `nats` are the costs of the map with these changes; `nats` is None if maps are not
+    weighed. `without` is a search, already ended, for the best map without any changes.
     """
     said = [f"{change}; this change costs {change.cost:g} dstates" for change in changes]
     if without.status is Status.UNSATISFIABLE:

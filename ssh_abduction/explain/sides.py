@@ -242,7 +242,10 @@ def _path_side(readings: list[Reading], place: int, path: int) -> PathSide:
 
 
 def _side_of(m: Reading, place: int, course: Course) -> tuple[_Side, RightBranch | None]:
-    """Find the side of a course on which a place lies, and the branch that shows it; or None."""
+    """Find the side of a course on which a place lies; None if unknown.
+
+    Also return the branch (a course that leaves this one) that shows the side, if there is one.
+    """
     if place in m.along.get(course[0], ()):
         return "on", None
     sides = m.once(known_sides)

@@ -266,7 +266,7 @@ def _effect(nats: float) -> str:
 
 
 def _difference(lost: Cost, won: Cost, theory: Theory) -> str:
-    """Compare costs in words by the first count that differs, and the equal ones before."""
+    """Compare two costs in words: the first count that differs, and the equal counts before it."""
     same: list[str] = []
     for (name, one), (_, other) in zip(
         _counts(lost, theory.priorities), _counts(won, theory.priorities), strict=True

@@ -60,7 +60,7 @@ class Words:
         self._courses: set[tuple[int, int]] = set()
 
     def know(self, conclusions: Iterable[clingo.Symbol]) -> None:
-        """Read from these conclusions which pairs of steps are along one course, to name paths."""
+        """Read which pairs of steps are along one course (path and direction), to name paths."""
         self._courses = {
             (steps[0], steps[1])
             for name, steps in map(facts.read_conclusion, conclusions)
@@ -120,7 +120,7 @@ class Words:
         *,
         short: bool = False,
     ) -> str:
-        """Put into a clause why an axiom at a step gives some conclusions.
+        """Write a clause that says why an axiom at a step implies some conclusions.
 
         Steps have their numbers in the piece. The argument is about the steps of `pair`. If
         `short`, write only the sentence of the axiom, without what was seen or done.

@@ -26,7 +26,7 @@ def pair_explained(
     """Explain in `limit` seconds why two steps are one dstate (place and heading), or not.
 
     `known` are the maps that the page shows. `watch` is not used, as the server ends the process
-    itself. `in_process` passes one to each function that it runs.
+    itself. It is a parameter because `in_process` passes a watch to each function that it runs.
     """
     return explain_pair(trace, first, second, theory, time_limit=limit, known=known)
 

@@ -51,8 +51,8 @@ def assumptions(
     def tell(pair: Pair, one: bool, lost: Side) -> None:
         """Record the costs for a pair.
 
-        `one` says whether its steps are one dstate in all minimal maps, `lost` what is known
-        about the maps in which it is the other way round.
+        `one` says whether its steps are one dstate in all minimal maps. `lost` says what is known
+        about the maps that contradict this.
         """
         won = Side(possible=True, cost=best, proven=True)
         same, different = (won, lost) if one else (lost, won)

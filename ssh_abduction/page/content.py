@@ -129,7 +129,7 @@ def content_of(
 
 
 def _leaps(ssh_map: SSHMap) -> list[int]:
-    """List the steps to which no street leads: a drive starts, an action slipped, or a lift led."""
+    """List the steps that no street leads to: after a slip or a lift, or where a drive starts."""
     floor = [s.floor for s in ssh_map.dstates]
     linked = {(s, x) for s, _, x in ssh_map.links if floor[s] == floor[x]}
     return [t for t, pair in enumerate(pairwise(ssh_map.dstate_at), 1) if pair not in linked]
@@ -150,7 +150,8 @@ def _shared(listing: Listing) -> dict[str, Any] | None:
 def _joins(listing: Listing) -> list[tuple[int, int, str | None]]:
     """List the joins of the first map that a reader may doubt, the most doubtful ones first.
 
-    Each is two steps and the probability of their join; None if the join rests on minimality alone.
+    Each has two steps and the probability of their join. It is None if no axiom and no observation
+    forces the join, and costs in nats are unknown.
     """
     if listing.weighed is None or listing.weighed.doubt:
         return [(join.first, join.second, None) for join in listing.by_minimality[:JOINS]]
@@ -159,7 +160,7 @@ def _joins(listing: Listing) -> list[tuple[int, int, str | None]]:
 
 
 def _drives(listing: Listing) -> dict[str, Any]:
-    """The drives of a joint trace, which the first map joins, and their joins with shares."""
+    """The drives of a joint trace, which of them the first map joins, and their common places."""
     first = {drive.name: drive.first for drive in listing.drives}
     return {
         "drives": [asdict(drive) for drive in listing.drives] if len(listing.drives) > 1 else [],
@@ -271,7 +272,10 @@ def _layouts(
 
 
 def _unit(found: Layout) -> float:
-    """Compute the median |dx| + |dy| from each place, or dstate, to the nearest (200 at most)."""
+    """Compute the median |dx| + |dy| from places, or dstates, to the nearest one.
+
+    At most 200 of them are measured.
+    """
     points = list(found.places.values()) or [(x, y) for x, y, _ in found.dstates]
     nearest = [
         min((abs(x - u) + abs(y - v) for u, v in points if (u, v) != (x, y)), default=0.0)

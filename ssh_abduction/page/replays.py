@@ -128,8 +128,8 @@ def _steps_of_map(first: SSHMap) -> list[dict[str, Any]]:
 def _beliefs(maps: Sequence[SSHMap], labelings: Sequence[int], run: Run) -> dict[str, Any]:
     """Compute the beliefs of a run in the maps, by labeling, as far as there is time.
 
-    Maps with the same labeling have the same links, and therefore the same beliefs. Malformed ones
-    raise MapError.
+    Maps with the same labeling have the same links, and therefore the same beliefs. Malformed
+    beliefs raise MapError.
     """
     found: dict[str, Any] = {}
     end = time.process_time() + BELIEVING
@@ -251,7 +251,7 @@ def _text(shares: NDArray[np.float64]) -> str:
 def _panoramas(
     held: Sequence[NDArray[np.float64] | None], shape: Any, each: int
 ) -> dict[str, Any] | None:
-    """Encode panoramas, thinned to few characters; None for a wrong shape or too many."""
+    """Encode panoramas at a lower resolution. None for a wrong shape, or for too many images."""
     if (
         not isinstance(shape, list)
         or len(shape) != 3

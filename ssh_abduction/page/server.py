@@ -145,7 +145,7 @@ class PageServer(ThreadingHTTPServer):
         }
 
     def _in_map(self, pair: tuple[int, int], theory: Theory) -> Iterator[str]:
-        """Yield what the maps of the page say about a pair of steps, unless more is assumed."""
+        """Yield what the maps of the page say about two steps, unless the user assumes more."""
         if theory == (self._theory or Theory.topological()) and (
             said := PairInMap.of(self._listing, *pair)
         ):

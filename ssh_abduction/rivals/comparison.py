@@ -339,7 +339,7 @@ def _choice(
     option: NDArray[np.intp],
     differing: dict[Matter, tuple[int, ...]],
 ) -> Choice:
-    """Make a choice of the questions `asked`. `option` numbers the option of each map."""
+    """Make a choice from the questions `asked`. `option` numbers the option of each map."""
     members = members_of(option.tolist())
     options = [
         Option(tuple(bool(a.column[maps[0]]) for a in asked), tuple(i + 1 for i in maps))

@@ -95,7 +95,7 @@ class Listing:
 
     @classmethod
     def of(cls, source: Maps) -> Listing:
-        """Make a listing of a solution, of a map or of several maps.
+        """Make a listing from a solution, a map or several maps.
 
         Args:
             source: A Solution, an SSHMap, or maps. A Listing is returned as it is.

@@ -257,7 +257,7 @@ def with_ends(
 def machine_of(
     start: int, links: Mapping[int, Mapping[str, int]], sights: Sequence[int]
 ) -> tuple[Machine, tuple[int, ...]]:
-    """Make the machine of a map, and the dstate of each of its states.
+    """Make the machine of a map. Also return the dstate of each state of the machine.
 
     For each dstate, `links` has the actions and where they lead, and `sights` the number of
     what is seen there.
