@@ -44,7 +44,7 @@ def uneven() -> Trace:
     return Trace.from_steps(trace.views, trace.actions, displacements=moved, odometry=WHITE)
 
 
-def test_four_right_turns_that_odometry_contradicts_are_explained() -> None:
+def test_explanation_names_turns_that_odometry_contradicts() -> None:
     """Four right turns make steps 0 and 4 one dstate, but the odometry says 60 degrees each."""
     explanation = explain(TURNS)
     assert explanation
@@ -63,7 +63,7 @@ def test_four_right_turns_that_odometry_contradicts_are_explained() -> None:
 
 
 @pytest.mark.slow
-def test_two_returns_that_cannot_both_be() -> None:
+def test_solver_refuses_two_returns_that_misfit_together() -> None:
     """Two asserted returns are refused together, but not alone.
 
     The refusal comes from a map, because the solver finds no pair in advance.
@@ -89,7 +89,7 @@ def test_two_returns_that_cannot_both_be() -> None:
     assert explain(trace, theory.replace(joint=1)) is None
 
 
-def test_in_maps_of_logs_two_returns_that_fit_badly_together_have_a_price() -> None:
+def test_weighed_maps_pay_for_two_returns_that_misfit_together() -> None:
     """Errors of logs have heavy tails."""
     trace, theory = uneven(), BARE.replace(same_place=[(1, 9), (3, 11)])
     assert solve(trace, theory.replace(joint=2)).status is Status.UNSATISFIABLE
@@ -98,7 +98,7 @@ def test_in_maps_of_logs_two_returns_that_fit_badly_together_have_a_price() -> N
     assert ssh_map.place_of(3) == ssh_map.place_of(11)
 
 
-def test_explanations_are_smallest_where_returns_are_refused_together() -> None:
+def test_explanation_of_refused_returns_names_a_minimal_set() -> None:
     """One return is asserted, the axioms imply another, and only both axioms are named."""
     trace, theory = uneven(), Theory.causal().replace(same=[(1, 9)])
     explanation = explain(trace, theory)
@@ -115,7 +115,7 @@ def test_explanations_are_smallest_where_returns_are_refused_together() -> None:
         assert explain(trace.prefix(12), left) is None
 
 
-def test_streets_that_would_cross_are_named() -> None:
+def test_explanation_names_streets_that_would_cross() -> None:
     """A street that is travelled back and forth leads back to its start, or it cannot be drawn.
 
     Only maps show that, and the explanation names it.
@@ -134,7 +134,7 @@ def test_streets_that_would_cross_are_named() -> None:
     assert explanation.sentences == ()
 
 
-def test_distances_are_those_of_dead_reckoning() -> None:
+def test_explanation_states_the_distance_by_dead_reckoning() -> None:
     """The sentence of a pair has its distance, and the uncertainty in that direction."""
     trace = circuit(5, 7, 1.0, odometry=Odometry(bend=0.001))
     theory = settle(trace, Theory()).theory
@@ -168,7 +168,7 @@ def test_distances_are_those_of_dead_reckoning() -> None:
     assert compared > 50
 
 
-def test_returns_of_a_stretch_are_those_of_the_whole_trace() -> None:
+def test_returns_refused_in_a_stretch_are_refused_in_the_trace() -> None:
     """What is refused in a stretch that begins with a visit is refused in the whole trace.
 
     The theory has counted the returns of the whole trace.
@@ -185,7 +185,7 @@ def test_returns_of_a_stretch_are_those_of_the_whole_trace() -> None:
             assert kept
 
 
-def test_the_shell_prints_what_the_odometry_says(
+def test_solve_prints_what_the_odometry_contradicts(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "turns.jsonl"
@@ -199,7 +199,7 @@ def test_the_shell_prints_what_the_odometry_says(
     assert json.loads(capsys.readouterr().out)["explanation"]["sentences"] == [said]
 
 
-def test_the_judge_says_it_in_metres() -> None:
+def test_checker_states_misfits_in_metres() -> None:
     trace = circuit(4, 9, 1.0)
     wrong = solve(trace, Theory(displacement="none")).maps[0]
     theory = Theory(displacement="use", prefer=())
@@ -217,6 +217,6 @@ def test_the_judge_says_it_in_metres() -> None:
 
 
 @pytest.mark.parametrize(("first", "second"), [(0, 5), (-1, 2), (2, 2), (True, 2)])
-def test_steps_that_are_not_there(first: int, second: int) -> None:
+def test_why_apart_refuses_unknown_steps(first: int, second: int) -> None:
     with pytest.raises(TraceError, match="step: expected"):
         why_apart(TURNS, first, second)

@@ -88,7 +88,7 @@ def partition(names: Collection[Any]) -> list[int]:
     [(STREET, "a", 1), (TEE, "W", 0), (RING, "a", 0)],
     ids=["street", "tee", "ring"],
 )
-def test_exploring_ends_when_all_streets_are_known(world: Streets, start: str, margin: int) -> None:
+def test_explorer_ends_after_trying_all_streets(world: Streets, start: str, margin: int) -> None:
     robot = Streetwalker(world, start, "E")
     found = Explorer(robot, margin=margin, time_limit=None).explore(200)
     assert (found.ending, found.is_unique, found.is_true) == ("done", True, True)
@@ -106,7 +106,7 @@ def test_exploring_ends_when_all_streets_are_known(world: Streets, start: str, m
         assert partition(ssh_map.labels) == partition(robot.been)
 
 
-def test_what_is_unique_is_what_solve_lists() -> None:
+def test_explorer_is_unique_if_solve_lists_one_map() -> None:
     seen = set()
     for seed in range(6):
         chance = random.Random(seed)
@@ -124,13 +124,13 @@ def test_what_is_unique_is_what_solve_lists() -> None:
     assert seen == {(False, False), (True, False), (True, True)}
 
 
-def test_steps_that_are_spent_are_said() -> None:
+def test_explorer_says_that_its_steps_are_used_up() -> None:
     found = Explorer(Streetwalker(RING, "a", "E", told=False), time_limit=None).explore(3)
     assert (found.steps, found.ending, found.is_true) == (3, "steps", None)
     assert "the robot did all the actions that were allowed" in found.sentence
 
 
-def test_rivals_that_nothing_tells_apart_are_said() -> None:
+def test_explorer_says_that_rivals_are_inseparable() -> None:
     # The robot is at the last state, which may be 0 or 2: p would tell, and cannot be done there.
     one_way = {0: {"p": 1}, 1: {"n": 2}, 2: {"p": 3}, 3: {"n": 4}, 4: {}}
     explorer = Explorer(Machine("axaza", one_way), Theory.causal(), time_limit=None)
@@ -145,7 +145,7 @@ def test_rivals_that_nothing_tells_apart_are_said() -> None:
     assert "not unique" in found.sentence
 
 
-def test_the_map_of_a_world_that_hides_its_states_is_not_true() -> None:
+def test_explorer_says_that_a_unique_map_is_not_true() -> None:
     blind = Explorer(
         Machine("aaa", {0: {"on": 1}, 1: {"on": 2}, 2: {"on": 0}}), Theory.causal(), time_limit=None
     ).explore(50)
@@ -153,7 +153,7 @@ def test_the_map_of_a_world_that_hides_its_states_is_not_true() -> None:
     assert "not true" in blind.sentence
 
 
-def test_a_margin_finds_what_the_fewest_dstates_hide() -> None:
+def test_explorer_with_a_margin_finds_the_larger_true_map() -> None:
     found = {}
     for margin in (0, 2):
         ring = Machine("abbc", {0: {"on": 1}, 1: {"on": 2}, 2: {"on": 3}, 3: {"on": 0}})
@@ -166,7 +166,7 @@ def test_a_margin_finds_what_the_fewest_dstates_hide() -> None:
     assert found[2].steps >= 4
 
 
-def test_a_rival_with_more_dstates_that_nothing_tells_apart_is_said() -> None:
+def test_explorer_names_an_inseparable_rival_with_more_dstates() -> None:
     found = Explorer(
         Machine("abab", {s: {"on": (s + 1) % 4} for s in range(4)}),
         Theory.causal(),
@@ -186,7 +186,7 @@ class Crooked(Streetwalker):
         return Step("here", star=(1, 0, 0, 0))
 
 
-def test_an_exploration_ends_as_contradicted_without_a_map() -> None:
+def test_explorer_ends_as_contradicted_without_a_map() -> None:
     explorer = Explorer(Crooked(TEE, "W", "E", told=False), time_limit=None)
     found = explorer.explore(10)
     assert (found.ending, found.is_unique, found.solution.status) == (
@@ -198,7 +198,7 @@ def test_an_exploration_ends_as_contradicted_without_a_map() -> None:
     assert found.steps < 10
 
 
-def test_a_step_goes_on_where_exploring_was_left() -> None:
+def test_explorer_continues_after_a_step_limit() -> None:
     whole, parts = (
         Explorer(Streetwalker(CORRIDOR, "a", "E"), margin=0, time_limit=None) for _ in range(2)
     )
@@ -252,12 +252,12 @@ class Nothing(Machine):
         ),
     ],
 )
-def test_bad_input_is_refused(build: Any, error: type[AbductionError], message: str) -> None:
+def test_explorer_refuses_bad_input(build: Any, error: type[AbductionError], message: str) -> None:
     with pytest.raises(error, match=message):
         build(Machine("a", {0: {}}))
 
 
-def test_a_robot_that_can_do_nothing_is_done_at_once() -> None:
+def test_explorer_without_actions_is_done_at_once() -> None:
     found = Explorer(Machine("a", {0: {}}), time_limit=None).explore(10)
     assert isinstance(found, Exploration)
     assert (found.steps, found.ending, found.is_unique, found.is_true) == (0, "done", True, True)

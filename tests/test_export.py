@@ -165,7 +165,7 @@ def graph_of_lcas(text: str) -> nx.DiGraph[Any]:
 
 @pytest.mark.parametrize("level", ["places", "dstates"])
 @pytest.mark.parametrize("has_poses", [True, False])
-def test_lcas_can_drive_a_tmap2(level: str, has_poses: bool, square: SSHMap) -> None:
+def test_tmap2_satisfies_the_lcas_format(level: str, has_poses: bool, square: SSHMap) -> None:
     ssh_map = square if has_poses else solve(rectangle(8)).maps[0]
     text = export_map(ssh_map, "tmap2", level=level, frame="hall")
     goals, graph = goals_of_humble(text), graph_of_lcas(text)
@@ -195,7 +195,7 @@ def test_numbers_have_a_decimal_point_and_no_exponent(x: float, heading: float) 
     assert pose["orientation"]["w"] == pytest.approx(math.cos(heading / 2), abs=1e-6)
 
 
-def test_a_turn_costs_a_planner_more_than_nothing(square: SSHMap) -> None:
+def test_nav2_turns_and_short_edges_have_positive_cost(square: SSHMap) -> None:
     nodes, edges = nav2_graph(export_map(square, "nav2", level="dstates"))
     costs = {nodes[start] == nodes[end]: cost for start, end, cost in edges.values()}
     assert costs[True] == TURN
@@ -221,7 +221,7 @@ def test_a_turn_costs_a_planner_more_than_nothing(square: SSHMap) -> None:
     ],
 )
 @pytest.mark.parametrize("to", formats.FOR_NAVIGATION)
-def test_nodes_at_one_position_are_told(
+def test_export_warns_of_nodes_at_one_position(
     to: str,
     theory: str,
     level: str | None,
@@ -248,7 +248,7 @@ def causal_pair() -> SSHMap:
     return solve(trace, Theory.causal()).maps[0]
 
 
-def test_nav2_gets_metres_from_poses(square: SSHMap) -> None:
+def test_nav2_export_has_metres_from_poses(square: SSHMap) -> None:
     nodes, edges = nav2_graph(export_map(square, "nav2"))
     assert len(nodes) == 4
     assert {(a, b) for a, b, _ in edges.values()} == {
@@ -259,7 +259,7 @@ def test_nav2_gets_metres_from_poses(square: SSHMap) -> None:
         assert cost == pytest.approx(10, abs=0.2)
 
 
-def test_dstates_have_an_edge_a_link(square: SSHMap) -> None:
+def test_export_of_dstates_has_one_edge_a_link(square: SSHMap) -> None:
     nodes, edges = nav2_graph(export_map(square, "nav2", level="dstates"))
     assert len(nodes) == 8
     assert {(a, b) for a, b, _ in edges.values()} == {(s, x) for s, _, x in square.links}
@@ -267,7 +267,7 @@ def test_dstates_have_an_edge_a_link(square: SSHMap) -> None:
 
 @pytest.mark.parametrize("level", ["places", "dstates"])
 @pytest.mark.parametrize("to", formats.FORMATS)
-def test_maps_without_poses_have_a_layout(to: str, level: str) -> None:
+def test_export_lays_out_maps_without_poses(to: str, level: str) -> None:
     ssh_map = solve(rectangle(8)).maps[0]
     if (to, level) == ("dot", "places"):
         with pytest.raises(MapError, match="DOT has a node for each dstate"):
@@ -299,7 +299,7 @@ def test_maps_without_poses_have_a_layout(to: str, level: str) -> None:
         }
 
 
-def test_maps_of_dstates_alone_are_exported(square: SSHMap) -> None:
+def test_causal_maps_are_exported(square: SSHMap) -> None:
     ssh_map = solve(rectangle(8), Theory.causal()).maps[0]
     assert len(nav2_graph(export_map(ssh_map, "nav2"))[0]) == len(ssh_map.dstates)
     assert len(checked_tmap2(export_map(ssh_map, "tmap2"))["nodes"]) == len(ssh_map.dstates)
@@ -326,7 +326,7 @@ def test_maps_of_dstates_alone_are_exported(square: SSHMap) -> None:
         "yes",
     ],
 )
-def test_a_tmap2_file_holds_any_text(text: str) -> None:
+def test_tmap2_export_keeps_any_text(text: str) -> None:
     ssh_map = SSHMap((0, 1), (DState(0, text), DState(1, "b")), ((0, text, 1),))
     data = checked_tmap2(export_map(ssh_map, "tmap2", name=text))
     assert data["name"] == text
@@ -335,7 +335,7 @@ def test_a_tmap2_file_holds_any_text(text: str) -> None:
     assert data["nodes"][1]["node"]["edges"] == []
 
 
-def test_what_no_file_can_hold_is_refused(square: SSHMap) -> None:
+def test_export_refuses_wrong_arguments_and_maps_without_roads(square: SSHMap) -> None:
     for arguments, message in [
         ({"to": "kml"}, "to: expected nav2, tmap2"),
         ({"to": "nav2", "level": "rooms"}, "level: expected places or dstates"),
@@ -348,7 +348,7 @@ def test_what_no_file_can_hold_is_refused(square: SSHMap) -> None:
         export_map(SSHMap((0,), (DState(0, "a"),), ()), "nav2")
 
 
-def test_the_command_writes_what_python_makes(
+def test_export_command_writes_the_output_of_python(
     square: SSHMap, tmp_path: object, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert verb.FORMATS == formats.FORMATS
@@ -368,7 +368,7 @@ def test_the_command_writes_what_python_makes(
     assert "1 to 1" in capsys.readouterr().err
 
 
-def test_undecided_places_are_hidden_and_their_roads_joined(
+def test_export_hides_undecided_places_and_joins_their_roads(
     square: SSHMap, tmp_path: object, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The robot drove once around the square. It began and ended at place 0."""
@@ -386,7 +386,7 @@ def test_undecided_places_are_hidden_and_their_roads_joined(
     assert len(square.places) == 4
 
 
-def test_a_road_past_a_hidden_place_is_that_of_the_robot() -> None:
+def test_road_past_a_hidden_place_keeps_its_travel_actions() -> None:
     """There and back along a corridor of four places. Two of them are undecided."""
     moves = [(5, 0, 0), (7, 0, 0), (5, 0, 0), (0, 0, math.pi)]
     moves += moves[:3]
@@ -401,7 +401,7 @@ def test_a_road_past_a_hidden_place_is_that_of_the_robot() -> None:
     assert [stop.id for stop in roads.stops] == [0, 3]
 
 
-def test_exports_have_regions() -> None:
+def test_exports_contain_regions() -> None:
     (ssh_map,) = solve(Trace.from_steps("abcdef", ["travel", "right", "travel", "left", "travel"]))
     regions = [region.to_dict() for region in ssh_map.regions or ()]
     graph = to_networkx(ssh_map)
@@ -432,7 +432,7 @@ def test_dot_nests_regions_behind_a_place() -> None:
 
 
 @pytest.mark.filterwarnings("ignore:views. trace 2 has no view in common")
-def test_pieces_keep_their_metres_and_are_drawn_below_each_other() -> None:
+def test_export_places_pieces_below_each_other_in_metres() -> None:
     """Two drives share nothing, so nothing says how their pieces lie."""
     ways, hall = [(10, 0, 0), (12, 0, 0)], [(1, 0, 0, 0), (1, 0, 1, 0), (0, 0, 1, 0)]
     doors = [(ahead, 1, back, left) for ahead, _, back, left in hall]

@@ -131,7 +131,7 @@ def told(ssh_map: SSHMap) -> Told:
     st.sampled_from([0.0, 0.3, 1.0]),
     st.booleans(),
 )
-def test_causal_maps_with_faults_are_those_of_brute_force(
+def test_causal_maps_with_faults_equal_the_brute_force(
     trace: Trace, misread: float, slipped: float, names: bool
 ) -> None:
     """The solver uses names, or the readable encoding. Costs of whole dstates make ties."""
@@ -150,7 +150,7 @@ def test_causal_maps_with_faults_are_those_of_brute_force(
 
 @settings(max_examples=8)
 @given(st.data())
-def test_few_names_and_few_steps_at_first_change_no_answer(data: st.DataObject) -> None:
+def test_few_names_and_short_prefixes_do_not_change_answers(data: st.DataObject) -> None:
     trace = data.draw(small_traces(max_steps=7))
     theory = Theory.causal().replace(
         misread=data.draw(st.sampled_from([0.0, 0.4, 1.0])),
@@ -175,7 +175,7 @@ def test_few_names_and_few_steps_at_first_change_no_answer(data: st.DataObject) 
 
 @settings(max_examples=5)
 @given(small_traces(max_steps=4), st.sampled_from([0.4, 1.0]))
-def test_topological_maps_are_those_of_corrected_traces(trace: Trace, misread: float) -> None:
+def test_topological_maps_with_faults_equal_the_brute_force(trace: Trace, misread: float) -> None:
     """Try every correction of views. The brute force, which has no faults, maps the corrected
     traces."""
     theory = Theory(boundary="none", star="none")
@@ -218,7 +218,7 @@ def test_topological_maps_are_those_of_corrected_traces(trace: Trace, misread: f
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_faults_of_machines_are_found(seed: int) -> None:
+def test_solve_finds_the_faults_of_machines(seed: int) -> None:
     walk, wrong, jumps = faulty_machine(
         6, 5, steps=200, seed=910 + seed, wrong=seed % 2, jumps=1 - seed % 2
     )
@@ -234,7 +234,7 @@ def test_the_faults_of_machines_are_found(seed: int) -> None:
 
 @settings(max_examples=10)
 @given(st.data())
-def test_bounds_by_blocks_are_no_more_than_the_minimum(data: st.DataObject) -> None:
+def test_bounds_by_blocks_do_not_exceed_the_minimum(data: st.DataObject) -> None:
     """Any map may be known: here it has one dstate for each view, or one for each step. All
     disagreements are faults."""
     trace = data.draw(small_traces(max_steps=7))
@@ -264,7 +264,7 @@ def test_bounds_by_blocks_are_no_more_than_the_minimum(data: st.DataObject) -> N
 
 
 @pytest.mark.parametrize("kind", ["misread", pytest.param("slipped", marks=pytest.mark.slow)])
-def test_many_faults_of_a_long_trace_are_proven(kind: str) -> None:
+def test_solve_proves_many_faults_of_a_long_trace(kind: str) -> None:
     """A rectangle of eight dstates and five views, 1,200 steps and twelve faults. The bounds of
     disjoint blocks add up to the cost of the map."""
     wrong = range(60, 1200, 100)
@@ -283,7 +283,7 @@ def test_many_faults_of_a_long_trace_are_proven(kind: str) -> None:
     assert (solution.cost.dstates, len(solution.maps[0].faults)) == (8, 12)
 
 
-def test_a_star_that_is_misread_is_excused() -> None:
+def test_solve_finds_a_misread_star() -> None:
     """Out and back along a corridor. At one end the robot sees one opening too many."""
     ends = [(1, 0, 0, 0), (0, 0, 1, 0)]
     stars = [*ends * 4, ends[0]]
@@ -304,7 +304,7 @@ RECTANGLE = Trace.from_steps(
 )
 
 
-def test_the_checker_judges_faults_itself() -> None:
+def test_checker_recomputes_faults() -> None:
     theory = Theory.causal().replace(misread=1.5)
     ssh_map = solve(RECTANGLE, theory).maps[0]
     assert [str(fault) for fault in ssh_map.faults] == [
@@ -336,12 +336,12 @@ def test_the_checker_judges_faults_itself() -> None:
         ({"misread": 1.5, "planar": True}, "planar: expected no planarity"),
     ],
 )
-def test_what_faults_do_not_go_with_is_refused(choices: dict[str, object], said: str) -> None:
+def test_theories_that_exclude_faults_are_refused(choices: dict[str, object], said: str) -> None:
     with pytest.raises(TheoryError, match=said):
         Theory(**choices)  # type: ignore[arg-type]
 
 
-def test_in_the_shell(
+def test_solve_prints_faults(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -378,7 +378,7 @@ def test_in_the_shell(
     assert "bound: expected a theory without faults" in capsys.readouterr().err
 
 
-def test_confidence_scales_what_a_fault_costs() -> None:
+def test_confidence_of_a_view_scales_the_cost_of_a_fault() -> None:
     """A confidence of 0.99 costs the whole price, as does a step without a confidence. For others
     the share is by the log odds, between a tenth and five times."""
     shares = {None: 15, 0.99: 15, 0.9: 7, 0.6: 2, 0.5: 2, 0.0: 2, 0.999: 23, 1.0: 75}
@@ -396,7 +396,7 @@ def test_confidence_scales_what_a_fault_costs() -> None:
     assert solution.cost.faults == 0.9
 
 
-def test_the_front_is_what_brute_force_finds() -> None:
+def test_front_equals_the_brute_force() -> None:
     trace = Trace.from_steps("abababba", ["right", "travel"] * 3 + ["right"])
     for kinds in ({"misread": 1.5}, {"slipped": 1.5}, {"misread": 1.5, "slipped": 1.5}):
         front = fault_front(trace, Theory.causal().replace(**kinds), most=3)
@@ -411,7 +411,7 @@ def test_the_front_is_what_brute_force_finds() -> None:
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_the_front_of_what_is_asserted_is_what_brute_force_finds(seed: int) -> None:
+def test_front_with_assertions_equals_the_brute_force(seed: int) -> None:
     rng = random.Random(seed)
     steps = rng.randint(3, 5)
     trace = Trace.from_steps(
@@ -436,7 +436,7 @@ def test_the_front_of_what_is_asserted_is_what_brute_force_finds(seed: int) -> N
         assert check(trace, point.map, theory.replace(misread=1.5, slipped=1.5)) == ()
 
 
-def test_a_dstate_whose_views_are_all_misread_has_a_view() -> None:
+def test_front_accepts_a_dstate_whose_views_are_all_misread() -> None:
     trace = Trace.from_steps(
         [3, 0, 0, 0, 0],
         ["travel", "right", "travel", "right"],
@@ -456,7 +456,7 @@ def test_a_dstate_whose_views_are_all_misread_has_a_view() -> None:
         (["--same", "0,1", "--json"], 20, r'"front": \[\]'),
     ],
 )
-def test_a_front_without_points_says_why(
+def test_front_without_points_names_its_cause(
     options: list[str], code: int, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = str(tmp_path / "trace.jsonl")
@@ -497,7 +497,7 @@ def fewest(
     return min(counts, default=None)
 
 
-def test_the_front_in_the_shell(
+def test_solve_prints_the_front(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -533,7 +533,7 @@ def test_the_front_in_the_shell(
     assert "within: expected 0 where faults are allowed" in capsys.readouterr().err
 
 
-def test_a_limit_leaves_a_map_and_a_bound() -> None:
+def test_solve_with_faults_at_a_time_limit_gives_map_and_bound() -> None:
     walk, _, _ = faulty_machine(20, 8, steps=300, seed=1, wrong=3)
     solution = solve(walk.trace, Theory.causal().replace(misread=1.5), time_limit=0.3)
     assert solution.status in (Status.FEASIBLE, Status.OPTIMAL)

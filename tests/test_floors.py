@@ -48,7 +48,7 @@ def traces_with_lifts(draw: st.DrawFn) -> Trace:
 
 @settings(max_examples=10)
 @given(st.data())
-def test_the_solver_lists_the_maps_with_floors_of_the_brute_force(data: st.DataObject) -> None:
+def test_maps_with_floors_equal_the_brute_force(data: st.DataObject) -> None:
     trace = data.draw(traces_with_lifts(), label="trace")
     theory = data.draw(theories(trace), label="theory")
     first_prefix = data.draw(st.sampled_from([1, 3, prefixes.FIRST_PREFIX]), label="first prefix")
@@ -63,7 +63,7 @@ def test_the_solver_lists_the_maps_with_floors_of_the_brute_force(data: st.DataO
 
 @settings(max_examples=3)
 @given(st.data())
-def test_the_checker_rejects_maps_with_floors_that_the_brute_force_does_not_find(
+def test_checker_rejects_maps_with_floors_outside_the_brute_force(
     data: st.DataObject,
 ) -> None:
     checker_rejects_foreign_maps(data, data.draw(traces_with_lifts(), label="trace"))
@@ -90,7 +90,7 @@ def test_floors_are_listed_saved_and_read(theory: Theory, tmp_path: Path) -> Non
     assert solve(SHAFT[:2], theory).maps[0].floors == ()
 
 
-def test_a_lift_is_deterministic_and_leads_along_no_path() -> None:
+def test_lift_is_deterministic_and_on_no_path() -> None:
     """The lift leads from the first b to an a. Later, it leads from this b to this a."""
     trace = Trace.from_steps("ababa", ["travel", UP, DOWN, UP])
     assert [m.dstate_at for m in solve(trace, Theory.causal()).maps] == [(0, 1, 2, 1, 2)]
@@ -99,7 +99,7 @@ def test_a_lift_is_deterministic_and_leads_along_no_path() -> None:
     assert [s.path for s in ssh_map.dstates] == [0, 0, None]
 
 
-def test_legs_that_meet_elsewhere_are_one_floor() -> None:
+def test_stretches_with_a_common_place_are_one_floor() -> None:
     """Steps 0 and 2 are on one floor as step 3 is at the place of step 1, so 0 and 3 are apart."""
     trace = Trace.from_steps("abab", [UP, DOWN, UP])
     problem = settle(trace, Theory.causal())
@@ -112,7 +112,7 @@ def test_legs_that_meet_elsewhere_are_one_floor() -> None:
     assert pairs.elsewhere == {1: frozenset({0}), 2: frozenset({1}), 3: frozenset({2})}
 
 
-def test_the_checker_judges_the_listed_floors() -> None:
+def test_checker_judges_the_floors_of_a_map() -> None:
     theory = Theory.causal()
     (ssh_map, *_) = solve(SHAFT, theory).maps
     assert check(SHAFT, ssh_map, theory) == ()
@@ -125,14 +125,14 @@ def test_the_checker_judges_the_listed_floors() -> None:
     assert any("no lifts" in v.message for v in check(flat, listed, theory))
 
 
-def test_the_checker_rejects_a_lift_that_stays_on_its_floor() -> None:
+def test_checker_rejects_a_lift_that_stays_on_its_floor() -> None:
     trace = Trace.from_steps("aa", [UP])
     stays = solve(trace, Theory.causal().replace(without=("other_floor",))).maps[0]
     assert stays.dstate_at == (0, 0)
     assert "other_floor" in {v.axiom for v in check(trace, stays, Theory.causal())}
 
 
-def test_each_floor_has_a_frame_of_its_own() -> None:
+def test_each_floor_has_its_own_coordinates() -> None:
     with pytest.raises(TraceError, match="step 1: displacement: expected none on the first step"):
         Trace.from_steps("ab", [UP], displacements=[(1, 0, 0)])
     # Two floors, one above the other: at no distance, and still two places.
@@ -145,12 +145,12 @@ def test_each_floor_has_a_frame_of_its_own() -> None:
     assert ssh_map.dstate_at == (0, 1, 2, 3, 0, 1)
 
 
-def test_actions_that_slip_are_refused_with_lifts() -> None:
+def test_slipped_actions_are_refused_with_lifts() -> None:
     with pytest.raises(TheoryError, match="slipped: expected no actions that slip"):
         solve(SHAFT, Theory.causal().replace(slipped=1.0))
 
 
-def test_a_misread_view_is_on_its_own_floor() -> None:
+def test_misread_view_does_not_move_a_place_to_another_floor() -> None:
     """A wrong view does not excuse a place on another floor."""
     trace = Trace.from_steps("abab", ["travel", UP, DOWN])
     (ssh_map, *_) = solve(trace, Theory.causal().replace(misread=0.5)).maps
@@ -158,14 +158,14 @@ def test_a_misread_view_is_on_its_own_floor() -> None:
     assert check(trace, ssh_map, Theory.causal().replace(misread=0.5)) == ()
 
 
-def test_the_readable_program_says_what_a_lift_is() -> None:
+def test_readable_program_contains_facts_about_lifts() -> None:
     text = program(settle(SHAFT, Theory()))
     assert 'kind("up",lift).' in text
     assert "stretch(3,2)." in text
     assert "lifted(2)." in text
 
 
-def test_floors_are_drawn_below_each_other_and_exported() -> None:
+def test_floors_are_drawn_below_each_other() -> None:
     moved = [(5.0, 0.0, 0.0), None, (5.0, 0.0, 0.0), (5.0, 0.0, 0.0)]
     trace = Trace.from_steps("abcde", ["travel", UP, "travel", "travel"], displacements=moved)
     for ssh_map in (*solve(trace).maps[:1], *solve(trace.without_displacements()).maps[:1]):
@@ -196,9 +196,7 @@ def driven(floors: int) -> Trace:
 @pytest.mark.parametrize(
     ("floors", "dstates"), [(2, 42), pytest.param(3, 60, marks=pytest.mark.slow)]
 )
-def test_a_robot_in_a_simulated_tower_changes_floors_by_lifts_only(
-    floors: int, dstates: int
-) -> None:
+def test_simulated_robot_changes_floors_by_lifts_only(floors: int, dstates: int) -> None:
     trace = driven(floors)
     found = [step.truth["dstate"] for step in trace.steps]
     assert len(set(found)) == dstates
@@ -211,7 +209,7 @@ def test_a_robot_in_a_simulated_tower_changes_floors_by_lifts_only(
 
 
 @pytest.mark.parametrize("theory", [Theory.causal(), Theory(displacement="none")])
-def test_the_map_of_a_simulated_tower_is_true(theory: Theory) -> None:
+def test_map_of_a_simulated_tower_is_true(theory: Theory) -> None:
     trace = driven(2)
     trace = trace.with_views([str(step.star) for step in trace.steps])
     solution = solve(trace, theory, max_maps=1)
@@ -225,7 +223,7 @@ def test_the_map_of_a_simulated_tower_is_true(theory: Theory) -> None:
 
 
 @pytest.mark.slow
-def test_signs_at_the_lifts_tell_three_floors_apart() -> None:
+def test_signs_at_lifts_tell_three_floors_apart() -> None:
     """Without signs, the third floor may be the first one, if the robot came by the second."""
     tower = World.named("tower-3")
     trace = driven(3)
@@ -246,7 +244,7 @@ def test_signs_at_the_lifts_tell_three_floors_apart() -> None:
     assert len(labels) == len(ssh_map.dstates) == 60
 
 
-def test_lifts_that_cannot_be_driven(tmp_path: Path) -> None:
+def test_simulator_refuses_wrong_lifts(tmp_path: Path) -> None:
     tower = World.named("tower-2")
     with pytest.raises(SimulatorError, match="lift to 1: expected a lift of this name at"):
         simulate(tower.with_choices(route="lift to 1"))
@@ -259,7 +257,7 @@ def test_lifts_that_cannot_be_driven(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("without", [(), ("path_on_one_floor",)])
-def test_a_route_changes_floors_by_the_lift_only(without: tuple[str, ...]) -> None:
+def test_route_changes_floors_by_the_lift_only(without: tuple[str, ...]) -> None:
     """If a path may lead on at the other floor, nobody can travel along it."""
     ssh_map = solve(SHAFT, Theory(without=without)).maps[0]
     assert len(ssh_map.paths) == (1 if without else 2)
@@ -269,7 +267,7 @@ def test_a_route_changes_floors_by_the_lift_only(without: tuple[str, ...]) -> No
 
 
 @pytest.mark.parametrize(("kind", "warned"), [("lift", 0), ("travel", 1)])
-def test_drives_may_take_different_lifts(kind: str, warned: int) -> None:
+def test_drives_by_different_lifts_give_no_false_warning(kind: str, warned: int) -> None:
     """Lifts to different floors have different names."""
     drives = [
         Trace.from_steps("ab", [{"name": name, "kind": kind}], name=f"{name}-drive")

@@ -57,11 +57,11 @@ def names_of(folder: Path, logs: list[str]) -> list[str]:
         (f"{LONG}.log", LONG),
     ],
 )
-def test_the_whole_stem_names_the_folder(file: str, name: str) -> None:
+def test_folder_has_the_name_of_the_log(file: str, name: str) -> None:
     assert named_after(f"some.folder/{file}") == name
 
 
-def test_a_folder_of_a_log_has_no_ending(tmp_path: Path) -> None:
+def test_bag_folder_keeps_its_full_name(tmp_path: Path) -> None:
     (tmp_path / "bag.1.db3").mkdir()
     assert named_after(str(tmp_path / "bag.1.db3")) == "bag.1.db3"
     assert named_after(str(tmp_path / "bag.1.db3" / ".")) == "bag.1.db3"
@@ -92,7 +92,7 @@ def test_a_folder_of_a_log_has_no_ending(tmp_path: Path) -> None:
         "long, of two bytes",
     ],
 )
-def test_no_two_logs_share_a_folder_in_whatever_order_they_come(
+def test_logs_have_different_folders_in_any_order(
     tmp_path: Path, files: list[str], names: list[str]
 ) -> None:
     logs = [log_at(tmp_path / file, file) for file in files]
@@ -106,7 +106,7 @@ def test_no_two_logs_share_a_folder_in_whatever_order_they_come(
         )
 
 
-def test_a_log_keeps_its_folder_whatever_joins_it_and_whatever_it_is_called(
+def test_log_keeps_its_folder_if_renamed_or_packed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     runs = tmp_path / "runs"
@@ -123,7 +123,7 @@ def test_a_log_keeps_its_folder_whatever_joins_it_and_whatever_it_is_called(
     assert names_of(runs, [str(packed), moved])[0].startswith("run-")
 
 
-def test_one_log_alone_has_the_folder_that_is_named_unless_another_log_has_it(
+def test_single_log_uses_the_output_folder_unless_it_is_taken(
     tmp_path: Path,
 ) -> None:
     runs = tmp_path / "runs"
@@ -135,26 +135,26 @@ def test_one_log_alone_has_the_folder_that_is_named_unless_another_log_has_it(
     assert names_of(runs, [second, first]) == ["run.1", "."]
 
 
-def test_copies_of_a_log_are_mapped_once_if_they_would_share_a_folder(tmp_path: Path) -> None:
+def test_copies_of_a_log_are_mapped_once(tmp_path: Path) -> None:
     copies = [log_at(tmp_path / folder / "run.log", "one") for folder in "ba"]
     found, same = folders_of(copies, tmp_path / "runs")
     assert (found, same) == ({copies[1]: tmp_path / "runs" / "run"}, {copies[0]: copies[1]})
 
 
-def test_a_log_that_is_not_there_takes_no_name(tmp_path: Path) -> None:
+def test_missing_log_takes_no_folder_name(tmp_path: Path) -> None:
     there = log_at(tmp_path / "b" / "run.log", "x")
     missing = str(tmp_path / "a" / "run.log")
     assert names_of(tmp_path / "runs", [missing, there])[1] == "run"
     assert len(set(names_of(tmp_path / "runs", [missing, there]))) == 2
 
 
-def test_bags_whose_files_have_the_same_names_and_sizes_are_two_logs(tmp_path: Path) -> None:
+def test_bags_with_equal_names_and_sizes_are_two_logs(tmp_path: Path) -> None:
     for name in "ab":
         log_at(tmp_path / name / "bag" / "bag_0.db3", name)
     assert digest([str(tmp_path / "a" / "bag")]) != digest([str(tmp_path / "b" / "bag")])
 
 
-def test_an_interrupted_run_is_not_done(tmp_path: Path) -> None:
+def test_interrupted_run_is_not_done(tmp_path: Path) -> None:
     log = log_at(tmp_path / "run.log", "x")
     map_in(tmp_path / "whole", log, interrupted=False)
     map_in(tmp_path / "part", log, interrupted=True)
@@ -163,7 +163,7 @@ def test_an_interrupted_run_is_not_done(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("at", range(1, 5))
-def test_a_run_that_could_not_be_written_is_not_done(
+def test_run_that_cannot_be_written_is_not_done(
     tmp_path: Path, at: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The disk is full at the first, second, … file.
@@ -189,7 +189,7 @@ def test_a_run_that_could_not_be_written_is_not_done(
     assert written[-1].name == ["trace.jsonl", "maps.json", "report.html", RUN][at - 1]
 
 
-def test_what_cannot_be_written_is_a_line_and_the_other_logs_go_on(
+def test_run_that_cannot_be_written_does_not_stop_other_logs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Of four logs, one has no folder because a file is in its place, and for another one the disk

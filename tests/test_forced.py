@@ -78,9 +78,7 @@ def solved(trace: Trace, theory: Theory) -> Case:
 @pytest.mark.filterwarnings("ignore:views")
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("kind", THEORIES)
-def test_every_cheap_map_has_the_forced_joins_and_none_costs_less_than_the_bound(
-    kind: str, seed: int
-) -> None:
+def test_forced_joins_are_in_all_cheap_maps_and_the_bound_holds(kind: str, seed: int) -> None:
     trace, theory, solution, weighed = case_of(kind, seed)
     most = weighed.nats + (1e-3, 4.0)[seed % 2]
     for ssh_map in {solution.maps[0], solution.maps[-1]}:
@@ -94,7 +92,7 @@ def test_every_cheap_map_has_the_forced_joins_and_none_costs_less_than_the_bound
                 assert names[join.first] == names[join.second]
 
 
-def test_the_proof_of_a_maze_of_sixty_steps() -> None:
+def test_forced_joins_prove_a_maze_of_sixty_steps() -> None:
     known = truth.random_walk(4, 60, 3001, truth.Noise(Odometry(**FINE)))
     trace, theory, solution, weighed = solved(known.trace, Theory.topological())
     forcing = forcing_of(trace, theory, solution.maps[0])
@@ -116,7 +114,7 @@ def true_map(known: truth.Known) -> SSHMap:
     return SSHMap(labels, tuple(dstates.values()), (), ())
 
 
-def test_the_bound_counts_what_laying_drives_on_each_other_costs() -> None:
+def test_forced_bound_counts_the_price_of_laying_drives() -> None:
     noise = truth.Noise(Odometry(**truth.NOISE))
     (known,) = together.of_mazes(4, 60, [4], noise, 3)
     ssh_map, problem = true_map(known), settle(known.trace)
@@ -128,7 +126,7 @@ def test_the_bound_counts_what_laying_drives_on_each_other_costs() -> None:
     assert bounds[1] + problem.overlap.price - EQUAL <= bounds[0] <= cost + EQUAL
 
 
-def test_the_lack_of_one_join_is_assumed_if_no_other_way_leads_on() -> None:
+def test_forcing_tries_single_missing_joins_to_raise_the_bound() -> None:
     known = truth.random_walk(6, 150, 3002, truth.Noise(Odometry(**FINE)))
     ssh_map, problem = true_map(known), settle(known.trace)
     cost = 8 * (len(ssh_map.dstates) + len(set(known.places)))
@@ -139,7 +137,7 @@ def test_the_lack_of_one_join_is_assumed_if_no_other_way_leads_on() -> None:
     assert forcing.low > cost - EQUAL
 
 
-def test_there_is_no_bound_if_the_trace_may_have_faults() -> None:
+def test_forced_bound_is_off_if_faults_are_allowed() -> None:
     known = truth.random_walk(3, 8, 0, truth.Noise(Odometry(**FINE)))
     assert Forcing.holds_for(settle(known.trace))
     assert not Forcing.holds_for(settle(known.trace, Theory(misread=2.0)))

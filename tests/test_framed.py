@@ -96,7 +96,7 @@ def framed_theories(draw: st.DrawFn) -> Theory:
 
 @settings(max_examples=12)
 @given(framed_traces(), framed_theories(), st.sets(st.sampled_from(SPEEDUPS)), st.data())
-def test_lists_the_maps_of_the_plain_encoding(
+def test_framed_maps_equal_those_of_the_plain_encoding(
     trace: Trace, theory: Theory, off: set[str], data: st.DataObject
 ) -> None:
     """Prefixes, cores and batches are so small that short traces use them all. Any speed-ups may be
@@ -143,7 +143,7 @@ def test_lists_the_maps_of_the_plain_encoding(
 
 @settings(max_examples=5)
 @given(framed_traces(most_steps=7), framed_theories(), st.data())
-def test_a_trace_that_grows_has_the_maps_of_the_plain_encoding(
+def test_framed_maps_of_a_growing_trace_equal_the_plain_encoding(
     trace: Trace, theory: Theory, data: st.DataObject
 ) -> None:
     """Whether clingo gets only what is new, or everything again."""
@@ -170,7 +170,7 @@ def test_a_trace_that_grows_has_the_maps_of_the_plain_encoding(
             assert answer.count == expected.count
 
 
-def test_a_maze_is_mapped_while_it_is_explored() -> None:
+def test_framed_mapper_maps_a_maze_step_by_step() -> None:
     """The trace is long enough for cores, transitivity rules of visits, and paths. The longer trace
     keeps them all."""
     trace = maze(3, 3, steps=27, seed=0, stars=True).trace
@@ -203,7 +203,7 @@ def test_a_maze_is_mapped_while_it_is_explored() -> None:
     assert any(told for _, told in paths)
 
 
-def test_each_speedup_off_alone() -> None:
+def test_framed_maps_are_equal_without_each_speedup() -> None:
     """The walks are long enough for cores, transitivity rules of visits, and maps near a guess."""
     trace = maze(2, 2, steps=36, seed=0, stars=True).trace
     expected = solve(trace, Theory.topological(), max_maps=None, speedups=Speedups.without("names"))
@@ -217,7 +217,7 @@ def test_each_speedup_off_alone() -> None:
         assert found.bound.dstates == expected.bound.dstates, off
 
 
-def test_apart_nodes_are_different_dstates_of_the_world() -> None:
+def test_apart_nodes_are_different_true_dstates() -> None:
     """In a world that satisfies the theory, steps that the trace alone distinguishes are truly
     different."""
     for seed in range(6):
@@ -232,7 +232,7 @@ def test_apart_nodes_are_different_dstates_of_the_world() -> None:
         assert not any(truth[i] == truth[j] for i, j in zip(*apart.nonzero(), strict=True))
 
 
-def test_pairs_that_are_too_many_are_not_listed() -> None:
+def test_too_many_pairs_of_visits_are_not_listed() -> None:
     """Pairs are counted before they are listed, because ten million would take gigabytes."""
     trace = maze(3, 3, steps=120, seed=1, stars=True).trace
     chart = Chart.framed(trace, Log(trace, Theory(star="frame")))
@@ -246,7 +246,7 @@ def test_pairs_that_are_too_many_are_not_listed() -> None:
     assert check(trace, solution.maps[0], solution.theory) == ()
 
 
-def test_nodes_that_one_frame_fits_are_not_apart() -> None:
+def test_nodes_with_a_common_frame_are_not_apart() -> None:
     """A node for each visit and heading. Rotations (both ways) and travels link them."""
     star = [(0, 0, 1, 0), (1, 0, 0, 0), (1, 0, 1, 0), (1, 0, 1, 0)]
     trace = Trace.from_steps(
@@ -272,7 +272,7 @@ def test_nodes_that_one_frame_fits_are_not_apart() -> None:
     assert apart[2, 3]  # they see the same, but face different slots of one place
 
 
-def test_a_visit_that_fits_no_frame_has_no_map() -> None:
+def test_visit_that_fits_no_frame_is_unsatisfiable() -> None:
     stars = [(1, 0, 0, 0), (0, 0, 0, 1), (0, 0, 1, 0), (0, 1, 0, 0), (1, 1, 0, 0)]
     trace = Trace.from_steps("aaaaa" * 6, ["right"] * 29, stars=stars * 6)
     assert Chart.framed(trace, Log(trace, Theory(star="frame"))) is None
@@ -282,7 +282,7 @@ def test_a_visit_that_fits_no_frame_has_no_map() -> None:
 
 
 @pytest.mark.parametrize(("seed", "counts"), [(0, (32, 8, 4)), (2, (24, 6, 4)), (3, (16, 4, 2))])
-def test_mazes_are_mapped(seed: int, counts: tuple[int, int, int]) -> None:
+def test_mazes_with_stars_have_true_maps(seed: int, counts: tuple[int, int, int]) -> None:
     """3 x 3 cells. The robot sees some of them.
 
     Order and sides in the trace alone show that the dstates of the last two steps differ.
@@ -306,7 +306,7 @@ def test_mazes_are_mapped(seed: int, counts: tuple[int, int, int]) -> None:
         assert check(walk.trace, ssh_map, Theory.topological()) == ()
 
 
-def test_pinned_stretches_leave_all_maps() -> None:
+def test_pinning_segments_keeps_all_maps() -> None:
     trace = maze(4, 4, steps=100, seed=41, stars=True).trace
     given: list[tuple[list[int], Sequence[int]]] = []
 
@@ -327,7 +327,7 @@ def test_pinned_stretches_leave_all_maps() -> None:
     assert set(maps) == set(solve(trace, max_maps=None, speedups=Speedups.without("clique")).maps)
 
 
-def test_what_is_not_told_beforehand_is_found() -> None:
+def test_lazy_rules_for_order_and_sides_give_the_same_maps() -> None:
     """Every answer is refused until clingo has the rules for order and sides. The maps are the
     same."""
     walk = maze(2, 2, steps=60, seed=1, stars=True)
@@ -345,7 +345,7 @@ def test_what_is_not_told_beforehand_is_found() -> None:
         assert set(maps) == set(expected.maps)
 
 
-def test_clingo_is_told_of_a_path_that_an_answer_contradicts() -> None:
+def test_refused_path_becomes_a_rule_for_clingo() -> None:
     """Otherwise the maps would be the same, but each answer without paths would be forbidden
     separately."""
     trace = maze(3, 3, steps=60, seed=0, stars=True).trace
@@ -370,7 +370,7 @@ def test_clingo_is_told_of_a_path_that_an_answer_contradicts() -> None:
         Theory(star="frame", boundary="none"),
     ],
 )
-def test_sides_and_streets_say_the_same(theory: Theory) -> None:
+def test_sides_and_paths_refuse_the_same_labels(theory: Theory) -> None:
     """Compare sides_framed.lp (one path and visits) with paths_framed.lp (all paths and fixed
     dstates)."""
     contradicted = 0
@@ -440,7 +440,7 @@ def test_sides_and_streets_say_the_same(theory: Theory) -> None:
     assert contradicted > 3
 
 
-def test_when_time_is_over_there_is_a_map_and_a_bound() -> None:
+def test_framed_search_at_the_time_limit_gives_map_and_bound() -> None:
     """Stop the search for paths, and the search for the fewest dstates."""
     walk = maze(3, 3, steps=200, seed=1, stars=True)
     with (
@@ -461,7 +461,7 @@ def test_when_time_is_over_there_is_a_map_and_a_bound() -> None:
 
 
 @pytest.mark.slow
-def test_a_maze_half_explored_is_mapped() -> None:
+def test_half_explored_maze_is_mapped() -> None:
     """Few views distinguish little, so order and sides matter."""
     trace = maze(10, 10, steps=4000, seed=2, stars=True).trace.prefix(145)
     solution = solve(trace, Theory.topological(), max_maps=3)
@@ -472,7 +472,7 @@ def test_a_maze_half_explored_is_mapped() -> None:
         assert check(trace, ssh_map, Theory.topological()) == ()
 
 
-def test_the_engine_goes_on_where_a_limit_stopped_it() -> None:
+def test_framed_engine_continues_after_a_limit() -> None:
     """The search may stop anywhere. It proves the same in the last part of the time."""
     trace = maze(10, 10, steps=150, seed=0, stars=True).trace
     fewest: set[int] = set()
@@ -502,7 +502,7 @@ def test_the_engine_goes_on_where_a_limit_stopped_it() -> None:
     assert stopped > 2
 
 
-def test_what_was_stopped_while_it_was_prepared_is_prepared_again() -> None:
+def test_framed_engine_interrupted_in_preparation_is_prepared_again() -> None:
     """Otherwise the time reserved for any map would go to the engine of a shorter prefix, whose map
     would be taken for one of the whole trace."""
     walk = maze(3, 3, steps=120, seed=1, stars=True)
@@ -522,7 +522,7 @@ def test_what_was_stopped_while_it_was_prepared_is_prepared_again() -> None:
         assert check(walk.trace, ssh_map, Theory.topological()) == ()
 
 
-def test_ctrl_c_in_the_last_part_of_the_time_leaves_no_engine_to_go_on_with() -> None:
+def test_ctrl_c_near_the_time_limit_discards_the_engine() -> None:
     """Clingo may have got half of a core. Then its answer for the longer trace may be wrong."""
     trace = maze(3, 3, steps=80, seed=1, stars=True).trace
     search = Search(trace.prefix(70), Theory.topological(), time_limit=100)
@@ -536,7 +536,7 @@ def test_ctrl_c_in_the_last_part_of_the_time_leaves_no_engine_to_go_on_with() ->
     assert set(later) == set(solve(trace, max_maps=None).maps)
 
 
-def test_an_error_leaves_no_engine_to_go_on_with() -> None:
+def test_error_discards_the_engine() -> None:
     trace = maze(3, 3, steps=80, seed=1, stars=True).trace
     first = Search(trace.prefix(60), Theory.topological())
     list(first)
@@ -553,7 +553,7 @@ def test_an_error_leaves_no_engine_to_go_on_with() -> None:
     )
 
 
-def test_maps_of_a_known_cost_are_listed_for_the_whole_trace() -> None:
+def test_search_with_a_known_cost_lists_maps_of_the_whole_trace() -> None:
     """A shorter prefix has maps with fewer dstates, and only those would be listed."""
     trace = maze(3, 3, steps=70, seed=44, stars=True).trace
     first = Search(trace, Theory.topological(), max_maps=1)
@@ -577,7 +577,7 @@ def places(walk: Walk, chart: FramedChart) -> list[object]:
     return list(place.values())
 
 
-def test_annealing_finds_the_places_of_a_maze() -> None:
+def test_annealing_finds_the_true_places_of_a_maze() -> None:
     walk = maze(4, 4, steps=800, seed=0, stars=True)
     chart = Chart.framed(walk.trace, Log(walk.trace, Theory(star="frame")))
     guess = annealed(chart)
@@ -592,7 +592,7 @@ def test_annealing_finds_the_places_of_a_maze() -> None:
 
 @settings(max_examples=15)
 @given(framed_traces(), st.integers(1, 20))
-def test_a_guess_holds_the_stars(trace: Trace, sweeps: int) -> None:
+def test_annealed_visits_of_a_place_have_one_star(trace: Trace, sweeps: int) -> None:
     """Check an uncertain guess, too: the visits of a place have the same star in its frame."""
     chart = Chart.framed(trace, Log(trace, Theory(star="frame")))
     if chart is None:
@@ -624,7 +624,7 @@ def framed_engine(trace: Trace, theory: Theory) -> FramedEngine:
 
 @settings(max_examples=10)
 @given(framed_traces(), framed_theories(), st.lists(st.integers(-1, 4), min_size=9, max_size=9))
-def test_any_guess_is_merged_to_a_map(trace: Trace, theory: Theory, guess: list[int]) -> None:
+def test_merging_any_guess_gives_a_map(trace: Trace, theory: Theory, guess: list[int]) -> None:
     """Only the causal axioms count. A guess that is a map stays as it is."""
     asked = framed_engine(trace, theory)
     if asked._visits._program is None:

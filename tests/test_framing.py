@@ -24,7 +24,7 @@ PATTERN = Theory(star="pattern")
 
 @settings(max_examples=8)
 @given(st.data())
-def test_maps_with_frames_are_maps_of_the_theory(data: st.DataObject) -> None:
+def test_framed_maps_satisfy_the_theory(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=10).filter(lambda t: t.has_stars), label="trace")
     theory = data.draw(theories(trace), label="theory")
     if theory.level != "topological" or theory.has_faults:
@@ -43,7 +43,7 @@ def test_maps_with_frames_are_maps_of_the_theory(data: st.DataObject) -> None:
 
 @settings(max_examples=8)
 @given(st.data())
-def test_a_map_with_frames_changes_no_answer(data: st.DataObject) -> None:
+def test_framing_changes_no_answer(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=6).filter(lambda t: t.has_stars), label="trace")
     expected = solve(trace, PATTERN, max_maps=None, speedups=Speedups.without(SPEEDUPS))
     with patch.multiple(choosing, STEPWISE=-1.0, FEW_STEPS=0):
@@ -51,7 +51,7 @@ def test_a_map_with_frames_changes_no_answer(data: st.DataObject) -> None:
     assert (found.status, set(found.maps)) == (expected.status, set(expected.maps))
 
 
-def test_a_maze_has_a_small_map_before_the_proof() -> None:
+def test_framing_gives_a_small_map_before_the_proof() -> None:
     """The robot was in fewer than 40 dstates; a sketch without frames has hundreds."""
     walk = maze(3, 3, steps=200, seed=0, stars=True)
     with patch.object(Prefixes, "find_minimum", side_effect=[StageTimeError, KeyboardInterrupt]):

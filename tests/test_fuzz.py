@@ -401,7 +401,7 @@ def cases(batch: int) -> Iterator[tuple[str, str, random.Random]]:
 
 @pytest.mark.filterwarnings("ignore")  # the command line prints warnings
 @pytest.mark.parametrize("batch", range(BATCHES))
-def test_damaged_files_end_as_documented(
+def test_damaged_files_end_with_documented_errors(
     batch: int, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)

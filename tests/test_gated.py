@@ -51,7 +51,7 @@ def drive(world: str, seed: int, steps: int = 24) -> Trace:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("world", WORLDS)
-def test_a_greedy_map_satisfies_all_axioms(world: str) -> None:
+def test_greedy_map_satisfies_all_axioms(world: str) -> None:
     for seed in range(2):
         trace = drive(world, seed)
         problem = settle(trace)
@@ -62,7 +62,7 @@ def test_a_greedy_map_satisfies_all_axioms(world: str) -> None:
 
 
 @pytest.mark.parametrize("world", ["junction of 5", "any angles"])
-def test_a_greedy_map_is_returned_when_time_is_up(world: str) -> None:
+def test_greedy_map_is_returned_at_the_time_limit(world: str) -> None:
     trace = drive(world, 0, 30)
     with patch.multiple(fallback, OVERTIME=100.0):
         solution = solve(trace, time_limit=1e-6)
@@ -71,7 +71,7 @@ def test_a_greedy_map_is_returned_when_time_is_up(world: str) -> None:
     assert len(solution.maps[0].dstates) < len(trace)  # known places are tried, too
 
 
-def test_evidence_keeps_two_places_apart() -> None:
+def test_greedy_map_obeys_evidence() -> None:
     back = Trace.from_steps(
         "abaa", ["travel", "around", "travel"], stars=[[0, 120], [180, 300], [0, 120], [180, 300]]
     )
@@ -105,7 +105,7 @@ def ruled(text: str, theory: Theory) -> Theory:
 
 
 @pytest.mark.parametrize("name", KEPT)
-def test_a_map_that_satisfies_own_rules_is_returned_when_time_is_up(name: str) -> None:
+def test_map_that_satisfies_own_rules_is_returned_at_the_limit(name: str) -> None:
     trace = maze(3, 3, steps=60, seed=0).trace
     theory = ruled(KEPT[name], Theory.topological())
     with patch.multiple(fallback, OVERTIME=100.0):
@@ -115,7 +115,7 @@ def test_a_map_that_satisfies_own_rules_is_returned_when_time_is_up(name: str) -
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_no_map_that_breaks_own_rules_is_returned(name: str) -> None:
+def test_map_that_breaks_own_rules_is_not_returned(name: str) -> None:
     trace = maze(3, 3, steps=60, seed=0).trace
     with patch.multiple(fallback, OVERTIME=100.0):
         assert solve(trace, ruled(BROKEN[name], Theory.topological()), time_limit=1e-6).maps == ()
@@ -137,7 +137,7 @@ READ = [
 @pytest.mark.parametrize(
     ("level", "body"), [("causal", READ[0]), *(("topological", body) for body in READ)]
 )
-def test_own_rules_hold_in_the_maps_that_clingo_lists(body: str, level: str) -> None:
+def test_own_rules_select_the_same_maps_as_clingo(body: str, level: str) -> None:
     """The maps without the rule that satisfy it are those that clingo finds with the rule."""
     plain = getattr(Theory, level)().replace(prefer=())
     theory = ruled(f"#program step(t).\n:- {body}.", plain)
@@ -155,7 +155,7 @@ def test_own_rules_hold_in_the_maps_that_clingo_lists(body: str, level: str) -> 
 
 
 @pytest.mark.parametrize("body", ["founded(S,t)", "used(H,t)", "violation(deterministic,t)"])
-def test_rules_about_atoms_that_maps_lack_cannot_be_asked(body: str) -> None:
+def test_rules_about_atoms_without_facts_cannot_be_checked(body: str) -> None:
     assert not can_be_asked(
         settle(SMALL, ruled(f"#program step(t).\n:- {body}.", Theory.topological())).theory
     )
@@ -185,14 +185,14 @@ def test_sketches_of_worlds_satisfy_all_axioms(world: str) -> None:
 
 @settings(max_examples=30)
 @given(traces())
-def test_there_is_a_sketch_if_there_is_a_map(trace: Trace) -> None:
+def test_sketch_exists_if_a_map_exists(trace: Trace) -> None:
     theory = settle(trace, Theory.topological().replace(star="gateways")).theory
     exists = any(check(trace, ssh_map, theory) == () for ssh_map in sketched(trace, theory))
     assert exists == bool(solve(trace, theory, max_maps=1, time_limit=100).maps)
 
 
 @pytest.mark.parametrize(("first", "places"), [([0], 2), ([0, 180], 3)])
-def test_a_travel_leads_back_only_to_an_end_of_its_path(first: list[int], places: int) -> None:
+def test_sketch_ends_paths_at_dead_ends_only(first: list[int], places: int) -> None:
     """The robot drives to and fro between a place and a dead end.
 
     Both dead ends are one. The other place is one only if it is a dead end, too.
@@ -209,7 +209,7 @@ def test_a_travel_leads_back_only_to_an_end_of_its_path(first: list[int], places
     assert check(trace, small, theory) == check(trace, large, theory) == ()
 
 
-def test_a_sketch_goes_on_from_a_map() -> None:
+def test_sketch_extends_a_known_map() -> None:
     trace = drive("junction of 5", 0, 40)
     theory = settle(trace).theory
     known = solve(trace.prefix(20), theory, max_maps=1).maps[0]

@@ -57,7 +57,7 @@ def test_a_star_survives_a_round_trip(tmp_path: Path) -> None:
     assert trace.steps[2].star == (0, Gateway(180, 90, None, None))
 
 
-def test_which_stars_and_turns_fit_right_angles() -> None:
+def test_stars_and_turns_that_fit_right_angles() -> None:
     fits = [
         (1, 0, 1, 1),
         (0, 90),
@@ -86,7 +86,7 @@ def test_which_stars_and_turns_fit_right_angles() -> None:
     ).in_quarters
 
 
-def test_what_the_trace_tells_settles_the_star() -> None:
+def test_trace_decides_between_star_frame_and_gateways() -> None:
     square, bend = (Trace.from_steps("a", [], stars=[star]) for star in ((0, 90), (0, 120)))
     for star in ("auto", "frame"):
         assert settle(square, Theory(star=star)).theory.star == "frame"
@@ -130,7 +130,7 @@ def test_what_the_trace_tells_settles_the_star() -> None:
         ("1000", "star: expected a list"),
     ],
 )
-def test_a_malformed_star_is_an_error(star: Any, message: str) -> None:
+def test_malformed_star_is_an_error(star: Any, message: str) -> None:
     with pytest.raises(TraceError, match=message):
         Trace.from_steps("a", [], stars=[star])
 
@@ -155,12 +155,12 @@ def test_a_malformed_star_is_an_error(star: Any, message: str) -> None:
         ({"bearing": "x"}, "action.bearing: expected degrees clockwise"),
     ],
 )
-def test_a_malformed_turn_is_an_error(action: dict[str, Any], message: str) -> None:
+def test_malformed_turn_is_an_error(action: dict[str, Any], message: str) -> None:
     with pytest.raises(TraceError, match=message):
         Action.of({"name": "x", "kind": "turn", **action})
 
 
-def test_gateways_that_could_be_one_are_an_error() -> None:
+def test_gateways_within_their_spreads_are_an_error() -> None:
     with pytest.raises(
         TraceError,
         match="step 0: star: expected gateways that their spreads tell apart, got 0 and 15 degrees",
@@ -171,7 +171,7 @@ def test_gateways_that_could_be_one_are_an_error() -> None:
 @pytest.mark.parametrize(
     ("bearing", "turn"), [(60, "right"), (-60, "left"), (175, "around"), (300, "left")]
 )
-def test_a_bearing_says_which_way_a_turn_goes(bearing: float, turn: str) -> None:
+def test_bearing_decides_between_turn_right_and_left(bearing: float, turn: str) -> None:
     assert Action("x", "turn", bearing=bearing).turn == turn
 
 
@@ -201,7 +201,7 @@ gateways = st.builds(
 
 @settings(max_examples=20)
 @given(gateways, gateways, st.integers(0, 3))
-def test_rotations_are_those_of_a_plain_search(first: Frame, then: Frame, shift: int) -> None:
+def test_rotations_equal_a_plain_search(first: Frame, then: Frame, shift: int) -> None:
     if first.slots != then.slots:
         assert not judge.rotations(first, then, shift)
         return
@@ -219,7 +219,7 @@ def test_rotations_are_those_of_a_plain_search(first: Frame, then: Frame, shift:
     st.floats(0, 2),
     st.floats(0, 359),
 )
-def test_headings_more_than_four_spreads_apart_are_never_one(
+def test_headings_four_spreads_apart_never_match(
     bearings: list[float], data: st.DataObject, spread: float, turn: float
 ) -> None:
     bearings = sorted(bearings)
@@ -320,7 +320,7 @@ def traces(draw: st.DrawFn) -> Trace:
 
 @settings(max_examples=8)
 @given(traces(), st.data())
-def test_solver_and_checker_agree_with_the_brute_force(trace: Trace, data: st.DataObject) -> None:
+def test_maps_with_gateways_equal_the_brute_force(trace: Trace, data: st.DataObject) -> None:
     theory = GATEWAYS.replace(
         boundary=data.draw(st.sampled_from(["none", "strict"])),
         path_order=data.draw(st.sampled_from(["partial", "total"])),
@@ -340,7 +340,7 @@ def test_solver_and_checker_agree_with_the_brute_force(trace: Trace, data: st.Da
 
 @settings(max_examples=8)
 @given(traces(), st.data())
-def test_stars_of_dstates_alone(trace: Trace, data: st.DataObject) -> None:
+def test_causal_maps_with_stars_equal_the_brute_force(trace: Trace, data: st.DataObject) -> None:
     """star=alike: solver and checker against the brute force, which tries all ways to pair
     gateways. The maps of the plain causal theory are judged, too."""
     theory = Theory.causal().replace(
@@ -360,7 +360,9 @@ def test_stars_of_dstates_alone(trace: Trace, data: st.DataObject) -> None:
 
 @settings(max_examples=8)
 @given(traces(), st.sampled_from(LEFT_OUT[:5]))
-def test_checker_rejects_what_the_brute_force_does_not_find(trace: Trace, left_out: str) -> None:
+def test_checker_rejects_maps_with_gateways_outside_the_brute_force(
+    trace: Trace, left_out: str
+) -> None:
     """Judge the maps of a theory that lacks an axiom by all axioms."""
     _, allowed = minimal_maps(trace, GATEWAYS.replace(prefer=()))
     for ssh_map in solve(
@@ -370,7 +372,7 @@ def test_checker_rejects_what_the_brute_force_does_not_find(trace: Trace, left_o
             assert check(trace, ssh_map, GATEWAYS)
 
 
-def test_an_opening_not_observed_matches_both() -> None:
+def test_unobserved_opening_matches_open_and_closed() -> None:
     """Out and back. At first it is unknown whether a gateway is behind the robot."""
     for back in (0, 1):
         trace = Trace.from_steps(
@@ -389,7 +391,7 @@ def test_an_opening_not_observed_matches_both() -> None:
     )
 
 
-def test_the_axioms_agree_with_frames_of_four_slots() -> None:
+def test_gateways_at_right_angles_equal_frames_of_four_slots() -> None:
     """If bearings name turns, four gateways at right angles are a frame of four slots."""
     from worlds import TOURS
     from worlds import drive as drive_streets
@@ -401,7 +403,7 @@ def test_the_axioms_agree_with_frames_of_four_slots() -> None:
         assert {key(m) for m in framed.maps} == {key(m) for m in general.maps}
 
 
-def test_general_stars_switch_off_what_knows_frames_of_four_slots() -> None:
+def test_general_stars_switch_off_speedups_for_right_angles() -> None:
     on = Speedups().that_hold_for(GATEWAYS)
     assert not any((on.names, on.ways, on.sides))
     assert on.prefixes
@@ -423,7 +425,7 @@ WORLDS: dict[str, tuple[nx.Graph, int, set[object]]] = {
 
 
 @pytest.mark.parametrize("name", WORLDS)
-def test_worlds_of_any_gateways_are_mapped_right(name: str) -> None:
+def test_worlds_with_any_gateways_have_true_maps(name: str) -> None:
     graph, steps, landmarks = WORLDS[name]
     start = next(iter(graph))
     tour = drive(
@@ -440,7 +442,7 @@ def test_worlds_of_any_gateways_are_mapped_right(name: str) -> None:
         assert check(tour.trace, ssh_map) == ()
 
 
-def test_a_bend_ends_two_paths() -> None:
+def test_bend_ends_two_paths() -> None:
     """Once around six bends of 120 degrees. There are six paths, although three pairs are parallel.
 
     Without the axiom some become one path.
@@ -459,7 +461,7 @@ def test_a_bend_ends_two_paths() -> None:
 
 
 @pytest.mark.parametrize(("noise", "unseen"), [(0, False), (8, False), (8, True)])
-def test_streets_at_any_angles_are_mapped_right(noise: float, unseen: bool) -> None:
+def test_streets_at_any_angles_have_true_maps(noise: float, unseen: bool) -> None:
     graph = planar.scattered(6, random.Random(3))
     tour = drive(graph, 0, next(iter(graph[0])), 24, random.Random(3), noise=noise, unseen=unseen)
     solution = solve(tour.trace, time_limit=100)
@@ -469,7 +471,7 @@ def test_streets_at_any_angles_are_mapped_right(noise: float, unseen: bool) -> N
     assert solution.cost.places == tour.places
 
 
-def test_no_axiom_forbids_the_true_map() -> None:
+def test_true_map_with_noisy_bearings_satisfies_the_axioms() -> None:
     """Hubs with a ring road. Bearings may be off by less than their spread, and gateways behind the
     robot may be unobserved."""
     tour = drive(planar.wheel(5), "hub", 0, 18, random.Random(5), noise=9, unseen=True)
@@ -487,7 +489,7 @@ def test_no_axiom_forbids_the_true_map() -> None:
     assert solution.cost.places == tour.places
 
 
-def test_online_maps_general_stars() -> None:
+def test_online_mapper_maps_general_stars() -> None:
     tour = drive(planar.triangle(), 0, 1, 9, random.Random(0))
     first = tour.trace.steps[0]
     mapper = OnlineMapper(first.view or "", star=first.star, time_limit=None)
@@ -502,7 +504,7 @@ def test_online_maps_general_stars() -> None:
         assert set(online.maps) == set(whole.maps)
 
 
-def test_maps_with_headings_in_degrees_survive_files(
+def test_maps_with_headings_in_degrees_survive_a_round_trip(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """`check` and `show` read the output of `solve` for a triangle."""
@@ -516,7 +518,7 @@ def test_maps_with_headings_in_degrees_survive_files(
     assert {s.heading for s in ssh_map.dstates} == {0, 120, 240}
 
 
-def test_a_star_of_quarters_is_read_as_before() -> None:
+def test_star_of_quarters_is_read_as_in_version_0_1_0() -> None:
     assert Step(view="a", star=(1, 0, 0, 1)).openings == (True, False, False, True)
     with pytest.raises(TraceError, match="star=gateways"):
         _ = Step(view="a", star=(0, 120)).openings

@@ -77,7 +77,9 @@ CASES = {
         *((case, ("dstates", "places")) for case in [*CASES][::3]),
     ],
 )
-def test_the_maps_are_those_of_the_plain_encoding(case: str, prefer: tuple[str, ...]) -> None:
+def test_maps_with_homes_equal_those_of_the_plain_encoding(
+    case: str, prefer: tuple[str, ...]
+) -> None:
     trace, theory = CASES[case], Theory.topological().replace(prefer=prefer)
     expected = solve(trace, theory, max_maps=None, speedups=PLAIN)
     with patch.multiple(choosing, FEW_STEPS=0, STEPWISE=-1.0):
@@ -86,7 +88,7 @@ def test_the_maps_are_those_of_the_plain_encoding(case: str, prefer: tuple[str, 
     assert (found.cost, set(found.maps)) == (expected.cost, set(expected.maps))
 
 
-def test_places_on_the_way_back_have_one_home_each() -> None:
+def test_places_on_the_way_back_have_one_home() -> None:
     there = [(9, i, i + 1) for i in range(3)]
     back = [(9, 6, 5), (9, 5, 4), (9, 4, 3)]
     elsewhere = [
@@ -102,11 +104,11 @@ def test_places_on_the_way_back_have_one_home_each() -> None:
 @pytest.mark.parametrize(
     "elsewhere", [[(0, 0)], [(0, 1), (1, 2), (0, 2), (3, 0), (3, 1), (3, 2), (0, 3), (3, 3)]]
 )
-def test_places_that_cannot_be_have_no_home(elsewhere: list[tuple[int, int]]) -> None:
+def test_impossible_places_have_no_homes(elsewhere: list[tuple[int, int]]) -> None:
     assert homes_of(Segments([0, 1, 2, 3], elsewhere, [], [], [])) is None
 
 
-def test_segments_of_which_none_can_be_one_path_are_as_many_paths() -> None:
+def test_pairwise_distinct_segments_bound_the_number_of_paths() -> None:
     assert (
         fewest_paths(
             Segments([], [], [], [0, 1, 2, 3], [(0, 1), (1, 0), (1, 2), (2, 1), (0, 2), (2, 0)])
@@ -115,7 +117,7 @@ def test_segments_of_which_none_can_be_one_path_are_as_many_paths() -> None:
     )
 
 
-def test_a_long_corridor_needs_no_search_for_places() -> None:
+def test_long_corridor_needs_no_search_for_places() -> None:
     """Clingo is asked once for the places of forty landmarks, and has no choice."""
     trace = corridor(40)
     with (
@@ -128,6 +130,6 @@ def test_a_long_corridor_needs_no_search_for_places() -> None:
     assert (found.cost.dstates, found.cost.places, found.cost.paths) == (80, 40, 1)
 
 
-def test_a_member_that_is_distinct_from_itself_does_not_hang_the_search() -> None:
+def test_pairwise_distinct_ends_if_a_member_differs_from_itself() -> None:
     """Labels that break an axiom may show it. Clingo then finds no map with them."""
     assert pairwise_distinct([4, 5], [(4, 4), (4, 5), (5, 4)]) == [4, 5]

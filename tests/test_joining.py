@@ -46,7 +46,7 @@ def along(*drives: str) -> Trace:
 
 @pytest.mark.parametrize("stars", [True, False], ids=["stars", "no stars"])
 @pytest.mark.parametrize("known", MAZES, ids=[known.name for known in MAZES])
-def test_the_joint_map_costs_no_more_than_the_true_one(known: truth.Known, stars: bool) -> None:
+def test_joined_map_costs_at_most_as_much_as_the_true_one(known: truth.Known, stars: bool) -> None:
     problem = settle(known.trace, Theory(star="auto" if stars else "none"))
     misfit = Misfit(problem)
 
@@ -64,7 +64,7 @@ def test_the_joint_map_costs_no_more_than_the_true_one(known: truth.Known, stars
 
 
 @pytest.mark.parametrize("seed", [513, 514, 515])
-def test_the_joint_map_names_the_gateways_that_changed(seed: int) -> None:
+def test_joined_map_names_the_gateways_that_changed(seed: int) -> None:
     case = changes.case(4, 60, seed, 3, 8)
     problem = settle(case.known.trace, Theory(changed=1.2, star="frame"))
     *_, best = joined(problem)
@@ -74,7 +74,7 @@ def test_the_joint_map_names_the_gateways_that_changed(seed: int) -> None:
     assert not [*violations(problem.trace, best, problem.theory)]
 
 
-def test_drives_with_two_places_at_one_position_may_overlap_by_chance() -> None:
+def test_two_places_at_one_position_prevent_a_probability() -> None:
     """A gateway is closed on the second drive. If gateways may not change, a place is two."""
     drives = [
         Trace.from_steps(
@@ -99,7 +99,7 @@ def test_drives_with_two_places_at_one_position_may_overlap_by_chance() -> None:
     assert doubt_of(settle(together(drives), Theory()), apart[0]) is None
 
 
-def test_a_gateway_that_closes_and_opens_again_changes_twice() -> None:
+def test_gateway_that_closes_and_opens_again_costs_two_changes() -> None:
     end = [(1, 0, 1, 0)]
     drives = [
         Trace.from_steps(
@@ -132,7 +132,7 @@ def test_a_gateway_that_closes_and_opens_again_changes_twice() -> None:
         ((0.4, 90.3, 200.0, 300.0), 1.2, False),  # too many changes
     ],
 )
-def test_a_dstate_sees_gateways_at_its_own_bearings(
+def test_sights_compare_gateways_by_bearing(
     bearings: tuple[float, ...], changed: float, is_one: bool
 ) -> None:
     stars = [Star(tuple(Gateway(b, 0.75) for b in seen)) for seen in ((0.0, 5.0, 90.0), bearings)]
@@ -142,7 +142,7 @@ def test_a_dstate_sees_gateways_at_its_own_bearings(
     assert sights.are_alike(*sights.shown) == is_one
 
 
-def test_drives_that_show_other_things_stay_apart() -> None:
+def test_drives_without_common_views_are_not_joined() -> None:
     monday = Trace.from_steps("abc", ["travel"] * 2, displacements=[(5.0, 0.0, 0.0)] * 2)
     tuesday = Trace.from_steps("xyz", ["travel"] * 2, displacements=[(5.0, 0.0, 0.0)] * 2)
     with pytest.warns(UserWarning, match="no view in common"):
@@ -152,7 +152,7 @@ def test_drives_that_show_other_things_stay_apart() -> None:
 
 
 @pytest.mark.parametrize("apart", [4.0, 9.0])
-def test_drives_that_cross_share_places(apart: float) -> None:
+def test_crossing_drives_share_places(apart: float) -> None:
     """One drive leads east to a dead end, through a crossing. The other drive crosses it twice."""
     ahead, left = (4.0, 0.0, 0.0), (0.0, 0.0, math.pi / 2)
     east = Trace.from_steps(
@@ -180,7 +180,7 @@ def test_drives_that_cross_share_places(apart: float) -> None:
     assert not [*violations(problem.trace, ssh_map, problem.theory)]
 
 
-def test_a_drive_is_joined_where_no_later_step_contradicts_it() -> None:
+def test_drive_is_joined_where_later_steps_agree() -> None:
     """Both drives begin with "abc", and then see other things."""
     problem = settle(along("abcdabc", "abcx"), Theory())
     *_, ssh_map = joined(problem)
@@ -188,7 +188,7 @@ def test_a_drive_is_joined_where_no_later_step_contradicts_it() -> None:
     assert not [*violations(problem.trace, ssh_map, problem.theory)]
 
 
-def test_drives_that_have_little_in_common_stay_apart() -> None:
+def test_drives_with_one_common_view_are_joined_only_by_a_closure() -> None:
     """One place may look like another by chance. A closure between them says that they are one."""
     joint = along("abcda", "ax")
     (apart,) = joined(settle(joint, Theory()))
@@ -202,13 +202,13 @@ def test_drives_that_have_little_in_common_stay_apart() -> None:
 
 
 @pytest.mark.slow
-def test_the_search_joins_many_drives() -> None:
+def test_search_joins_six_drives() -> None:
     (known,) = of_mazes(4, 60, [315], NOISE, drives=6)
     *_, ssh_map = Search(known.trace)._parts.candidates.joined()
     assert truth.is_true(ssh_map, known)
 
 
-def test_explain_says_what_laying_costs() -> None:
+def test_explain_states_the_price_of_laying_drives() -> None:
     """The second drive may begin at the last place of the first one."""
     said = str(explain_pair(along("abcda", "a"), 4, 5, time_limit=100))
     assert "saves 1 dstate, 1 place (16.0 nats)" in said

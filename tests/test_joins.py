@@ -70,7 +70,7 @@ def agree(trace: Trace, theory: Theory, ssh_map: SSHMap) -> tuple[Join, ...]:
 
 @settings(max_examples=10)
 @given(st.data())
-def test_joins_imply_all_others_and_none_follows(data: st.DataObject) -> None:
+def test_named_joins_are_a_minimal_set_that_implies_all_others(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=6))
     fixed = ("rules", "weigh", "next_place", "planar")
     theory = settle(trace, data.draw(theories(trace, fixed)).replace(weigh="count")).theory
@@ -113,7 +113,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_joins_of_small_worlds(name: str) -> None:
+def test_joins_of_small_worlds_equal_hand_results(name: str) -> None:
     views, actions, theory, expected = CASES[name]
     stars = [CROSSING] * len(views) if theory.star == "frame" else None
     trace = read(views, actions, stars=stars)
@@ -123,13 +123,13 @@ def test_joins_of_small_worlds(name: str) -> None:
     assert told == expected
 
 
-def test_an_action_that_slipped_forces_nothing() -> None:
+def test_slipped_action_forces_no_join() -> None:
     solution = solve(read("abcabcacabc", "oooooooooo"), CAUSAL.replace(slipped=0.5))
     assert [fault.step for fault in solution.maps[0].faults] == [6]
     assert [(join.first, join.second) for join in solution.by_minimality] == [(0, 3), (5, 7)]
 
 
-def test_sentences_name_few_joins() -> None:
+def test_sentence_names_at_most_five_joins() -> None:
     joins = [Join(i, i + 9, at_place=True) for i in range(7)]
     assert joins_in_words([], minimal=True) == ""
     assert joins_in_words(joins, minimal=True) == (
@@ -145,7 +145,7 @@ def test_sentences_name_few_joins() -> None:
 TOLD = "minimal; nothing observed separates these places: steps 0 and 8"
 
 
-def test_commands_say_which_joins_rest_on_minimality(
+def test_commands_print_joins_that_rest_on_minimality(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     trace, maps = str(EXAMPLES / "notched-rectangle.jsonl"), str(tmp_path / "maps.json")
@@ -164,7 +164,7 @@ def test_commands_say_which_joins_rest_on_minimality(
     assert json.loads(capsys.readouterr().out)["by_minimality"] == written["by_minimality"]
 
 
-def test_solutions_from_files_keep_the_joins() -> None:
+def test_solution_file_keeps_the_joins() -> None:
     solution = solve(Trace.load(EXAMPLES / "notched-rectangle.jsonl"))
     read_again = Solution.from_dict(solution.to_dict())
     assert read_again.by_minimality == solution.by_minimality == (Join(0, 8, at_place=True),)
@@ -175,7 +175,7 @@ def test_solutions_from_files_keep_the_joins() -> None:
             Solution.from_dict({**solution.to_dict(), "by_minimality": wrong})
 
 
-def test_weighed_maps_have_probabilities_instead() -> None:
+def test_weighed_maps_have_probabilities_of_joins() -> None:
     square = [(10, 0, 0), (0, 0, 1.5708)] * 4
     trace = read("ababababa", "TLTLTLTL", displacements=square)
     weighed = solve(trace)
@@ -187,7 +187,7 @@ def test_weighed_maps_have_probabilities_instead() -> None:
     assert counted.sureness.startswith("minimal; nothing observed separates")
 
 
-def test_the_page_lists_doubtful_joins() -> None:
+def test_page_lists_doubtful_joins() -> None:
     solution = solve(Trace.load(EXAMPLES / "notched-rectangle.jsonl"))
     content = content_of(solution)
     assert content["sureness"] == TOLD
@@ -201,7 +201,7 @@ def test_the_page_lists_doubtful_joins() -> None:
     assert content["sureness"] == weighed.sentence
 
 
-def test_maps_of_logs_say_it_too() -> None:
+def test_maps_of_logs_name_doubtful_joins() -> None:
     solution = solve(Trace.load(EXAMPLES / "notched-rectangle.jsonl"))
     told = f"minimal map; {TOLD.removeprefix('minimal; ')}"
     run = {"log": {"scans": 9, "metres": 5.0}, "visits": 3, "steps": 401}

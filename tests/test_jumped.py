@@ -69,7 +69,7 @@ def small_traces(draw: st.DrawFn) -> Trace:
 
 @settings(max_examples=5)
 @given(small_traces(), st.booleans(), st.sampled_from([0.4, 1.0, 1.7]))
-def test_minimal_maps_are_the_best_of_all_ways_to_leave_displacements_out(
+def test_maps_with_jumps_equal_the_best_subset_of_displacements(
     trace: Trace, causal: bool, price: float
 ) -> None:
     if not trace.has_displacements:
@@ -99,7 +99,7 @@ def test_minimal_maps_are_the_best_of_all_ways_to_leave_displacements_out(
 
 
 @pytest.mark.slow
-def test_a_robot_that_was_carried_away_finds_its_circuit_again() -> None:
+def test_carried_robot_finds_its_circuit_again() -> None:
     trace, solution = circuit(18, (9,)), carried()
     without = solve(trace, Theory(weigh="count")).cost
     assert without is not None
@@ -116,14 +116,14 @@ def test_a_robot_that_was_carried_away_finds_its_circuit_again() -> None:
 
 
 @pytest.mark.slow
-def test_speedups_change_no_map_of_a_robot_that_was_carried_away() -> None:
+def test_speedups_do_not_change_maps_with_jumps() -> None:
     trace, solution = circuit(18, (9,)), carried()
     plain = solve(trace, solution.theory, speedups=Speedups.without(SPEEDUPS), max_maps=None)
     assert plain.maps == solution.maps
 
 
 @pytest.mark.slow
-def test_the_checker_believes_what_the_map_believes() -> None:
+def test_checker_judges_maps_by_their_assumed_jumps() -> None:
     trace, solution = circuit(18, (9,)), carried()
     best = solution.maps[0]
 
@@ -139,7 +139,7 @@ def test_the_checker_believes_what_the_map_believes() -> None:
 
 
 @pytest.mark.slow
-def test_a_maze_with_wrong_displacements_has_a_map_that_costs_no_more_than_the_truth() -> None:
+def test_map_of_a_maze_with_jumps_costs_at_most_the_true_cost() -> None:
     seed, jumps = 12, 2
     chance = random.Random(seed)
     walk = maze(3, 3, steps=60, seed=seed, stars=True, follow=True, odometry=NOISE)
@@ -167,7 +167,7 @@ def test_a_maze_with_wrong_displacements_has_a_map_that_costs_no_more_than_the_t
     assert solution.weighed.proven or solution.weighed.confidence < 0.5
 
 
-def test_a_local_search_finds_a_map_that_costs_no_more_than_the_truth() -> None:
+def test_annealing_with_a_jump_costs_at_most_the_true_cost() -> None:
     """It begins with a map that believes all displacements, and changes one guess at a time."""
     walk, jump = maze(3, 3, steps=16, seed=12, stars=True, follow=True, odometry=NOISE), 6
     steps = list(walk.trace.steps)
@@ -192,12 +192,12 @@ def test_a_local_search_finds_a_map_that_costs_no_more_than_the_truth() -> None:
 
 
 @pytest.mark.parametrize("jumps", [(), (17,), (11, 30)])
-def test_returns_vote_on_what_displacements_are_wrong(jumps: tuple[int, ...]) -> None:
+def test_returns_vote_for_the_wrong_displacements(jumps: tuple[int, ...]) -> None:
     labels = [t % 8 for t in range(48)]
     assert sorted(wrong_displacements(circuit(48, jumps), labels, [None] * 48)) == list(jumps)
 
 
-def test_what_cannot_be_asked_with_jumps_is_refused() -> None:
+def test_jumps_are_refused_where_unsupported() -> None:
     theory = Theory(jumped=2)
     for ask in (
         lambda: OnlineMapper("a", theory),
@@ -212,6 +212,6 @@ def test_what_cannot_be_asked_with_jumps_is_refused() -> None:
         Theory(jumped=-1)
 
 
-def test_displacements_in_words() -> None:
+def test_displacement_has_a_sentence() -> None:
     assert in_words((0.0, 0.0, 0.0)) == "no move"
     assert in_words((-3.0, 0.04, -math.pi / 2)) == "3.0 m back, turned 90 degrees right"

@@ -61,7 +61,7 @@ def metres(scans: tuple[Scan, ...]) -> float:
 
 
 @pytest.mark.parametrize(("at", "is_timed"), [({65}, True), ({30, 60, 100}, False)])
-def test_an_odometer_that_starts_anew_is_cut_there(
+def test_track_is_cut_where_the_odometer_restarts(
     scans: tuple[Scan, ...], metres: float, at: set[int], is_timed: bool
 ) -> None:
     broken = stepwise(scans, lambda i, step: None if i in at else step)
@@ -73,7 +73,7 @@ def test_an_odometer_that_starts_anew_is_cut_there(
     assert "Map both parts together if they are of one building" in notes
 
 
-def test_no_displacement_leads_across_a_cut_and_solver_and_checker_agree(
+def test_trace_has_no_displacement_across_a_cut(
     scans: tuple[Scan, ...],
 ) -> None:
     done = import_log(
@@ -87,7 +87,7 @@ def test_no_displacement_leads_across_a_cut_and_solver_and_checker_agree(
     assert not check(done.trace, solution.maps[0], solution.theory)
 
 
-def test_a_robot_that_is_carried_while_its_odometer_stands_still_is_tracked_by_scans(
+def test_stuck_odometer_is_replaced_by_scan_matching(
     scans: tuple[Scan, ...], metres: float
 ) -> None:
     track, notes = told(stepwise(scans, lambda i, step: START if 60 <= i < 80 else step))
@@ -96,7 +96,7 @@ def test_a_robot_that_is_carried_while_its_odometer_stands_still_is_tracked_by_s
     assert "The odometry stands still in" in notes
 
 
-def test_a_robot_that_stands_is_not_carried(scans: tuple[Scan, ...]) -> None:
+def test_standing_robot_is_not_called_carried(scans: tuple[Scan, ...]) -> None:
     rng = np.random.default_rng(1)
     stands = [
         replace(scans[60], ranges=scans[60].ranges + 0.02 * rng.normal(size=len(scans[60].ranges)))
@@ -106,7 +106,7 @@ def test_a_robot_that_stands_is_not_carried(scans: tuple[Scan, ...]) -> None:
 
 
 @pytest.mark.slow
-def test_a_robot_that_was_carried_unseen_is_mapped_as_two_ways(scans: tuple[Scan, ...]) -> None:
+def test_carried_robot_gives_a_slipped_action(scans: tuple[Scan, ...]) -> None:
     """The laser is off while the robot is carried, and the odometer is where it was."""
     lifted = stepwise((*scans[:60], *scans[85:]), lambda i, step: START if i == 60 else step)
     done = import_log(RobotLog(lifted, source="drive"))
@@ -121,7 +121,7 @@ def test_a_robot_that_was_carried_unseen_is_mapped_as_two_ways(scans: tuple[Scan
     assert not check(done.trace, solution.maps[0], solution.theory)
 
 
-def test_a_second_drive_may_begin_where_the_odometer_jumps_once(scans: tuple[Scan, ...]) -> None:
+def test_note_says_that_a_second_drive_may_begin_at_a_jump(scans: tuple[Scan, ...]) -> None:
     parts = (*scans[:60], *scans[85:])
     track, notes = told(stepwise(parts, lambda i, step: (80.0, 30.0, 0.0) if i == 60 else step))
     assert track.cuts == (60,)
@@ -129,12 +129,12 @@ def test_a_second_drive_may_begin_where_the_odometer_jumps_once(scans: tuple[Sca
     assert "If a second drive begins there, cut the log there." in notes
 
 
-def test_a_pause_in_which_the_robot_drove_on_is_no_jump(scans: tuple[Scan, ...]) -> None:
+def test_missing_scans_with_good_odometry_are_no_jump(scans: tuple[Scan, ...]) -> None:
     assert unknown_steps(RobotLog((*scans[:60], *scans[75:]))) == Unknown()
 
 
 @pytest.mark.parametrize(("unit", "count"), [("millimetres", 1000.0), ("centimetres", 100.0)])
-def test_odometry_in_another_unit_is_read_in_it(
+def test_odometry_in_another_unit_is_converted(
     scans: tuple[Scan, ...], metres: float, unit: str, count: float
 ) -> None:
     track, notes = told(
@@ -151,7 +151,7 @@ def test_odometry_in_another_unit_is_read_in_it(
 
 
 @pytest.mark.parametrize("share", [None, 0.3])
-def test_poses_of_two_sources_that_alternate_are_those_of_one(
+def test_alternating_odometry_sources_are_reduced_to_one(
     scans: tuple[Scan, ...], metres: float, share: float | None
 ) -> None:
     draw = random.Random(1)
@@ -165,7 +165,7 @@ def test_poses_of_two_sources_that_alternate_are_those_of_one(
     assert "The poses of several sources alternate in the odometry" in notes
 
 
-def test_alternating_poses_that_are_near_give_a_note(scans: tuple[Scan, ...]) -> None:
+def test_near_alternating_odometry_gives_a_note(scans: tuple[Scan, ...]) -> None:
     draw = random.Random(1)
     poses = [
         moved((1.0, 0.8, 0.05), scan.odometry) if draw.random() < 0.5 else scan.odometry
@@ -175,14 +175,14 @@ def test_alternating_poses_that_are_near_give_a_note(scans: tuple[Scan, ...]) ->
 
 
 @pytest.mark.parametrize("block", [1, 10])
-def test_a_log_that_is_not_in_order_is_said_to_be(scans: tuple[Scan, ...], block: int) -> None:
+def test_note_names_a_log_that_is_not_in_order(scans: tuple[Scan, ...], block: int) -> None:
     blocks = [scans[i : i + block] for i in range(0, 40, block)]
     random.Random(1).shuffle(blocks)
     notes = told([scan for some in blocks for scan in some])[1]
     assert "The odometry jumps" in notes or "The usual step between two scans is" in notes
 
 
-def test_a_drive_that_is_broken_all_over_is_an_error(
+def test_log_with_too_many_breaks_is_refused(
     scans: tuple[Scan, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(importing, "MOST_BREAKS", -1.0)
@@ -192,7 +192,7 @@ def test_a_drive_that_is_broken_all_over_is_an_error(
         import_log(RobotLog(scans[:60], source="drive"))
 
 
-def test_scans_that_turn_otherwise_than_the_odometer_are_said(
+def test_note_names_scans_that_turn_unlike_the_odometry(
     scans: tuple[Scan, ...], metres: float
 ) -> None:
     track, notes = told(

@@ -70,7 +70,7 @@ def exact_panorama(world: World, pose: tuple[float, float, float]) -> np.ndarray
 
 @settings(max_examples=5)
 @given(st.integers(0, 8), st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-3, 3))
-def test_a_panorama_shows_the_streets_and_where_they_meet(
+def test_panorama_gives_the_streets_and_their_junction(
     shape: int, dx: float, dy: float, heading: float
 ) -> None:
     """Near the fixed point: streets to a degree, the fixed point to two centimetres."""
@@ -104,7 +104,7 @@ def _segments(polygon: list[list[float]]) -> np.ndarray:
     return np.hstack([polygon, np.roll(polygon, -1, axis=0)])
 
 
-def test_a_street_that_goes_straight_on_is_no_place() -> None:
+def test_straight_street_is_no_place() -> None:
     world = World(
         "w",
         np.vstack([_segments(p) for p in drawn(streets(0, 175), REACH, ("hub", 0))["polygons"]]),
@@ -116,7 +116,7 @@ def test_a_street_that_goes_straight_on_is_no_place() -> None:
 
 @settings(max_examples=5)
 @given(st.floats(-3, 3), st.floats(-3, 3), st.floats(-0.03, 0.03), st.integers(0, 10**6))
-def test_the_compass_tells_how_the_robot_is_turned(
+def test_compass_measures_a_turn_to_half_a_degree(
     heading: float, turn: float, error: float, seed: int
 ) -> None:
     """Odometry is off by up to 3 % of the turn. Images measure the turn to half a degree."""
@@ -129,7 +129,7 @@ def test_the_compass_tells_how_the_robot_is_turned(
     )
 
 
-def test_a_panorama_is_what_is_around() -> None:
+def test_panorama_of_noisy_images_equals_exact_ranges() -> None:
     """Images of a turning robot, with noise, and with turns that are off by 3 %."""
     rng, pose = np.random.default_rng(0), (0.1, 0.2, 0.5)
     panorama = Panorama(Laser().scan(FIVE, np.array([pose]), rng)[0])
@@ -155,7 +155,7 @@ def test_a_panorama_is_what_is_around() -> None:
         (streets(0, 50, 135, 180, 270), (0, "hub")),
     ],
 )
-def test_the_robot_comes_to_every_dstate(
+def test_simulated_robot_reaches_every_dstate(
     tmp_path: Path, graph: nx.Graph, start: tuple[object, object]
 ) -> None:
     """Along all streets in both directions, each step is near a true dstate, with the true star."""
@@ -178,7 +178,7 @@ def test_the_robot_comes_to_every_dstate(
         assert sorted((float(b) + 5) % 360 for b in step.star) == pytest.approx(expected, abs=2)  # type: ignore[arg-type]
 
 
-def test_displacements_are_as_good_as_their_covariances_say() -> None:
+def test_displacement_errors_fit_their_covariances() -> None:
     """Relative to fixed points, 40 steps have a chi-square near its degrees of freedom."""
     trace = simulate(FIVE, tours=2, seed=5)
     true = {dstate.name: dstate.pose for dstate in FIVE.dstates}
@@ -231,12 +231,14 @@ def test_control_never_reads_the_true_pose() -> None:
         (["travel", "right"], r"right at \(.*\): expected a street to the right, got none"),
     ],
 )
-def test_what_cannot_be_driven(tmp_path: Path, route: list[str], message: str) -> None:
+def test_simulator_refuses_routes_that_cannot_be_driven(
+    tmp_path: Path, route: list[str], message: str
+) -> None:
     with pytest.raises(SimulatorError, match=message):
         simulate(world_of(tmp_path, streets(0, 60), ("hub", 0), route=[*route, "around"]))
 
 
-def test_a_start_that_is_no_place(tmp_path: Path) -> None:
+def test_simulator_refuses_a_start_that_is_no_place(tmp_path: Path) -> None:
     with pytest.raises(
         SimulatorError,
         match=(
@@ -251,7 +253,7 @@ def test_a_start_that_is_no_place(tmp_path: Path) -> None:
         simulate(world_of(tmp_path, streets(0, 60), ("hub", 0), reach=0.4))
 
 
-def test_walls_tell_which_control_laws_hold(tmp_path: Path) -> None:
+def test_walls_decide_between_right_and_any_angles(tmp_path: Path) -> None:
     assert World.named("notched-rectangle").angles == World.named("taylor-hall").angles == "right"
     assert all(World.named(name).angles == "any" for name in SHIPPED)
     assert (
@@ -270,7 +272,7 @@ def test_walls_tell_which_control_laws_hold(tmp_path: Path) -> None:
     assert world_of(tmp_path, streets(0, 90), ("hub", 0), angles="any").angles == "any"
 
 
-def test_images_at_even_distances() -> None:
+def test_simulator_takes_images_at_even_distances() -> None:
     trace = simulate(FIVE, seed=7, every=1.0)
     assert len(trace) == pytest.approx(2 * 32 / 1.0, rel=0.25)
     assert all(step.action is None or step.action.name == "travel" for step in trace.steps)
@@ -289,7 +291,7 @@ def test_images_at_even_distances() -> None:
         pytest.param("six-ways", 1, 5, marks=pytest.mark.slow),
     ],
 )
-def test_the_true_map_is_found_from_what_was_simulated(
+def test_simulated_images_give_one_true_map(
     name: str, tours: int, seed: int, tmp_path: Path
 ) -> None:
     """simulate, cluster and solve, as a user would: one minimal map, which is the true one."""

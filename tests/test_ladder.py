@@ -27,7 +27,7 @@ def aces3() -> truth.Known:
 
 
 @pytest.mark.slow
-def test_displacements_make_the_true_map_of_aces3_the_only_minimal_one() -> None:
+def test_ladder_finds_the_true_map_of_aces3_with_displacements() -> None:
     rungs = {rung.name: rung for rung in ladder(aces3().trace)}
     assert list(rungs) == ["views", "+ star", "+ pairs", "+ geometry", "+ planarity"]
     assert [rung.solution.cost.dstates for rung in rungs.values() if rung.solution.cost] == [
@@ -42,7 +42,7 @@ def test_displacements_make_the_true_map_of_aces3_the_only_minimal_one() -> None
     assert [rung.solution.theory.star for rung in rungs.values()] == ["none", *["frame"] * 4]
 
 
-def test_what_a_trace_does_not_have_is_no_rung() -> None:
+def test_ladder_omits_rungs_without_evidence() -> None:
     trace = aces3().trace.prefix(8)
     assert [rung.name for rung in ladder(trace.without_displacements(), max_maps=1)] == [
         "views",
@@ -60,14 +60,14 @@ def test_what_a_trace_does_not_have_is_no_rung() -> None:
     }  # planarity is about places
 
 
-def test_what_is_solved_already_is_its_rung() -> None:
+def test_ladder_reuses_a_known_solution() -> None:
     known = solve(SQUARE)
     assert [rung.name for rung in ladder(SQUARE, known=known) if rung.solution is known] == [
         "+ geometry"
     ]
 
 
-def test_a_ladder_that_is_interrupted_ends_with_the_rungs_so_far() -> None:
+def test_interrupted_ladder_returns_the_rungs_so_far() -> None:
     under_way = UnderWay()
     names = []
     for rung in ladder(SQUARE, under_way=under_way):
@@ -79,14 +79,16 @@ def test_a_ladder_that_is_interrupted_ends_with_the_rungs_so_far() -> None:
     assert (only.name, only.solution.stopped, only.evaluation) == ("views", "interrupted", None)
 
 
-def test_where_faults_are_allowed_planarity_is_no_rung() -> None:
+def test_ladder_omits_planarity_if_faults_are_allowed() -> None:
     trace = Trace.from_steps("aba", ["travel", "travel"])
     assert [rung.name for rung in ladder(trace, Theory.topological().replace(misread=1.5))] == [
         "views"
     ]
 
 
-def test_the_shell_prints_a_row_a_rung(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_ladder_prints_a_row_for_each_rung(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "route.jsonl"
     corners = [{"dstate": i % 8, "place": (i + 1) // 2 % 4} for i in range(len(SQUARE))]
     told = zip(SQUARE.steps, corners, strict=True)

@@ -16,7 +16,7 @@ from ssh_abduction.solver.drives import onto
 
 
 @pytest.mark.slow
-def test_drives_are_laid_on_the_map_one_by_one() -> None:
+def test_onto_lays_drives_on_the_map_one_by_one() -> None:
     """The method was developed on seed 0."""
     known = list(walks(6, 100, 4, seed=300))
     solution: Solution | None = None
@@ -71,7 +71,7 @@ ERRORS = st.lists(st.floats(-0.2, 0.2), min_size=3, max_size=3)
     st.tuples(st.integers(0, 3), st.integers(1, 3), ERRORS),
     st.tuples(st.integers(0, 3), st.integers(1, 3), ERRORS),
 )
-def test_the_cost_is_that_of_solving_all_drives_together(
+def test_onto_costs_as_much_as_solving_all_drives(
     monday: tuple[int, int, list[float]], tuesday: tuple[int, int, list[float]]
 ) -> None:
     """That is so if the best joint map has the map of the old drives."""
@@ -91,7 +91,7 @@ def test_the_cost_is_that_of_solving_all_drives_together(
     assert laid.weighed.bound <= all_together.weighed.nats
 
 
-def test_an_interrupt_gives_the_new_drive_dstates_of_its_own() -> None:
+def test_interrupted_onto_gives_the_new_drive_its_own_dstates() -> None:
     monday, tuesday = (
         around_the_room(0, corners, name, [0.0] * corners)
         for corners, name in ((4, "monday"), (30, "tuesday"))

@@ -125,7 +125,7 @@ def check(ssh_map: SSHMap, found: Layout, turns: Mapping[str, float] | None = No
     [TWO_BLOCKS, SQUARE, TEE, PLUS, COMB],
     ids=["two blocks", "square", "tee", "plus", "comb"],
 )
-def test_true_maps_are_drawn_true(world: Streets) -> None:
+def test_layout_of_true_maps_keeps_the_geometry(world: Streets) -> None:
     ssh_map = mapped(world)
     found = layout(ssh_map)
     check(ssh_map, found)
@@ -133,7 +133,7 @@ def test_true_maps_are_drawn_true(world: Streets) -> None:
 
 
 @pytest.mark.parametrize("tour", ["square", "tee", "plus", "comb"])
-def test_paths_are_straight_and_turns_go_to_their_side(tour: str) -> None:
+def test_layout_has_straight_paths_and_correct_turns(tour: str) -> None:
     trace = drive(*TOURS[tour], stars=True)
     for ssh_map in solve(trace, Theory.circumscriptive()).maps:
         found = layout(ssh_map, trace)
@@ -143,7 +143,7 @@ def test_paths_are_straight_and_turns_go_to_their_side(tour: str) -> None:
         assert found == layout(ssh_map, trace) == layout(ssh_map)
 
 
-def test_six_by_six_blocks_are_the_grid_that_they_are() -> None:
+def test_layout_of_six_by_six_blocks_is_a_grid() -> None:
     ssh_map = mapped(SIX)
     found = layout(ssh_map)
     check(ssh_map, found)
@@ -156,14 +156,14 @@ def test_six_by_six_blocks_are_the_grid_that_they_are() -> None:
 
 
 @pytest.mark.parametrize("turns", [4, 6, 8])
-def test_a_spiral_does_not_lie_on_itself(turns: int) -> None:
+def test_layout_of_a_spiral_does_not_overlap(turns: int) -> None:
     ssh_map = spiral(turns)
     found = layout(ssh_map)
     check(ssh_map, found)
     assert not crossings(ssh_map, found)
 
 
-def test_angles_may_be_any() -> None:
+def test_layout_accepts_any_angles() -> None:
     """A triangle with turns of 120 degrees, first by actions and then by headings at places."""
     dstates = tuple(DState(i, f"v{i}", (i + 1) // 2 % 3, i // 2, 1) for i in range(6))
     links = tuple((i, "travel" if i % 2 == 0 else "turn", (i + 1) % 6) for i in range(6))
@@ -186,7 +186,7 @@ def test_angles_may_be_any() -> None:
     assert np.allclose(list(layout(told).places.values()), list(found.places.values()))
 
 
-def test_streets_that_no_straight_path_holds_are_straight_one_by_one() -> None:
+def test_layout_straightens_single_streets_of_a_bent_path() -> None:
     """A map with few paths may join the north and the south side of a square to one path."""
     square = mapped(SQUARE)
     north, south = (
@@ -208,7 +208,7 @@ def test_streets_that_no_straight_path_holds_are_straight_one_by_one() -> None:
     ] == pytest.approx([1.0] * 4)
 
 
-def test_poses_are_taken_as_they_are() -> None:
+def test_layout_uses_given_poses() -> None:
     square = mapped(SQUARE)
     poses = tuple(Pose(3.0 * (s.place or 0), 0.5, 0.1 * s.id) for s in square.dstates)
     found = layout(replace(square, fit=Fit(1.0, 1, 0.5, poses=poses)))
@@ -219,7 +219,7 @@ def test_poses_are_taken_as_they_are() -> None:
     assert found.to_dict()["places"][1] == [1, [3.0, 0.5]]
 
 
-def test_parts_that_nothing_connects_are_side_by_side() -> None:
+def test_layout_places_unconnected_parts_side_by_side() -> None:
     square = mapped(SQUARE)
     far = [
         replace(s, id=s.id + 16, place=(s.place or 0) + 4, path=(s.path or 0) + 4)
@@ -239,14 +239,14 @@ def test_parts_that_nothing_connects_are_side_by_side() -> None:
     assert max(found.places[p][0] for p in range(4)) < min(found.places[p][0] for p in range(4, 8))
 
 
-def test_turns_that_are_none_are_told() -> None:
+def test_layout_refuses_wrong_turns() -> None:
     with pytest.raises(MapError, match=r"turns\['veer'\]: expected"):
         layout(mapped(SQUARE), {"veer": "sideways"})
     with pytest.raises(MapError, match=r"turns\['veer'\]: expected"):
         layout(mapped(SQUARE), {"veer": math.nan})
 
 
-def test_the_graph_of_places_has_positions_and_streets() -> None:
+def test_graph_of_places_has_positions_and_streets() -> None:
     ssh_map = mapped(SQUARE)
     graph = to_networkx(ssh_map, "places")
     assert nx.is_isomorphic(graph, nx.cycle_graph(4))
@@ -270,7 +270,7 @@ def test_the_graph_of_places_has_positions_and_streets() -> None:
     assert {data["metres"] for _, _, data in metric.edges(data=True)} == {3.0, 9.0}
 
 
-def test_a_map_knows_the_place_of_a_step() -> None:
+def test_map_gives_the_place_of_a_step() -> None:
     trace = drive(*TOURS["square"])
     (ssh_map,) = solve(trace).maps
     assert [ssh_map.place_of(step) for step in range(len(trace))] == [
@@ -281,7 +281,7 @@ def test_a_map_knows_the_place_of_a_step() -> None:
             ssh_map.place_of(step)  # type: ignore[arg-type]
 
 
-def test_faults_are_marked_and_views_stay_text() -> None:
+def test_drawing_marks_faults_and_escapes_views() -> None:
     square = mapped(SQUARE)
     doubted = replace(square, faults=(Fault(3, "misread", "<script>alert(1)</script>", "v3"),))
     marks = [
@@ -303,7 +303,7 @@ def test_faults_are_marked_and_views_stay_text() -> None:
     assert to_svg(posed).count('class="fault"') == 1
 
 
-def test_the_axes_of_matplotlib_hold_what_is_drawn() -> None:
+def test_matplotlib_axes_hold_the_drawn_places_and_dstates() -> None:
     matplotlib = pytest.importorskip("matplotlib")
     matplotlib.use("Agg")
     from matplotlib import pyplot
@@ -319,7 +319,7 @@ def test_the_axes_of_matplotlib_hold_what_is_drawn() -> None:
     pyplot.close("all")
 
 
-def test_what_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in ("pandas", "matplotlib"):
         monkeypatch.setitem(sys.modules, module, None)
     ssh_map = mapped(SQUARE)
@@ -331,7 +331,7 @@ def test_what_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None
         plot(ssh_map)
 
 
-def test_a_table_has_a_row_for_each_step() -> None:
+def test_table_has_a_row_for_each_step() -> None:
     pytest.importorskip("pandas")
     trace = Trace.load(
         Path(__file__).parent.parent / "examples" / "notched-rectangle.jsonl"

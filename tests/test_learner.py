@@ -87,7 +87,7 @@ def hall() -> Trace:
     return simulate(World.named("taylor-hall"), tours=3, seed=500)
 
 
-def test_the_notched_rectangle_is_learnt_from_its_images_alone(
+def test_learner_learns_the_notched_rectangle_from_images(
     run: Trace, learnt: BootstrapLearner
 ) -> None:
     learner = learnt
@@ -110,7 +110,7 @@ def test_the_notched_rectangle_is_learnt_from_its_images_alone(
 
 
 @pytest.mark.slow
-def test_the_hall_is_learnt_with_the_openings_seen(hall: Trace) -> None:
+def test_learner_learns_taylor_hall_with_stars(hall: Trace) -> None:
     learner = BootstrapLearner(Theory.topological().replace(displacement="none")).fit(hall)
     assert learner.clusterer_.k_ == 10
     assert (len(learner.map_.dstates), len(learner.map_.places), len(learner.map_.paths)) == (
@@ -121,24 +121,24 @@ def test_the_hall_is_learnt_with_the_openings_seen(hall: Trace) -> None:
     assert one_to_one(learner.labels_, true_dstates(hall))
 
 
-def test_who_has_not_learnt_recognises_nothing() -> None:
+def test_learner_refuses_to_predict_before_fit() -> None:
     assert repr(BootstrapLearner(choose=1)) == "BootstrapLearner(choose=1)"
     with pytest.raises(LearnerError, match="call fit with a trace first"):
         BootstrapLearner().predict([[1.0, 2.0]])
 
 
-def test_the_loop_fits_on_one_screen() -> None:
+def test_learner_loop_fits_on_one_screen() -> None:
     assert len(inspect.getsource(BootstrapLearner.fit).splitlines()) < 50
 
 
-def test_learning_reads_no_truth(run: Trace, learnt: BootstrapLearner) -> None:
+def test_learner_does_not_read_the_truth(run: Trace, learnt: BootstrapLearner) -> None:
     bare = replace(run, steps=tuple(replace(step, truth=None) for step in run.steps))
     without = BootstrapLearner(VIEWS_ALONE).fit(bare)
     np.testing.assert_array_equal(learnt.labels_, without.labels_)
     assert learnt.map_ == without.map_
 
 
-def test_where_maps_disagree_nothing_is_learnt_unless_one_is_chosen() -> None:
+def test_steps_on_which_maps_disagree_get_no_label() -> None:
     trace = Trace.from_steps("abbab", ["travel", "around", "right", "right"])
     solution = solve(trace, VIEWS_ALONE, max_maps=None)
     assert solution.count > 1
@@ -157,7 +157,7 @@ def test_where_maps_disagree_nothing_is_learnt_unless_one_is_chosen() -> None:
         labels_of([])
 
 
-def test_an_incomplete_list_of_maps_gives_a_warning() -> None:
+def test_learner_warns_of_an_incomplete_list_of_maps() -> None:
     maps = solve(Trace.from_steps("aba", ["travel", "travel"])).maps
     with pytest.warns(AmbiguousMapWarning, match="at least 1 minimal map remains, and agree"):
         labels_of(maps, complete=False)
@@ -174,7 +174,7 @@ def test_an_incomplete_list_of_maps_gives_a_warning() -> None:
         labels_of(maps)
 
 
-def test_other_clusterings_can_be_plugged_in(run: Trace) -> None:
+def test_learner_accepts_a_clusterer_of_scikit_learn(run: Trace) -> None:
     clusterer = ViewClusterer(clusterer=AgglomerativeClustering(linkage="complete"), k_max=10)
     assert one_to_one(BootstrapLearner(VIEWS_ALONE, clusterer).fit(run).labels_, true_dstates(run))
 
@@ -220,7 +220,7 @@ def test_the_learner_is_an_estimator(run: Trace) -> None:
     )
 
 
-def test_several_traces_share_views_and_a_map(run: Trace) -> None:
+def test_learner_fits_several_traces_with_one_map(run: Trace) -> None:
     short = simulate(World.named("notched-rectangle"), tours=2, seed=503)
     late = replace(short, steps=short.steps[3:])  # begins at x3
     drives = [late, run, short]
@@ -251,11 +251,11 @@ def test_several_traces_share_views_and_a_map(run: Trace) -> None:
         AgglomerativeClustering(n_clusters=None, distance_threshold=6.0),
     ],
 )
-def test_clusterers_of_others_make_the_views(run: Trace, clusterer: Any) -> None:
+def test_learner_accepts_any_clusterer(run: Trace, clusterer: Any) -> None:
     assert one_to_one(BootstrapLearner(VIEWS_ALONE, clusterer).fit(run).labels_, true_dstates(run))
 
 
-def test_an_image_that_is_noise_is_not_learnt_from(run: Trace) -> None:
+def test_learner_ignores_images_that_are_noise(run: Trace) -> None:
     odd = replace(
         run,
         steps=(
@@ -273,7 +273,7 @@ def test_an_image_that_is_noise_is_not_learnt_from(run: Trace) -> None:
 # Which beams tell dstates apart
 
 
-def test_the_beams_that_tell_corners_apart_see_the_notch(run: Trace) -> None:
+def test_telling_features_are_the_beams_at_the_notch(run: Trace) -> None:
     """Whether a beam hits the notch, or its edge within 15 cm.
 
     Facing the notch, the robot stops at the same distance from it, and sees that the wall beside it
@@ -299,7 +299,7 @@ def test_the_beams_that_tell_corners_apart_see_the_notch(run: Trace) -> None:
             assert at[1] < 0.01, (i, method, at)
 
 
-def test_the_shell_tells_what_tells_dstates_apart(
+def test_tell_apart_prints_and_plots_telling_beams(
     run: Trace, learnt: BootstrapLearner, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     views, maps = tmp_path / "views.jsonl", tmp_path / "maps.json"
@@ -347,7 +347,7 @@ def large_room() -> Trace:
     )
 
 
-def test_another_map_of_the_runner_up_is_said(large_room: Trace) -> None:
+def test_learner_warns_if_the_runner_up_gives_another_map(large_room: Trace) -> None:
     with pytest.warns(
         RunnerUpWarning,
         match=(
@@ -368,7 +368,7 @@ def test_another_map_of_the_runner_up_is_said(large_room: Trace) -> None:
     assert len(trimmed.map_.dstates) == 8
 
 
-def test_the_shell_says_it_too(
+def test_cluster_and_solve_warn_of_the_runner_up(
     large_room: Trace, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     said = (
@@ -395,7 +395,7 @@ def test_the_shell_says_it_too(
     assert "runner_up" not in Path(views).read_text()
 
 
-def test_a_runner_up_is_whole_or_wrong() -> None:
+def test_partial_runner_up_is_refused() -> None:
     trace = Trace.from_steps("aba", ["travel", "travel"])
     assert runner_up(trace) is None
     other = with_runner_up(trace, "abc")
@@ -430,7 +430,7 @@ def test_a_runner_up_is_whole_or_wrong() -> None:
 # Images
 
 
-def test_images_from_a_sidecar_file(run: Trace, tmp_path: Path) -> None:
+def test_images_are_read_from_a_sidecar_file(run: Trace, tmp_path: Path) -> None:
     table = images_of(run)
     indexed = replace(
         run,
@@ -451,7 +451,7 @@ def test_images_from_a_sidecar_file(run: Trace, tmp_path: Path) -> None:
         images_of(Trace.load(tmp_path / "run.jsonl"))
 
 
-def test_clustering_into_another_folder_keeps_the_images(
+def test_cluster_into_another_folder_keeps_the_images(
     run: Trace, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     np.savez(tmp_path / "scans.npz", images=images_of(run))
@@ -474,7 +474,7 @@ def test_clustering_into_another_folder_keeps_the_images(
     )
 
 
-def test_what_was_replaced_is_said_in_one_line(
+def test_cluster_reports_replaced_ranges_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     table = np.array([[1.0, np.inf, 2.0], [1.0, 1.0, np.nan], [3.0, 1.0, 0.0], [3.0, 1.1, 1.0]])
@@ -495,7 +495,7 @@ def test_what_was_replaced_is_said_in_one_line(
     )
 
 
-def test_images_that_cannot_be_a_table() -> None:
+def test_images_of_unequal_shape_are_refused() -> None:
     uneven = Trace((Step(image=(1.0, 2.0), action=None),))
     steps = (
         replace(uneven.steps[0], action=Trace.from_steps("ab", ["travel"]).actions[0]),
@@ -511,7 +511,7 @@ def test_images_that_cannot_be_a_table() -> None:
         images_of(Trace((Step(image=3),)))
 
 
-def test_poor_images_are_counted_or_refused() -> None:
+def test_cluster_counts_or_refuses_poor_images() -> None:
     action = Trace.from_steps("ab", ["travel"]).actions[0]
 
     def trace_of(*images: tuple[float, ...]) -> Trace:
@@ -537,7 +537,7 @@ def test_poor_images_are_counted_or_refused() -> None:
 # Claims
 
 
-def test_the_claims_are_those_of_the_paper() -> None:
+def test_claims_contain_the_figures_of_the_paper() -> None:
     for name, e in EXPERIMENTS.items():
         papers = [claim.paper for claim in claims(name)]
         assert str(e.views) in papers
@@ -551,7 +551,7 @@ def test_the_claims_are_those_of_the_paper() -> None:
     assert (higher.paper, higher.ours) == ("above 10", False)
 
 
-def test_recognition_by_poor_labels_is_poor(run: Trace) -> None:
+def test_recogniser_with_poor_labels_is_poor(run: Trace) -> None:
     truth = true_dstates(run)
     images = images_of(run)
     codes = np.unique(truth, return_inverse=True)[1]
@@ -561,7 +561,7 @@ def test_recognition_by_poor_labels_is_poor(run: Trace) -> None:
 
 
 @pytest.mark.slow
-def test_outcomes_differ_over_notch_and_spread(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_outcomes_depend_on_notch_and_spread(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(
         EXPERIMENTS, "notched-rectangle", replace(EXPERIMENTS["notched-rectangle"], tours=10)
     )
@@ -576,7 +576,7 @@ def test_outcomes_differ_over_notch_and_spread(monkeypatch: pytest.MonkeyPatch) 
 # The shell
 
 
-def test_from_simulation_to_recognition_in_the_shell(
+def test_shell_goes_from_simulation_to_recognition(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def path(name: str) -> str:
@@ -645,7 +645,7 @@ def test_from_simulation_to_recognition_in_the_shell(
     assert capsys.readouterr().out.splitlines()[0].split() == ["step", "dstate"]
 
 
-def test_traces_go_through_pipes(
+def test_simulate_and_cluster_work_through_pipes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Warnings about images go to standard error."""
@@ -661,7 +661,7 @@ def test_traces_go_through_pipes(
     assert len(set(Trace.load(path).views)) == 4
 
 
-def test_errors_of_the_wings_are_one_line(
+def test_errors_of_learning_verbs_are_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     trace = tmp_path / "t.jsonl"
@@ -705,7 +705,7 @@ def test_errors_of_the_wings_are_one_line(
 
 
 @pytest.mark.slow
-def test_reproduce_writes_the_page_and_all_that_made_it(
+def test_reproduce_writes_the_page_and_its_data(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
@@ -767,7 +767,7 @@ def test_reproduce_writes_the_page_and_all_that_made_it(
 
 
 @pytest.mark.slow
-def test_a_summary_counts_the_seeds_in_which_a_claim_holds(measured: SeedRun) -> None:
+def test_summary_counts_the_seeds_in_which_a_claim_holds(measured: SeedRun) -> None:
     good = measured
     bad = replace(
         good,
@@ -795,7 +795,7 @@ def five_circuits() -> tuple[Trace, BootstrapLearner]:
 
 
 @pytest.mark.slow
-def test_bad_images_are_disbelieved_where_views_may_be_misread(
+def test_bad_images_become_faults_if_views_may_be_misread(
     five_circuits: tuple[Trace, BootstrapLearner],
 ) -> None:
     trace, without = five_circuits
@@ -829,7 +829,7 @@ def test_bad_images_are_disbelieved_where_views_may_be_misread(
     ].tolist() == [-1, -1]
 
 
-def test_bad_images_are_named_where_no_fault_is_allowed() -> None:
+def test_warning_names_bad_images_if_no_fault_is_allowed() -> None:
     trace = simulate(World.named("notched-rectangle"), tours=4, seed=503)
     images = images_of(trace).copy()
     images[9] = np.random.default_rng(0).uniform(0.1, 8, 180)

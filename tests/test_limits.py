@@ -70,7 +70,7 @@ def noisy(tmp_path: Path) -> Path:
     return path
 
 
-def test_grounding_ends_with_the_limit() -> None:
+def test_grounding_stops_at_the_time_limit() -> None:
     watch = Watch(0.2)
     watch.use_reserve()
     watch.start()
@@ -81,7 +81,7 @@ def test_grounding_ends_with_the_limit() -> None:
     assert caught.value.reason == "time limit"
 
 
-def test_what_ends_grounding_is_raised_as_it_is() -> None:
+def test_error_during_grounding_is_raised_unchanged() -> None:
     error = ValueError("enough", 3)
 
     def check() -> None:
@@ -98,7 +98,7 @@ def test_what_ends_grounding_is_raised_as_it_is() -> None:
     ("seconds", "mebibytes", "reason"),
     [(200.0, 0.0, "time limit"), (0.0, 200.0, "memory limit"), (0.0, 0.0, None)],
 )
-def test_what_would_go_beyond_a_limit_is_not_begun(
+def test_watch_refuses_work_beyond_a_limit(
     seconds: float, mebibytes: float, reason: str | None
 ) -> None:
     watch = Watch(100.0, peak_memory() + 100)
@@ -112,7 +112,7 @@ def test_what_would_go_beyond_a_limit_is_not_begun(
     assert stopped == reason
 
 
-def test_the_search_ends_in_time_with_its_best_map(noisy: Path) -> None:
+def test_solve_of_a_noisy_trace_ends_in_time_with_a_map(noisy: Path) -> None:
     trace = Trace.load(noisy)
     solution = solve(trace, time_limit=0.5)
     assert solution.stopped == "time limit"
@@ -127,7 +127,7 @@ def test_the_search_ends_in_time_with_its_best_map(noisy: Path) -> None:
     ids=lambda case: f"{case.family}, {len(case.trace)} steps",
 )
 @POSIX
-def test_limits_hold_on_traces_with_flaws(case: Case, tmp_path: Path) -> None:
+def test_time_limit_holds_on_traces_with_flaws(case: Case, tmp_path: Path) -> None:
     """A process that runs half a minute too long is killed, and has no exit status."""
     found = outcome(case, tmp_path)
     assert found.status in ("optimal", "feasible", "unsatisfiable", "unknown")
@@ -136,9 +136,7 @@ def test_limits_hold_on_traces_with_flaws(case: Case, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @POSIX
-def test_rules_of_ones_own_that_are_too_large_end_with_the_limit(
-    noisy: Path, tmp_path: Path
-) -> None:
+def test_own_rules_with_huge_grounding_stop_at_the_limit(noisy: Path, tmp_path: Path) -> None:
     rules = tmp_path / "own.lp"
     rules.write_text(
         "n(1..400). large(X,Y,Z) :- n(X), n(Y), n(Z).\n#program step(t).\n:- same(I,t), "
@@ -159,7 +157,7 @@ def test_rules_of_ones_own_that_are_too_large_end_with_the_limit(
 
 
 @POSIX
-def test_who_is_ended_prints_what_is_known(noisy: Path) -> None:
+def test_solve_ended_by_sigterm_prints_its_map(noisy: Path) -> None:
     """tests/test_cli.py does the same with Ctrl-C, and tests/test_batch.py with several traces."""
     command = [sys.executable, "-m", "ssh_abduction", "-v", "solve", "--json", str(noisy)]
     with subprocess.Popen(
@@ -189,7 +187,7 @@ def test_who_is_ended_prints_what_is_known(noisy: Path) -> None:
         (0, 0, signal.SIGINT, "interrupted"),
     ],
 )
-def test_the_guard_speaks_while_clingo_does_not_listen(
+def test_guard_reports_while_clingo_is_busy(
     limit: float, memory: float, number: int | None, why: str
 ) -> None:
     command = [sys.executable, "-c", DEAF, str(limit), str(memory)]
@@ -205,7 +203,7 @@ def test_the_guard_speaks_while_clingo_does_not_listen(
     assert (out, process.returncode) == (f"begun, known: {why}", 10)
 
 
-def test_a_snapshot_waits_for_the_sketch_that_is_under_way(
+def test_snapshot_waits_for_the_running_sketch(
     noisy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begun = threading.Event()
@@ -228,7 +226,7 @@ def test_a_snapshot_waits_for_the_sketch_that_is_under_way(
     assert (len(sketches), snapshot.status, len(snapshot.maps)) == (1, Status.FEASIBLE, 1)
 
 
-def test_that_there_is_no_map_is_complete_in_a_snapshot_too() -> None:
+def test_snapshot_of_an_unsatisfiable_search_is_complete() -> None:
     search = Search(Trace.from_steps("xyabcd", ["right", "travel", "travel", "around", "around"]))
     list(search)
     snapshot = search.snapshot("time limit")
@@ -236,7 +234,7 @@ def test_that_there_is_no_map_is_complete_in_a_snapshot_too() -> None:
 
 
 @POSIX
-def test_who_is_interrupted_ends_though_nobody_reads_what_is_printed() -> None:
+def test_sigterm_ends_a_program_whose_output_nobody_reads() -> None:
     program = DEAF[: DEAF.index("    control")].replace('"begun, "', '"much" * 10**6')
     with subprocess.Popen(
         [sys.executable, "-c", program, "0", "0"], stdout=subprocess.PIPE
@@ -248,7 +246,7 @@ def test_who_is_interrupted_ends_though_nobody_reads_what_is_printed() -> None:
         assert process.wait(SOON) == 143
 
 
-def test_an_explanation_can_be_stopped_while_it_grounds() -> None:
+def test_explanation_stops_during_grounding() -> None:
     trace = rectangle(40)
     asked = iter([False, False, True])
     with pytest.raises(Interrupted):
@@ -258,18 +256,18 @@ def test_an_explanation_can_be_stopped_while_it_grounds() -> None:
         )
 
 
-def test_answers_of_workers() -> None:
+def test_workers_answer_all_tasks() -> None:
     tasks = [(number, 0.0) for number in range(5)]
     assert sorted(workers.answers(sleep, tasks, 2, lambda: False, None, 1.0)) == [0, 1, 2, 3, 4]
 
 
-def test_a_worker_that_ends_behind_its_answer_gets_no_other_task() -> None:
+def test_worker_that_exits_after_its_answer_loses_no_task() -> None:
     """The next task was lost, and its trace was said to be killed for lack of memory."""
     tasks = [(number, 0.5) for number in range(3)]
     assert list(workers.answers(answer_and_end, tasks, 1, bool, None, 1.0)) == [0, 1, 2]
 
 
-def test_a_worker_that_vanishes_or_is_late_loses_its_task_alone(
+def test_dead_or_late_worker_loses_only_its_task(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(workers, "STARTING", 0.5)
@@ -283,7 +281,7 @@ def test_a_worker_that_vanishes_or_is_late_loses_its_task_alone(
     ]
 
 
-def test_what_is_given_up_is_answered_and_nothing_begins() -> None:
+def test_stopped_workers_answer_and_start_nothing() -> None:
     answers = workers.answers(
         sleep, [(0, 0.0), (1, 1000.0), (2, 0.0)], 1, lambda: bool(found), None, 20.0
     )
@@ -293,7 +291,7 @@ def test_what_is_given_up_is_answered_and_nothing_begins() -> None:
 
 
 @POSIX
-def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
+def test_workers_end_if_their_parent_is_killed(tmp_path: Path) -> None:
     path = tmp_path / "pid"
     program = (
         "from ssh_abduction.solver.asp import workers; from in_processes import stay; "
@@ -363,14 +361,14 @@ def with_view(step: int) -> tuple[list[int], list[int]]:
         ([0] * 40 + [1], [0] * 40, None),  # a long corridor, and its end
     ],
 )
-def test_noise_is_told_from_circuits_and_from_what_is_new(
+def test_noise_is_distinguished_from_circuits_and_new_places(
     views: list[int], actions: list[int], step: int | None
 ) -> None:
     noise = noise_in(views, actions)
     assert (noise and noise.step) == step
 
 
-def test_a_warning_names_the_step(noisy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_noise_warning_names_the_step(noisy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     main(["solve", str(noisy), "--json", "--theory=causal"])
     out, err = capsys.readouterr()
     last = len(Trace.load(noisy)) - 1
@@ -383,7 +381,7 @@ def test_a_warning_names_the_step(noisy: Path, capsys: pytest.CaptureFixture[str
     )
 
 
-def test_noise_is_told_where_the_search_is_stopped_after_a_minimal_map_is_known() -> None:
+def test_noise_is_reported_if_listing_is_stopped() -> None:
     trace = rectangle(80)
     flawed = replace(trace, steps=trace.steps[:40] + trace.steps[41:])
     search = Search(flawed, Theory.causal())
@@ -398,7 +396,7 @@ def test_noise_is_told_where_the_search_is_stopped_after_a_minimal_map_is_known(
     assert noise.step == 40
 
 
-def test_a_certificate_without_words_is_checked_along_the_trace(
+def test_certificate_without_words_is_checked_along_the_trace(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     trace = Trace.from_steps(["a", "b", "a", "c"], ["travel", "travel", "travel"])
@@ -412,7 +410,7 @@ def test_a_certificate_without_words_is_checked_along_the_trace(
     assert check_bound(rectangle(8), {"clique": [0, 8], "refuted": []}).faults != ()
 
 
-def test_a_busy_machine_has_a_map_when_the_limit_is_long_over(
+def test_solve_returns_a_map_long_after_the_limit(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The clock runs twenty times too fast: the limit is over before the search begins."""
@@ -425,7 +423,7 @@ def test_a_busy_machine_has_a_map_when_the_limit_is_long_over(
         assert len(solution.maps) == 1
 
 
-def test_a_limit_while_the_last_maps_are_ranked_leaves_a_complete_list(
+def test_limit_during_ranking_leaves_the_list_complete(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def over(search: Search) -> bool:
@@ -438,7 +436,7 @@ def test_a_limit_while_the_last_maps_are_ranked_leaves_a_complete_list(
     assert (solution.complete, solution.stopped) == (True, None)
 
 
-def test_ctrl_c_while_an_object_is_deleted_ends_the_search() -> None:
+def test_ctrl_c_in_a_destructor_ends_the_search() -> None:
     """Python only prints exceptions in `__del__`. Clingo's programs have one."""
 
     class Slow:
@@ -454,7 +452,7 @@ def test_ctrl_c_while_an_object_is_deleted_ends_the_search() -> None:
     assert sys.unraisablehook is before
 
 
-def test_who_is_ended_writes_the_best_map(room: str, tmp_path: Path) -> None:
+def test_solve_ended_late_writes_the_best_map(room: str, tmp_path: Path) -> None:
     program = """
 import sys, time
 from ssh_abduction.cli import guard, main

@@ -50,7 +50,7 @@ def given(monkeypatch: pytest.MonkeyPatch, data: bytes) -> None:
 
 
 @pytest.mark.parametrize("pack", [bytes, pytest.param(gzip.compress, marks=pytest.mark.slow)])
-def test_import_of_a_pipe_shows_each_place_and_writes_the_trace_of_the_file(
+def test_import_of_a_pipe_prints_visits_and_equals_import_of_a_file(
     pack: Callable[[bytes], bytes],
     drive: Path,
     tmp_path: Path,
@@ -68,7 +68,7 @@ def test_import_of_a_pipe_shows_each_place_and_writes_the_trace_of_the_file(
     assert live.closures == done.trace.closures
 
 
-def test_a_pipe_shows_at_its_end_where_lanes_part(
+def test_import_of_a_pipe_counts_diverging_lanes_at_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     # In a wide corridor, the robot comes back on another lane.
@@ -84,7 +84,7 @@ def test_a_pipe_shows_at_its_end_where_lanes_part(
     assert sum(math.dist(visit.middle, (12, 0.4)) < 1.0 for visit in visits) == 2
 
 
-def test_a_trace_on_standard_output_is_alone_there(
+def test_trace_on_standard_output_has_no_other_lines(
     drive: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     given(monkeypatch, drive.read_bytes())
@@ -104,7 +104,7 @@ def test_a_trace_on_standard_output_is_alone_there(
         (b"", ["--format", "mcap"], "got another format or a topic"),
     ],
 )
-def test_a_pipe_has_lines_of_carmen(
+def test_import_of_a_pipe_refuses_other_formats_and_options(
     data: bytes,
     options: list[str],
     told: str,
@@ -116,7 +116,7 @@ def test_a_pipe_has_lines_of_carmen(
     assert told in capsys.readouterr().err
 
 
-def test_a_pipe_is_read_as_it_comes(drive: Path) -> None:
+def test_pipe_is_read_line_by_line(drive: Path) -> None:
     """The first scan is there long before the end of the pipe."""
     lines = drive.read_bytes().splitlines(keepends=True) * 20
     read = 0
@@ -155,26 +155,26 @@ def mirrored(scans: Scans) -> Scans:
         (mirrored, "the laser hangs upside down"),
     ],
 )
-def test_a_stream_is_checked_as_a_log_is(
+def test_stream_gets_the_warnings_of_a_log(
     change: Callable[[Scans], Scans], told: str, scans: tuple[Scan, ...]
 ) -> None:
     assert told in notes_of(change(scans))
 
 
 @pytest.mark.slow
-def test_a_good_stream_is_not_doubted(scans: tuple[Scan, ...]) -> None:
+def test_good_stream_gets_no_warning(scans: tuple[Scan, ...]) -> None:
     assert not notes_of(scans)
     # A robot that stands for a while is not doubted, either.
     assert not notes_of([scans[0]] * (LOOKS[0] + 50) + list(scans[:60]))
 
 
-def test_shuffled_scans_end_a_stream_before_they_are_matched(scans: tuple[Scan, ...]) -> None:
+def test_shuffled_stream_is_refused_before_matching(scans: tuple[Scan, ...]) -> None:
     mixed = random.Random(1).sample(scans, len(scans))
     with pytest.raises(LogError, match="in random order"):
         next(stream_visits(mixed))
 
 
-def test_odometry_of_two_sources_ends_a_stream(scans: tuple[Scan, ...]) -> None:
+def test_stream_with_two_odometry_sources_is_refused(scans: tuple[Scan, ...]) -> None:
     two = [
         replace(scan, odometry=(scan.odometry[0] + 30 * (i % 2), *scan.odometry[1:]))
         for i, scan in enumerate(scans)
@@ -183,7 +183,7 @@ def test_odometry_of_two_sources_ends_a_stream(scans: tuple[Scan, ...]) -> None:
         next(stream_visits(two))
 
 
-def test_a_clock_that_starts_anew_does_not_cut_a_drive_whose_scans_match(
+def test_restarted_clock_does_not_cut_a_matching_drive(
     scans: tuple[Scan, ...],
 ) -> None:
     some = [
@@ -197,6 +197,6 @@ def test_a_clock_that_starts_anew_does_not_cut_a_drive_whose_scans_match(
     assert not [note for note in done.notes if "jumps" in note]
 
 
-def test_a_pipe_without_a_drive_says_so() -> None:
+def test_import_of_an_empty_pipe_is_refused() -> None:
     with pytest.raises(LogError, match="expected scans, got none"):
         import_live([])

@@ -40,7 +40,7 @@ def labels(chart: FramedChart, found: Located) -> list[int]:
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_a_true_map_of_some_visits_tells_the_states_of_all(seed: int) -> None:
+def test_map_of_some_visits_locates_all_visits(seed: int) -> None:
     """The map asks for more visits until all states are known. It does not need all visits."""
     walk = maze(3, 3, steps=1000, seed=seed, stars=True)
     chart = charted(walk)
@@ -56,7 +56,7 @@ def test_a_true_map_of_some_visits_tells_the_states_of_all(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_a_map_of_a_beginning_explains_all_visits_or_misses_some(seed: int) -> None:
+def test_map_of_a_prefix_locates_all_visits_or_names_missing_ones(seed: int) -> None:
     """If the map implies all states, they make a map. Otherwise it names missing visits."""
     walk = maze(3, 3, steps=200, seed=seed, stars=True)
     chart = charted(walk)
@@ -85,7 +85,7 @@ def test_a_map_of_a_beginning_explains_all_visits_or_misses_some(seed: int) -> N
             assert {visit: found.states[visit] for visit in at} == at
 
 
-def test_a_long_trace_is_solved_from_few_of_its_visits() -> None:
+def test_long_trace_is_solved_from_some_of_its_visits() -> None:
     """It has the same minimal maps as when clingo is given all visits."""
     trace = maze(3, 3, steps=500, seed=1, stars=True).trace
     search = Search(trace, max_maps=None)

@@ -224,7 +224,7 @@ def random_case(seed: int) -> tuple[SSHMap, Trace, Trace]:
 
 
 @pytest.mark.parametrize("seed", range(60))
-def test_beliefs_are_those_of_a_filter_written_out_from_the_equations(seed: int) -> None:
+def test_beliefs_equal_a_filter_written_from_the_equations(seed: int) -> None:
     ssh_map, labelled, trace = random_case(seed)
     chance = random.Random(seed)
     chances = chance.choice(
@@ -235,7 +235,7 @@ def test_beliefs_are_those_of_a_filter_written_out_from_the_equations(seed: int)
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_trace_estimates_the_zeros_and_ones_of_its_map(seed: int) -> None:
+def test_beliefs_by_map_equal_beliefs_by_its_trace(seed: int) -> None:
     """On the trace that a map explains, equation 3 is equation 4, to the last bit.
 
     The beliefs are also those of a filter that counts only what is allowed.
@@ -267,7 +267,7 @@ def test_a_trace_estimates_the_zeros_and_ones_of_its_map(seed: int) -> None:
         assert at[t] in weight
 
 
-def test_what_a_labelled_trace_says_is_counted() -> None:
+def test_localiser_counts_views_and_links_of_a_labelled_trace() -> None:
     """Dstate 0 showed `a` in three of four visits, and `on` led from it to 1 in two of three."""
     ssh_map = map_of("ab", [(0, "on", 1)], [0, 1, 0, 1, 0, 0])
     labelled = Trace.from_steps("abcbaa", ["on", "back", "on", "back", "on"])
@@ -285,7 +285,7 @@ def test_what_a_labelled_trace_says_is_counted() -> None:
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_a_kidnapped_robot_is_noticed_and_found_again(seed: int) -> None:
+def test_localiser_notices_and_finds_a_kidnapped_robot(seed: int) -> None:
     walk = moore(20, 6, steps=800, seed=100 + seed)
     ssh_map = true_map(walk.truth, walk.trace)
     trace, at = drive(ssh_map, 60, seed, kidnapped=30)
@@ -300,7 +300,7 @@ def test_a_kidnapped_robot_is_noticed_and_found_again(seed: int) -> None:
     assert not beliefs[-1].lost
 
 
-def test_one_misread_view_is_forgiven() -> None:
+def test_localiser_tolerates_one_misread_view() -> None:
     walk = moore(20, 6, steps=800, seed=5)
     ssh_map = true_map(walk.truth, walk.trace)
     trace, at = drive(ssh_map, 40, 1)
@@ -312,7 +312,7 @@ def test_one_misread_view_is_forgiven() -> None:
     assert beliefs[25].verdict is BeliefVerdict.LOCATED
 
 
-def test_a_robot_is_found_again_where_it_is_as_sure_as_before() -> None:
+def test_lost_robot_is_found_if_as_sure_as_before() -> None:
     """Opposite corners of the notched rectangle look alike, and so do the dstates after them."""
     (ssh_map,) = solve(rectangle(40), Theory.topological()).maps
     views = [f"v{i % 4}" for i in range(9)] + [f"v{i % 4}" for i in range(3, 10)]
@@ -325,7 +325,7 @@ def test_a_robot_is_found_again_where_it_is_as_sure_as_before() -> None:
     assert (beliefs[-1].verdict, beliefs[-1].lost) == (BeliefVerdict.UNSURE, False)
 
 
-def test_views_that_the_map_does_not_have_are_nowhere() -> None:
+def test_unknown_views_give_the_belief_nowhere() -> None:
     ssh_map = true_map(*_walk_of_moore(3))
     trace, at = drive(ssh_map, 24, 3)
     views = [v if t < 12 or t >= 16 else "a lift" for t, v in enumerate(trace.views)]
@@ -341,7 +341,7 @@ def test_views_that_the_map_does_not_have_are_nowhere() -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_another_world_that_shows_the_same_views_is_nowhere(seed: int) -> None:
+def test_another_world_with_equal_views_gives_the_belief_nowhere(seed: int) -> None:
     """No view is new there, but their order differs from the map."""
     ssh_map, foreign = true_map(*_walk_of_moore(seed)), true_map(*_walk_of_moore(50 + seed))
     trace, _ = drive(foreign, 60, seed)
@@ -360,7 +360,7 @@ def _walk_of_moore(seed: int) -> tuple[Sequence[object], Trace]:
 
 
 @pytest.mark.parametrize(("degrees", "expected"), [(93.0, 2), (-86.0, 1), (180.0, None)])
-def test_turns_of_another_drive_are_compared_by_angle(degrees: float, expected: int | None) -> None:
+def test_localiser_compares_turns_by_angle(degrees: float, expected: int | None) -> None:
     """Both sides of a hall have a door. No two drives have turns with the same names."""
     ssh_map = SSHMap(
         (0, 1, 0, 2),
@@ -380,7 +380,7 @@ def test_turns_of_another_drive_are_compared_by_angle(degrees: float, expected: 
         assert localiser.update(localiser.start("hall"), turned, "door").dstate == expected
 
 
-def test_a_belief_is_a_frozen_value_that_says_what_it_comes_to() -> None:
+def test_belief_is_frozen_and_has_verdict_and_entropy() -> None:
     localiser = Localiser(map_of("aab", [(0, "on", 2), (1, "on", 1), (2, "on", 0)]))
     prior, belief = localiser.prior, localiser.start("a")
     assert prior.probabilities.sum() + prior.nowhere == pytest.approx(1)
@@ -419,7 +419,7 @@ def pictures(
     return places[at] * np.random.default_rng(seed).normal(1, noise, (len(at), beams)), at
 
 
-def test_an_image_of_nothing_is_recognised_as_nothing() -> None:
+def test_foreign_image_gets_no_label() -> None:
     images, at = pictures(6, 8, seed=1)
     known = recogniser().fit(images, at)
     likelihood = ImageLikelihood.of(known)
@@ -432,7 +432,7 @@ def test_an_image_of_nothing_is_recognised_as_nothing() -> None:
     assert likelihood.labels(more, unmapped=0.0) == known.predict(more).tolist()
 
 
-def test_densities_of_images_are_those_of_a_gaussian_about_the_nearest_image() -> None:
+def test_image_density_is_a_gaussian_about_the_nearest_image() -> None:
     images, at = pictures(3, 5, seed=1, beams=4)
     likelihood = ImageLikelihood.of(PlaceRecogniser().fit(images, at))
     squares = [
@@ -458,7 +458,7 @@ def test_densities_of_images_are_those_of_a_gaussian_about_the_nearest_image() -
     assert ratios == pytest.approx(np.array(places) * 4 / (sum(places) + novel))
 
 
-def test_one_image_of_each_place_is_enough_for_a_careful_localiser() -> None:
+def test_one_image_a_place_gives_a_weak_but_correct_likelihood() -> None:
     images, at = pictures(6, 2, seed=1)
     with pytest.warns(ImageWarning, match="Each place has one image"):
         likelihood = ImageLikelihood.of(recogniser().fit(images[:6], at[:6]))
@@ -470,7 +470,7 @@ def test_one_image_of_each_place_is_enough_for_a_careful_localiser() -> None:
         assert 1 < ratios[place] < more_sure[place]
 
 
-def test_a_localiser_reads_images() -> None:
+def test_localiser_reads_images() -> None:
     """Two of the six places look the same; what follows tells them apart.
 
     In the middle somebody stands in front, and then the robot is carried elsewhere.
@@ -513,7 +513,7 @@ def _imaged(images: Sequence[Array]) -> Trace:
     )
 
 
-def test_of_a_dstate_without_images_images_say_nothing() -> None:
+def test_image_leaves_a_dstate_without_images_unchanged() -> None:
     images, at = pictures(2, 8, seed=1)
     localiser = Localiser(
         map_of("vvv", []), recogniser().fit(images, at), chances=Chances(unmapped=0.1)
@@ -624,7 +624,7 @@ IMAGES, AT = pictures(3, 4, seed=1)
         ),  # type: ignore[arg-type]
     ],
 )
-def test_bad_input_is_said(make: Any, error: type[Exception], message: str) -> None:
+def test_localiser_refuses_bad_input(make: Any, error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         make()
 
@@ -637,12 +637,12 @@ def test_bad_input_is_said(make: Any, error: type[Exception], message: str) -> N
         (1.0, "expected 12 ranges each"),
     ],
 )
-def test_a_bad_image_is_said(image: Any, message: str) -> None:
+def test_localiser_refuses_a_bad_image(image: Any, message: str) -> None:
     with pytest.raises(PerceptionError, match=message):
         Localiser(RING, recogniser().fit(IMAGES, AT)).start(image=image)
 
 
-def test_an_image_that_is_not_finite_is_said() -> None:
+def test_localiser_refuses_an_image_that_is_not_finite() -> None:
     with pytest.raises(PerceptionError, match="expected finite numbers"):
         Localiser(RING, PlaceRecogniser().fit(IMAGES, AT)).start(image=np.full(12, np.nan))
 
@@ -660,7 +660,7 @@ def files(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_localize_in_the_shell(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_localise_prints_beliefs(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
     maps, other = str(files / "maps.json"), str(files / "other.jsonl")
     expected = [b.to_dict() for b in Localiser(SSHMap.load(maps)).beliefs(Trace.load(other))]
     assert main(["localise", maps, other, "--json", "--plot", str(files / "beliefs.png")]) == 0
@@ -705,7 +705,7 @@ def test_localize_in_the_shell(files: Path, capsys: pytest.CaptureFixture[str]) 
 
 
 @pytest.mark.filterwarnings("always")
-def test_localize_takes_one_of_several_maps_and_says_so(
+def test_localise_uses_the_first_of_several_maps_with_a_note(
     files: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     several = files / "several.json"
@@ -724,7 +724,7 @@ def test_localize_takes_one_of_several_maps_and_says_so(
     assert (json.loads(told.out)["map"], json.loads(told.out)["dstates"], told.err) == (2, 3, "")
 
 
-def test_localize_reads_images_and_recognise_says_nowhere(
+def test_localise_reads_images_and_recognise_prints_nowhere(
     files: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     RING.save(files / "ring.json")
@@ -747,9 +747,7 @@ def test_localize_reads_images_and_recognise_says_nowhere(
     assert capsys.readouterr().out.splitlines()[-1].split() == ["5", "nowhere"]
 
 
-def test_localize_says_what_is_wrong_in_one_line(
-    files: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_localise_errors_are_one_line(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
     maps, other = str(files / "maps.json"), str(files / "other.jsonl")
     (files / "none.json").write_text('{"maps": []}')
     _imaged(IMAGES).save(files / "images.jsonl")

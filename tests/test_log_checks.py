@@ -105,27 +105,29 @@ def of_two_clocks(scans: Scans) -> Scans:
         (lambda scans: scans[:80], "never comes back to where it was"),
     ],
 )
-def test_what_is_wrong_with_a_log_is_said(
+def test_warning_for_each_kind_of_bad_log(
     scans: tuple[Scan, ...], change: Callable[[Scans], Scans], told: str
 ) -> None:
     assert told in notes_of(change(scans))
 
 
-def test_a_good_drive_is_not_doubted(scans: tuple[Scan, ...]) -> None:
+def test_good_log_gets_no_warning(scans: tuple[Scan, ...]) -> None:
     assert notes_of(scans) == ""
 
 
 @pytest.mark.parametrize("count", [2, 3])
-def test_a_few_scans_are_not_said_to_go_back_and_forth(scans: tuple[Scan, ...], count: int) -> None:
+def test_short_log_gets_no_warning_of_going_back_and_forth(
+    scans: tuple[Scan, ...], count: int
+) -> None:
     assert notes_of(scans[:count]) == ""
 
 
-def test_jumps_do_not_make_headings_wrong(scans: tuple[Scan, ...]) -> None:
+def test_odometry_jumps_do_not_make_headings_degrees(scans: tuple[Scan, ...]) -> None:
     assert "headings are wrong" not in notes_of(in_blocks(scans))
 
 
 @pytest.mark.parametrize(("count", "unit"), [(100, "centimetres"), (1000, "millimetres")])
-def test_ranges_that_are_not_in_metres_are_refused(
+def test_reader_refuses_ranges_in_other_units(
     scans: tuple[Scan, ...], count: int, unit: str
 ) -> None:
     longer = [
@@ -136,7 +138,7 @@ def test_ranges_that_are_not_in_metres_are_refused(
         tracked(RobotLog(tuple(longer), source="drive"))
 
 
-def test_headings_in_degrees_are_read_as_such(scans: tuple[Scan, ...]) -> None:
+def test_headings_in_degrees_are_converted(scans: tuple[Scan, ...]) -> None:
     good, other = (
         tracked(RobotLog(tuple(some), source="drive"))[1]
         for some in (scans[:80], in_degrees(scans[:80]))
@@ -144,7 +146,7 @@ def test_headings_in_degrees_are_read_as_such(scans: tuple[Scan, ...]) -> None:
     assert other.poses == pytest.approx(good.poses, abs=0.01)
 
 
-def test_a_shuffled_log_is_refused_before_it_is_matched(
+def test_shuffled_log_is_refused_before_matching(
     scans: tuple[Scan, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("perception.places.importing.follow", None)
@@ -154,7 +156,7 @@ def test_a_shuffled_log_is_refused_before_it_is_matched(
 
 
 @pytest.mark.slow
-def test_a_log_whose_scans_do_not_match_is_refused(
+def test_log_with_unmatched_scans_is_refused(
     scans: tuple[Scan, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log = RobotLog(scans[::20], source="drive")
@@ -168,7 +170,7 @@ def test_a_log_whose_scans_do_not_match_is_refused(
     assert [tracked(drive)[1].is_reliable for drive in drives] == [True, False]
 
 
-def test_scans_of_few_beams_are_said_to_have_too_few(
+def test_refusal_advises_more_beams_if_scans_have_few(
     scans: Scans, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(log_checks, "HOPELESS", -1.0)
@@ -181,7 +183,7 @@ def test_scans_of_few_beams_are_said_to_have_too_few(
         assert "; " in str(refused.value)  # there is advice
 
 
-def test_an_error_does_not_repeat_the_notes(scans: Scans, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_does_not_repeat_the_notes(scans: Scans, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(log_checks, "HOPELESS", -1.0)
     log, told = RobotLog(tuple(backwards(scans[:120])), source="drive"), list[str]()
     with pytest.raises(LogError) as refused:
@@ -193,7 +195,7 @@ def test_an_error_does_not_repeat_the_notes(scans: Scans, monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize("missing", [0, 70])
-def test_missing_scans_are_said_though_the_odometry_goes_on(scans: Scans, missing: int) -> None:
+def test_warning_names_missing_scans(scans: Scans, missing: int) -> None:
     notes = notes_of([*scans[:100], *scans[100 + missing : 160 + missing]])
     assert ("The odometry alone connects the parts" in notes) == (missing > 0)
     assert ("before scan 100 " in notes) == (missing > 0)

@@ -76,7 +76,7 @@ def runs(hall: Path, in_this_process: Callable[[], AbstractContextManager[object
     return hall.parent / "runs"
 
 
-def test_scans_mend_the_odometry(hall: Path) -> None:
+def test_scan_matching_corrects_the_odometry(hall: Path) -> None:
     log = read_log(hall)
     track = follow(log)
     true = [scan.corrected for scan in log.scans]
@@ -99,7 +99,7 @@ def test_scans_mend_the_odometry(hall: Path) -> None:
     "words",
     ["check", "compare", "explain FOLDER 0 1", "view -o PAGE", "localise"],
 )
-def test_a_folder_of_map_stands_for_its_maps_and_its_trace(
+def test_verbs_accept_the_folder_of_a_map(
     runs: Path, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     verb, *others = words.replace("PAGE", str(tmp_path / "page.html")).split()
@@ -120,7 +120,7 @@ def test_a_folder_of_map_stands_for_its_maps_and_its_trace(
     assert said.out
 
 
-def test_what_the_map_says_about_the_places_of_two_steps(
+def test_explain_prints_the_probability_of_a_join(
     runs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The listed maps, and nothing else, say how probable it is that the steps are at one place."""
@@ -140,7 +140,7 @@ def test_what_the_map_says_about_the_places_of_two_steps(
     assert capsys.readouterr().out.startswith("in map 1, the steps are at one place; the prob")
 
 
-def test_maps_without_a_trace_beside_them_need_one(
+def test_check_asks_for_a_trace_if_none_is_beside_the_maps(
     runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     alone = tmp_path / "maps.json"
@@ -149,7 +149,7 @@ def test_maps_without_a_trace_beside_them_need_one(
     assert "trace: expected the trace of" in capsys.readouterr().err
 
 
-def test_a_drive_becomes_a_trace_of_the_places_it_passed(runs: Path) -> None:
+def test_import_makes_a_trace_of_the_places_passed(runs: Path) -> None:
     trace = Trace.load(runs / "hall" / "trace.jsonl")
     # Each visit has one step or two: the robot goes on straight, or it turns.
     visits = [step.extra["visit"] for step in trace]
@@ -168,7 +168,7 @@ def test_a_drive_becomes_a_trace_of_the_places_it_passed(runs: Path) -> None:
         assert error @ np.linalg.solve(covariance, error) < 30
 
 
-def test_the_map_of_a_drive_joins_what_is_one_place(runs: Path) -> None:
+def test_map_of_a_drive_has_perfect_place_precision(runs: Path) -> None:
     folder = runs / "hall"
     assert {path.name for path in folder.iterdir()} == {
         "trace.jsonl",
@@ -187,7 +187,7 @@ def test_the_map_of_a_drive_joins_what_is_one_place(runs: Path) -> None:
     assert "<script" not in (folder / "report.html").read_text()
 
 
-def test_the_recogniser_of_a_run_finds_the_robot_on_another_drive(
+def test_stored_recogniser_recognises_another_drive(
     runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     trace = Trace.load(runs / "hall" / "trace.jsonl")
@@ -208,7 +208,7 @@ def test_the_recogniser_of_a_run_finds_the_robot_on_another_drive(
     assert "located at steps" in capsys.readouterr().out
 
 
-def test_corrected_poses_are_not_read(hall: Path) -> None:
+def test_import_does_not_read_corrected_poses(hall: Path) -> None:
     log = RobotLog(every_second_beam(read_log(hall).scans[:40]), source="x")
     blind = tuple(
         Scan(scan.ranges, scan.laser, scan.odometry, None, scan.time, scan.line)
@@ -221,7 +221,7 @@ def test_corrected_poses_are_not_read(hall: Path) -> None:
     assert not any(step.truth for step in unseen)
 
 
-def test_a_log_of_a_robot_that_stands_or_passes_nothing_is_an_error() -> None:
+def test_log_without_motion_or_walls_is_refused() -> None:
     laser = LaserScanner(-math.pi / 2, math.radians(1), 181, 30.0)
     corridor = np.minimum(1.0 / np.maximum(np.abs(np.sin(laser.bearings)), 1e-9), 30.0)
     still = [Scan(corridor, laser, (0.0, 0.0, 0.0))] * 3
@@ -244,7 +244,7 @@ def test_a_log_of_a_robot_that_stands_or_passes_nothing_is_an_error() -> None:
 
 
 @pytest.mark.usefixtures("without_processes")
-def test_a_run_is_done_once_and_bad_logs_do_not_stop_the_others(
+def test_finished_run_is_skipped_and_bad_logs_do_not_stop_others(
     hall: Path, runs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bad = hall.with_name("bad.log")
@@ -267,7 +267,7 @@ def test_a_run_is_done_once_and_bad_logs_do_not_stop_the_others(
         (["--set", "level=causal"], "none", "none"),
     ],
 )
-def test_flags_are_laid_over_the_theory_for_logs(
+def test_flags_override_the_theory_for_logs(
     hall: Path,
     flags: list[str],
     star: str,
@@ -294,7 +294,7 @@ def test_flags_are_laid_over_the_theory_for_logs(
     assert f"star={star}, boundary={boundary}" in capsys.readouterr().err
 
 
-def test_a_log_has_a_twentieth_of_its_drive_to_be_mapped_in_less_what_the_import_took() -> None:
+def test_default_time_limit_is_a_twentieth_of_the_drive() -> None:
     laser = LaserScanner(-1.0, 1.0, 3, 30.0)
     timed = tuple(Scan(np.ones(3), laser, (0.1 * i, 0.0, 0.0), time=2.0 * i) for i in range(51))
     track = Track(np.array([scan.odometry for scan in timed]), np.zeros((51, 3, 3)))
@@ -321,7 +321,7 @@ def test_a_log_has_a_twentieth_of_its_drive_to_be_mapped_in_less_what_the_import
 
 
 @pytest.mark.parametrize("is_reliable", [True, False])
-def test_a_map_on_an_unreliable_track_has_no_probability(
+def test_map_on_an_unreliable_track_has_no_probability(
     hall: Path, imported_hall: Imported, monkeypatch: pytest.MonkeyPatch, is_reliable: bool
 ) -> None:
     track = replace(imported_hall.track, is_reliable=is_reliable)
@@ -333,7 +333,7 @@ def test_a_map_on_an_unreliable_track_has_no_probability(
 
 
 @pytest.mark.parametrize(("limit", "searches"), [(None, 3), (5.0, 1)])
-def test_without_a_limit_the_search_goes_on_until_it_has_a_map(
+def test_search_without_a_limit_continues_until_it_has_a_map(
     hall: Path,
     imported_hall: Imported,
     monkeypatch: pytest.MonkeyPatch,
@@ -366,7 +366,7 @@ def test_without_a_limit_the_search_goes_on_until_it_has_a_map(
         )
 
 
-def test_a_search_says_why_it_has_no_map_or_no_proof() -> None:
+def test_report_says_why_there_is_no_map_or_proof() -> None:
     solution = solve(Trace.from_steps([0, 1], ["travel"]))
     assert how_it_ended(solution, 5.0) is None
     assert how_it_ended(replace(solution, stopped="time limit"), 5.0) is None  # of the listing
@@ -385,7 +385,7 @@ def test_a_search_says_why_it_has_no_map_or_no_proof() -> None:
         (["-o", "x", "--maps", "-1"], "--maps: expected a number of minimal maps to list"),
     ],
 )
-def test_map_refuses_wrong_options_before_it_reads_a_log(
+def test_map_refuses_wrong_options_before_reading_a_log(
     tmp_path: Path, flags: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "no.log"
@@ -394,7 +394,7 @@ def test_map_refuses_wrong_options_before_it_reads_a_log(
     assert said in capsys.readouterr().err
 
 
-def test_two_runs_are_compared(
+def test_compare_reads_two_runs(
     runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder, other = runs / "hall", tmp_path / "other"
@@ -417,7 +417,7 @@ def test_two_runs_are_compared(
 
 
 @pytest.mark.slow
-def test_a_process_of_its_own_maps_a_log(hall: Path, tmp_path: Path) -> None:
+def test_log_is_mapped_in_its_own_process(hall: Path, tmp_path: Path) -> None:
     question = MapQuestion(None, {}, {}, 0.5, 1000.0, 1, False)
     small = tmp_path / "small.log"
     small.write_text("\n".join(hall.read_text().splitlines()[:80]) + "\n")
@@ -426,7 +426,7 @@ def test_a_process_of_its_own_maps_a_log(hall: Path, tmp_path: Path) -> None:
     assert dict(answer.files)["run.json"]
 
 
-def test_a_process_that_is_killed_loses_its_log_alone(hall: Path) -> None:
+def test_killed_process_loses_only_its_log(hall: Path) -> None:
     question = MapQuestion(None, {}, {}, 0.5, 1000.0, 1, False)
     lost = question.lost(workers.Lost(0, late=False), str(hall))
     assert (lost.code, "got a killed process" in lost.line) == (1, True)
@@ -434,7 +434,7 @@ def test_a_process_that_is_killed_loses_its_log_alone(hall: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not REAL.exists(), reason="real logs are not part of the project")
-def test_each_visit_to_a_crossing_of_the_building_of_the_paper_is_noticed() -> None:
+def test_import_finds_all_visits_to_crossings_in_aces() -> None:
     log = read_log(REAL / "aces-corrected.log.gz")
     truth = Truth.of_aces(np.array([scan.corrected for scan in log.scans]))
     scans = [int(step.extra["scan"]) for step in import_log(log).trace]
@@ -442,7 +442,7 @@ def test_each_visit_to_a_crossing_of_the_building_of_the_paper_is_noticed() -> N
 
 
 @pytest.mark.parametrize("command", [["import"], ["map", "--set", "ladder=false"]])
-def test_options_of_the_old_detector_have_no_effect_and_say_so(
+def test_old_detector_options_warn_and_have_no_effect(
     hall: Path, command: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     old = ["--places", "doors", "--gateway=0.8", "--set", "radius=5"]
@@ -455,7 +455,7 @@ def test_options_of_the_old_detector_have_no_effect_and_say_so(
 
 
 @pytest.mark.slow
-def test_the_rooms_of_a_building_are_told_apart(tmp_path: Path) -> None:
+def test_map_of_four_rooms_has_perfect_place_precision(tmp_path: Path) -> None:
     """A robot drives around four rooms in a ring, and the map has a place in each of them."""
     middles = {room: middle for room, middle in MIDDLES.items() if room != "closet"}
     drive = record_plan(

@@ -51,13 +51,13 @@ def along(*places: int) -> SSHMap:
         ((0,), set()),
     ],
 )
-def test_places_without_a_decision_are_those_with_one_pair_of_neighbours(
+def test_undecided_places_have_one_pair_of_neighbours(
     places: tuple[int, ...], undecided: set[int]
 ) -> None:
     assert undecided_places(along(*places)) == undecided
 
 
-def test_places_without_a_decision_are_dots_and_the_others_have_numbers(house: LogMap) -> None:
+def test_picture_draws_undecided_places_as_dots(house: LogMap) -> None:
     ssh_map = house.solution.maps[0]
     hidden = undecided_places(ssh_map)
     picture = figure(house.log, house.imported, house.solution)
@@ -67,7 +67,7 @@ def test_places_without_a_decision_are_dots_and_the_others_have_numbers(house: L
         assert (f"<title>place {place}</title>" in picture) == (place in hidden)
 
 
-def test_places_have_the_names_that_a_person_gave(house: LogMap) -> None:
+def test_picture_shows_names_of_places(house: LogMap) -> None:
     best = house.solution.maps[0]
     hidden = min(undecided_places(best))
     shown = min(set(best.places) - undecided_places(best))
@@ -79,7 +79,7 @@ def test_places_have_the_names_that_a_person_gave(house: LogMap) -> None:
     assert f"<title>place {hidden} (corner)</title>" in picture
 
 
-def test_edges_follow_the_robot_and_each_is_drawn_once(house: LogMap) -> None:
+def test_picture_draws_each_edge_once_along_the_drive(house: LogMap) -> None:
     picture = figure(house.log, house.imported, house.solution)
     courses = [mark for mark in picture.split("<path ") if 'stroke-width="4"' in mark]
     places = place_of_steps(house.solution.maps[0])
@@ -92,7 +92,7 @@ def test_edges_follow_the_robot_and_each_is_drawn_once(house: LogMap) -> None:
     assert max(mark.count("L") for mark in courses) > 5
 
 
-def test_a_course_follows_the_robot_from_one_middle_to_the_next(house: LogMap) -> None:
+def test_course_of_a_travel_follows_the_robot(house: LogMap) -> None:
     trace, visits = house.imported.trace, house.imported.visits
     bows = 0
     for t, action in enumerate(trace.actions):
@@ -121,7 +121,7 @@ def test_a_course_follows_the_robot_from_one_middle_to_the_next(house: LogMap) -
     assert bows
 
 
-def test_paths_are_shown_only_if_the_theory_says_something_of_them(house: LogMap) -> None:
+def test_report_shows_paths_only_if_the_theory_has_axioms_on_them(house: LogMap) -> None:
     solution = house.solution
     with_paths = solution.theory.replace(without=("one_dstate_per_course",), weigh="auto")
     planar = solve(house.imported.trace, with_paths, time_limit=20)
@@ -136,7 +136,7 @@ def test_paths_are_shown_only_if_the_theory_says_something_of_them(house: LogMap
     ).count(f'stroke="{EDGE}"')
 
 
-def test_doubtful_joins_show_their_probability(
+def test_picture_shows_probabilities_of_doubtful_joins(
     house: LogMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert ALARM not in figure(house.log, house.imported, house.solution)
@@ -149,7 +149,7 @@ def test_doubtful_joins_show_their_probability(
     assert "<h2>Doubtful joins</h2><table>" in page
 
 
-def test_rooms_and_wings_have_bands(house: LogMap) -> None:
+def test_picture_draws_regions_as_bands(house: LogMap) -> None:
     regions = house.solution.maps[0].regions or ()
     picture = figure(house.log, house.imported, house.solution)
     assert regions

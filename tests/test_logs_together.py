@@ -89,7 +89,7 @@ def test_joint_logs_number_scans_and_visits_over_all_drives(
 
 
 @pytest.mark.slow
-def test_closures_between_drives_are_right(
+def test_closures_between_drives_match_the_truth(
     joint: tuple[RobotLog, Imported, list[Imported]], halves: tuple[RobotLog, RobotLog]
 ) -> None:
     # Furniture makes the places of this world differ. Each drive is a tour.
@@ -113,14 +113,14 @@ def test_closures_between_drives_are_right(
     assert closures_between(parts[0], joint[2][0], *scenes) == []
 
 
-def test_a_single_log_stays_as_it_is(
+def test_join_logs_keeps_a_single_log(
     joint: tuple[RobotLog, Imported, list[Imported]], halves: tuple[RobotLog, RobotLog]
 ) -> None:
     part = joint[2][0]
     assert join_logs(halves[:1], [part]) == (halves[0], part)
 
 
-def test_one_map_joins_two_drives(folder: Path) -> None:
+def test_map_together_joins_two_drives(folder: Path) -> None:
     run = json.loads((folder / "run.json").read_text())
     assert [drive["name"] for drive in run["drives"]] == ["monday", "tuesday"]
     assert [drive["source"][-4:] for drive in run["drives"]] == [".log"] * 2
@@ -143,7 +143,7 @@ def test_one_map_joins_two_drives(folder: Path) -> None:
     assert all(ssh_map.place_of(i) == ssh_map.place_of(j) for i, j in near)
 
 
-def test_the_report_shows_drives_in_their_colours_and_their_joins(folder: Path) -> None:
+def test_report_shows_drives_in_colours_and_their_joins(folder: Path) -> None:
     report = (folder / "report.html").read_text()
     for k in range(2):
         assert f'stroke="{colour_of(k)}"' in report
@@ -155,7 +155,9 @@ def test_the_report_shows_drives_in_their_colours_and_their_joins(folder: Path) 
     assert "<td>tuesday:" in report
 
 
-def test_a_run_of_the_same_logs_is_done(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_joint_run_of_the_same_logs_is_skipped(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     logs = [str(folder.parent / f"{name}.log") for name in ("monday", "tuesday")]
     command = ["map", *logs, "--together", "-o", str(folder), "--time-limit", "5"]
     assert main([*command, "--set", "ladder=false"]) == 0
@@ -164,7 +166,7 @@ def test_a_run_of_the_same_logs_is_done(folder: Path, capsys: pytest.CaptureFixt
 
 
 @pytest.mark.slow
-def test_maps_of_logs_obey_what_a_person_says(
+def test_map_together_obeys_corrections(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A person denies a join between the drives, and names a place."""
@@ -200,7 +202,7 @@ def test_maps_of_logs_obey_what_a_person_says(
     assert capsys.readouterr().out.count("expected no corrections, got") == 2
 
 
-def test_drives_are_laid_over_each_other(
+def test_joint_track_lays_drives_over_each_other(
     joint: tuple[RobotLog, Imported, list[Imported]], folder: Path
 ) -> None:
     log, imported, _ = joint
@@ -228,7 +230,7 @@ def test_drives_are_laid_over_each_other(
     assert right[:, 0].min() == pytest.approx(left[:, 0].max() + ASIDE)
 
 
-def test_logs_that_do_not_go_together_are_refused(
+def test_map_together_refuses_equal_names_and_several_jobs(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for folder, text in (("a", "one"), ("b", "two")):
@@ -253,12 +255,12 @@ def test_logs_that_do_not_go_together_are_refused(
         ([RobotLog(())], ["one", "two"], "name: expected 1, one per drive, got 2"),
     ],
 )
-def test_map_log_says_what_it_takes(given: Any, names: Any, said: str) -> None:
+def test_map_log_refuses_wrong_arguments(given: Any, names: Any, said: str) -> None:
     with pytest.raises(LogError, match=said):
         map_log(given, name=names)
 
 
-def test_the_report_names_a_drive_that_shares_nothing() -> None:
+def test_report_names_a_drive_that_shares_no_place() -> None:
     drives = [("monday", "ab"), ("tuesday", "xy")]
     with pytest.warns(UserWarning, match="no view in common"):
         joint = together([Trace.from_steps(views, ["travel"], name=name) for name, views in drives])

@@ -25,7 +25,7 @@ def the_map(tour: str, theory: Theory) -> SSHMap:
     return ssh_map
 
 
-def test_the_map_of_a_tee_is_the_tee() -> None:
+def test_map_of_a_tee_equals_the_world() -> None:
     graph = to_networkx(the_map("tee", Theory.circumscriptive()), "topological")
     truth = nx.Graph([("W", "main"), ("J", "main"), ("E", "main"), ("J", "side"), ("S", "side")])
     assert nx.is_isomorphic(graph, truth)
@@ -42,7 +42,7 @@ def test_the_comb_is_found_with_stars_and_paths_first() -> None:
     assert nx.is_isomorphic(graph, truth)
 
 
-def test_the_causal_graph_has_an_edge_a_link() -> None:
+def test_causal_graph_has_one_edge_a_link() -> None:
     ssh_map = the_map("comb", Theory.circumscriptive())
     graph = to_networkx(ssh_map)
     assert {(s, data["action"], x) for s, x, data in graph.edges(data=True)} == set(ssh_map.links)
@@ -54,7 +54,7 @@ def test_the_causal_graph_has_an_edge_a_link() -> None:
         to_networkx(ssh_map, "metrical")  # type: ignore[arg-type]
 
 
-def test_maps_survive_files(tmp_path: Path) -> None:
+def test_maps_survive_a_round_trip(tmp_path: Path) -> None:
     for ssh_map in solve(drive(*TOURS["comb"]), Theory.topological()).maps:
         ssh_map.save(tmp_path / "map.json")
         loaded = SSHMap.load(tmp_path / "map.json")
@@ -86,7 +86,7 @@ def test_maps_survive_files(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_malformed_maps(change: dict[str, object], message: str) -> None:
+def test_malformed_maps_are_refused(change: dict[str, object], message: str) -> None:
     (ssh_map,) = solve(written("a T b")).maps
     with pytest.raises(MapError) as error:
         SSHMap.from_dict({**ssh_map.to_dict(), **change}, "file")
@@ -115,7 +115,7 @@ def test_right_angled_worlds_are_drawn_at_right_angles(tour: str) -> None:
         assert list(ys) in (sorted(ys), sorted(ys, reverse=True))
 
 
-def test_turns_right_go_round_clockwise_on_the_page() -> None:
+def test_drawing_shows_right_turns_clockwise() -> None:
     (ssh_map,) = solve(rectangle(16)).maps
     at = positions(to_svg(ssh_map))
     corners = [at[str(p)] for p in range(4)]
@@ -145,7 +145,7 @@ def test_strange_names_are_drawn_and_written_safely() -> None:
     ET.fromstring(to_svg(causal))
 
 
-def test_the_drawing_methods_of_version_0_1_0_warn_and_call_the_functions() -> None:
+def test_old_drawing_methods_warn_and_call_the_functions() -> None:
     (ssh_map,) = solve(written("a T b")).maps
     old: Any = ssh_map
     for name in MOVED:

@@ -27,12 +27,12 @@ def test_masks_grow_and_shrink_by_one_cell(mask: np.ndarray) -> None:
 
 @pytest.mark.parametrize("far", [0.05, 0.25, 0.3, 1.2, 9.0])
 @pytest.mark.parametrize("mask", MASKS)
-def test_near_cells_are_those_at_a_small_distance(mask: np.ndarray, far: float) -> None:
+def test_near_equals_a_distance_transform(mask: np.ndarray, far: float) -> None:
     distance = ndimage.distance_transform_edt(~mask) * 0.1
     assert (near(mask, far, 0.1) == (distance < far)).all()
 
 
-def test_a_box_has_all_cells_and_a_margin() -> None:
+def test_box_contains_all_cells_and_a_margin() -> None:
     mask = np.zeros((9, 8), bool)
     assert not mask[box_of(mask)].size
     mask[3, 2] = mask[5, 7] = True

@@ -50,7 +50,7 @@ def scene(patch: Patch) -> Scene:
 @pytest.mark.parametrize(
     ("turn", "x", "y"), [(0.0, 0.0, 0.0), (0.3, 0.62, -0.4), (-2.0, -1.0, 0.5), (3.1, 0.0, 2.0)]
 )
-def test_a_match_finds_how_a_room_is_turned_and_shifted(turn: float, x: float, y: float) -> None:
+def test_match_finds_turn_and_shift_of_a_room(turn: float, x: float, y: float) -> None:
     found = match(scene(patch_of(turn, x, y)), Turned.of(scene(patch_of()), ALL_TURNS.tolist()))
     assert found is not None
     assert found.score > 0.75
@@ -60,20 +60,20 @@ def test_a_match_finds_how_a_room_is_turned_and_shifted(turn: float, x: float, y
     assert abs(math.remainder(found.turn - turn, math.tau)) < math.radians(1.5)
 
 
-def test_a_match_that_slides_while_it_is_refined_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_match_that_slides_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     shifted, room = scene(patch_of(0.3, 0.6, -0.4)), Turned.of(scene(patch_of()), [0.3])
     assert match(shifted, room) is not None
     monkeypatch.setattr(matching, "SLID", 0.1)  # the coarse shift is 0.2 m off
     assert match(shifted, room) is None
 
 
-def test_another_room_matches_badly() -> None:
+def test_match_of_another_room_scores_low() -> None:
     other = [(-5, -1), (5, -1), (5, 1), (-5, 1)]
     found = match(scene(patch_of()), Turned.of(scene(patch_of(corners=other)), ALL_TURNS.tolist()))
     assert found is None or found.score < 0.6 or found.mutual < 0.2
 
 
-def test_a_wall_in_free_space_lowers_the_score() -> None:
+def test_wall_in_free_space_lowers_the_score() -> None:
     room = patch_of()
     split = room.occupied.copy()
     split[80, 70:95] = True
@@ -106,7 +106,7 @@ def test_visits_to_one_fork_have_a_closure() -> None:
         assert abs(closing.match.turn) < math.radians(1)
 
 
-def test_a_closure_that_the_track_refuses_does_not_count() -> None:
+def test_closure_that_contradicts_the_track_is_dropped() -> None:
     """The later visits are 4 m aside by a track that is sure of itself."""
     _, track, visits, patches = rounds()
     late = find_closures(track, visits, patches, 2 * WINDOW)[0].last
@@ -124,7 +124,7 @@ def test_a_closure_that_the_track_refuses_does_not_count() -> None:
     assert all(not closing.first < late <= closing.last for closing in found)
 
 
-def test_no_closure_leads_across_a_cut() -> None:
+def test_closures_do_not_cross_a_cut() -> None:
     _, track, visits, patches = rounds()
     (closing, *_) = find_closures(track, visits, patches, 2 * WINDOW)
     cut = replace(track, cuts=(visits[closing.last].scan,))
@@ -132,7 +132,7 @@ def test_no_closure_leads_across_a_cut() -> None:
     assert all(not c.first < closing.last <= c.last for c in found)
 
 
-def test_a_trace_has_the_closures_of_its_visits() -> None:
+def test_trace_has_the_closures_of_its_visits() -> None:
     log, track, visits, patches = rounds()
     expected = find_closures(track, visits, patches, 2 * WINDOW)
     trace = to_trace(log, track, visits, expected)
@@ -150,14 +150,14 @@ def test_a_trace_has_the_closures_of_its_visits() -> None:
         assert closure.displacement == pytest.approx(displacement_between(*poses), abs=0.1)
 
 
-def test_a_pose_is_relative_to_the_heading_of_the_earlier_step() -> None:
+def test_closure_is_relative_to_the_heading_of_the_earlier_step() -> None:
     shift = Match(1.0, 0.1, np.array([1.0, 0.0]), 1.0, 0.1)
     closure = closure_of(VisitMatch(0, 1, shift), [(0, math.pi / 2), (1, math.pi)])
     assert closure.displacement == pytest.approx((0.0, -1.0, math.pi / 2 + 0.1), abs=1e-4)
 
 
 @pytest.mark.parametrize(("share", "is_wide"), [(1.0, False), (0.7, True)])
-def test_a_doubtful_match_against_the_odometer_is_uncertain(share: float, is_wide: bool) -> None:
+def test_match_against_the_odometer_gets_a_large_covariance(share: float, is_wide: bool) -> None:
     """The odometer turned by 0.5 radians, and the walls say that the robot did not turn."""
     along = np.linspace(-3, 3, 61)
     sides = [(along, np.full(61, 2.0)), (along, np.full(61, -2.0)), (np.full(61, 3.5), along)]
@@ -176,7 +176,7 @@ def test_a_doubtful_match_against_the_odometer_is_uncertain(share: float, is_wid
     assert bool(covariance[2, 2] > 0.4**2) is is_wide
 
 
-def test_the_uncertainty_of_a_point_is_that_of_all_increments() -> None:
+def test_covariance_of_a_point_sums_all_increments() -> None:
     """Each increment is an arm that ends at the point; the sum is computed one by one."""
     rng = np.random.default_rng(1)
     poses = np.column_stack([np.cumsum(rng.normal(0, 1, (9, 2)), axis=0), rng.normal(0, 1, 9)])
@@ -192,7 +192,7 @@ def test_the_uncertainty_of_a_point_is_that_of_all_increments() -> None:
     assert uncertainty(track, 7, 2, end) == pytest.approx(expected)
 
 
-def test_a_visit_is_matched_with_a_bounded_number_of_earlier_ones(
+def test_visit_is_matched_with_a_limited_number_of_earlier_ones(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """With one match per visit, it is the nearest one: another pass of the same fork."""

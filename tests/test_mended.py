@@ -41,7 +41,7 @@ def flawed(kind: str, seed: int) -> tuple[Trace, Theory]:
 
 
 @pytest.mark.parametrize("kind", ["misread", "slipped", "jumped"])
-def test_a_mended_sketch_is_a_map(kind: str) -> None:
+def test_mended_sketch_is_a_map_with_faults(kind: str) -> None:
     needed = 0
     for seed in range(4):
         trace, theory = flawed(kind, seed)
@@ -54,12 +54,12 @@ def test_a_mended_sketch_is_a_map(kind: str) -> None:
     assert needed
 
 
-def test_a_fault_that_the_theory_does_not_allow_is_not_paid() -> None:
+def test_mended_sketch_uses_only_allowed_faults() -> None:
     trace, theory = flawed("misread", 0)
     assert mended_sketch(trace, settle(trace, theory.replace(misread=0)).theory) is None
 
 
-def test_steps_that_contradict_a_sketch_are_searched_for_a_clash() -> None:
+def test_steps_that_contradict_a_sketch_are_checked_for_a_clash() -> None:
     """Out along a corridor, and around twice: the robot faces on, but sees something else."""
     views = [*range(12), "around", "wrong", "later"]
     trace = Trace.from_steps(views, [*["travel"] * 11, "around", "around", "travel"])
@@ -83,13 +83,13 @@ def test_steps_that_contradict_a_sketch_are_searched_for_a_clash() -> None:
     assert clash_in(trace, settle(trace, faulty).theory, [clash], maps_of) is None
 
 
-def test_steps_that_are_said_to_be_at_one_place_are_searched_for_a_clash() -> None:
+def test_contradicting_assertion_is_unsatisfiable_at_once() -> None:
     around = Trace.from_steps("abcd" * 24, ["right", "travel"] * 47 + ["right"])
     solution = solve(around, Theory(same_place=((0, 4),)), time_limit=0.5)
     assert (solution.status, len(solution.maps)) == (Status.UNSATISFIABLE, 0)
 
 
-def test_maps_that_are_not_proven_when_they_are_listed_are_not_called_minimal() -> None:
+def test_unproven_maps_of_a_mended_trace_are_not_minimal() -> None:
     """When minimal maps of a mended trace are listed, the time may be over before they are found
     again."""
     trace = maze(2, 2, steps=30, seed=2).trace

@@ -42,7 +42,7 @@ CAUSAL = Theory.causal()
 
 @settings(max_examples=15)
 @given(machines(), st.integers(0, 10_000), st.data())
-def test_a_search_near_a_guess_changes_no_answer(
+def test_search_near_a_guess_changes_no_answer(
     trace: Trace, cores: int, data: st.DataObject
 ) -> None:
     """The guess may be right or wrong."""
@@ -82,7 +82,7 @@ def test_known_labels_end_a_search_only_if_they_reach_the_bound() -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_some_maps_where_the_search_near_a_guess_has_the_proof(seed: int) -> None:
+def test_first_map_near_a_guess_equals_a_listed_map(seed: int) -> None:
     """There may be fewer names than dstates. An answer with a step at a rest is no map."""
     trace = moore(7, 2, steps=60, seed=seed).trace
     with (
@@ -107,7 +107,7 @@ def test_some_maps_where_the_search_near_a_guess_has_the_proof(seed: int) -> Non
         assert len(ssh_map.dstates) == every.bound.dstates
 
 
-def test_a_causal_maze_is_guessed_by_its_turns() -> None:
+def test_annealing_guesses_a_maze_from_views_and_turns() -> None:
     """Annealing finds a good guess from views and turns alone."""
     walk = maze(3, 3, steps=400, seed=1)
     log = Log(walk.trace, CAUSAL)
@@ -118,7 +118,7 @@ def test_a_causal_maze_is_guessed_by_its_turns() -> None:
     assert same > 0.9 * len(guess)
 
 
-def test_a_limit_leaves_the_small_map_found_near_a_guess() -> None:
+def test_limit_leaves_the_small_map_found_near_a_guess() -> None:
     """The guess has no more dstates than the robot visited. A map by greedy merging has more than
     twice as many."""
     walk = maze(4, 4, steps=600, seed=1)
@@ -149,7 +149,7 @@ def test_a_limit_leaves_the_small_map_found_near_a_guess() -> None:
     assert check(walk.trace, solution.maps[0], CAUSAL) == ()
 
 
-def test_a_search_of_the_whole_trace_keeps_no_time_back() -> None:
+def test_search_of_the_whole_trace_uses_the_reserved_time() -> None:
     """The reserved time is for that search, and a restart would lose its progress. So it may use
     the whole limit from its start. If it is stopped without a map, no other search for any map
     follows."""
@@ -190,19 +190,19 @@ def _labels_of(chart: Chart, states: tuple[object, ...], number: dict[object, in
         ("abcab", ["right", "right", "right", "right"]),  # three quarters round
     ],
 )
-def test_no_frame_is_guessed(views: str, actions: list[object]) -> None:
+def test_inconsistent_turns_give_no_chart(views: str, actions: list[object]) -> None:
     trace = Trace.from_steps(views, actions)
     assert Chart.turned(trace, Log(trace, CAUSAL), len(trace)) is None
 
 
-def test_a_chart_of_what_is_seen_around() -> None:
+def test_turned_chart_has_a_star_for_each_visit() -> None:
     trace = Trace.from_steps("abab", ["right", "travel", "left"])
     chart = Chart.turned(trace, Log(trace, CAUSAL), 4)
     assert chart.stars == ((0, 1, 0, 1), (0, 1, 0, 1))
     assert chart.node_of == (0, 1, 2, 3)
 
 
-def test_what_turns_of_any_kind_show_is_put_together() -> None:
+def test_turned_chart_combines_all_turns_of_a_visit() -> None:
     """No turn led right from the slot behind, nor left to it."""
     trace = Trace.from_steps("abadaca", ["right", "left", "left", "right", "travel", "around"])
     chart = Chart.turned(trace, Log(trace, CAUSAL), 7)
@@ -236,7 +236,7 @@ def pinned_in_a_maze() -> tuple[Trace, Pinned]:
         pytest.param(20, 501, True, marks=pytest.mark.slow),
     ],
 )
-def test_a_guess_at_the_beginning_of_a_long_trace_goes_on_if_it_can(
+def test_guess_for_a_prefix_is_extended_if_possible(
     first: int, guessed: int, goes_on: bool
 ) -> None:
     """The map of 460 steps in a maze of 6 cells fits all later steps. The map of 20 or 40 steps
@@ -255,7 +255,7 @@ def test_a_guess_at_the_beginning_of_a_long_trace_goes_on_if_it_can(
 
 
 @pytest.mark.slow
-def test_of_a_long_trace_clingo_is_given_some_links_at_a_time() -> None:
+def test_clingo_gets_links_of_a_long_trace_in_parts() -> None:
     """The simplest links come first, and the search may end before clingo has all. The map is a
     guess, or from clingo."""
     walk = maze(3, 3, steps=500, seed=1, loops=0.3)
@@ -283,7 +283,7 @@ def test_of_a_long_trace_clingo_is_given_some_links_at_a_time() -> None:
     assert all(after - before <= 500 for before, after in pairwise(given))
 
 
-def test_of_a_long_trace_as_much_is_taken_as_adds_to_the_clique() -> None:
+def test_next_prefix_grows_until_the_clique_grows() -> None:
     trace = maze(3, 3, steps=3000, seed=0).trace
     log = Log(trace, CAUSAL)
     long = CausalEngine(engine.Task.of(Problem.of(trace, CAUSAL), Watch(100.0)))

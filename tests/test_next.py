@@ -76,7 +76,7 @@ def shortest(maps: Sequence[SSHMap], longest: int, actions: Sequence[str] = ACTI
     return None
 
 
-def test_two_rivals_are_told_apart_by_the_fewest_actions() -> None:
+def test_plan_for_two_rivals_has_the_fewest_actions() -> None:
     lengths = []
     for seed in range(200):
         chance = random.Random(seed)
@@ -165,7 +165,7 @@ def least_worst(maps: Sequence[SSHMap]) -> int:
     return least(frozenset((i, m.labels[-1]) for i, m in enumerate(maps)), 20)
 
 
-def test_a_plan_for_many_leaves_what_cannot_be_told_apart_and_hardly_ever_more() -> None:
+def test_plan_for_many_rivals_leaves_only_inseparable_ones() -> None:
     as_good = 0
     for seed in range(60):
         chance = random.Random(f"many {seed}")
@@ -183,7 +183,7 @@ def test_a_plan_for_many_leaves_what_cannot_be_told_apart_and_hardly_ever_more()
     assert as_good >= 54
 
 
-def test_rivals_that_predict_the_same_are_merged() -> None:
+def test_rivals_with_equal_predictions_are_merged() -> None:
     one = machine(random.Random(1), 4, 2, 1.0)
     renamed = replace(one, dstates=one.dstates)
     other = next(
@@ -207,7 +207,7 @@ def with_paths(courses: Sequence[int]) -> SSHMap:
     return SSHMap((0, 1, 2), dstates, ((0, "travel", 1), (1, "travel", 2)), (0, 1, 2), orders)
 
 
-def test_rivals_that_differ_in_paths_alone_are_said_to() -> None:
+def test_sentence_says_that_rivals_differ_only_in_paths() -> None:
     experiment = next_experiment([with_paths([0, 0, 0]), with_paths([0, 0, 1])])
     assert experiment.plan.branches == ()
     assert experiment.worst == 2
@@ -217,7 +217,7 @@ def test_rivals_that_differ_in_paths_alone_are_said_to() -> None:
     )
 
 
-def test_seven_hundred_rivals_of_one_labelling_are_one_machine() -> None:
+def test_many_rivals_with_equal_labels_are_merged() -> None:
     ssh_map = solve(maze(3, 3, steps=60, seed=0, stars=True, follow=True).trace, max_maps=1).maps[0]
     maps = [replace(ssh_map, paths=ssh_map.paths[: 1 + i % len(ssh_map.paths)]) for i in range(780)]
     assert next_experiment(maps).alike == (tuple(range(1, 781)),)
@@ -242,7 +242,7 @@ def test_stars_are_predicted_beside_views() -> None:
     assert without.plan.actions == ("around", "travel", "travel") or without.worst == 2
 
 
-def test_stars_that_could_be_one_are_no_difference() -> None:
+def test_stars_within_their_spreads_do_not_separate_rivals() -> None:
     def stars(bearing: float) -> list[list[float]]:
         return [[0.0], [0.0, 60.0], [0.0, bearing]]
 
@@ -267,7 +267,7 @@ def framed(headings: Sequence[int]) -> tuple[SSHMap, list[Seen]]:
     return SSHMap(tuple(range(len(headings))), dstates, (), (0,)), looks
 
 
-def test_a_frame_tells_the_end_of_turns() -> None:
+def test_frame_predicts_the_result_of_turns() -> None:
     ssh_map, looks = framed([0, 1])
     says = Consequences(ssh_map, leads_of(ssh_map, 0), looks, None)
     turn = {
@@ -287,7 +287,7 @@ def test_a_frame_tells_the_end_of_turns() -> None:
     assert weak.of(0, turn["right"]).how == "open"
 
 
-def test_a_path_tells_what_comes_next() -> None:
+def test_path_predicts_the_next_dstate() -> None:
     ssh_map = with_paths([0, 0, 0])
     bare = replace(ssh_map, links=())
     looks = [Seen(s.view) for s in bare.dstates]
@@ -301,7 +301,7 @@ def test_a_path_tells_what_comes_next() -> None:
     assert not says.of(0, travel).clashes(says.of(1, travel))  # expectations refute nobody
 
 
-def test_the_untried_action_that_tells_most_is_taken() -> None:
+def test_plan_names_the_most_informative_untried_action() -> None:
     # Both maps go a from 0 to 1 and back; one has tried b in dstate 1, where it leads to x. None
     # has tried b in dstate 0.
     dstates = (DState(0, "v"), DState(1, "w"), DState(2, "x"))
@@ -317,7 +317,7 @@ def test_the_untried_action_that_tells_most_is_taken() -> None:
 
 
 @pytest.mark.parametrize("seen", ["end", "hall"])
-def test_what_comes_of_an_untried_action_leaves_the_rivals_that_said_so(seen: str) -> None:
+def test_outcome_of_an_untried_action_keeps_the_rivals_that_predicted_it(seen: str) -> None:
     views, actions = ["end", "hall", "end", "end", "hall"], ["travel", "travel", "around", "travel"]
     trace = Trace.from_steps(views, actions)
     solution = solve(trace)
@@ -331,7 +331,7 @@ def test_what_comes_of_an_untried_action_leaves_the_rivals_that_said_so(seen: st
     ]
 
 
-def test_what_one_map_leaves_untried_is_the_nearest() -> None:
+def test_plan_for_one_map_names_the_nearest_untried_action() -> None:
     trace = rectangle(1).trace
     (ssh_map,) = solve(trace).maps
     experiment = next_experiment(ssh_map, trace)
@@ -345,7 +345,7 @@ def rivals() -> Iterator[tuple[Trace, Theory]]:
         yield moore(6, 3, steps=25, seed=seed).trace, Theory.causal()
 
 
-def test_real_rivals_are_told_apart_by_what_is_planned() -> None:
+def test_plans_separate_rivals_of_real_traces() -> None:
     told = 0
     for trace, theory in rivals():
         solution = solve(trace, theory, max_maps=None)
@@ -360,7 +360,7 @@ def test_real_rivals_are_told_apart_by_what_is_planned() -> None:
     assert told
 
 
-def test_limits_leave_a_plan_that_says_so() -> None:
+def test_interrupted_plan_names_its_limit() -> None:
     chance = random.Random(3)
     maps = [machine(chance, 5, 2, 1.0) for _ in range(2)]
     watch = Watch()
@@ -398,7 +398,7 @@ def test_limits_leave_a_plan_that_says_so() -> None:
         ),
     ],
 )
-def test_maps_that_do_not_fit_are_refused(maps: list[SSHMap], message: str) -> None:
+def test_next_experiment_refuses_maps_of_other_traces(maps: list[SSHMap], message: str) -> None:
     with pytest.raises(MapError, match=message):
         next_experiment(maps, Trace.from_steps("v", []))
 
@@ -414,7 +414,7 @@ def machines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> tuple[str, s
     return str(trace), str(maps)
 
 
-def test_the_shell_prints_what_python_says(
+def test_next_prints_the_result_of_python(
     machines: tuple[str, str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["next", *machines, "--json"]) == 0
@@ -427,7 +427,7 @@ def test_the_shell_prints_what_python_says(
     assert "the plan\n" in out
 
 
-def test_the_shell_says_of_which_maps_it_knows_nothing(
+def test_next_warns_that_maps_may_be_missing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["solve", ACES, "-n", "2", "--json"]) == 0
@@ -440,7 +440,7 @@ def test_the_shell_says_of_which_maps_it_knows_nothing(
     )
 
 
-def test_errors_of_the_shell_are_one_line(
+def test_next_errors_are_one_line(
     machines: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     trace, maps = machines

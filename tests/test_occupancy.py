@@ -112,7 +112,7 @@ def test_yaml_is_read_by_a_parser(text: str | bytes, tmp_path: Path) -> None:
     "name",
     ["floor #1.pgm", "floor: 1.pgm", "2020-01-01", "on", "sub/map.pgm", "étage.png", "'.bmp"],
 )
-def test_the_image_is_named_seen_from_the_yaml_file(name: str, tmp_path: Path) -> None:
+def test_image_path_is_relative_to_the_yaml_file(name: str, tmp_path: Path) -> None:
     image = tmp_path / name
     image.parent.mkdir(exist_ok=True)
     Image.fromarray(GREY).save(image, {".png": "PNG", ".bmp": "BMP"}.get(image.suffix, "PPM"))
@@ -125,7 +125,7 @@ def test_the_image_is_named_seen_from_the_yaml_file(name: str, tmp_path: Path) -
 @pytest.mark.parametrize("negate", [False, True])
 @pytest.mark.parametrize("mode", ["trinary", "scale", "raw"])
 @pytest.mark.parametrize("kind", ["L", "1", "LA", "P", "P with alpha", "RGB", "RGBA", "I;16"])
-def test_pixels_become_walls_by_the_rules_of_map_server(
+def test_pixels_become_walls_as_in_map_server(
     kind: str, mode: str, negate: bool, yaw: float, tmp_path: Path
 ) -> None:
     if mode == "raw" and negate:
@@ -193,7 +193,7 @@ def test_pixels_become_walls_by_the_rules_of_map_server(
     ] == [True] * bool(between)
 
 
-def test_a_map_with_yaw_is_turned_about_its_lower_left_corner(tmp_path: Path) -> None:
+def test_yaw_turns_a_map_about_its_lower_left_corner(tmp_path: Path) -> None:
     world = World.named(str(saved(tmp_path, HEAD + f"origin: [1, 2, {math.pi / 2}]\n" + TAIL)))
     assert world.bounds == pytest.approx((-1.0, 2.0, 1.0, 4.0))
 
@@ -303,14 +303,14 @@ def test_errors_of_occupancy_maps_name_the_file(
         (b"\x89PNG\r\n\x1a\n" + b"\0" * 30, "image: .*map.pgm"),
     ],
 )
-def test_images_that_are_damaged_are_refused(image: bytes, message: str, tmp_path: Path) -> None:
+def test_damaged_images_are_refused(image: bytes, message: str, tmp_path: Path) -> None:
     path = saved(tmp_path, HEAD + ORIGIN + TAIL, None)
     (tmp_path / "map.pgm").write_bytes(image)
     with pytest.raises(SimulatorError, match=f"map.yaml: .*{message}"):
         read_occupancy(path)
 
 
-def test_a_field_that_is_misspelt_is_named(tmp_path: Path) -> None:
+def test_misspelt_field_is_named(tmp_path: Path) -> None:
     with pytest.warns(
         SimulatorWarning,
         match="got others, which are not read: 'free_threshold, occupied_threshold'",
@@ -320,7 +320,7 @@ def test_a_field_that_is_misspelt_is_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("body", ["binary", "text"])
 @pytest.mark.parametrize("white", [1, 100, 255, 1000, 65535])
-def test_white_of_a_pgm_is_what_its_head_says(white: int, body: str, tmp_path: Path) -> None:
+def test_maxval_of_a_pgm_is_white(white: int, body: str, tmp_path: Path) -> None:
     table = np.where(GREY < 89, 0, white)
     pixels = (
         " ".join(map(str, table.ravel())).encode()

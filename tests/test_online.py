@@ -89,13 +89,13 @@ def agree(trace: Trace, theory: Theory) -> None:
 
 @settings(max_examples=5)
 @given(st.data())
-def test_after_every_step_the_answer_is_that_of_solving_anew(data: st.DataObject) -> None:
+def test_online_maps_equal_those_of_solve_after_every_step(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=7), label="trace")
     agree(trace, data.draw(theories(trace), label="theory"))
 
 
 @pytest.mark.parametrize("name", ["deterministic", "one_place", "travel_leaves"])
-def test_a_theory_without_an_axiom_is_solved_anew(name: str) -> None:
+def test_online_mapper_solves_anew_without_an_axiom(name: str) -> None:
     agree(
         Trace.from_steps("abaabb", ["travel", "around", "travel", "right", "travel"]),
         Theory(without=(name,)),
@@ -104,7 +104,7 @@ def test_a_theory_without_an_axiom_is_solved_anew(name: str) -> None:
 
 @settings(max_examples=5)
 @given(st.data())
-def test_a_mapper_keeps_at_most_max_maps(data: st.DataObject) -> None:
+def test_online_mapper_keeps_at_most_max_maps(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=6), label="trace")
     theory = settle(trace, data.draw(theories(trace), label="theory")).theory
     _, answers = follow(
@@ -122,7 +122,7 @@ def test_a_mapper_keeps_at_most_max_maps(data: st.DataObject) -> None:
         assert not answer.complete or answer.count == anew.count
 
 
-def test_a_bound_is_known_where_more_maps_of_a_known_cost_are_asked_for() -> None:
+def test_online_mapper_knows_the_bound_if_it_lists_more_maps() -> None:
     """This also holds if clingo gets the whole trace at each step."""
     actions = "RRRRRVTRRVRRCRCRTRTVRV"
     named = {
@@ -144,7 +144,7 @@ def test_a_bound_is_known_where_more_maps_of_a_known_cost_are_asked_for() -> Non
     [Theory.causal(), Theory.topological(), Theory.circumscriptive()],
     ids=["causal", "dstates", "paths"],
 )
-def test_circuits_are_replayed(theory: Theory) -> None:
+def test_online_mapper_replays_circuits(theory: Theory) -> None:
     mapper, answers = follow(rectangle(200), theory)
     assert answers[-1].maps == solve(rectangle(200), theory).maps
     assert all(a.status is Status.OPTIMAL and a.complete for a in answers)
@@ -152,7 +152,7 @@ def test_circuits_are_replayed(theory: Theory) -> None:
     assert mapper.solution.effort.prefix < 16
 
 
-def test_a_star_seen_from_another_side_is_no_contradiction() -> None:
+def test_rotated_star_pattern_is_no_contradiction() -> None:
     """The robot turns where all looks alike. One dstate shows its pattern in every rotation."""
     stars = [(1, 0, 0, 0), (0, 0, 0, 1), (0, 0, 1, 0), (0, 1, 0, 0)]
     trace = Trace.from_steps("a" * 20, ["right"] * 19, stars=stars * 5)
@@ -161,7 +161,7 @@ def test_a_star_seen_from_another_side_is_no_contradiction() -> None:
     assert mapper.searches == 2
 
 
-def test_a_mapper_says_how_far_it_is() -> None:
+def test_repr_of_a_mapper_shows_its_progress() -> None:
     mapper = OnlineMapper("a", time_limit=None)
     mapper.observe("travel", "b")
     assert repr(mapper) == "<OnlineMapper: 2 steps, optimal, 2 dstates>"
@@ -169,7 +169,7 @@ def test_a_mapper_says_how_far_it_is() -> None:
 
 @settings(max_examples=25)
 @given(st.data())
-def test_sketches_are_consistent(data: st.DataObject) -> None:
+def test_online_sketches_are_consistent(data: st.DataObject) -> None:
     trace = data.draw(
         traces(max_steps=14), label="trace"
     ).without_displacements()  # sketches ignore evidence
@@ -210,7 +210,7 @@ def draft(trace: Trace, theory: Theory, known: int, which: int) -> list[bool]:
 
 @settings(max_examples=8)
 @given(st.data())
-def test_a_map_that_goes_on_like_a_sketch_is_consistent(data: st.DataObject) -> None:
+def test_map_continued_by_a_sketch_is_consistent(data: st.DataObject) -> None:
     trace = data.draw(
         traces(max_steps=10), label="trace"
     ).without_displacements()  # sketches ignore evidence
@@ -225,7 +225,7 @@ def test_a_map_that_goes_on_like_a_sketch_is_consistent(data: st.DataObject) -> 
     )
 
 
-def test_a_draft_whose_turns_lead_back_may_contradict_an_axiom() -> None:
+def test_draft_with_turns_that_lead_back_may_break_an_axiom() -> None:
     """Two turns to the right lead back, so a new place ahead would be on both sides of a path."""
     trace = Trace.from_steps("aaaa", ["right", "right", "travel"])
     theory = settle(trace, Theory(star="none", path_order="partial", all_on_paths=True)).theory
@@ -233,7 +233,7 @@ def test_a_draft_whose_turns_lead_back_may_contradict_an_axiom() -> None:
 
 
 @pytest.mark.parametrize("stars", [False, True])
-def test_a_draft_follows_a_robot_through_a_maze(stars: bool) -> None:
+def test_draft_follows_a_robot_through_a_maze(stars: bool) -> None:
     doubts: list[bool] = []
     for seed in range(3):
         trace = maze(3, 3, steps=60, seed=seed, loops=0.5, stars=True).trace
@@ -246,7 +246,7 @@ def test_a_draft_follows_a_robot_through_a_maze(stars: bool) -> None:
 
 @settings(max_examples=5)
 @given(st.data())
-def test_without_time_there_is_a_map_and_later_the_proof(data: st.DataObject) -> None:
+def test_online_mapper_without_time_has_a_map_and_proves_it_later(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=9), label="trace")
     theory = settle(trace, data.draw(theories(trace), label="theory")).theory
     mapper, answers = follow(trace, theory, limit=NO_TIME)
@@ -268,7 +268,7 @@ def test_without_time_there_is_a_map_and_later_the_proof(data: st.DataObject) ->
     assert (answer.status, answer.complete, set(answer.maps)) == (anew.status, True, set(anew.maps))
 
 
-def test_a_limit_leaves_feasible_maps_and_sound_bounds() -> None:
+def test_online_limit_leaves_feasible_maps_and_sound_bounds() -> None:
     """The first half of the tour is solved. After that there is no time."""
     trace = drive(*TOURS["plus"])
     theory = settle(trace).theory
@@ -302,7 +302,7 @@ def explore(trace: Trace, mapper: OnlineMapper) -> list[Solution]:
     ]
 
 
-def test_a_contradicting_step_leaves_a_mapper_without_maps() -> None:
+def test_contradicting_step_leaves_no_maps() -> None:
     mapper = OnlineMapper("a", star=[1, 0, 0, 0], time_limit=None)
     assert mapper.observe("around", "b", star=[0, 0, 1, 0]).status is Status.OPTIMAL
     for view in ("a", "c", "a"):
@@ -333,7 +333,7 @@ def test_a_contradicting_step_leaves_a_mapper_without_maps() -> None:
         ("travel", None, [1, 0, 0, 0], "step 2: view: expected"),
     ],
 )
-def test_a_step_that_does_not_fit_changes_nothing(
+def test_refused_step_leaves_the_mapper_unchanged(
     action: object, view: object, star: object, message: str
 ) -> None:
     mapper, other = (
@@ -371,7 +371,9 @@ def test_a_step_that_does_not_fit_changes_nothing(
         ),
     ],
 )
-def test_a_displacement_that_is_none_changes_nothing(given: dict[str, Any], message: str) -> None:
+def test_malformed_displacement_leaves_the_mapper_unchanged(
+    given: dict[str, Any], message: str
+) -> None:
     trace = Trace.from_steps("ab", ["travel"], displacements=[(1.0, 0.0, 0.0)])
     mapper, other = (follow(trace, Theory())[0] for _ in range(2))
     before = mapper.solution
@@ -399,7 +401,7 @@ def test_a_displacement_that_is_none_changes_nothing(given: dict[str, Any], mess
         (Theory.causal(), False, 16),
     ],
 )
-def test_the_trace_settles_displacements_as_it_grows(
+def test_growing_trace_settles_the_use_of_displacements(
     theory: Theory, stars: bool, steps: int
 ) -> None:
     """The first displacement comes late, and one is missing.
@@ -435,7 +437,7 @@ def test_the_trace_settles_displacements_as_it_grows(
     assert len({answer.theory.returns for answer in answers}) > 2
 
 
-def test_displacements_may_be_asked_for_before_the_first_one_comes() -> None:
+def test_displacements_can_be_required_before_the_first_one() -> None:
     trace = maze(2, 2, steps=12, seed=0, odometry=Odometry()).trace
     theory = Theory(displacement="use", star="none", weigh="count")
     mapper, answers = follow(trace, theory)
@@ -445,7 +447,7 @@ def test_displacements_may_be_asked_for_before_the_first_one_comes() -> None:
     assert follow(trace, Theory(displacement="none"))[0].theory.displacement == "none"
 
 
-def test_the_first_step_settles_the_stars() -> None:
+def test_first_step_settles_the_stars() -> None:
     assert OnlineMapper("a", star=[1, 0, 0, 0]).theory.star == "frame"
     plain = OnlineMapper("a")
     assert plain.theory.star == "none"
@@ -461,7 +463,7 @@ def test_the_first_step_settles_the_stars() -> None:
     )
 
 
-def test_the_same_steps_give_the_same_answers() -> None:
+def test_equal_steps_give_equal_answers() -> None:
     trace = drive(*TOURS["plus"], stars=False)
     first, second = (
         [(a.maps, a.cost, a.effort.prefix) for a in follow(trace, Theory())[1]] for _ in range(2)

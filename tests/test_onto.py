@@ -49,7 +49,7 @@ def keeps(ssh_map: SSHMap) -> Callable[[Key], bool]:
 @pytest.mark.filterwarnings("ignore:views. trace")
 @settings(max_examples=6)
 @given(st.data())
-def test_onto_finds_the_minimal_maps_that_keep_the_existing_map(data: st.DataObject) -> None:
+def test_onto_lists_minimal_maps_that_keep_the_existing_map(data: st.DataObject) -> None:
     joint = data.draw(joint_traces(), label="trace")
     theory = data.draw(theories(joint), label="theory")
     toys = [toy for toy in TOYS if toy.rules in theory.rules]
@@ -90,7 +90,9 @@ MONDAY = Trace.from_steps("abcd", ["travel", "around", "travel"], name="monday")
 TUESDAY = Trace.from_steps("bcd", ["around", "travel"], name="tuesday")
 
 
-def test_a_drive_is_added_in_the_shell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_solve_onto_adds_a_drive_in_the_shell(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for trace in (MONDAY, TUESDAY):
         replace(trace, name=None).save(tmp_path / f"{trace.name}.jsonl")
     monday, tuesday, maps = (str(tmp_path / f) for f in ("monday.jsonl", "tuesday.jsonl", "m.json"))
@@ -117,7 +119,7 @@ def test_a_drive_is_added_in_the_shell(tmp_path: Path, capsys: pytest.CaptureFix
     )
 
 
-def test_a_drive_that_contradicts_the_map_is_refused() -> None:
+def test_onto_refuses_a_drive_that_contradicts_the_map() -> None:
     """Monday saw b twice. Its minimal map makes that one dstate; Tuesday shows that it is two."""
     monday = Trace.from_steps("abcb", ["on", "on", "back"], name="monday")
     tuesday = Trace.from_steps("bcb", ["on", "back"], name="tuesday")
@@ -132,7 +134,7 @@ def test_a_drive_that_contradicts_the_map_is_refused() -> None:
     assert solve([monday, wrong], sure)[0].dstate_at == (0, 1, 2, 3, 2, 3, 4)
 
 
-def test_a_drive_with_displacements_is_added_by_cost() -> None:
+def test_onto_adds_a_drive_with_displacements_by_cost() -> None:
     monday = Trace.from_steps(
         "abcd", ["travel", "around", "travel"], displacements=[(4, 0, 0), (0, 0, 3.14), (4, 0, 0)]
     )
@@ -149,7 +151,7 @@ def test_a_drive_with_displacements_is_added_by_cost() -> None:
         assert rival.dstates[:4] == standing.maps[0].dstate_at
 
 
-def test_a_short_time_gives_a_map_that_keeps_the_standing_one() -> None:
+def test_onto_without_time_keeps_the_existing_map() -> None:
     """The first map of a search makes every step a new dstate, so it does not keep a map."""
     around = Trace.from_steps("abababab" * 2, ["travel", "left"] * 7 + ["travel"], name="monday")
     again = Trace.from_steps("ababab", ["travel", "left"] * 2 + ["travel"], name="tuesday")
@@ -162,7 +164,7 @@ def test_a_short_time_gives_a_map_that_keeps_the_standing_one() -> None:
     assert solution[0].dstate_at[: len(around)] == standing[0].dstate_at
 
 
-def test_onto_needs_a_map_with_its_trace(tmp_path: Path) -> None:
+def test_onto_refuses_a_solution_without_map_or_trace(tmp_path: Path) -> None:
     standing = solve(MONDAY)
     for bad in (replace(standing, trace=None), replace(standing, maps=())):
         with pytest.raises(SolverError, match="onto: expected a solution with a map and its trace"):
@@ -174,7 +176,7 @@ def test_onto_needs_a_map_with_its_trace(tmp_path: Path) -> None:
         solve(TUESDAY, onto=faulty)
 
 
-def test_a_digest_has_each_link_once() -> None:
+def test_digest_has_each_link_once() -> None:
     long = Trace.from_steps("ab" * 50, ["travel"] * 99, name="long")
     standing = solve(long, Theory.causal())
     digest = Digest.of(long, standing[0], short=True)
@@ -184,7 +186,7 @@ def test_a_digest_has_each_link_once() -> None:
     assert solve(short, onto=standing)[0].dstate_at == (0, 1) * 50 + (0, 1, 0, 1, 0, 1, 0)
 
 
-def test_names_stay_when_drives_are_added() -> None:
+def test_onto_keeps_names() -> None:
     monday = Trace.from_steps("abcd", ["travel", "around", "travel"], name="monday")
     said = Corrections.for_drives(monday).with_name("kitchen", "place", "monday:1")
     said = said.with_name("corridor", "path", "monday:0")
@@ -201,7 +203,7 @@ def test_names_stay_when_drives_are_added() -> None:
     assert solve(last, onto=solution, corrections=unnamed).maps[0].names == ()
 
 
-def test_the_seconds_count_all_of_the_work() -> None:
+def test_onto_counts_the_time_of_all_searches() -> None:
     """Not only those of the last search."""
     monday = Trace.from_steps("abcd", ["travel", "around", "travel"], name="monday")
     solution = solve(monday)

@@ -60,7 +60,7 @@ def with_toy(toy: Toy, theory: Theory) -> Theory:
 @pytest.mark.parametrize("toy", TOYS, ids=lambda toy: toy.rules.name)
 @settings(max_examples=2)
 @given(data=st.data())
-def test_an_axiom_that_nothing_knows_is_obeyed(name: str, toy: Toy, data: st.DataObject) -> None:
+def test_own_axiom_is_obeyed_offline_and_online(name: str, toy: Toy, data: st.DataObject) -> None:
     """Solve offline and online, against the brute force. The first prefixes are so short that
     replay would overlook the axiom."""
     theory = (
@@ -104,7 +104,7 @@ def test_an_axiom_that_nothing_knows_is_obeyed(name: str, toy: Toy, data: st.Dat
 
 
 @pytest.mark.parametrize(("steps", "dstates"), [(24, 16), (61, 53)])
-def test_a_rule_about_pairs_of_steps_on_circuits(steps: int, dstates: int) -> None:
+def test_own_rule_about_pairs_holds_on_circuits(steps: int, dstates: int) -> None:
     trace = Trace.load(EXAMPLES / "notched-rectangle.jsonl").prefix(steps)
     solution = solve(trace, Theory.causal().replace(rules=[FORGETFUL]))
     assert solution.status is Status.OPTIMAL
@@ -143,7 +143,7 @@ def wider(own_encodings: Path) -> type[Theory]:
     return Wider
 
 
-def test_an_axiom_put_into_the_encodings_and_the_theory_alone_is_obeyed(
+def test_axiom_added_to_encodings_and_theory_is_obeyed(
     wider: type[Theory],
 ) -> None:
     trace = Trace.load(EXAMPLES / "notched-rectangle.jsonl").prefix(24)
@@ -162,7 +162,7 @@ def test_an_axiom_put_into_the_encodings_and_the_theory_alone_is_obeyed(
 @pytest.mark.parametrize(
     ("speedup", "theory"), [("visits", Theory(star="frame")), ("ways", Theory(star="none"))]
 )
-def test_an_axiom_that_a_shared_encoding_drops_switches_off_its_speedups(
+def test_speedups_are_off_if_a_shared_encoding_drops_an_axiom(
     own_encodings: Path, speedup: str, theory: Theory
 ) -> None:
     assert row(speedup).holds_for(theory)
@@ -173,7 +173,7 @@ def test_an_axiom_that_a_shared_encoding_drops_switches_off_its_speedups(
     assert not row(speedup).holds_for(theory)
 
 
-def test_a_file_of_the_working_directory_is_not_taken_for_an_encoding(
+def test_encodings_are_not_read_from_the_working_directory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As clingo's own `#include` would."""
@@ -185,7 +185,7 @@ def test_a_file_of_the_working_directory_is_not_taken_for_an_encoding(
     assert solve(trace, Theory(star="frame")).status is Status.OPTIMAL
 
 
-def test_a_field_that_nothing_speaks_for_switches_off_what_is_exact_for_known_axioms() -> None:
+def test_unknown_theory_field_switches_off_exact_speedups() -> None:
     @dataclass(frozen=True)
     class Wider(Theory):
         penalty: float | None = None
@@ -198,7 +198,7 @@ def test_a_field_that_nothing_speaks_for_switches_off_what_is_exact_for_known_ax
     assert not any(speedup.holds_for(Wider.causal().replace(penalty=1.5)) for speedup in exact)
 
 
-def test_every_switch_has_a_row_and_every_row_a_switch() -> None:
+def test_every_speedup_has_a_row_and_a_switch() -> None:
     assert {speedup.switch for speedup in TABLE} == set(SPEEDUPS)
     for speedup in TABLE:
         assert row(speedup.name) is speedup
@@ -207,7 +207,7 @@ def test_every_switch_has_a_row_and_every_row_a_switch() -> None:
 
 
 @pytest.mark.parametrize("axiom", ["functional_view", "deterministic"])
-def test_what_rests_on_an_axiom_is_off_without_it(axiom: str) -> None:
+def test_speedup_is_off_without_its_axiom(axiom: str) -> None:
     resting = [speedup for speedup in TABLE if axiom in speedup.rests_on]
     assert len(resting) > 5
     assert not any(
@@ -244,7 +244,7 @@ class NoLongReturns:
 @pytest.mark.parametrize("name", THEORIES)
 @settings(max_examples=6)
 @given(data=st.data())
-def test_what_evidence_refuses_of_a_map_is_forbidden(name: str, data: st.DataObject) -> None:
+def test_maps_refused_by_evidence_are_forbidden(name: str, data: st.DataObject) -> None:
     """The answer is that of the brute force, whichever maps clingo finds first."""
     trace = data.draw(traces(max_steps=5), label="trace")
     named = Rules("seldom.lp", "% @axiom(seldom) No dstate is seen three times.\n")
@@ -278,7 +278,7 @@ FAST = {
 @pytest.mark.parametrize("name", FAST)
 @settings(max_examples=10)
 @given(data=st.data())
-def test_every_engine_forbids_maps_that_evidence_refuses(name: str, data: st.DataObject) -> None:
+def test_every_engine_forbids_maps_refused_by_evidence(name: str, data: st.DataObject) -> None:
     """An engine that settles dstates first obeys it, too. Its maps are those of the brute force."""
     theory, kind = FAST[name]
     trace = data.draw(traces(max_steps=5), label="trace")
@@ -307,7 +307,7 @@ def test_every_engine_forbids_maps_that_evidence_refuses(name: str, data: st.Dat
     assert {key(ssh_map) for ssh_map in found} == expected
 
 
-def test_steps_said_to_be_at_one_place_that_cannot_be() -> None:
+def test_impossible_assertions_and_rules_are_unsatisfiable() -> None:
     trace = Trace.load(EXAMPLES / "aces3-route.jsonl")[:17]
     at_check = Rules("one.lp", "#program check(t).\n:- query(t), not same_place(5,15).")
     at_step = Rules("one.lp", "#program step(t).\n:- t = 15, not same_place(5,t).")
@@ -315,7 +315,7 @@ def test_steps_said_to_be_at_one_place_that_cannot_be() -> None:
         assert solve(trace, Theory(**choices)).status is Status.UNSATISFIABLE  # type: ignore[arg-type]
 
 
-def test_an_explanation_names_assertions_and_own_axioms() -> None:
+def test_explanation_names_assertions_and_own_axioms() -> None:
     trace = Trace.from_steps("aba", ["travel", "travel"])
     said = explain(trace, Theory.topological().replace(same=[(0, 1)]))
     assert said
@@ -386,7 +386,7 @@ def test_an_explanation_names_assertions_and_own_axioms() -> None:
         ),
     ],
 )
-def test_rules_that_could_never_be_read_say_how_to_write_them(
+def test_unreadable_rules_are_refused_with_advice(
     text: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -413,7 +413,7 @@ SOUND = (
         f'{SOUND}%* é %* nested *% “ *%\nown("é\\"”"). % é'.encode(),
     ],
 )
-def test_rules_of_any_editor_are_read(data: bytes, tmp_path: Path) -> None:
+def test_rules_with_any_line_ends_are_read(data: bytes, tmp_path: Path) -> None:
     (tmp_path / "own.lp").write_bytes(data)
     theory = Theory.causal().replace(rules=[tmp_path / "own.lp"])
     assert [axiom.name for axiom in theory.rules[0].axioms] == ["near"]
@@ -446,7 +446,7 @@ def test_rules_of_any_editor_are_read(data: bytes, tmp_path: Path) -> None:
         ("% é".encode("latin-1"), "cannot be read: no text in UTF-8; save it as UTF-8"),
     ],
 )  # fmt: skip
-def test_characters_that_end_clingo_are_refused(
+def test_rules_with_characters_that_abort_clingo_are_refused(
     data: str | bytes, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Such files abort clingo, or end its reading."""
@@ -478,7 +478,7 @@ def test_malformed_rules_are_refused() -> None:
     ("text", "where"),
     [("#program step(t).\n:- same(I,t), X > 3.", "b.lp:2"), ("#const n = 2.", "b.lp:1")],
 )
-def test_of_several_files_of_rules_the_wrong_one_is_named(text: str, where: str) -> None:
+def test_error_names_the_wrong_file_of_rules(text: str, where: str) -> None:
     rules = [Rules("a.lp", "#const n = 1."), Rules("b.lp", text)]
     for files in (rules, rules[::-1]) if "same" in text else (rules,):
         with pytest.raises(TheoryError, match=where):
@@ -486,7 +486,7 @@ def test_of_several_files_of_rules_the_wrong_one_is_named(text: str, where: str)
 
 
 @pytest.mark.parametrize("words", ["solve T", "solve T --jobs 1", "check T M"])
-def test_a_step_that_the_trace_does_not_have_is_an_error(
+def test_assertion_about_an_unknown_step_is_an_error(
     words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     trace = Trace.from_steps("aa", ["travel"])
@@ -507,16 +507,14 @@ def test_a_step_that_the_trace_does_not_have_is_an_error(
         solve(trace, Theory(same=[(0, 2)]))
 
 
-def test_a_file_of_rules_without_end_is_an_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_endless_file_of_rules_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ssh_abduction.theory.rules.LARGEST", 100)
     (tmp_path / "own.lp").write_text("% long\n" * 100)
     with pytest.raises(TheoryError, match="cannot be read: expected at most"):
         Theory.causal().replace(rules=[tmp_path / "own.lp"])
 
 
-def test_rules_may_read_facts_and_atoms_of_their_own() -> None:
+def test_rules_can_define_facts_and_atoms() -> None:
     rules = Rules(
         "own.lp",
         "#const most = 1.\nlimit(most).\nfar(I,T) :- pair(I,T).\npair(0,2).\n#program "
@@ -528,7 +526,7 @@ def test_rules_may_read_facts_and_atoms_of_their_own() -> None:
     )
 
 
-def test_a_map_that_breaks_an_axiom_is_an_internal_error() -> None:
+def test_inconsistent_map_of_an_engine_is_an_internal_error() -> None:
     trace = Trace.from_steps("abab", [ACTIONS["T"]] * 3)
     found = StepEngine._read
 
@@ -548,7 +546,7 @@ def follow(mapper: OnlineMapper, views: str) -> None:
         mapper.observe("travel", view)
 
 
-def test_a_replayed_map_that_breaks_an_axiom_is_an_internal_error_while_a_robot_drives() -> None:
+def test_inconsistent_replayed_map_is_an_internal_error() -> None:
     """Replays are checked, too, as long as that takes a tenth of the time at most."""
     mapper = OnlineMapper("a", Theory.causal(), time_limit=None)
     right = ReplayedMap.map
@@ -564,7 +562,7 @@ def test_a_replayed_map_that_breaks_an_axiom_is_an_internal_error_while_a_robot_
         follow(mapper, "bababa")
 
 
-def test_what_is_asserted_is_told_to_the_engine_with_names() -> None:
+def test_assertions_enlarge_the_pinned_clique() -> None:
     """Then more steps differ, so the pinned clique is larger, and clingo need not find that out."""
     trace = Trace.from_steps("ab" * 20, ["travel"] * 39)
     cliques = []

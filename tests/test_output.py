@@ -45,7 +45,7 @@ each_writer = pytest.mark.parametrize("kind", WRITERS)
 
 
 @each_writer
-def test_a_pipe_takes_what_is_written(kind: str, tmp_path: Path) -> None:
+def test_writers_write_into_a_pipe(kind: str, tmp_path: Path) -> None:
     pipe, copy = tmp_path / "pipe", tmp_path / "copy"
     os.mkfifo(pipe)
     reader = threading.Thread(target=lambda: copy.write_bytes(pipe.read_bytes()))
@@ -57,7 +57,7 @@ def test_a_pipe_takes_what_is_written(kind: str, tmp_path: Path) -> None:
 
 
 @each_writer
-def test_a_device_takes_what_is_written(kind: str, tmp_path: Path) -> None:
+def test_writers_write_into_a_device(kind: str, tmp_path: Path) -> None:
     device = tmp_path / "null"
     try:
         os.mknod(device, stat.S_IFCHR | 0o600, os.makedev(1, 3))
@@ -71,7 +71,7 @@ def test_a_device_takes_what_is_written(kind: str, tmp_path: Path) -> None:
 
 @each_writer
 @pytest.mark.parametrize("exists", [True, False])
-def test_a_link_is_written_through(kind: str, exists: bool, tmp_path: Path) -> None:
+def test_writers_follow_a_symbolic_link(kind: str, exists: bool, tmp_path: Path) -> None:
     (tmp_path / "there").mkdir()
     target, second, link = tmp_path / "there" / "target", tmp_path / "second", tmp_path / "link"
     if exists:
@@ -86,7 +86,7 @@ def test_a_link_is_written_through(kind: str, exists: bool, tmp_path: Path) -> N
 
 
 @each_writer
-def test_a_file_is_replaced_whole_and_keeps_its_permissions(kind: str, tmp_path: Path) -> None:
+def test_written_file_is_replaced_whole_and_keeps_permissions(kind: str, tmp_path: Path) -> None:
     path, other = tmp_path / "out", tmp_path / "other"
     path.write_text("old")
     path.chmod(0o640)
@@ -98,9 +98,7 @@ def test_a_file_is_replaced_whole_and_keeps_its_permissions(kind: str, tmp_path:
     assert len(list(tmp_path.iterdir())) == 2  # no draft is left behind
 
 
-def test_a_draft_that_fails_leaves_the_old_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: Any) -> None:
         raise OSError(28, "No space left on device")
 
@@ -112,7 +110,7 @@ def test_a_draft_that_fails_leaves_the_old_file(
     assert [other.read_bytes() for other in tmp_path.iterdir()] == [b"old"]
 
 
-def test_a_closed_pipe_and_a_ring_of_links_are_errors(
+def test_closed_pipe_and_circular_link_are_errors(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "a").symlink_to("b")
@@ -137,7 +135,7 @@ def test_a_closed_pipe_and_a_ring_of_links_are_errors(
         "learning-curve x y --plot",
     ],
 )
-def test_an_empty_name_of_a_file_is_refused(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_empty_file_name_is_refused(words: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
         main([*words.split(), *([] if words.endswith("--plot") else ["-o"]), ""])
     assert (
@@ -156,13 +154,13 @@ def test_an_empty_name_of_a_file_is_refused(words: str, capsys: pytest.CaptureFi
         "check x y --set prefer=--",
     ],
 )
-def test_two_dashes_as_a_value_are_refused(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_double_dash_as_a_value_is_refused(words: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
         main(words.split())
     assert "expected a value, got '--'" in capsys.readouterr().err
 
 
-def test_every_verb_that_writes_writes_into_a_pipe(
+def test_every_writing_verb_writes_into_a_pipe(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = tmp_path / "run.jsonl"
@@ -212,7 +210,7 @@ def learnt(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
     ]
 
 
-def test_a_missing_matplotlib_is_an_error_before_the_work(
+def test_missing_matplotlib_is_an_error_before_the_work(
     tmp_path: Path,
     learnt: list[str],
     capsys: pytest.CaptureFixture[str],
@@ -245,7 +243,7 @@ def test_a_missing_matplotlib_is_an_error_before_the_work(
     assert main(learnt) == 0
 
 
-def test_a_picture_that_fails_loses_nothing(
+def test_failed_picture_loses_no_other_output(
     tmp_path: Path, learnt: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([*learnt, "--json", "--plot", str(tmp_path / "none" / "x.png")]) == 1
@@ -272,7 +270,7 @@ def test_a_picture_that_fails_loses_nothing(
     assert "chosen" in capsys.readouterr().out
 
 
-def test_a_reproduction_writes_its_data_before_it_draws(
+def test_reproduce_writes_its_data_before_it_draws(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from ssh_abduction.evaluation.paper import report
@@ -308,9 +306,7 @@ def test_a_reproduction_writes_its_data_before_it_draws(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="terminals")
-def test_json_goes_to_its_file_while_progress_shows_on_a_terminal(
-    room: str, tmp_path: Path
-) -> None:
+def test_json_output_is_separate_from_progress_on_a_terminal(room: str, tmp_path: Path) -> None:
     import pty
 
     ours, theirs = pty.openpty()
@@ -396,7 +392,9 @@ SCRIPT = "-c import~sys;from~ssh_abduction.__main__~import~run;sys.exit(run())"
         *((SCRIPT, module) for module in ("ssh_abduction.cli", "numpy")),
     ],
 )
-def test_ctrl_c_while_modules_load_is_quiet(program: str, module: str, tmp_path: Path) -> None:
+def test_ctrl_c_while_modules_load_prints_no_traceback(
+    program: str, module: str, tmp_path: Path
+) -> None:
     (tmp_path / "sitecustomize.py").write_text(CTRL_C_AT.format(module=module))
     path = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
     words = [word.replace("~", " ") for word in program.split(" ")]
@@ -418,7 +416,7 @@ def test_ctrl_c_while_modules_load_is_quiet(program: str, module: str, tmp_path:
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
 
 
-def test_what_would_steer_a_terminal_is_escaped(
+def test_terminal_control_characters_are_escaped(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     strange = "\x1b[31m\x9bred\u202e"
@@ -466,7 +464,7 @@ def test_what_would_steer_a_terminal_is_escaped(
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is full")
-def test_a_full_standard_output_is_an_error(tmp_path: Path) -> None:
+def test_full_standard_output_is_an_error(tmp_path: Path) -> None:
     Trace.from_steps("aba", ["travel"] * 2).save(tmp_path / "trace.jsonl")
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
@@ -482,14 +480,14 @@ def test_a_full_standard_output_is_an_error(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["", "a\0b"])
-def test_save_refuses_a_name_that_is_no_file(name: str) -> None:
+def test_save_refuses_a_name_that_is_not_a_file(name: str) -> None:
     with pytest.raises(TraceError, match=r"cannot write the trace: .*; name a file") as error:
         Trace.from_steps("aba", ["travel"] * 2).save(name)
     assert not str(error.value).startswith("output")
 
 
 @pytest.mark.parametrize("target", ["nowhere/file", "file/under", "folder"])
-def test_an_error_names_the_file_and_no_draft(target: str, tmp_path: Path) -> None:
+def test_write_error_names_the_target_file(target: str, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     (tmp_path / "folder").mkdir()
     path = tmp_path / target
@@ -505,7 +503,7 @@ def test_an_error_names_the_file_and_no_draft(target: str, tmp_path: Path) -> No
         ("sealed/maps.json", "its folder may not be written; name another one"),
     ],
 )
-def test_a_file_that_cannot_be_written_is_an_error_before_the_work(
+def test_unwritable_file_is_an_error_before_the_work(
     target: str,
     why: str,
     tmp_path: Path,

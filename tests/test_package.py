@@ -37,7 +37,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_the_wheel_holds_the_encodings_the_examples_and_the_wings(
+def test_wheel_contains_encodings_examples_and_all_packages(
     installed: Path, tmp_path: Path
 ) -> None:
     for folder in ("encodings", "examples"):
@@ -68,9 +68,7 @@ def test_the_wheel_holds_the_encodings_the_examples_and_the_wings(
 
 
 @pytest.mark.slow
-def test_the_first_commands_of_the_readme_run_where_the_wheel_is_installed(
-    installed: Path, tmp_path: Path
-) -> None:
+def test_readme_commands_run_with_the_installed_wheel(installed: Path, tmp_path: Path) -> None:
     lines, output = re.findall(
         r"```sh\n([^`]*examples/[^`]*)```\n\n```\n(.*?)```",
         (ROOT / "README.md").read_text(),
@@ -104,7 +102,7 @@ def without_speed(text: str) -> str:
     return re.sub(r"\d+\.\d+ s|\d+ of \d+ steps", "_", text)
 
 
-def test_examples_that_somebody_changed_are_not_overwritten(
+def test_examples_does_not_overwrite_changed_files(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "deep" / "copies"
@@ -120,18 +118,18 @@ def test_examples_that_somebody_changed_are_not_overwritten(
     assert not (folder / "adventure.py").exists()
 
 
-def test_the_top_level_folder_of_encodings_is_no_package() -> None:
+def test_encodings_folder_is_not_a_package() -> None:
     assert not (ROOT / "encodings" / "__init__.py").exists()
     assert encodings.folder().is_dir()
 
 
-def test_wings_export_nothing_at_the_top() -> None:
+def test_perception_and_simulator_export_nothing() -> None:
     for wing in ("perception", "simulator"):
         (docstring,) = ast.parse((ROOT / wing / "__init__.py").read_text()).body
         assert isinstance(docstring, ast.Expr)
 
 
-def test_all_that_is_exported_exists() -> None:
+def test_every_exported_name_exists() -> None:
     for name in ssh_abduction.__all__:
         assert getattr(ssh_abduction, name).__name__ == name
 
@@ -150,7 +148,7 @@ def test_docstrings_run() -> None:
     assert attempted > 50
 
 
-def test_the_citation_and_the_changelog_have_the_version_of_the_package() -> None:
+def test_citation_and_changelog_have_the_package_version() -> None:
     import tomllib
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]

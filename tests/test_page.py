@@ -91,7 +91,7 @@ def hostile() -> tuple[Solution, Trace]:
     return replace(solution, maps=(faulty,)), trace
 
 
-def test_page_is_one_file_that_loads_nothing_and_keeps_texts_as_texts() -> None:
+def test_page_is_one_file_that_loads_nothing_and_escapes_texts() -> None:
     solution, trace = hostile()
     text_of_page = view_page(
         solution,
@@ -107,7 +107,7 @@ def test_page_is_one_file_that_loads_nothing_and_keeps_texts_as_texts() -> None:
     assert "https://" not in text_of_page
 
 
-def test_ranges_are_drawn_at_the_bearings_that_the_header_says() -> None:
+def test_page_draws_ranges_at_the_bearings_of_the_header() -> None:
     images = [(1.0, float("inf"), 2.0, float("nan")), (4.0, 1.0, 2.0, 4.0)]
     steps = tuple(
         Step("v", image=image, action=Action("on") if k == 0 else None)
@@ -130,7 +130,7 @@ def test_ranges_are_drawn_at_the_bearings_that_the_header_says() -> None:
         drawn_images(replace(trace, extra={"beams": {"first": 0, "step": 200}}))
 
 
-def test_images_of_a_sidecar_file_and_panoramas_are_shown(
+def test_page_shows_images_of_a_sidecar_file_and_panoramas(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shape = [2, 3, 1]
@@ -152,7 +152,7 @@ def test_images_of_a_sidecar_file_and_panoramas_are_shown(
         assert drawn_images(trace) is None
 
 
-def test_beliefs_are_those_of_the_localiser_in_each_rival() -> None:
+def test_page_beliefs_equal_those_of_the_localiser() -> None:
     trace = Trace.from_steps("abcbabcb", ["on"] * 7)
     solution = solve(trace, Theory.causal())
     found = view_page(
@@ -174,7 +174,7 @@ def test_beliefs_are_those_of_the_localiser_in_each_rival() -> None:
         view_page(solution, trace, run=trace[2:6], beliefs=lambda ssh_map: [])
 
 
-def test_colours_can_be_told_apart_by_the_colour_blind_and_from_the_paper() -> None:
+def test_page_colours_have_enough_contrast_for_the_colour_blind() -> None:
     light, dark = re.findall(
         r":root \{([^}]*)\}", (Path(html.__file__).parent / "page.css").read_text()
     )
@@ -229,7 +229,7 @@ def cielab(rgb: Any) -> Any:
     return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
 
 
-def test_the_flags_shown_for_a_theory_give_that_theory() -> None:
+def test_flags_shown_on_the_page_reproduce_the_theory() -> None:
     parser = Parser()
     add_theory(parser)
     for theory in (
@@ -250,7 +250,7 @@ def test_the_flags_shown_for_a_theory_give_that_theory() -> None:
 
 
 @pytest.mark.slow
-def test_page_of_many_maps_of_500_dstates_in_metres_is_small() -> None:
+def test_page_of_many_large_maps_is_small() -> None:
     """A page has a limited number of drawings, each with its own poses. Further maps share them."""
     rng, places, maps = np.random.default_rng(0), 250, []
     for _ in range(DRAWN // 500 + 10):
@@ -285,7 +285,7 @@ def test_page_of_many_maps_of_500_dstates_in_metres_is_small() -> None:
     assert len(gzip.compress(found.html.encode())) < 250_000
 
 
-def test_trace_of_other_maps_is_refused(rivals: Solution, route: Trace) -> None:
+def test_view_page_refuses_a_trace_of_other_maps(rivals: Solution, route: Trace) -> None:
     with pytest.raises(MapError, match="expected 5, one for each step"):
         view_page(rivals, route[:5])
 
@@ -320,7 +320,7 @@ def test_view_writes_a_page_with_beliefs(
         assert said in capsys.readouterr().err
 
 
-def test_costs_of_assumptions_are_those_of_explain_pair() -> None:
+def test_page_costs_of_assumptions_equal_explain_pair() -> None:
     trace = Trace.from_steps("abab", ["travel", "travel", "around"])
     solution = solve(trace, max_maps=None)
     known = assumptions(Listing.of(solution), trace, Theory(), seconds=1000)
@@ -371,7 +371,7 @@ def asked(
     return told
 
 
-def test_server_answers_only_who_knows_its_token_from_this_computer(server: PageServer) -> None:
+def test_server_refuses_requests_without_token_or_from_elsewhere(server: PageServer) -> None:
     own = server.url.partition(str(server.port))[2]
     assert asked(server, "GET", own)[0] == 200
     assert asked(server, "GET", "/") == (403, b"")
@@ -386,7 +386,7 @@ def test_server_answers_only_who_knows_its_token_from_this_computer(server: Page
 @pytest.mark.parametrize(
     "length", ["9" * 5000, "-1", "", "+2", " ", "2.0", "0x2", "²", "٢", "2\r\nContent-Length: 3"]
 )
-def test_a_request_with_a_wrong_length_is_refused(server: PageServer, length: str) -> None:
+def test_server_refuses_a_request_with_a_wrong_length(server: PageServer, length: str) -> None:
     own = server.url.partition(str(server.port))[2]
     with socket.create_connection(("127.0.0.1", server.port), timeout=20) as connection:
         head = (
@@ -397,7 +397,7 @@ def test_a_request_with_a_wrong_length_is_refused(server: PageServer, length: st
         assert connection.recv(100).startswith(b"HTTP/1.0 403")
 
 
-def test_question_whose_asker_is_gone_is_given_up(
+def test_server_stops_a_question_whose_client_is_gone(
     server: PageServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     own = server.url.partition(str(server.port))[2]
@@ -413,7 +413,7 @@ def test_question_whose_asker_is_gone_is_given_up(
 
 
 @pytest.mark.slow
-def test_answers_begin_with_the_maps_of_the_page() -> None:
+def test_server_starts_from_the_maps_of_the_page() -> None:
     """The time is too short for a search that would find these maps again."""
     trace = Trace.load(Path(__file__).parent.parent / "examples" / "aces3-route.jsonl")
     listing = Listing.of(solve(trace))
@@ -438,7 +438,7 @@ def until(happened: Callable[[], bool]) -> None:
         time.sleep(0.02)
 
 
-def test_server_solves_under_what_is_assumed_and_explains(server: PageServer) -> None:
+def test_server_solves_and_explains_under_assumptions(server: PageServer) -> None:
     own = server.url.partition(str(server.port))[2]
     told = json.loads(asked(server, "POST", own + "solve", {"different": [[0, 4]]})[1])
     assert (
@@ -560,7 +560,7 @@ def test_page_in_the_browser(browser: Any, tmp_path: Path, content: dict[str, An
     assert page.complaints == []
 
 
-def test_hostile_texts_stay_texts_in_the_browser(browser: Any, tmp_path: Path) -> None:
+def test_browser_shows_hostile_texts_as_text(browser: Any, tmp_path: Path) -> None:
     solution, trace = hostile()
     view_page(
         solution,
@@ -601,7 +601,7 @@ def test_assuming_and_explaining_in_the_browser(browser: Any, server: PageServer
     assert page.complaints == []
 
 
-def test_content_has_the_regions_of_maps(content: dict[str, Any], rivals: Solution) -> None:
+def test_page_content_contains_regions(content: dict[str, Any], rivals: Solution) -> None:
     for told, ssh_map in zip(content["maps"], rivals.maps, strict=True):
         regions = content["regions"][told["regions"]]
         assert [(list(p), d) for p, _, d in regions] == [
@@ -636,7 +636,7 @@ def test_regions_in_the_browser(browser: Any, tmp_path: Path) -> None:
     assert page.complaints == []
 
 
-def test_floors_are_named_beside_their_places(browser: Any, tmp_path: Path) -> None:
+def test_page_names_floors_beside_their_places(browser: Any, tmp_path: Path) -> None:
     trace = Trace.from_steps("abcde", ["travel", Action("up", "lift"), "travel", "travel"])
     solution = solve(trace)
     content = content_of(solution, trace)
@@ -657,7 +657,7 @@ def test_floors_are_named_beside_their_places(browser: Any, tmp_path: Path) -> N
     assert "floors" not in content_of(flat, trace[:2])["layouts"][0]
 
 
-def test_a_map_without_paths_has_a_street_for_each_travel(browser: Any, tmp_path: Path) -> None:
+def test_page_draws_a_street_for_each_travel_without_paths(browser: Any, tmp_path: Path) -> None:
     """Maps of logs have places, but no paths. A lift and the start of a drive are no street."""
     monday = Trace.from_steps("abcde", ["travel", "travel", Action("up", "lift"), "travel"])
     trace = together([replace(monday, name="monday"), Trace.from_steps("fg", ["travel"], name="b")])
@@ -681,7 +681,7 @@ def test_a_map_without_paths_has_a_street_for_each_travel(browser: Any, tmp_path
     assert page.complaints == []
 
 
-def test_the_page_of_a_joint_map_shows_its_drives(browser: Any, tmp_path: Path) -> None:
+def test_page_of_a_joint_map_shows_its_drives(browser: Any, tmp_path: Path) -> None:
     monday = Trace.from_steps("abc", ["travel", "travel"], name="monday")
     tuesday = Trace.from_steps("cd", ["travel"], name="<b>tuesday</b>")
     joint = together([monday, tuesday])
