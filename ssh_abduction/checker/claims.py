@@ -30,9 +30,9 @@ def false_claims(
 ) -> tuple[str, ...]:
     """Find the false claims in the JSON that `solve --json` printed. Each claim is checked.
 
-    `steps` is the number of steps of the trace. The theory has all defaults resolved. `proven`
-    is the lower bound on dstates that the certificate of the answer proves. Numbers of dstates
-    that clingo refuted, by the certificate, are included without a check.
+    `steps` is the number of steps of the trace. In the theory no field is "auto". `proven` is the
+    lower bound on dstates by the certificate of the answer. The certificate may also say that
+    clingo refuted some numbers of dstates. These count in the bound, but are not checked.
     """
     claims = _Claims(answer, maps, steps, theory, proven)
     return tuple(
@@ -45,10 +45,10 @@ def false_claims(
 def contradictions(
     answer: Mapping[str, Any], maps: Sequence[SSHMap], steps: int, theory: Theory
 ) -> Iterator[str]:
-    """Find contradictions between the claims of an answer and its maps, as `false_claims`.
+    """Find contradictions between the claims of an answer and its maps.
 
-    The certificate of the answer is accepted unchecked, because its check needs the trace. If
-    the theory allows faults, costs and bounds are not compared.
+    This is as in `false_claims`, but the certificate of the answer is not checked, because that
+    needs the trace. If the theory allows faults, costs and bounds are not compared.
     """
     claims = _Claims(answer, maps, steps, theory, sys.maxsize)
     for check in (
@@ -141,9 +141,9 @@ class _Claims:
             yield "complete: expected true, as the status is unsatisfiable, got false"
 
     def cost(self) -> Iterator[str]:
-        """Check that the first map has the claimed cost and that no other map is worse or better.
+        """Check that the first map has the claimed cost and that all maps are equally good.
 
-        If the answer also lists maps above the minimum, the costs of all levels are checked.
+        If the answer also lists maps above the minimum, `_costs_within` checks their costs.
         """
         if "cost" in self.answer:
             cost = self.answer["cost"]
@@ -173,7 +173,10 @@ class _Claims:
                 )
 
     def _preferred(self, i: int) -> list[int]:
-        """List the counts of map i, the most preferred first; empty if there is no map i."""
+        """List the counts of map i that the theory minimises, the most important first.
+
+        Empty if there is no map i.
+        """
         return [
             counts[name] for counts in self.counts[i : i + 1] for name in self.theory.priorities
         ]
@@ -237,10 +240,10 @@ class _Claims:
                 )
 
     def _least(self, cost: Any) -> dict[str, int]:
-        """Return the counts of the first map, as a dict from name to number.
+        """Return the counts that `cost` should have, as a dict from name to number.
 
-        If axioms are left out, clingo may count more than the map lists. Then the result has the
-        larger numbers of the claimed `cost`.
+        These are the counts of the first map. If axioms are left out, clingo may count more than
+        the map lists. Then a larger number in `cost` is right, too.
         """
         shown = self.counts[0]
         if not self.theory.without or not isinstance(cost, Mapping):

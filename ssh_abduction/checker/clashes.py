@@ -41,7 +41,7 @@ class Clash:
         place: The place.
         steps: The first step of each sight.
         axioms: The axioms that forbid the set. Leaving out any one of them lets a frame fit. If
-            there is no such axiom, these are all axioms about gateways that hold.
+            there is no such axiom, these are all axioms of the theory about gateways.
     """
 
     place: int
@@ -53,7 +53,7 @@ def clashes(sights: Sequence[Sight], turns: Turns, axioms: Collection[str]) -> I
     """Yield a minimal set of sights (dstate and star) for each place where they fit no frame.
 
     The sights are those of a map, sorted by first step. `turns` has the turns between sights of one
-    place. `axioms` has the names of the axioms that hold.
+    place. `axioms` has the names of the theory's axioms.
     """
     hard = [name for name in NAMES if name in axioms]
     for place, seen in by_place(sights).items():
@@ -78,7 +78,7 @@ def _clashes_of(m: Reading) -> list[Clash]:
 
 
 def _sights_of(m: Reading) -> tuple[list[Sight], Turns]:
-    """Return the sights (dstate and star) of a map; of each drive, if gateways may change."""
+    """Return the sights of a map, for each drive if gateways may change; and the turns."""
     return sights_of(m.trace, m.map, m.onward, bool(m.theory.changed))
 
 

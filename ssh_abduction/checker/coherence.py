@@ -127,7 +127,7 @@ def has_what_the_theory_has(m: Reading) -> Found:
 
 
 def excused_are_pairs_of_paths(m: Reading) -> Found:
-    """Check that each excuse of the map is a pair of its own paths."""
+    """Check that each excuse of the map (an exception to side_of_branch) is a pair of its paths."""
     paths = {h.id for h in m.map.paths}
     for pair in m.map.excused:
         if not is_pair(pair) or not set(pair) <= paths:

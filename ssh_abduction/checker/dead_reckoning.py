@@ -43,7 +43,7 @@ class ErrorFilter:
     The errors are errors of the pose (x and y in metres, heading in radians), of the scale, and of
     the drift of the heading. The arguments `first` and `last` of the methods are the steps at the
     ends of m loops, as arrays of length m. For a single loop they may be two numbers; then the
-    result has no first axis.
+    result lacks the axis of length m.
 
     Args:
         trace: The trace, with displacements.
@@ -91,17 +91,17 @@ class ErrorFilter:
             self.repeated[t] = onward @ self.repeated[t - 1] + new
 
     def onward(self, first: Any, last: Any) -> Array:
-        """Compute F(last, first), (m, 3, 3): how a pose error at `first` shows at `last`."""
+        """Compute F(last, first) of shape (m, 3, 3): how a pose error at `first` moves `last`."""
         return _onward(self.pose[last, :2] - self.pose[first, :2])
 
     def since(self, first: Any, last: Any) -> Array:
-        """Compute the covariance at `last` of the noise between `first` and `last`, (m, 3, 3)."""
+        """Compute the covariance, (m, 3, 3), that noise between `first` and `last` causes."""
         onward = self.onward(first, last)
         covariance: Array = self.white[last] - onward @ self.white[first] @ onward.swapaxes(-1, -2)
         return covariance
 
     def new_until(self, end: int) -> Array:
-        """For each step, return the covariance at `end` of the noise up to it, (end + 1, 9)."""
+        """Return the covariance at `end` from the noise up to each step, of shape (end + 1, 9)."""
         onward = self.onward(np.arange(end + 1), np.full(end + 1, end))
         covariance: Array = (onward @ self.white[: end + 1] @ onward.swapaxes(-1, -2)).reshape(
             -1, 9
@@ -109,14 +109,17 @@ class ErrorFilter:
         return covariance
 
     def repeated_since(self, first: Any, last: Any) -> Array:
-        """Compute the closing errors, (m, 3, 2), from one sigma of the scale and of the drift."""
+        """Compute the closing errors that one standard deviation of scale, and of drift, causes.
+
+        The shape is (m, 3, 2).
+        """
         moved: Array = (
             self.repeated[last] - self.onward(first, last) @ self.repeated[first]
         ) * self.sigma
         return moved
 
     def covariance(self, first: Any, last: Any) -> Array:
-        """Compute the covariance of the closing error of each loop, (m, 3, 3).
+        """Compute the covariance of the closing error of each loop, of shape (m, 3, 3).
 
         Errors of the heading have effects that are not linear. The covariance is enlarged by a
         bound on these effects.
@@ -168,7 +171,7 @@ class ErrorFilter:
         return known
 
     def closing(self, first: Any, last: Any) -> Array:
-        """Compute the closing error of each loop (x, y, heading), (m, 3).
+        """Compute the closing error (x, y, heading) of each loop, of shape (m, 3).
 
         This is the pose at `last` minus the pose at `first`, by dead reckoning.
         """
@@ -178,7 +181,7 @@ class ErrorFilter:
 
 
 def _onward(moved: Array) -> Array:
-    """Compute F, (m, 3, 3): how errors of the pose change by the movements `moved`, (m, 2)."""
+    """Compute F of shape (m, 3, 3): how movements `moved`, (m, 2), change errors of the pose."""
     onward = np.zeros((*moved.shape[:-1], 3, 3))
     onward[..., range(3), range(3)] = 1.0
     onward[..., 0, 2], onward[..., 1, 2] = -moved[..., 1], moved[..., 0]
@@ -186,7 +189,7 @@ def _onward(moved: Array) -> Array:
 
 
 class Drifts:
-    """Iterates over possible drifts of the heading, no drift first.
+    """Iterates over possible drifts of the heading. The first one is no drift.
 
     For each drift it yields an `ErrorFilter` with the poses for this drift, and the chi-square of
     the drift itself. Poses are computed at their first use.

@@ -187,7 +187,10 @@ def closure(m: Reading) -> Found:
 
 
 def _p_value(match: Closure, odometry: Odometry, freedom: int) -> float:
-    """Compute how probable a closure so far from zero is if poses, or positions, are equal."""
+    """Compute the p-value of a closure if its two steps have equal poses, or equal positions.
+
+    `freedom` is 3 for poses and 2 for positions.
+    """
     import numpy as np
     from scipy.special import chdtrc  # scipy.stats has the same, and loads for half a second
 
@@ -200,7 +203,10 @@ def _p_value(match: Closure, odometry: Odometry, freedom: int) -> float:
 
 
 def planar(m: Reading) -> Found:
-    """Check that the map can be drawn in the plane without a crossing, right turns to the right."""
+    """Check that the map can be drawn in the plane without a crossing.
+
+    In the drawing, right turns must lead to the right.
+    """
     place_of = {s.id: s.place for s in m.states.values() if s.place is not None}
     headings = {s: heading for s in place_of if (heading := heading_of(m.states[s])) is not None}
     turns = [

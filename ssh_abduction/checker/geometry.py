@@ -252,9 +252,9 @@ def _refused_together(
 def _sets(rows: Steps, filtered: ErrorFilter, most: float) -> Iterator[tuple[Steps, Steps]]:
     """Yield the pairs of returns whose loops overlap and that need a test, in portions.
 
-    A portion is two arrays, each with the indices in `rows` of one return of each pair. `rows` has
-    the first step, last step and degrees of freedom of each return, sorted by last step, (m, 3).
-    `most` is the least chi-square that may be rejected.
+    A portion is two arrays: for each pair, the indices of its two returns in `rows`. `rows` is of
+    shape (m, 3): the first step, last step and degrees of freedom of each return, sorted by last
+    step. `most` is the least chi-square that may be rejected.
     """
     alone = _EachReturn(filtered, rows)
     found = []
@@ -273,9 +273,9 @@ class _EachReturn:
     """Values of m returns, each taken alone.
 
     Attributes:
-        inverse: The inverse of the covariance of each closing error, (m, 9).
-        square: The chi-square of each return, (m,).
-        repeated: The part of each covariance that scale and drift cause, (m, 9).
+        inverse: The inverse of the covariance of each closing error. Shape (m, 9).
+        square: The chi-square of each return. Shape (m,).
+        repeated: The part of each covariance that scale and drift cause. Shape (m, 9).
     """
 
     def __init__(self, filtered: ErrorFilter, rows: Steps) -> None:
@@ -377,7 +377,7 @@ def _square_together(filtered: ErrorFilter, rows: Steps, here: Steps, others: St
 
 
 def _square(off: Array, covariance: Array) -> Array:
-    """Compute the chi-squares of closing errors `off`, (m, k), with covariances, (m, k, k)."""
+    """Compute the chi-squares of closing errors `off`, m x k, with covariances, m x k x k."""
     square: Array = np.einsum("mi,mi->m", off, np.linalg.solve(covariance, off[..., None])[..., 0])
     return square
 

@@ -1,5 +1,7 @@
 """Find the joins of a map that rest on minimality alone: no axiom and no observation forces them.
 
+A join is two steps that a map has at one place or at one dstate.
+
 >>> from ssh_abduction.data.maps import DState, SSHMap
 >>> from ssh_abduction.data.trace import Trace
 >>> from ssh_abduction.theory.theory import Theory
@@ -69,12 +71,12 @@ def joins_by_minimality(
     - Both are known to be at one place, and along one path in one direction by the robot's travels
       and turns around (`one_dstate_per_course`).
 
-    With headings, a join of places includes how the robot faces there. For each listed join, there
-    is a map that satisfies the axioms and has the joins listed before it, but not this one. There
-    are exceptions: a join may follow from the user's own rules, or from `next_place`, which is off
-    in every preset. With `star=gateways` it is assumed that turns determine the heading. Few turns
-    do not, such as a turn right at a place with two gateways on the right and the same star in both
-    directions.
+    With headings, a join of places also says which way the robot faces there. For each listed join,
+    there is a map that satisfies the axioms and has the joins listed before it, but not this one.
+    There are exceptions: a join may follow from the user's own rules, or from `next_place`, which
+    is off in every preset. With `star=gateways` it is assumed that turns determine the heading. A
+    few turns do not, such as a turn right at a place with two gateways on the right and the same
+    star in both directions.
 
     Args:
         theory: The theory, with each "auto" replaced; Theory.topological() if None.
@@ -191,7 +193,7 @@ class _JoinCollector:
         return tuple(sorted(found, key=lambda join: (join.second, join.first)))
 
     def _is_forced(self, first: int, second: int) -> bool:
-        """Whether it is known that two steps are one dstate. In the map, they must be one."""
+        """Whether two steps at one dstate of the map are known to be one dstate."""
         if second in self.asserted:
             return True
         here = self.map.dstates[self.map.dstate_at[second]]

@@ -189,7 +189,7 @@ class _Errors:
         return float(z @ z)
 
     def _closings(self, z: Array) -> tuple[Array, Array]:
-        """Compute c(z), by how much loops and closures are off, and J, its derivatives by z."""
+        """Compute c(z), by how much loops and closures are off, and its derivatives J."""
         size = len(self._moved)
         scale, bend = self._sigma * z[-2:]
         noise = np.einsum("tij,tj->ti", self._root, z[: 3 * size].reshape(size, 3))
@@ -245,7 +245,7 @@ class _Errors:
         return np.array(off), np.concatenate(rows) if rows else np.zeros((0, self._size))
 
     def _row(self, pose: Array, own: Array, first: int, last: int) -> Array:
-        """Compute how the pose at `last` minus that at `first` changes with all unknowns."""
+        """Compute the derivatives, by all unknowns, of the pose at `last` minus that at `first`."""
         along = slice(first + 1, last + 1)
         rest = pose[last, :2] - pose[along, :2]
         # An error of the heading turns the rest of the way.
@@ -259,10 +259,11 @@ class _Errors:
 
 
 def _off_dstates(trace: Trace) -> Array:
-    """The standard deviations of the robot's error at dstates, (steps, 3), metres and radians.
+    """The standard deviations of the robot's pose relative to its dstate, of shape (steps, 3).
 
-    Turns do not move the robot, so the k steps of a visit share one error of position. To count
-    this error once, each of the steps gets k times its variance. Empty if none are declared.
+    They are in metres and radians. Turns do not move the robot, so the k steps of a visit share one
+    error of position. To count this error once, each of the steps gets k times its variance. Empty
+    if the odometry declares no such errors.
     """
     odometry = trace.odometry or Odometry()
     if not odometry.offset and not odometry.facing:
@@ -286,7 +287,7 @@ def likely_moves(
 ) -> Iterator[tuple[int, tuple[float, float, float]]]:
     """Guess the displacements that lead to the `missing` steps.
 
-    `moved` has the displacement that leads to each of n steps, (n, 3), in metres and radians.
+    `moved`, of shape (n, 3), has the displacement that leads to each step, in metres and radians.
     `dstates` and `places` have the dstate and the place of each step.
     """
     begins = [0, *sorted(missing)]
@@ -330,7 +331,10 @@ def _frame(
     known: dict[int, int],
     position: dict[int, complex],
 ) -> _Frame | None:
-    """Find the origin of a stretch, by a dstate or two places with known poses; else None."""
+    """Find the origin of a stretch of steps, from a dstate or two places with known poses.
+
+    None if the stretch has neither.
+    """
     for t in steps:
         if dstates[t] in known:
             at, heading = pose[known[dstates[t]]]

@@ -33,7 +33,7 @@ class Reading:
         map: The map.
         theory: The theory.
         steps: The numbers of all steps. With several drives, a step prints with its drive's name.
-        axioms: Names of the axioms that hold.
+        axioms: Names of the theory's axioms.
         records: For each id, the dstates of the map with this id. A malformed map may have several.
         first: The first step of each label.
         views: The first step of each pair (label, view). Views that the map ignores are left out.
@@ -206,7 +206,7 @@ class Order:
         listed: The places as the map lists them, in direction +1.
         travels: For pairs (p, q) of places, a travel that shows that p comes before q in
             direction +1.
-        axioms: Names of the axioms that hold.
+        axioms: Names of the theory's axioms.
 
     Attributes:
         listed: The argument `listed`.
@@ -304,7 +304,10 @@ class Order:
         return self.listed[i + 1 :] if direction == 1 else self.listed[:i]
 
     def _follows(self, p: int, direction: int) -> list[int]:
-        """Find the places that travels, or else the list of a total order, put after p."""
+        """Find the places after p: by travels, and in a total order also by the list.
+
+        If a travel contradicts the list, the travel decides.
+        """
         travelled = self._next[direction].get(p, {})
         later = self._later(p, direction) if self._total else ()
         return [

@@ -54,7 +54,7 @@ def _beside(m: Reading) -> dict[_Places, str]:
 
 
 def _between(m: Reading) -> dict[_Places, str]:
-    """Find the region of each place right of courses: all places right of the same courses."""
+    """For each place right of some courses, find its region: the places right of all of these."""
     sides = m.once(known_sides)
     found = {}
     for p in {p for places in sides.values() for p in places}:
@@ -65,7 +65,7 @@ def _between(m: Reading) -> dict[_Places, str]:
 
 
 def _behind(m: Reading) -> dict[_Places, int]:
-    """Find the regions that one place cuts off, each with this place."""
+    """Find the regions that one place cuts off. Return this place for each region."""
     links = _links(m)
     parts: dict[_Places, int] = {}
     for node in [node for node in links if node[0] == "place"]:

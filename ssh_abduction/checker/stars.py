@@ -51,7 +51,7 @@ def star_frame(m: Reading) -> Found:
 
 
 def _alike(place: int, seen: Sequence[tuple[Openings, int]]) -> Found:
-    """Check that one drive saw the same at a place at all its steps there."""
+    """Check that all steps of one drive at a place saw the same openings."""
     first, at = seen[0]
     for star, i in seen[1:]:
         if star != first:
@@ -59,9 +59,10 @@ def _alike(place: int, seen: Sequence[tuple[Openings, int]]) -> Found:
 
 
 def gateways_by_drive(m: Reading) -> Iterator[tuple[int, str, list[tuple[Openings, int]]]]:
-    """For each place, by number, and each drive there, by time, yield what the drive saw there.
+    """Yield what each drive saw at each place: the place, the name of the drive, and the sights.
 
-    The third value has pairs: the openings, turned into slots of the place, and the step.
+    They are sorted by place, then by time. A sight is a pair: the openings, turned into slots of
+    the place, and the step.
     """
     seen: dict[tuple[int, int], list[tuple[Openings, int]]] = {}
     names = [m.trace.drive or m.trace.name or ALONE]
