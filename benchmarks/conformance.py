@@ -31,7 +31,10 @@ def cases() -> list[tuple[Trace, Theory]]:
     sys.path.insert(0, str(ROOT / "tests"))
     import test_tables as tables
 
-    small = [tuple(row.values[:2]) for row in tables.test_small_traces.pytestmark[0].args[1]]
+    small = [
+        tuple(row.values[:2])
+        for row in tables.test_small_traces_have_the_known_numbers_of_maps.pytestmark[0].args[1]
+    ]
     round_about = [
         (tables.rectangle(actions), theory)
         for theory, *_ in tables.NOTCHED

@@ -41,11 +41,11 @@ def run() -> Trace:
 
 @parametrize_with_checks([PanoramaTransformer()])
 @pytest.mark.filterwarnings("ignore")
-def test_the_transformer_keeps_the_rules_of_scikit_learn(estimator: Any, check: Any) -> None:
+def test_transformer_keeps_the_rules_of_scikit_learn(estimator: Any, check: Any) -> None:
     check(estimator)
 
 
-def test_walls_stand_as_high_as_the_laser_says_that_they_are_near(
+def test_wall_heights_in_a_panorama_fit_laser_ranges(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(Paint, "texture", lambda self, key: np.array([0.9] * 13 + [0.0] * 36))
@@ -64,7 +64,7 @@ def test_walls_stand_as_high_as_the_laser_says_that_they_are_near(
     assert np.abs(height - expected).max() < 0.005
 
 
-def test_a_turn_of_the_robot_turns_the_panorama() -> None:
+def test_turning_the_robot_shifts_the_panorama() -> None:
     camera = Camera(noise=0, hours=(20.0, 20.0))
     rng = np.random.default_rng(0)
     first, turned = (
@@ -75,7 +75,7 @@ def test_a_turn_of_the_robot_turns_the_panorama() -> None:
     assert np.abs(first.astype(int) - turned).mean() > 5
 
 
-def test_what_is_in_the_middle_of_a_panorama_is_ahead() -> None:
+def test_middle_of_a_panorama_is_straight_ahead() -> None:
     """Facing the near wall of a room, the robot sees it higher in the middle than behind itself."""
     image = Camera(noise=0).shot(ROOM, (3.8, 1.0, 0.0), np.random.default_rng(0)).astype(int)
     floor = np.abs(image[-1] - image[-1, 0]).max(axis=1) > 3
@@ -83,7 +83,7 @@ def test_what_is_in_the_middle_of_a_panorama_is_ahead() -> None:
     assert not floor[:3].any()
 
 
-def test_repeated_textures_make_opposite_corners_look_alike_and_unique_ones_do_not() -> None:
+def test_only_repeated_textures_make_opposite_corners_look_alike() -> None:
     rectangle = replace(
         ROOM, segments=np.array([[0, 0, 4, 0], [4, 0, 4, 2], [4, 2, 0, 2], [0, 2, 0, 0]], float)
     )
@@ -101,7 +101,7 @@ def test_repeated_textures_make_opposite_corners_look_alike_and_unique_ones_do_n
     assert np.abs(a - b).mean() > 5  # The sun is at one side.
 
 
-def test_clutter_keeps_its_texture_where_it_is_moved() -> None:
+def test_moved_clutter_keeps_its_texture() -> None:
     paint = Paint(1)
     box = np.array([[1.0, 1, 2, 1], [2, 1, 2, 2], [2, 2, 1, 2], [1, 2, 1, 1]])
     before = paint.keys(np.vstack([ROOM.segments, box]), len(ROOM.segments))
@@ -110,7 +110,7 @@ def test_clutter_keeps_its_texture_where_it_is_moved() -> None:
     assert paint.keys(box, 4) != paint.keys(box + 0.37, 4)
 
 
-def test_the_sun_is_brightest_at_noon_and_reddest_when_it_is_low() -> None:
+def test_light_is_brightest_at_noon_and_reddest_in_the_morning() -> None:
     noon, morning, night = Light.at(12), Light.at(7), Light.at(23)
     assert noon.colour.sum() > morning.colour.sum() > night.colour.sum() > 0
     assert morning.colour[0] / morning.colour[2] > noon.colour[0] / noon.colour[2]
@@ -118,7 +118,7 @@ def test_the_sun_is_brightest_at_noon_and_reddest_when_it_is_low() -> None:
     assert night.on(np.array([0.0, 1.0, 2.0])).tolist() == [1, 1, 1]
 
 
-def test_a_camera_makes_up_for_brightness_by_its_exposure() -> None:
+def test_exposure_compensates_for_brightness() -> None:
     rng = np.random.default_rng(0)
     by = {
         exposure: [
@@ -158,7 +158,7 @@ def test_features_do_not_change_with_the_light() -> None:
         assert (distances[same].max() < distances[~same].min()) == parted
 
 
-def test_patches_that_do_not_divide_a_panorama_are_smaller() -> None:
+def test_last_patches_of_a_panorama_may_be_smaller() -> None:
     image = np.arange(5 * 7, dtype=float).reshape(1, -1)
     made = PanoramaTransformer((5, 7, 1), patch=(3, 4), floor=1.0).fit_transform(image)
     table = image.reshape(5, 7)
@@ -180,12 +180,12 @@ def test_patches_that_do_not_divide_a_panorama_are_smaller() -> None:
         ({"floor": -1.0}, "floor: expected a number of 0 or more, got -1.0"),
     ],
 )
-def test_bad_settings_are_named(settings: dict[str, Any], message: str) -> None:
+def test_wrong_transformer_settings_are_refused(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(PerceptionError, match=message):
         PanoramaTransformer(**settings).fit(np.ones((3, 12)))
 
 
-def test_bad_images_and_headers_are_named(run: Trace) -> None:
+def test_wrong_images_and_headers_are_refused(run: Trace) -> None:
     with pytest.raises(PerceptionError, match="images: expected values of 0 or more, got -3"):
         PanoramaTransformer().fit([[1.0, 2.0]]).transform([[1.0, -3.0]])
     with pytest.raises(
@@ -207,12 +207,12 @@ def test_bad_images_and_headers_are_named(run: Trace) -> None:
         ({"noise": -1.0}, "camera.noise: expected a number from 0 to 255, got -1.0"),
     ],
 )
-def test_bad_cameras_are_named(settings: dict[str, Any], message: str) -> None:
+def test_wrong_camera_settings_are_refused(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(SimulatorError, match=message):
         Camera(**settings)
 
 
-def test_the_robot_drives_the_same_with_a_camera_and_without(run: Trace) -> None:
+def test_camera_does_not_change_the_drive(run: Trace) -> None:
     blind = simulate(ROOM, tours=5, seed=500)
     assert [(s.action, s.star, s.displacement, s.truth) for s in blind.steps] == [
         (s.action, s.star, s.displacement, s.truth) for s in run.steps
@@ -223,7 +223,7 @@ def test_the_robot_drives_the_same_with_a_camera_and_without(run: Trace) -> None
 
 
 @pytest.mark.filterwarnings("ignore::perception.errors.ImageWarning")
-def test_the_loop_has_the_true_map_over_a_day_where_views_of_raw_pixels_cannot(run: Trace) -> None:
+def test_learner_finds_the_true_map_from_panoramas_over_a_day(run: Trace) -> None:
     clusterer = ViewClusterer(k_max=12, n_init=3, random_state=0)
     learner = BootstrapLearner(VIEWS_ALONE, clusterer).fit(run)
     assert one_to_one(learner.labels_, true_dstates(run))
@@ -241,7 +241,7 @@ def test_the_loop_has_the_true_map_over_a_day_where_views_of_raw_pixels_cannot(r
 
 
 @pytest.mark.filterwarnings("ignore::perception.errors.ImageWarning")
-def test_any_clusterer_plugs_in(run: Trace) -> None:
+def test_learner_of_panoramas_accepts_any_clusterer(run: Trace) -> None:
     part = replace(run, steps=(*run.steps[8:23], replace(run.steps[23], action=None)))
     learner = BootstrapLearner(VIEWS_ALONE, AgglomerativeClustering(4, linkage="average")).fit(
         [run, part]
@@ -249,14 +249,14 @@ def test_any_clusterer_plugs_in(run: Trace) -> None:
     assert one_to_one(learner.labels_, np.concatenate([true_dstates(run), true_dstates(run)[8:24]]))
 
 
-def test_a_recogniser_of_panoramas_is_stored(run: Trace, tmp_path: Path) -> None:
+def test_recogniser_of_panoramas_survives_a_round_trip(run: Trace, tmp_path: Path) -> None:
     images, labels = images_of(run), np.arange(len(run)) % 8
     save(recogniser(features=features_of(run)).fit(images, labels), tmp_path / "r.skops")
     assert load(tmp_path / "r.skops").labels(images) == labels.tolist()
 
 
 @pytest.mark.filterwarnings("ignore::perception.errors.ImageWarning")
-def test_panoramas_in_the_shell(
+def test_shell_simulates_and_clusters_panoramas(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -300,7 +300,7 @@ def test_panoramas_in_the_shell(
         ),
     ],
 )
-def test_bad_options_are_named(
+def test_simulate_refuses_wrong_camera_options(
     options: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert (

@@ -47,7 +47,9 @@ def walked(corners: Points, pace: float = PACE) -> Array:
         (STRAIGHT, [(0, 0), (8, 0), (10, 1.5), (12, 0), (20, 0)], []),  # around somebody
     ],
 )
-def test_stretches_lead_apart_where_both_go_on(first: Points, last: Points, where: Points) -> None:
+def test_lead_apart_finds_where_two_stretches_diverge(
+    first: Points, last: Points, where: Points
+) -> None:
     ours, theirs = walked(first), walked(last)
     found = [(ours[a] + theirs[b]) / 2 for a, b in lead_apart(cdist(ours, theirs))]
     assert len(found) >= len(where)
@@ -90,7 +92,7 @@ def added(visits: Sequence[Visit], every: Sequence[Visit]) -> list[Visit]:
 
 @pytest.mark.parametrize("pose", [(0.0, 0.0, 0.0), (5.0, -3.0, 0.4), (0.0, 50.0, -2.0)])
 @pytest.mark.parametrize(("first", "last"), [(STRAIGHT, LANE), (LANE, STRAIGHT)])
-def test_each_pass_of_a_parting_has_a_visit(
+def test_each_pass_of_a_parting_gets_a_visit(
     first: Points, last: Points, pose: tuple[float, float, float]
 ) -> None:
     # The third pass does not leave the first one, but it passes, too.
@@ -120,7 +122,7 @@ def test_each_pass_of_a_parting_has_a_visit(
     ]
 
 
-def test_a_place_nearby_is_the_place_of_a_parting() -> None:
+def test_nearby_visit_serves_as_the_parting() -> None:
     for x, count in ((11.0, 0), (8.0, 2)):
         track, visits, closings = drive([STRAIGHT, LANE], (0.0, 50.0, 0.0), [(x, 0.0)])
         for radius in (0.5, 4.0):  # even if the parting is in its disc
@@ -129,7 +131,7 @@ def test_a_place_nearby_is_the_place_of_a_parting() -> None:
 
 
 @pytest.mark.parametrize(("off", "one"), [(0.8, True), (1.3, False)])
-def test_visits_with_nearly_one_middle_get_the_same_middle(off: float, one: bool) -> None:
+def test_visits_with_near_middles_get_one_middle(off: float, one: bool) -> None:
     pose = (5.0, -3.0, 0.4)
     track, visits, closings = drive([STRAIGHT, STRAIGHT], pose, [(9.0, 0.0)])
     middle = points_moved(pose, visits[1].middle[None] + (off, 0.0))[0]
@@ -144,7 +146,7 @@ def test_visits_with_nearly_one_middle_get_the_same_middle(off: float, one: bool
     assert [tuple(found.match.shift) for found in closed] == [pytest.approx((0.0, 0.0))]
 
 
-def test_only_closures_and_short_ways_relate_stretches() -> None:
+def test_stretches_are_compared_after_a_closure_or_short_way() -> None:
     track, visits, closings = drive([STRAIGHT, LANE], (0.0, 0.0, 0.0))
     assert with_partings(track, visits, [])[0] == tuple(visits)
     assert len(with_partings(track, visits, closings)[0]) == 4
@@ -158,7 +160,7 @@ def test_only_closures_and_short_ways_relate_stretches() -> None:
     assert all(math.dist(visit.middle, (11, 0.5)) < 1.0 for visit in added(visits, every))
 
 
-def test_no_stretch_crosses_a_cut_of_the_track() -> None:
+def test_stretches_do_not_cross_a_cut() -> None:
     track, visits, closings = drive([STRAIGHT, LANE], (0.0, 0.0, 0.0))
     cut = Track(track.poses, track.covariances, cuts=(30,))
     assert with_partings(cut, visits, closings)[0] == tuple(visits)

@@ -85,7 +85,7 @@ def test_estimators_keep_the_rules_of_scikit_learn(estimator: Any, check: Any) -
 # reciprocals
 
 
-def test_reciprocals_are_of_metres_and_clipped_at_the_floor() -> None:
+def test_reciprocal_ranges_are_clipped_at_the_floor() -> None:
     assert ReciprocalTransformer(0.1).fit_transform([[0.5, 0.05, 4.0]]).tolist() == [[2, 10, 0.25]]
 
 
@@ -112,7 +112,7 @@ def test_images_of_unequal_length_are_named(estimator: Any) -> None:
         estimator.fit([[1.0, 2.0], [1.0, 3.0], [1.0, 2.0, 3.0]])
 
 
-def test_errors_of_perception_are_the_packages() -> None:
+def test_perception_errors_are_errors_of_the_package() -> None:
     assert issubclass(PerceptionError, AbductionError)
 
 
@@ -127,7 +127,7 @@ def test_errors_of_perception_are_the_packages() -> None:
     st.integers(2, 5),
     st.sampled_from(["normal", "grid", "offset"]),
 )
-def test_quality_is_the_ratio_over_all_pairs(
+def test_cluster_quality_equals_the_ratio_over_all_pairs(
     seed: int, count: int, beams: int, clusters: int, kind: str
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -157,7 +157,7 @@ def test_quality_is_the_ratio_over_all_pairs(
 
 @pytest.mark.parametrize(("cell", "block"), [(2, 3), (7, 16), (quality.CELL, quality.BLOCK)])
 @pytest.mark.parametrize("scale", [1e-120, 1.0, 1e120])
-def test_cells_and_blocks_change_nothing(
+def test_quality_does_not_depend_on_cells_and_blocks(
     monkeypatch: pytest.MonkeyPatch, cell: int, block: int, scale: float
 ) -> None:
     monkeypatch.setattr(quality, "CELL", cell)
@@ -176,7 +176,7 @@ def test_cells_and_blocks_change_nothing(
     )
 
 
-def test_near_images_far_from_others_are_compared_exactly() -> None:
+def test_spanning_tree_of_near_images_is_exact() -> None:
     # Squared distances of 1e-14 next to norms of 1e6 are lost in the rounding of |a|² + |b|² - 2ab.
     rng = np.random.default_rng(0)
     images = np.concatenate(
@@ -197,7 +197,7 @@ def test_near_images_far_from_others_are_compared_exactly() -> None:
     )
 
 
-def test_a_tree_serves_every_labeling() -> None:
+def test_spanning_tree_serves_every_labelling() -> None:
     images = np.random.default_rng(0).normal(size=(700, 9))
     tree = spanning_tree(images)
     for k in (2, 5, 30):
@@ -207,7 +207,7 @@ def test_a_tree_serves_every_labeling() -> None:
         )
 
 
-def test_quality_where_it_degenerates() -> None:
+def test_cluster_quality_of_degenerate_input() -> None:
     images = np.array([[0.0], [0.0], [1.0]])
     assert math.isnan(cluster_quality(images, [0, 0, 0]))
     assert cluster_quality(images, [0, 0, 1]) == math.inf
@@ -225,17 +225,17 @@ def test_many_equal_images_are_clustered_quickly() -> None:
 
 
 @pytest.mark.parametrize("labels", [[0, 1], [[0], [1], [1]], []])
-def test_labels_are_one_an_image(labels: Any) -> None:
+def test_cluster_quality_refuses_a_wrong_number_of_labels(labels: Any) -> None:
     with pytest.raises(PerceptionError, match="labels: expected a row of 3 labels"):
         cluster_quality([[0.0], [1.0], [2.0]], labels)
 
 
-def test_quality_of_images_that_are_not_finite_is_refused() -> None:
+def test_cluster_quality_refuses_images_that_are_not_finite() -> None:
     with pytest.raises(ValueError, match="infinity"):
         cluster_quality([[0.0], [np.inf]], [0, 1])
 
 
-def test_memory_is_that_of_blocks_not_of_all_pairs() -> None:
+def test_cluster_quality_needs_memory_for_blocks_only() -> None:
     images = np.random.default_rng(0).normal(size=(6_000, 4)) + 10 * (np.arange(6_000) % 2)[:, None]
     tracemalloc.start()
     cluster_quality(images, np.arange(6_000) % 2)
@@ -247,7 +247,7 @@ def test_memory_is_that_of_blocks_not_of_all_pairs() -> None:
 # M, trimmed
 
 
-def test_trimmed_quality_is_the_ratio_of_quantiles() -> None:
+def test_trimmed_quality_equals_the_ratio_of_quantiles() -> None:
     images, truth = blobs(4, 10, spread=0.4, seed=3)
     distances = squareform(pdist(images))
     for trim in (0.0, 0.1, 0.5):
@@ -265,7 +265,7 @@ def test_trimmed_quality_is_the_ratio_of_quantiles() -> None:
         trimmed_quality(images, truth[1:])
 
 
-def test_trimmed_quality_where_it_degenerates(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_trimmed_quality_of_degenerate_input(monkeypatch: pytest.MonkeyPatch) -> None:
     images = np.array([[0.0], [0.0], [1.0], [3.0]])
     assert math.isnan(trimmed_quality(images, [0, 0, 0, 0]))
     assert trimmed_quality(images, [0, 1, 2, 3]) == 0
@@ -280,7 +280,7 @@ def test_trimmed_quality_where_it_degenerates(monkeypatch: pytest.MonkeyPatch) -
     )  # a cluster without an image in the sample
 
 
-def test_one_lost_beam_changes_m_and_not_trimmed_m() -> None:
+def test_one_lost_beam_changes_quality_but_not_trimmed_quality() -> None:
     images, truth = blobs(4, 20)
     spoilt = images.copy()
     spoilt[0, 0] += 2.5  # almost as far as the next cluster
@@ -292,7 +292,7 @@ def test_one_lost_beam_changes_m_and_not_trimmed_m() -> None:
 
 
 @given(st.lists(st.tuples(st.integers(0, 3), st.sampled_from("abcd")), min_size=1, max_size=40))
-def test_uncertainty_is_information_over_entropy(pairs: list[tuple[int, str]]) -> None:
+def test_uncertainty_coefficient_is_information_over_entropy(pairs: list[tuple[int, str]]) -> None:
     seen, truth = zip(*pairs, strict=True)
     shares = np.unique(seen, return_counts=True)[1] / len(seen)
     entropy = -(shares * np.log(shares)).sum()
@@ -300,7 +300,7 @@ def test_uncertainty_is_information_over_entropy(pairs: list[tuple[int, str]]) -
     assert uncertainty_coefficient(seen, truth) == pytest.approx(expected, abs=1e-9)
 
 
-def test_uncertainty_forgives_aliasing_and_not_variability() -> None:
+def test_uncertainty_coefficient_tolerates_aliasing_only() -> None:
     assert uncertainty_coefficient([0, 0, 1, 1], ["a", "b", "c", "c"]) == pytest.approx(1)
     assert uncertainty_coefficient([0, 1, 0, 1], ["a", "a", "b", "b"]) == pytest.approx(0)
     with pytest.raises(PerceptionError, match="truth: expected 2 states, one for each entry"):
@@ -310,7 +310,7 @@ def test_uncertainty_forgives_aliasing_and_not_variability() -> None:
 # views
 
 
-def test_k_is_where_the_quality_peaks() -> None:
+def test_clusterer_chooses_k_with_the_best_quality() -> None:
     images, truth = blobs(5, 20)
     found = ViewClusterer(random_state=0).fit(images)
     assert found.k_ == 5
@@ -327,7 +327,7 @@ def test_k_is_where_the_quality_peaks() -> None:
     assert (found.predict(images) == nearest).all()
 
 
-def test_the_runner_up_is_what_trimmed_m_likes_about_as_well() -> None:
+def test_runner_up_has_nearly_the_best_trimmed_quality() -> None:
     """Two pairs of near clusters: the farther the pairs, the less reason for four."""
     rng = np.random.default_rng(0)
     found = {}
@@ -368,7 +368,7 @@ def test_many_images_are_clustered_from_a_sample(monkeypatch: pytest.MonkeyPatch
     assert adjusted_rand_score(truth, found.labels_) == 1
 
 
-def test_the_same_seed_gives_the_same_views() -> None:
+def test_equal_seeds_give_equal_views() -> None:
     images = np.random.default_rng(0).normal(size=(80, 4))
     first, second = (ViewClusterer(random_state=3).fit(images) for _ in range(2))
     assert first.quality_ == second.quality_
@@ -376,7 +376,7 @@ def test_the_same_seed_gives_the_same_views() -> None:
 
 
 @pytest.mark.parametrize("clusterer", [AgglomerativeClustering(), KMeans(n_init=2)])
-def test_other_clusterers_are_swept(clusterer: Any) -> None:
+def test_clusterers_with_k_are_tried_for_every_k(clusterer: Any) -> None:
     images, truth = blobs(4, 15)
     before = clusterer.get_params()
     found = ViewClusterer(clusterer=clusterer, k_max=7, random_state=0).fit(images)
@@ -387,7 +387,7 @@ def test_other_clusterers_are_swept(clusterer: Any) -> None:
 
 
 @pytest.mark.parametrize("clusterer", [DBSCAN(eps=1.0, min_samples=3), MeanShift(bandwidth=1.5)])
-def test_clusterers_without_a_number_of_clusters_are_used_as_they_are(clusterer: Any) -> None:
+def test_clusterers_without_k_are_fitted_once(clusterer: Any) -> None:
     images, truth = blobs(4, 15)
     found = ViewClusterer(clusterer=clusterer).fit(images)
     assert found.k_ == 4
@@ -396,7 +396,7 @@ def test_clusterers_without_a_number_of_clusters_are_used_as_they_are(clusterer:
     assert hasattr(found, "cluster_centers_") == isinstance(clusterer, MeanShift)
 
 
-def test_noise_is_no_view() -> None:
+def test_noise_gets_no_view() -> None:
     images = np.concatenate([blobs(3, 15)[0], np.full((1, 8), 50.0)])
     found = ViewClusterer(clusterer=DBSCAN(eps=1.0)).fit(images)
     assert found.k_ == 3
@@ -416,7 +416,7 @@ def test_noise_is_no_view() -> None:
         (HDBSCAN(min_cluster_size=5, copy=True), [4]),
     ],
 )
-def test_mixtures_and_thresholds_plug_in(clusterer: Any, tried: list[int]) -> None:
+def test_mixtures_and_thresholds_can_be_clusterers(clusterer: Any, tried: list[int]) -> None:
     images, truth = blobs(4, 15)
     found = ViewClusterer(clusterer=clusterer, k_max=6, random_state=0).fit(images)
     assert (found.k_, list(found.quality_)) == (4, tried)
@@ -433,7 +433,7 @@ def test_mixtures_and_thresholds_plug_in(clusterer: Any, tried: list[int]) -> No
     assert not hasattr(clusterer, "means_")
 
 
-def test_a_given_clusterer_becomes_one_of_views() -> None:
+def test_any_clusterer_becomes_a_view_clusterer() -> None:
     images = blobs(4, 15)[0]
     assert as_view_clusterer(GaussianMixture(3, random_state=0)).fit(images).k_ == 3
     assert as_view_clusterer(DBSCAN(eps=1.0)).fit(images).k_ == 4
@@ -468,7 +468,7 @@ def test_empty_components_of_a_mixture_give_no_views() -> None:
 # confidence
 
 
-def test_confidence_is_that_of_the_own_centre_against_the_next() -> None:
+def test_confidence_compares_the_two_nearest_centres() -> None:
     images, truth = blobs(3, 12)
     sure = confidence(images, truth)
     for i in (0, 7, 35):
@@ -484,7 +484,7 @@ def test_confidence_is_that_of_the_own_centre_against_the_next() -> None:
     assert ViewClusterer(k=3, random_state=0).fit(images).confidence_.tolist() == sure.tolist()
 
 
-def test_confidence_where_nothing_tells() -> None:
+def test_confidence_of_degenerate_input() -> None:
     images, truth = blobs(3, 12)
     alone = np.vstack([images, np.full((1, 8), 40.0)])
     assert confidence(alone, [*truth, 3])[-1] == 0.5
@@ -500,7 +500,7 @@ def test_confidence_where_nothing_tells() -> None:
         nearest_views(images, [-1] * 36)
 
 
-def test_doubtful_images_and_views_are_said() -> None:
+def test_warning_names_doubtful_images_and_views() -> None:
     truth, sure = np.arange(60) % 3, np.full(60, 0.99)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -519,7 +519,7 @@ def test_doubtful_images_and_views_are_said() -> None:
         warn_of_doubts(truth, sure, 0.4)
 
 
-def test_equal_images_are_one_view() -> None:
+def test_equal_images_give_one_view() -> None:
     with pytest.warns(ImageWarning, match="all 6 images are equal: they are taken as one view"):
         found = ViewClusterer().fit(np.ones((6, 3)))
     assert found.k_ == 1
@@ -528,7 +528,7 @@ def test_equal_images_are_one_view() -> None:
     assert found.predict([[2.0, 2.0, 2.0]]).tolist() == [0]
 
 
-def test_a_few_different_images_bound_k() -> None:
+def test_k_is_at_most_the_number_of_different_images() -> None:
     images = np.repeat(np.eye(3), 5, axis=0)
     found = ViewClusterer(random_state=0).fit(images)
     assert (found.k_, found.quality_[3], max(found.quality_)) == (3, math.inf, 3)
@@ -549,7 +549,7 @@ def test_a_few_different_images_bound_k() -> None:
         ({"clusterer": DBSCAN(), "k": 2}, "k: DBSCAN finds the number of clusters itself"),
     ],
 )
-def test_contradicting_settings_of_a_view_clusterer_are_refused(
+def test_contradicting_clusterer_settings_are_refused(
     settings: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(PerceptionError, match=message):
@@ -561,7 +561,7 @@ def test_one_image_cannot_be_clustered() -> None:
         ViewClusterer().fit([[1.0, 2.0]])
 
 
-def test_images_that_are_not_finite_need_the_transformer() -> None:
+def test_transformer_makes_infinite_ranges_usable() -> None:
     images = 1 / (0.3 + np.abs(blobs(3, 10)[0]))
     images[::7, 0] = np.inf
     with pytest.raises(ValueError, match="infinity"):
@@ -576,7 +576,7 @@ def test_images_that_are_not_finite_need_the_transformer() -> None:
 # recognition
 
 
-def test_the_nearest_image_names_the_place() -> None:
+def test_recogniser_returns_the_place_of_the_nearest_image() -> None:
     images, truth = blobs(4, 10)
     places = np.array(["north", "east", "south", "west"])[truth]
     model = PlaceRecogniser().fit(images, places)
@@ -590,7 +590,7 @@ def test_the_nearest_image_names_the_place() -> None:
         PlaceRecogniser(41).fit(images, places)
 
 
-def test_a_learning_curve_rises_to_certainty() -> None:
+def test_learning_curve_rises_to_one() -> None:
     images, truth = blobs(4, 30, spread=0.05)
     curve = learning_curve(
         1 / (0.5 + np.abs(images)), truth, sizes=[1, 2, 4, 40, 120], random_state=0
@@ -602,7 +602,7 @@ def test_a_learning_curve_rises_to_certainty() -> None:
     assert 0.2 < curve.mean[1] <= 0.5  # Two of four places were seen.
 
 
-def test_a_learning_curve_never_tests_on_what_it_learned() -> None:
+def test_learning_curve_tests_on_held_out_images() -> None:
     # Every image differs from all others, so only an image itself could tell its label.
     rng = np.random.default_rng(0)
     curve = learning_curve(
@@ -611,7 +611,7 @@ def test_a_learning_curve_never_tests_on_what_it_learned() -> None:
     assert curve.mean[0] < 0.15
 
 
-def test_places_seen_once_are_learned_and_not_tested() -> None:
+def test_learning_curve_does_not_test_places_seen_once() -> None:
     images, truth = blobs(3, 10)
     labels = np.append(truth, 3)
     curve = learning_curve(
@@ -625,7 +625,7 @@ def test_places_seen_once_are_learned_and_not_tested() -> None:
     assert curve.mean == (1.0,)
 
 
-def test_a_learning_curve_warns_once() -> None:
+def test_learning_curve_warns_once() -> None:
     images, truth = blobs(2, 10)
     images = np.abs(images) + 0.5
     images[3, 3] = np.inf
@@ -643,7 +643,7 @@ def test_a_learning_curve_warns_once() -> None:
         ({"sizes": [6], "folds": 7}, "folds: expected at most 6"),
     ],
 )
-def test_learning_curves_that_cannot_be_drawn(arguments: dict[str, Any], message: str) -> None:
+def test_learning_curve_refuses_wrong_arguments(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(PerceptionError, match=message):
         learning_curve(np.ones((6, 2)), [0, 0, 0, 1, 1, 1], **arguments)
 
@@ -651,7 +651,7 @@ def test_learning_curves_that_cannot_be_drawn(arguments: dict[str, Any], message
 # what distinguishes two dstates
 
 
-def test_the_feature_that_differs_tells_two_apart() -> None:
+def test_telling_features_find_the_feature_that_differs() -> None:
     rng = np.random.default_rng(0)
     labels = np.repeat([3, 8, 5], 20)
     images = rng.normal(
@@ -681,7 +681,7 @@ def test_the_feature_that_differs_tells_two_apart() -> None:
         ([0, 1], (0, 1), "labels: expected 4, one per image"),
     ],
 )
-def test_dstates_that_cannot_be_compared(
+def test_telling_features_refuse_wrong_pairs(
     labels: list[int], pair: tuple[int, int], message: str
 ) -> None:
     with pytest.raises(PerceptionError, match=message):
@@ -704,7 +704,7 @@ def fitted() -> Any:
         ViewClusterer(clusterer=DBSCAN(eps=1.0)),
     ],
 )
-def test_fitted_estimators_pickle_and_clone(model: Any) -> None:
+def test_fitted_estimators_can_be_pickled_and_cloned(model: Any) -> None:
     images = np.abs(blobs(3, 10)[0]) + 1
     model.fit(images)
     again = pickle.loads(pickle.dumps(model))
@@ -713,7 +713,7 @@ def test_fitted_estimators_pickle_and_clone(model: Any) -> None:
     assert repr(clone(model)) == repr(model)
 
 
-def test_a_recogniser_comes_back_from_its_file(tmp_path: Path) -> None:
+def test_recogniser_survives_a_round_trip(tmp_path: Path) -> None:
     model, path = fitted(), tmp_path / "a.skops"
     store.save(model, path)
     held = store.load(path)
@@ -725,7 +725,7 @@ def test_a_recogniser_comes_back_from_its_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("clusterer", [None, AgglomerativeClustering()])
-def test_views_come_back_from_their_file(tmp_path: Path, clusterer: Any) -> None:
+def test_view_clusterer_survives_a_round_trip(tmp_path: Path, clusterer: Any) -> None:
     images = blobs(3, 10)[0]
     model = make_pipeline(
         ReciprocalTransformer(0.5), ViewClusterer(clusterer=clusterer, random_state=0)
@@ -746,7 +746,7 @@ class Trap:
         return os.mkdir, (str(self.mark),)
 
 
-def test_hostile_and_damaged_files_run_nothing(tmp_path: Path) -> None:
+def test_hostile_recogniser_files_run_no_code(tmp_path: Path) -> None:
     mark, good = tmp_path / "mark", tmp_path / "good.skops"
     store.save(fitted(), good)
     whole = good.read_bytes()
@@ -800,21 +800,23 @@ def test_hostile_and_damaged_files_run_nothing(tmp_path: Path) -> None:
         assert not mark.exists(), name
 
 
-def test_an_archive_that_swells_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_recogniser_file_that_unpacks_too_large_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     store.save(fitted(), tmp_path / "a.skops")
     monkeypatch.setattr(store, "LARGEST", 100)
     with pytest.raises(PerceptionError, match="expected at most 100 bytes once unpacked"):
         store.load(tmp_path / "a.skops")
 
 
-def test_files_that_are_not_there(tmp_path: Path) -> None:
+def test_missing_recogniser_files_are_errors(tmp_path: Path) -> None:
     with pytest.raises(PerceptionError, match="expected a readable recogniser: No such file"):
         store.load(tmp_path / "none.skops")
     with pytest.raises(PerceptionError, match="cannot write the recogniser: No such file"):
         store.save(fitted(), tmp_path / "none" / "a.skops")
 
 
-def test_a_model_that_load_would_reject_is_not_saved(tmp_path: Path) -> None:
+def test_save_refuses_a_model_that_load_would_reject(tmp_path: Path) -> None:
     with pytest.raises(PerceptionError, match="expected a model of types that can be read back"):
         store.save(
             make_pipeline(FunctionTransformer(functools.partial(os.mkdir, "x"))),
@@ -827,7 +829,7 @@ def test_a_model_that_load_would_reject_is_not_saved(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_benchmark_runs(capsys: pytest.CaptureFixture[str]) -> None:
+def test_recognition_benchmark_runs(capsys: pytest.CaptureFixture[str]) -> None:
     benchmark.search("dstates", 60)
     assert "60 images" in capsys.readouterr().out
 

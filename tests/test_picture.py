@@ -91,7 +91,7 @@ def page(picture: str) -> tuple[float, float, float, float]:
 
 
 @pytest.mark.parametrize("theory", ["topological", "causal"])
-def test_dots_are_where_the_dstates_are(theory: str) -> None:
+def test_picture_draws_dstates_at_their_poses(theory: str) -> None:
     ssh_map = surveyed(theory)
     assert ssh_map.fit is not None
     found = dots(to_svg(ssh_map))
@@ -106,7 +106,7 @@ def test_dots_are_where_the_dstates_are(theory: str) -> None:
     assert scale > 5
 
 
-def test_the_bar_is_as_long_as_it_says() -> None:
+def test_picture_scale_bar_has_its_stated_length() -> None:
     ssh_map = grid(4, apart=8.0)
     picture = to_svg(ssh_map)
     (metres,) = (float(found) for found in re.findall(r">([0-9.]+) m<", picture))
@@ -122,7 +122,7 @@ def test_the_bar_is_as_long_as_it_says() -> None:
     )
 
 
-def test_arrows_point_where_the_dstates_face() -> None:
+def test_picture_arrows_point_along_the_headings() -> None:
     ssh_map = surveyed()
     assert ssh_map.fit is not None
     turned = {}
@@ -138,7 +138,7 @@ def test_arrows_point_where_the_dstates_face() -> None:
     )
 
 
-def test_ellipses_have_the_axes_of_the_covariance() -> None:
+def test_picture_ellipses_show_the_covariance() -> None:
     ssh_map = grid(3)
     assert ssh_map.fit is not None
     picture = to_svg(ssh_map)
@@ -169,7 +169,7 @@ def test_ellipses_have_the_axes_of_the_covariance() -> None:
     [surveyed(), surveyed("causal"), grid(2), grid(9), grid(3, apart=0.02)],
     ids=["square", "causal", "four", "many", "near"],
 )
-def test_nothing_lies_outside_the_page(ssh_map: SSHMap) -> None:
+def test_picture_marks_lie_within_the_page(ssh_map: SSHMap) -> None:
     picture = to_svg(ssh_map)
     left, top, right, bottom = page(picture)
     inside = []
@@ -195,7 +195,7 @@ def test_nothing_lies_outside_the_page(ssh_map: SSHMap) -> None:
     assert max(right - left, bottom - top) < 2600
 
 
-def test_labels_do_not_overlap() -> None:
+def test_picture_labels_do_not_overlap() -> None:
     for ssh_map in (grid(2), grid(9), grid(3, apart=0.02), surveyed("causal")):
         boxes = []
         for mark in ET.fromstring(to_svg(ssh_map)).iter(f"{SVG}text"):
@@ -208,14 +208,14 @@ def test_labels_do_not_overlap() -> None:
             )
 
 
-def test_each_place_of_a_large_map_is_named() -> None:
+def test_picture_names_each_place_of_a_large_map() -> None:
     ssh_map = grid(9)
     named = {str(mark.text) for mark in ET.fromstring(to_svg(ssh_map)).iter(f"{SVG}text")}
     assert {str(p) for p in ssh_map.places} <= named
     assert "x0 start" in named
 
 
-def test_maps_without_poses_are_drawn_as_before() -> None:
+def test_maps_without_poses_are_drawn_by_layout() -> None:
     (without,) = solve(drive(*TOURS["tee"]), Theory.circumscriptive()).maps
     before = to_svg(without)
     poses = [Pose(0.1 * s.id, 0.0, 0.0) for s in without.dstates]
@@ -230,7 +230,7 @@ def test_maps_without_poses_are_drawn_as_before() -> None:
     assert to_svg(replace(without, fit=Fit(1.0, 1, 0.5, poses=tuple(poses)))) == before
 
 
-def test_the_file_is_written_where_it_is_asked_for(
+def test_export_writes_svg_to_file_or_standard_output(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     surveyed().save(tmp_path / "maps.json")
@@ -245,7 +245,7 @@ def test_the_file_is_written_where_it_is_asked_for(
     assert "cannot write the map" in capsys.readouterr().err
 
 
-def test_bands_of_regions_lie_behind_a_place() -> None:
+def test_picture_draws_bands_of_regions() -> None:
     ssh_map = solve(trace_of(TOUR), LOG, max_maps=1)[0]
     root = ET.fromstring(to_svg(ssh_map))
     groups = [g for g in root.iter(f"{SVG}g") if g.get("class") == "region"]
@@ -259,7 +259,7 @@ def test_bands_of_regions_lie_behind_a_place() -> None:
     assert "region" not in to_svg(replace(ssh_map, regions=None))
 
 
-def test_titles_of_places_name_their_sides() -> None:
+def test_picture_titles_of_places_name_their_sides() -> None:
     corner = solve(Trace.from_steps("abcd", ["travel", "right", "travel"]))[0]
     titles = [node.text for node in ET.fromstring(to_svg(corner)).iter(f"{SVG}title")]
     assert "place 2, right of path 0+, in region 1" in titles

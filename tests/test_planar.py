@@ -72,7 +72,7 @@ def networkx_says(rotation: dict[object, list[object]]) -> bool:
 
 
 @pytest.mark.parametrize("name", NAMED)
-def test_rotation_systems_of_known_graphs(name: str) -> None:
+def test_planarity_test_agrees_with_networkx_on_known_graphs(name: str) -> None:
     graph, rng = NAMED[name], random.Random(name)
     planar, embedding = nx.check_planarity(graph)
     if planar:
@@ -85,7 +85,7 @@ def test_rotation_systems_of_known_graphs(name: str) -> None:
     assert planar or not any(answers)
 
 
-def test_rotation_systems_of_random_graphs() -> None:
+def test_planarity_test_agrees_with_networkx_on_random_graphs() -> None:
     rng = random.Random(0)
     answers = []
     for _ in range(600):
@@ -101,7 +101,7 @@ def test_rotation_systems_of_random_graphs() -> None:
     assert 100 < sum(answers) < 500
 
 
-def test_drawings_with_free_orders_are_those_of_planar_graphs() -> None:
+def test_drawings_with_free_orders_equal_planar_graphs() -> None:
     rng = random.Random(1)
     graphs = [
         NAMED[name]
@@ -113,7 +113,7 @@ def test_drawings_with_free_orders_are_those_of_planar_graphs() -> None:
     assert {True, False} <= set(answers[7:])
 
 
-def test_drawings_with_given_orders_are_those_of_rotation_systems() -> None:
+def test_drawings_with_given_orders_equal_rotation_systems() -> None:
     rng = random.Random(2)
     answers = []
     for _ in range(200):
@@ -137,7 +137,7 @@ def test_drawings_with_given_orders_are_those_of_rotation_systems() -> None:
     assert 20 < sum(answers) < 180
 
 
-def test_streets_that_lead_back_and_parallel_streets() -> None:
+def test_planarity_of_loops_and_parallel_streets() -> None:
     assert is_planar({})
     assert is_planar({"a": (0, 1)})
     assert not is_planar({"a": (0, 2, 1, 3)})
@@ -172,7 +172,7 @@ TREES: list[tuple[str, Cells | None, tuple[int, int, int, int]]] = [
 
 
 @pytest.mark.parametrize(("route", "walls", "counts"), TREES)
-def test_the_table_of_numbers_of_maps(
+def test_numbers_of_planar_maps_equal_the_table(
     route: str, walls: Cells | None, counts: tuple[int, ...]
 ) -> None:
     choices = ([], [passes_no_place_twice], [drawn], [passes_no_place_twice, drawn])
@@ -210,7 +210,7 @@ def equalities(joined: Joined, route: str) -> tuple[tuple[int, ...], tuple[int, 
 
 @pytest.mark.parametrize("planar", [False, True])
 @pytest.mark.parametrize("route", ["ESWN", "EESS", "ESES", "EWE", "EESWN"])
-def test_the_maps_of_the_solver_are_those_of_the_tree(route: str, planar: bool) -> None:
+def test_maps_of_the_solver_equal_the_search_tree(route: str, planar: bool) -> None:
     """The checker accepts the planar maps of the tree, minimal or not.
 
     Two maps of the tree that differ only in headings are one map, planar if one of them is.
@@ -253,7 +253,7 @@ def loose(data: st.DataObject, trace: Trace) -> Theory:
 
 @settings(max_examples=6)
 @given(data=st.data())
-def test_minimal_maps_are_those_of_the_brute_force(data: st.DataObject) -> None:
+def test_minimal_planar_maps_equal_the_brute_force(data: st.DataObject) -> None:
     trace = data.draw(winding(), label="trace")
     theory = loose(data, trace)
     counts, expected = minimal_maps(trace, theory)
@@ -278,7 +278,7 @@ def holds(equality: Equality, ssh_map: SSHMap) -> bool:
     return same == equality.holds
 
 
-def test_what_is_refused_holds_in_no_planar_map_and_the_checker_refuses_the_same() -> None:
+def test_refusals_hold_in_no_planar_map() -> None:
     """Evidence accepts exactly the maps that the brute force calls planar.
 
     No planar map has all equalities for which another one is refused.
@@ -313,7 +313,7 @@ def test_what_is_refused_holds_in_no_planar_map_and_the_checker_refuses_the_same
     assert min(refused, accepted) > 10
 
 
-def test_a_map_cut_to_first_steps_stays_planar() -> None:
+def test_planar_map_cut_to_a_prefix_stays_planar() -> None:
     rng = random.Random(4)
     for _ in range(8):
         letters = [rng.choice("TTRRLA") for _ in range(9)]
@@ -328,7 +328,7 @@ def test_a_map_cut_to_first_steps_stays_planar() -> None:
 
 @settings(max_examples=5)
 @given(data=st.data())
-def test_while_a_robot_drives_maps_are_those_of_solve(data: st.DataObject) -> None:
+def test_online_planar_maps_equal_those_of_solve(data: st.DataObject) -> None:
     trace = data.draw(winding(), label="trace")
     theory = loose(data, trace)
     first = trace.steps[0]
@@ -384,7 +384,7 @@ def true_labels(trace: Trace) -> tuple[int, ...]:
     return tuple(number.setdefault(step.truth, len(number)) for step in trace.steps)
 
 
-def test_planarity_excludes_the_minimal_maps_and_finds_the_true_one(
+def test_planarity_excludes_smaller_maps_and_finds_the_true_one(
     tour: Trace, smaller: Solution
 ) -> None:
     """Four smaller maps explain the tour; their streets cross."""
@@ -400,7 +400,7 @@ def test_planarity_excludes_the_minimal_maps_and_finds_the_true_one(
     assert [ssh_map.labels for ssh_map in solution.maps] == [true_labels(tour)]
 
 
-def test_the_checker_names_streets_that_cross(tour: Trace, smaller: Solution) -> None:
+def test_checker_names_streets_that_cross(tour: Trace, smaller: Solution) -> None:
     ssh_map = smaller.maps[0]
     (violation,) = (v for v in check(tour, ssh_map, Theory(planar=True)) if v.axiom == "planar")
     assert "paths cross" in violation.message
@@ -413,9 +413,7 @@ def test_the_checker_names_streets_that_cross(tour: Trace, smaller: Solution) ->
     }
 
 
-def test_what_is_refused_speaks_of_few_steps_and_tells_their_places_apart(
-    tour: Trace, smaller: Solution
-) -> None:
+def test_refusal_by_planarity_names_few_steps(tour: Trace, smaller: Solution) -> None:
     """A place that the map keeps apart from another one may be where streets meet.
 
     Without this, a refusal would forbid planar maps.
@@ -438,7 +436,7 @@ def test_what_is_refused_speaks_of_few_steps_and_tells_their_places_apart(
 @pytest.mark.parametrize("star", ["frame", "none"])
 @pytest.mark.parametrize("follow", [True, False])
 @pytest.mark.parametrize(("cells", "steps"), [(4, 60), (8, 300)])
-def test_the_true_map_of_a_maze_is_not_refused(
+def test_planarity_accepts_the_true_map_of_a_maze(
     cells: int, steps: int, follow: bool, star: Literal["frame", "none"]
 ) -> None:
     """The true map is drawn, although places without frames leave the order of gateways open."""
@@ -457,7 +455,7 @@ def test_the_true_map_of_a_maze_is_not_refused(
 
 
 @pytest.mark.parametrize(("planar", "expected"), [(False, {0, 1}), (True, {1})])
-def test_no_travel_passes_a_place_unseen(planar: bool, expected: set[int]) -> None:
+def test_planarity_forbids_passing_a_place_unseen(planar: bool, expected: set[int]) -> None:
     """After two travels and a turn around, a travel leads back to the second place.
 
     A gateway leads to one gateway; without that, the travel may pass the place.

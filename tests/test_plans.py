@@ -129,7 +129,7 @@ def true_map(plan: Plan, trace: Trace) -> SSHMap:
     ).renumbered()
 
 
-def test_a_plan_is_read_in_metres_with_north_up(ring: Plan) -> None:
+def test_plan_is_read_in_metres_with_north_up(ring: Plan) -> None:
     assert ring.name == "school"
     assert [room.centre for room in ring.rooms] == [
         (5, -5),
@@ -157,7 +157,7 @@ def test_a_plan_is_read_in_metres_with_north_up(ring: Plan) -> None:
     ]  # From a through b into the closet is one path.
 
 
-def test_two_doors_between_two_rooms_are_two(tmp_path: Path) -> None:
+def test_two_doors_between_two_rooms_are_kept(tmp_path: Path) -> None:
     again = [*DOORS, ("a", "b", (99, 20), (101, 20)), ("a", "b", (99, 80), (101, 80))]
     plan = plan_of(tmp_path, xml(again))
     positions = sorted(door.position for door in plan.doors if door.rooms == (0, 1))
@@ -167,7 +167,7 @@ def test_two_doors_between_two_rooms_are_two(tmp_path: Path) -> None:
     assert len(plan.told_apart(20).doors) == len(plan.doors)
 
 
-def test_no_path_comes_back_to_a_room(tmp_path: Path) -> None:
+def test_paths_do_not_return_to_a_room(tmp_path: Path) -> None:
     """From the middle of the inner room, its two doors to the outer room are opposite."""
     doors = [("in", "out", (60, 100), (58, 100)), ("in", "out", (140, 100), (142, 100))]
     plan = plan_of(tmp_path, xml(doors, middles={"in": (100, 100), "out": (100, 400)}))
@@ -177,7 +177,7 @@ def test_no_path_comes_back_to_a_room(tmp_path: Path) -> None:
     assert [len(path) for path in plan.paths] == [1, 1]
 
 
-def test_each_step_is_at_a_room_and_a_door(ring: Plan) -> None:
+def test_each_step_of_a_tour_is_at_a_room_and_a_door(ring: Plan) -> None:
     trace = tour(ring, 60, seed=3)
     assert len(trace) == 61
     assert trace == tour(ring, 60, seed=3) != tour(ring, 60, seed=4)
@@ -213,7 +213,7 @@ def sees(step: Step, bearing: float) -> bool:
     )
 
 
-def test_turns_are_counted_to_their_side(tmp_path: Path) -> None:
+def test_turns_of_a_tour_count_gateways_to_their_side(tmp_path: Path) -> None:
     """In a hub with doors at 0, 60, 120, 195 and 300 degrees, the name of a turn tells its end."""
     bearings = (0, 60, 120, 195, 300)
     plan = hub(tmp_path, bearings)
@@ -246,7 +246,7 @@ def test_turns_are_counted_to_their_side(tmp_path: Path) -> None:
     }  # At 240 it faces no door, since it enters by the one at 60.
 
 
-def test_without_noise_displacements_lead_from_true_pose_to_true_pose(ring: Plan) -> None:
+def test_exact_displacements_connect_true_poses(ring: Plan) -> None:
     trace = tour(ring, 80, seed=1)
     pose = tuple(trace.steps[0].truth["pose"])
     for step in trace.steps[1:]:
@@ -258,7 +258,7 @@ def test_without_noise_displacements_lead_from_true_pose_to_true_pose(ring: Plan
         )
 
 
-def test_noise_does_not_change_the_way(ring: Plan) -> None:
+def test_noise_does_not_change_the_route(ring: Plan) -> None:
     exact, noisy = tour(ring, 40, seed=1), tour(ring, 40, seed=1, odometry=NOISE, scale=0.1)
     assert noisy.odometry == NOISE
     assert noisy.without_displacements().steps == exact.without_displacements().steps
@@ -269,7 +269,7 @@ def test_noise_does_not_change_the_way(ring: Plan) -> None:
     assert sum(ways[1]) / sum(ways[0]) == pytest.approx(1.1, abs=0.03)
 
 
-def test_the_truth_of_a_tour_is_a_map(ring: Plan, tmp_path: Path) -> None:
+def test_truth_of_a_tour_is_a_consistent_map(ring: Plan, tmp_path: Path) -> None:
     trace = tour(ring, 60, seed=3)
     assert (
         check(
@@ -285,7 +285,7 @@ def test_the_truth_of_a_tour_is_a_map(ring: Plan, tmp_path: Path) -> None:
     assert again.actions == trace.actions
 
 
-def test_directions_of_doors_tell_dstates_apart(tmp_path: Path) -> None:
+def test_stars_tell_doors_with_near_directions_apart(tmp_path: Path) -> None:
     """Of four doors, two have nearly one direction: odometry confuses them, the star does not."""
     plan = hub(tmp_path, (0, 7, 120, 240))
     trace = tour(plan, 60, seed=0, odometry=Odometry(along=0.1, heading=0.05))
@@ -295,7 +295,7 @@ def test_directions_of_doors_tell_dstates_apart(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_no_axiom_forbids_the_truth_of_doors_close_together(tmp_path: Path, seed: int) -> None:
+def test_true_map_with_close_doors_satisfies_the_axioms(tmp_path: Path, seed: int) -> None:
     """Errors of bearings and rounding may bring two doors 1.5 degrees close to each other."""
     plan = hub(tmp_path, (0, 3.3, 7, 10.2, 120, 240))
     trace = tour(plan, 60, seed)
@@ -328,12 +328,12 @@ def test_no_axiom_forbids_the_truth_of_doors_close_together(tmp_path: Path, seed
         ('<!DOCTYPE b [<!ENTITY e "e">]>' + xml(), "expected a plan without entities of its own"),
     ],
 )
-def test_what_is_wrong_with_a_plan_is_said(tmp_path: Path, text: str, message: str) -> None:
+def test_malformed_plan_is_refused(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(SimulatorError, match=message):
         plan_of(tmp_path, text)
 
 
-def test_tours_that_cannot_be(tmp_path: Path, ring: Plan) -> None:
+def test_wrong_tours_are_refused(tmp_path: Path, ring: Plan) -> None:
     with pytest.raises(SimulatorError, match="expected a readable plan: No such file"):
         Plan.load(tmp_path / "none.xml")
     with pytest.raises(

@@ -52,7 +52,7 @@ def is_written(path: Path) -> bool:
     return path.stat().st_mtime_ns != before
 
 
-def test_the_result_comes_from_another_process() -> None:
+def test_in_process_returns_the_result_of_another_process() -> None:
     values = list(range(100_000))  # more than a pipe holds
     doubled, process = in_process(double_and_tell_where, values, watch=Watch())
     assert doubled == [2 * value for value in values]
@@ -70,17 +70,17 @@ def test_output_of_a_startup_file_does_not_disturb_a_process(
 
 
 @pytest.mark.parametrize("executable", ["", None, "/usr/bin/robot", "/nowhere/python"])
-def test_where_no_process_can_be_had_work_is_done_here(executable: str | None) -> None:
+def test_in_process_works_here_if_no_process_starts(executable: str | None) -> None:
     with patch.object(sys, "executable", executable):
         assert in_process(double_and_tell_where, [1, 2], watch=Watch()) == ([2, 4], os.getpid())
 
 
-def test_what_work_raises_is_raised_here() -> None:
+def test_in_process_raises_the_error_of_the_work() -> None:
     with pytest.raises(ValueError, match="twice nothing"):
         in_process(fail, "twice nothing", watch=Watch())
 
 
-def test_what_ends_the_search_ends_the_process(tmp_path: Path) -> None:
+def test_interrupt_ends_the_process(tmp_path: Path) -> None:
     path = tmp_path / "written"
     watch = Watch()
 
@@ -97,7 +97,7 @@ def test_what_ends_the_search_ends_the_process(tmp_path: Path) -> None:
     assert not is_written(path)
 
 
-def test_a_process_ends_with_the_one_that_waits_for_it(tmp_path: Path) -> None:
+def test_process_ends_with_its_parent(tmp_path: Path) -> None:
     path = tmp_path / "written"
     program = f"""
 from pathlib import Path
@@ -119,12 +119,12 @@ in_process(write_again_and_again, Path({str(path)!r}), watch=Watch())
         assert time.monotonic() < ends
 
 
-def test_a_process_that_is_killed_stops_the_search() -> None:
+def test_killed_process_is_a_limit_error() -> None:
     with pytest.raises(LimitError):
         in_process(end_at_once, watch=Watch())
 
 
-def test_what_is_left_of_the_memory_is_that_of_the_process() -> None:
+def test_memory_limit_of_a_process_ignores_its_parent() -> None:
     """It does not count the memory of this process."""
     held = b"x" * (150 * 2**20)
     limited = Watch(memory=peak_memory() + 100)

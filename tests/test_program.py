@@ -48,13 +48,13 @@ def hostile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_a_file_of_the_current_folder_is_run_if_nothing_is_done_about_it(hostile: Path) -> None:
+def test_python_imports_modules_of_the_current_folder(hostile: Path) -> None:
     """Without the protection, the modules in the folder are run."""
     subprocess.run([sys.executable, "-c", "import csv"], check=True)
     assert "csv" in (hostile / "mark").read_text()
 
 
-def test_no_process_that_is_begun_runs_a_file_of_the_current_folder(
+def test_workers_import_no_module_of_the_current_folder(
     hostile: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "path", ["", str(hostile), *sys.path])
@@ -65,7 +65,7 @@ def test_no_process_that_is_begun_runs_a_file_of_the_current_folder(
     assert not (hostile / "mark").exists()
 
 
-def test_the_program_runs_no_file_of_the_current_folder(hostile: Path, room: str) -> None:
+def test_program_imports_no_module_of_the_current_folder(hostile: Path, room: str) -> None:
     words = "solve ROOM ROOM --jobs 2 --time-limit 50"
     done = subprocess.run(
         [sys.executable, "-P", "-m", "ssh_abduction", *words.replace("ROOM", room).split()],
@@ -76,7 +76,7 @@ def test_the_program_runs_no_file_of_the_current_folder(hostile: Path, room: str
     assert (done.returncode, (hostile / "mark").exists()) == (0, False), done.stderr
 
 
-def test_without_p_the_program_puts_the_current_folder_behind_all_others(tmp_path: Path) -> None:
+def test_program_without_p_searches_the_current_folder_last(tmp_path: Path) -> None:
     """Python has loaded some other modules by then. runpy does not load these ones."""
     for name in ("csv", "signal", "json", "argparse", "numpy", "clingo"):
         (tmp_path / f"{name}.py").write_text("raise SystemExit(99)")
@@ -92,7 +92,7 @@ def test_without_p_the_program_puts_the_current_folder_behind_all_others(tmp_pat
     assert done.returncode == 0, done.stderr
 
 
-def test_the_current_folder_is_searched_last_for_modules(
+def test_current_folder_moves_to_the_end_of_the_module_path(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -120,7 +120,7 @@ __main__.run()
 
 @POSIX
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_verb_that_ignores_a_signal_ends_with_its_exit_code(number: int, code: int) -> None:
+def test_verb_without_handler_ends_with_the_exit_code_of_the_signal(number: int, code: int) -> None:
     with subprocess.Popen(
         [sys.executable, "-c", DEAF, "facts", ACES], stdout=subprocess.PIPE, text=True
     ) as process:
@@ -162,7 +162,7 @@ def test_ladder_prints_the_rungs_so_far(
 
 @pytest.mark.slow
 @POSIX
-def test_an_interrupted_map_says_so_and_the_next_call_maps_again(
+def test_interrupted_map_run_is_repeated_by_the_next_call(
     tmp_path: Path,
     signals: None,
     monkeypatch: pytest.MonkeyPatch,
@@ -192,7 +192,7 @@ def test_an_interrupted_map_says_so_and_the_next_call_maps_again(
 
 
 @POSIX
-def test_temporary_files_of_workers_go_with_them(tmp_path: Path) -> None:
+def test_temporary_files_of_workers_are_removed(tmp_path: Path) -> None:
     """Also where their parent is killed."""
     told = tmp_path / "told"
     script = f"""
@@ -209,7 +209,7 @@ list(workers.answers(leave_a_temporary_file, [(0, {str(told)!r})], 1, lambda: Fa
     until(lambda: list(tmp_path.iterdir()) == [told])
 
 
-def test_results_of_work_come_in_order() -> None:
+def test_results_of_workers_keep_their_order() -> None:
     """Answers keep their order, and an error is raised in its turn."""
 
     def backwards(work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], *_: Any) -> Any:
@@ -223,7 +223,7 @@ def test_results_of_work_come_in_order() -> None:
 
 
 @pytest.mark.slow
-def test_work_in_processes_gives_results_in_order_and_raises_what_it_raises() -> None:
+def test_results_and_errors_of_processes_keep_their_order() -> None:
     found = report._each(divmod, [(9, i) for i in (4, 3, 2, 1, 0)], 2)
     assert [next(found) for _ in range(4)] == [(2, 1), (3, 0), (4, 1), (9, 0)]
     with pytest.raises(ZeroDivisionError):
@@ -231,7 +231,7 @@ def test_work_in_processes_gives_results_in_order_and_raises_what_it_raises() ->
     assert list(report._each(divmod, [(9, 4)], 2)) == [(2, 1)]
 
 
-def test_work_that_is_killed_is_an_error() -> None:
+def test_killed_worker_is_an_error() -> None:
     killed = patch.object(workers, "answers", lambda *_: iter([workers.Lost(0, late=False)]))
     with killed, pytest.raises(AbductionError, match="expected an answer, got a killed process"):
         list(report._each(divmod, [(9, 4), (9, 3)], 2))

@@ -29,7 +29,7 @@ from ssh_abduction.solver.steps.log import Log
 
 @settings(max_examples=20)
 @given(machines(most_steps=30))
-def test_what_the_solver_writes_holds(trace: Trace) -> None:
+def test_checker_accepts_the_certificates_of_solve(trace: Trace) -> None:
     for theory in (
         (Theory.causal(), Theory.topological().replace(star="none"))
         if len(trace) < 12
@@ -47,7 +47,7 @@ def test_what_the_solver_writes_holds(trace: Trace) -> None:
 
 
 @pytest.mark.parametrize("length", [12, 120])
-def test_a_certificate_is_worked_out_when_asked_for(length: int) -> None:
+def test_certificate_is_computed_on_demand(length: int) -> None:
     """The certificate is written once, for the prefix that clingo was given.
 
     This is so whether or not the search itself needed steps that are apart.
@@ -71,7 +71,7 @@ def test_a_certificate_is_worked_out_when_asked_for(length: int) -> None:
 
 
 @pytest.mark.parametrize("asked", [False, True])
-def test_a_solution_travels_with_its_certificate(asked: bool) -> None:
+def test_pickled_solution_keeps_its_certificate(asked: bool) -> None:
     trace = wandering(2, rooms=5, length=12, views=3)
     solution = solve(trace, Theory.causal())
     if asked:
@@ -88,13 +88,13 @@ def test_a_solution_travels_with_its_certificate(asked: bool) -> None:
     assert replace(solution, support=Support()).certificate is None
 
 
-def test_a_theory_without_what_it_rests_on_has_no_certificate() -> None:
+def test_no_certificate_without_the_axiom_deterministic() -> None:
     trace = wandering(2, rooms=5, length=5, views=3)
     solution = solve(trace, Theory.causal().replace(without=("deterministic",)))
     assert (solution.support.basis, solution.certificate) == (None, None)
 
 
-def test_a_mapper_gives_a_certificate() -> None:
+def test_online_mapper_gives_a_certificate() -> None:
     mapper = OnlineMapper("a", Theory.causal(), time_limit=None)
     for view in "bab":
         mapper.observe("travel", view)
@@ -102,7 +102,7 @@ def test_a_mapper_gives_a_certificate() -> None:
     assert mapper.solution.certificate.bound == 2
 
 
-def test_a_short_trace_is_solved_without_numpy() -> None:
+def test_short_trace_is_solved_without_numpy() -> None:
     """numpy takes longer to load than all the rest."""
     program = textwrap.dedent("""
         import sys
@@ -124,7 +124,7 @@ def certified() -> tuple[Trace, dict[str, Any]]:
     return trace, certificate.to_dict(trace)
 
 
-def test_a_changed_word_is_a_fault() -> None:
+def test_check_bound_refuses_a_changed_word() -> None:
     trace, data = certified()
     assert len(data["words"]) > 5
     for entry in data["words"]:
@@ -139,7 +139,7 @@ def test_a_changed_word_is_a_fault() -> None:
         entry[2] = word
 
 
-def test_a_step_that_may_be_another_is_a_fault() -> None:
+def test_check_bound_refuses_a_clique_with_one_more_step() -> None:
     trace, data = certified()
     for step in set(range(len(trace))) - set(data["clique"]):
         data["clique"].append(step)
@@ -166,14 +166,12 @@ def test_malformed_certificates_are_errors(change: dict[str, Any], word: str) ->
         check_bound(trace, {**data, **change})
 
 
-def test_a_certificate_says_its_clique() -> None:
+def test_check_bound_refuses_a_certificate_without_clique() -> None:
     with pytest.raises(MapError, match="clique: expected a clique"):
         check_bound(certified()[0], {})
 
 
-def test_check_bound_on_the_command_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_check_bound_prints_the_bound(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     trace, maps = tmp_path / "trace.jsonl", tmp_path / "maps.json"
     wandering(1, rooms=12, length=300, views=3).save(trace)
     assert main(["solve", str(trace), "--theory", "causal", "--json"]) == 0
@@ -205,7 +203,7 @@ def test_check_bound_on_the_command_line(
     assert "which the proof rests on" in capsys.readouterr().err
 
 
-def test_a_verdict_on_another_theory_or_trace_is_not_believed(
+def test_check_bound_refuses_refutations_of_another_theory(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Without sides the rectangle has four dstates, so refutations under sides do not count."""

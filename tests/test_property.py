@@ -43,7 +43,7 @@ def agree(trace: Trace, theory: Theory) -> None:
 
 @settings(max_examples=20)
 @given(st.data())
-def test_solver_lists_the_maps_of_the_brute_force(data: st.DataObject) -> None:
+def test_minimal_maps_equal_the_brute_force(data: st.DataObject) -> None:
     trace = data.draw(traces(closures=True), label="trace")
     theory = data.draw(theories(trace), label="theory")
     # The traces are shorter than the solver's first prefix: a shorter one makes it replay and
@@ -61,7 +61,7 @@ def test_solver_lists_the_maps_of_the_brute_force(data: st.DataObject) -> None:
 @pytest.mark.parametrize(
     "prefer", [("places",), ("paths", "places"), ("excuses", "places"), ("places", "excuses")]
 )
-def test_excuses_are_counted_where_no_pair_of_paths_can_be_excused(
+def test_excuses_are_counted_without_excusable_paths(
     prefer: tuple[Count, ...],
 ) -> None:
     """The maps 0, 0 and 0, 1 are both minimal if dstates are not counted."""
@@ -70,7 +70,7 @@ def test_excuses_are_counted_where_no_pair_of_paths_can_be_excused(
 
 
 @pytest.mark.parametrize("prefer", [(), ("excuses",)])
-def test_excuses_alone_are_minimised_where_no_pair_of_paths_can_be_excused(
+def test_excuses_are_minimised_without_excusable_paths(
     prefer: tuple[Count, ...],
 ) -> None:
     trace = Trace.from_steps("aaaaaaa", ["travel"] * 6)
@@ -79,7 +79,7 @@ def test_excuses_alone_are_minimised_where_no_pair_of_paths_can_be_excused(
 
 @settings(max_examples=13)
 @given(st.data())
-def test_checker_rejects_what_the_brute_force_does_not_find(data: st.DataObject) -> None:
+def test_checker_rejects_maps_outside_the_brute_force(data: st.DataObject) -> None:
     """The maps of one theory under the axioms of another.
 
     If the other axioms allow a map, its witnesses may have to change.

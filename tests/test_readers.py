@@ -128,7 +128,7 @@ def by_gmapping(scans: int = 8, with_neff: bool = True) -> tuple[list[str], list
 
 @pytest.mark.parametrize("noise", [0.03, 0.0])
 @pytest.mark.parametrize("name", ["drive.log", "drive.log.gz", *BAGS])
-def test_a_log_is_read_as_it_was_written(tmp_path: Path, name: str, noise: float) -> None:
+def test_logs_survive_a_round_trip(tmp_path: Path, name: str, noise: float) -> None:
     """True poses have a place of their own, and are kept even without odometry noise."""
     scans = drive(noise=noise)
     (write_bag if name in BAGS else write_carmen)(tmp_path / name, scans)
@@ -143,7 +143,7 @@ def test_a_log_is_read_as_it_was_written(tmp_path: Path, name: str, noise: float
 
 
 @pytest.mark.parametrize("name", ["drive.log", *BAGS])
-def test_without_true_poses_none_are_read(tmp_path: Path, name: str) -> None:
+def test_log_without_corrected_poses_has_none(tmp_path: Path, name: str) -> None:
     scans = [Scan(s.ranges, s.laser, s.odometry) for s in drive(4)]
     (write_bag if name in BAGS else write_carmen)(tmp_path / name, scans)
     log = read_log(tmp_path / name)
@@ -152,7 +152,7 @@ def test_without_true_poses_none_are_read(tmp_path: Path, name: str) -> None:
     assert [scan.time for scan in log.scans] == [0, 1, 2, 3]
 
 
-def test_writers_refuse_what_they_cannot_write(tmp_path: Path) -> None:
+def test_writers_refuse_bad_input(tmp_path: Path) -> None:
     scans = drive(2)
     with pytest.raises(LogError, match="at least one to write"):
         write_carmen(tmp_path / "a.log", [])
@@ -172,9 +172,7 @@ def test_writers_refuse_what_they_cannot_write(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("with_neff", [True, False])
-def test_odometry_of_gmappings_logs_is_without_the_corrections(
-    tmp_path: Path, with_neff: bool
-) -> None:
+def test_odometry_of_gmapping_logs_excludes_corrections(tmp_path: Path, with_neff: bool) -> None:
     lines, odometry, truth = by_gmapping(with_neff=with_neff)
     log = read_text(tmp_path / "a.log", *lines)
     assert all(is_near(scan.odometry, at) for scan, at in zip(log.scans, odometry, strict=True))
@@ -193,7 +191,7 @@ def test_odometry_of_gmappings_logs_is_without_the_corrections(
         None,
     ],
 )
-def test_a_scan_that_is_lost_leaves_no_correction_in_odometry(
+def test_lost_scan_leaves_no_correction_in_odometry(
     tmp_path: Path, damage: str | None, with_neff: bool
 ) -> None:
     lines, odometry, _ = by_gmapping(with_neff=with_neff)
@@ -207,7 +205,7 @@ def test_a_scan_that_is_lost_leaves_no_correction_in_odometry(
     assert all(is_near(scan.odometry, at) for scan, at in zip(log.scans, kept, strict=True))
 
 
-def test_a_lost_odometer_line_of_gmappings_logs_costs_no_more_than_its_motion(
+def test_lost_odometer_line_loses_only_its_motion(
     tmp_path: Path,
 ) -> None:
     lines, odometry, _ = by_gmapping()
@@ -250,7 +248,7 @@ def test_poses_of_a_raw_log_are_odometry(tmp_path: Path) -> None:
     assert is_near(log.scans[0].laser.mount, (0.15, 0, 0))
 
 
-def test_a_first_pose_that_wanders_is_a_corrected_one(tmp_path: Path) -> None:
+def test_drifting_first_pose_is_read_as_corrected(tmp_path: Path) -> None:
     poses: list[Pose] = [(0.5 * i, 0.0, 0.0) for i in range(20)]
     lines = [flaser(moved((0, 0, 0.1 * i), at), at) for i, at in enumerate(poses)]
     log = read_text(tmp_path / "a.log", "PARAM robot_frontlaser_offset 0.3 host 1", *lines)
@@ -269,7 +267,7 @@ def test_a_first_pose_that_wanders_is_a_corrected_one(tmp_path: Path) -> None:
         (361, ["PARAM laser_front_laser_fov 90 host 1"], 90 / 360, 9.0),
     ],
 )
-def test_where_beams_go_and_how_far(
+def test_beam_angles_and_reach_of_carmen_lines(
     tmp_path: Path, beams: int, lines: list[str], step: float, reach: float
 ) -> None:
     log = read_text(
@@ -289,7 +287,7 @@ def test_where_beams_go_and_how_far(
 
 
 @pytest.mark.parametrize("lines", [[], ["PARAM robot_front_laser_max 81.92 host 1"]])
-def test_ranges_that_a_sick_uses_as_codes_mean_no_return(tmp_path: Path, lines: list[str]) -> None:
+def test_error_codes_of_a_sick_laser_mean_no_return(tmp_path: Path, lines: list[str]) -> None:
     scan = read_text(
         tmp_path / "a.log", *lines, flaser(START, START, ranges="81.91 81.87 40 2 1")
     ).scans[0]
@@ -311,7 +309,7 @@ def test_scans_without_poses_are_placed_between_odometer_lines(tmp_path: Path) -
     assert all(is_near(scan.odometry, at) for scan, at in zip(log.scans, expected, strict=True))
 
 
-def test_of_scans_that_are_logged_twice_the_better_ones_are_read(tmp_path: Path) -> None:
+def test_scans_logged_twice_are_read_once(tmp_path: Path) -> None:
     log = read_text(
         tmp_path / "a.log", *[flaser(START, START), robotlaser(START, START)] * 4, "RLASER 1 2"
     )
@@ -355,7 +353,7 @@ def chained(motions: Iterable[Pose]) -> list[Pose]:
 
 @pytest.mark.parametrize("names", [("VERTEX2", "EDGE2"), ("VERTEX_SE2", "EDGE_SE2")])
 @pytest.mark.parametrize("order", ["as they are", "edges first", "vertices first"])
-def test_odometry_of_a_graph_is_the_chain_of_its_edges(
+def test_odometry_of_a_g2o_graph_chains_its_edges(
     tmp_path: Path, names: tuple[str, str], order: str
 ) -> None:
     lines = graph(VERTICES, MOTIONS, names)
@@ -379,19 +377,19 @@ def test_odometry_of_a_graph_is_the_chain_of_its_edges(
     assert is_near(log.scans[0].laser.mount, (-0.04, 0, 0))
 
 
-def test_a_graph_with_odometry_of_its_own_keeps_it(tmp_path: Path) -> None:
+def test_g2o_graph_with_own_odometry_keeps_it(tmp_path: Path) -> None:
     odometry = chained(MOTIONS)
     log = read_text(tmp_path / "a.graph", *graph(VERTICES, [], scans=odometry))
     assert all(is_near(scan.odometry, at) for scan, at in zip(log.scans, odometry, strict=True))
     assert all(is_near(scan.corrected, at) for scan, at in zip(log.scans, VERTICES, strict=True))
 
 
-def test_a_graph_that_nobody_corrected_has_no_corrected_poses(tmp_path: Path) -> None:
+def test_uncorrected_g2o_graph_has_no_corrected_poses(tmp_path: Path) -> None:
     log = read_text(tmp_path / "a.graph", *graph(chained(MOTIONS), MOTIONS))
     assert {scan.corrected for scan in log.scans} == {None}
 
 
-def test_a_damaged_vertex_costs_its_scan_alone(tmp_path: Path) -> None:
+def test_damaged_vertex_loses_only_its_scan(tmp_path: Path) -> None:
     vertices = [*VERTICES, *[(float(i), 9.0, 0.0) for i in range(10)]]
     motions = [*MOTIONS, *[(1.0, 0.0, 0.0)] * 10]
     lines = graph(vertices, motions)
@@ -401,7 +399,7 @@ def test_a_damaged_vertex_costs_its_scan_alone(tmp_path: Path) -> None:
     assert is_near(log.scans[2].odometry, chained(motions)[3])
 
 
-def test_a_missing_edge_is_told(tmp_path: Path) -> None:
+def test_note_names_a_missing_edge(tmp_path: Path) -> None:
     lines = graph(VERTICES, MOTIONS)
     # This edge is as good as the one from 2 to 3.
     lines[-2] = f"EDGE2 3 2 {pose(displacement_between(MOTIONS[2], START))} 1 0 1 1 0 0"
@@ -497,7 +495,7 @@ class Messages:
         return self.types["tf2_msgs/msg/TFMessage"](transforms=[stamped])
 
 
-def test_odometry_of_a_bag_is_that_at_the_times_of_the_scans(tmp_path: Path) -> None:
+def test_odometry_of_a_bag_is_interpolated_at_scan_times(tmp_path: Path) -> None:
     """Headings wrap between two messages. A scan long after the last message has no odometry."""
     path = bag(
         tmp_path / "bag",
@@ -521,7 +519,7 @@ def test_odometry_of_a_bag_is_that_at_the_times_of_the_scans(tmp_path: Path) -> 
     assert "No transform leads" in " ".join(log.notes)
 
 
-def test_odometry_of_transforms_and_a_laser_upside_down(tmp_path: Path) -> None:
+def test_bag_with_transforms_and_a_laser_upside_down_is_read(tmp_path: Path) -> None:
     """Without Odometry messages, the transforms lead from odom to the laser.
 
     The chain is odom, base_footprint, base_link, mast, laser; some names have the slash of ROS 1.
@@ -553,7 +551,7 @@ def test_odometry_of_transforms_and_a_laser_upside_down(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("stamp", [0.0, 500.0])
-def test_times_of_recording_are_used_where_headers_have_none_or_those_of_another_clock(
+def test_recording_times_replace_missing_or_foreign_header_times(
     tmp_path: Path, stamp: float
 ) -> None:
     path = bag(
@@ -568,7 +566,7 @@ def test_times_of_recording_are_used_where_headers_have_none_or_those_of_another
     assert "times of recording" in " ".join(log.notes)
 
 
-def test_a_damaged_message_is_skipped_and_told(tmp_path: Path) -> None:
+def test_damaged_message_is_skipped_and_reported(tmp_path: Path) -> None:
     def messages(m: Messages) -> list[tuple[str, float, Any]]:
         no_step, no_ranges, nowhere = (
             m.scan(1.0),
@@ -601,7 +599,7 @@ def test_a_damaged_message_is_skipped_and_told(tmp_path: Path) -> None:
     assert all("expected" in damage.what for damage in log.damaged)
 
 
-def test_several_topics_are_listed_and_can_be_named(tmp_path: Path) -> None:
+def test_error_lists_several_scan_topics(tmp_path: Path) -> None:
     path = bag(
         tmp_path / "bag",
         lambda m: (
@@ -625,7 +623,7 @@ def test_several_topics_are_listed_and_can_be_named(tmp_path: Path) -> None:
     assert [scan.odometry[0] for scan in log.scans] == [2, 2]
 
 
-def test_bags_without_scans_or_odometry(tmp_path: Path) -> None:
+def test_bags_without_scans_or_odometry_are_refused(tmp_path: Path) -> None:
     with pytest.raises(LogError, match=r"expected scans .* got none; topics: /odom \(Odometry\)"):
         read_log(bag(tmp_path / "a", lambda m: [("/odom", 1.0, m.odometry(1.0, START))]))
     with pytest.raises(LogError, match=r"expected odometry .* got none; topics: /scan"):
@@ -635,7 +633,7 @@ def test_bags_without_scans_or_odometry(tmp_path: Path) -> None:
         read_log(tmp_path / "c")
 
 
-def test_a_bag_is_known_by_its_content(tmp_path: Path) -> None:
+def test_format_of_a_bag_is_found_from_its_content(tmp_path: Path) -> None:
     for name, format in BAGS.items():
         write_bag(tmp_path / name, drive(2))
         file = tmp_path / name if name != "drive" else next((tmp_path / name).glob("*.db3"))
@@ -643,7 +641,7 @@ def test_a_bag_is_known_by_its_content(tmp_path: Path) -> None:
         assert read_log(tmp_path / "log.data").format == format
 
 
-def test_without_rosbags_the_error_says_how_to_get_it(
+def test_missing_rosbags_is_named_with_the_install_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_bag(tmp_path / "a.bag", drive(2))
@@ -679,7 +677,7 @@ DAMAGED = {
 
 
 @pytest.mark.parametrize("what", DAMAGED)
-def test_a_damaged_line_is_skipped_and_told(tmp_path: Path, what: str) -> None:
+def test_damaged_line_is_skipped_and_reported(tmp_path: Path, what: str) -> None:
     """If a ROBOTLASER1 line is the damaged one, ROBOTLASER1 is still the kind that is read."""
     good = robotlaser if DAMAGED[what].startswith(b"ROBOT") else flaser
     lines = [good((0.1 * i, 0, 0), (0.1 * i, 0, 0)).encode() for i in range(5)]
@@ -694,13 +692,13 @@ def test_a_damaged_line_is_skipped_and_told(tmp_path: Path, what: str) -> None:
     assert [type(item) for item in streamed] == [Scan, Scan, Damage, Scan, Scan, Scan]
 
 
-def test_a_mark_of_the_encoding_costs_no_scan(tmp_path: Path) -> None:
+def test_byte_order_mark_loses_no_scan(tmp_path: Path) -> None:
     (tmp_path / "a.log").write_text(flaser(START, START), encoding="utf-8-sig")
     log = read_log(tmp_path / "a.log")
     assert (len(log), log.damaged) == (1, ())
 
 
-def test_what_no_reader_knows_is_no_damage(tmp_path: Path) -> None:
+def test_unknown_lines_are_skipped_silently(tmp_path: Path) -> None:
     log = read_text(
         tmp_path / "a.log",
         "# a comment",
@@ -736,7 +734,7 @@ def broken(tmp_path: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("what", broken(Path()))
-def test_what_is_no_log_is_one_clear_error(tmp_path: Path, what: str) -> None:
+def test_file_that_is_no_log_is_one_clear_error(tmp_path: Path, what: str) -> None:
     (tmp_path / "a.log").write_bytes(broken(tmp_path)[what])
     with pytest.raises(LogError, match=r"a\.log: .*expected .*") as caught:
         read_log(tmp_path / "a.log")
@@ -755,7 +753,7 @@ def test_what_is_no_log_is_one_clear_error(tmp_path: Path, what: str) -> None:
         ({"odom_topic": 4}, "odom_topic: expected a text, got 4"),
     ],
 )
-def test_arguments_of_other_types_are_refused(wrong: dict[str, Any], said: str) -> None:
+def test_read_log_refuses_arguments_of_wrong_types(wrong: dict[str, Any], said: str) -> None:
     arguments = {"path": "drive.mcap", **wrong}
     with pytest.raises(LogError, match=said):
         read_log(**arguments)
@@ -763,12 +761,12 @@ def test_arguments_of_other_types_are_refused(wrong: dict[str, Any], said: str) 
         next(stream_log(**arguments))
 
 
-def test_a_stream_of_text_is_no_pipe() -> None:
+def test_live_log_refuses_a_text_stream() -> None:
     with pytest.raises(LogError, match="stream: expected a stream of bytes"):
         next(live_log(io.StringIO("FLASER 1 2\n")))  # type: ignore[arg-type]
 
 
-def test_paths_and_formats_that_cannot_be(tmp_path: Path) -> None:
+def test_wrong_paths_and_formats_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.log").write_text(flaser(START, START))
     for path, options, text in (
         (tmp_path / "none.log", {}, "No such file"),
@@ -789,7 +787,7 @@ def test_paths_and_formats_that_cannot_be(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["drive.log", "drive.log.gz", "gmapping.log", "graph.log", *BAGS])
-def test_nothing_that_bytes_can_hold_is_a_crash(tmp_path: Path, name: str) -> None:
+def test_damaged_logs_never_crash_the_reader(tmp_path: Path, name: str) -> None:
     """Bytes are changed, left out, or repeated."""
     file = tmp_path / name
     if name in BAGS:
@@ -824,7 +822,7 @@ def test_nothing_that_bytes_can_hold_is_a_crash(tmp_path: Path, name: str) -> No
     )  # the check sum of gzipped data is wrong
 
 
-def test_memory_does_not_grow_with_what_is_skipped(tmp_path: Path) -> None:
+def test_memory_does_not_grow_with_skipped_lines(tmp_path: Path) -> None:
     scan = flaser(START, START) + "\n"
     with gzip.open(tmp_path / "a.log", "wt", compresslevel=1) as file:
         file.write(scan)
@@ -842,7 +840,7 @@ def test_memory_does_not_grow_with_what_is_skipped(tmp_path: Path) -> None:
     assert peak < 14e6  # of 12 MB of lines, one of 4 MB
 
 
-def test_a_pipe_is_read(tmp_path: Path) -> None:
+def test_log_is_read_from_a_named_pipe(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     text = "\n".join(flaser(START, START) for _ in range(3))
     writer = threading.Thread(target=(tmp_path / "pipe").write_text, args=[text])
@@ -851,7 +849,7 @@ def test_a_pipe_is_read(tmp_path: Path) -> None:
     writer.join()
 
 
-def test_a_log_that_is_given_as_a_trace_is_named(tmp_path: Path) -> None:
+def test_trace_reader_recognises_a_log(tmp_path: Path) -> None:
     write_carmen(tmp_path / "a.log", drive(2))
     write_carmen(tmp_path / "a.log.gz", drive(2))
     write_bag(tmp_path / "a.bag", drive(2))
@@ -882,7 +880,7 @@ REAL = {
 
 
 @pytest.mark.parametrize("name", REAL)
-def test_logs_of_real_robots(name: str) -> None:
+def test_logs_of_real_robots_are_read(name: str) -> None:
     if not (LOGS / name).exists():
         pytest.skip("needs the logs of shared/data")
     count, beams, reach, driven, truly, median, most = REAL[name]

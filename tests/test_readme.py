@@ -205,7 +205,7 @@ def compare(block: Block) -> None:
 
 @pytest.mark.usefixtures("without_processes")
 @pytest.mark.parametrize("block", RUN)
-def test_the_shell_lines_and_python_lines_print_what_is_shown(
+def test_code_blocks_print_the_shown_output(
     block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(streets, "WORK", 0)  # no page shows what these lines draw
@@ -216,7 +216,7 @@ def test_the_shell_lines_and_python_lines_print_what_is_shown(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
-def test_the_shell_lines_of_a_tutorial_can_be_followed_in_an_empty_folder(
+def test_tutorials_run_in_an_empty_folder(
     page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(log_maps, "LEAST", 1000.0)  # however slow this machine is
@@ -227,11 +227,11 @@ def test_the_shell_lines_of_a_tutorial_can_be_followed_in_an_empty_folder(
             compare(block)
 
 
-def test_what_is_shown_is_run() -> None:
+def test_pages_have_enough_runnable_blocks() -> None:
     assert len(RUN) > 35
 
 
-def test_the_command_line_knows_all_that_is_shown() -> None:
+def test_shown_commands_parse() -> None:
     lines = [
         line
         for blocks in BLOCKS.values()
@@ -245,14 +245,14 @@ def test_the_command_line_knows_all_that_is_shown() -> None:
         assert parser().parse_args(words[1:]), line
 
 
-def test_the_page_of_commands_lists_all_verbs() -> None:
+def test_commands_page_lists_all_verbs() -> None:
     page = (ROOT / "docs" / "reference" / "commands.md").read_text()
     table = page.partition("## Verbs")[2].partition("## Options")[0]
     cells = re.findall(r"^\| (`.*?) \|", table, re.MULTILINE)
     assert set(re.findall(r"`([a-z-]+)`", " ".join(cells))) == set(parser().verbs)
 
 
-def test_the_trace_of_the_formats_page_has_a_map(tmp_path: Path) -> None:
+def test_trace_of_the_formats_page_has_a_map(tmp_path: Path) -> None:
     written = tmp_path / "trace.jsonl"
     written.write_text(
         (ROOT / "docs" / "reference" / "formats.md").read_text().split("```")[1].lstrip()
@@ -260,7 +260,7 @@ def test_the_trace_of_the_formats_page_has_a_map(tmp_path: Path) -> None:
     assert solve(Trace.load(written)).status is Status.OPTIMAL
 
 
-def test_the_picture_is_the_map() -> None:
+def test_picture_on_the_page_equals_the_drawn_map() -> None:
     (ssh_map,) = solve(Trace.load(ROOT / "examples" / "notched-rectangle.jsonl")).maps
     assert (ROOT / "docs" / "figures" / "notched-rectangle.svg").read_text() == to_svg(
         ssh_map
@@ -268,11 +268,11 @@ def test_the_picture_is_the_map() -> None:
 
 
 @pytest.mark.parametrize("name", figures.DRAWN)
-def test_the_figures_are_what_the_program_draws(name: str) -> None:
+def test_figures_equal_the_output_of_the_program(name: str) -> None:
     assert (figures.FIGURES / f"{name}.svg").read_text() == figures.DRAWN[name]() + "\n"
 
 
-def test_the_readme_is_short_and_its_links_are_whole() -> None:
+def test_readme_is_short_and_its_links_are_absolute() -> None:
     text = README.read_text()
     assert len(text.encode()) <= 8192
     links = re.findall(r"\]\(([^)]+)\)|^\[\w+\]: (\S+)|src=\"([^\"]+)\"", text, re.MULTILINE)
@@ -283,7 +283,7 @@ def test_the_readme_is_short_and_its_links_are_whole() -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_every_file_it_names_exists(page: Path) -> None:
+def test_files_named_in_pages_exist(page: Path) -> None:
     text = page.read_text()
     linked = [page.parent / name for name in re.findall(r"\]\(([^)#:]+)\)", text)]
     whole = [ROOT / name for name in re.findall(ABSOLUTE + r"([\w./-]+\w)", text)]
@@ -299,7 +299,7 @@ def test_every_file_it_names_exists(page: Path) -> None:
     assert page != README or len(whole) > 5
 
 
-def test_the_design_tells_the_floors_as_they_are_checked() -> None:
+def test_design_page_lists_the_layers_of_import_linter() -> None:
     contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"][
         "contracts"
     ]
@@ -314,7 +314,7 @@ def test_the_design_tells_the_floors_as_they_are_checked() -> None:
     ]
 
 
-def test_the_rule_of_the_theory_page_is_obeyed() -> None:
+def test_rule_of_the_theory_page_is_obeyed() -> None:
     (rule,) = [
         text
         for language, text in BLOCKS[ROOT / "docs" / "explanation" / "theory.md"]
@@ -330,7 +330,7 @@ def fewest(trace: Trace, theory: Theory) -> int | None:
     return cost and cost.dstates
 
 
-def test_contributors_are_told_of_names_that_are_there() -> None:
+def test_names_in_contributing_exist() -> None:
     text = (ROOT / "docs" / "contributing.md").read_text()
     code = "\n".join(path.read_text() for path in FILES if path.suffix in (".py", ".lp"))
     names = set(re.findall(r"`([A-Z_]{4,}|[A-Z][a-z]+|\w+_\w+)`", text)) - {"NAME", "FIELD"}

@@ -76,7 +76,7 @@ def circuit(steps: int, wrong: int | None = None, seen: str = "v3") -> Trace:
 @given(
     small_traces(max_steps=7), st.sampled_from([0.0, 0.4, 1.0]), st.sampled_from([0.0, 0.3, 1.0])
 )
-def test_after_every_step_the_maps_are_those_of_brute_force(
+def test_online_maps_with_faults_equal_the_brute_force(
     trace: Trace, misread: float, slipped: float
 ) -> None:
     if not misread and not slipped:
@@ -103,7 +103,7 @@ def test_after_every_step_the_maps_are_those_of_brute_force(
 
 @settings(max_examples=5)
 @given(st.data())
-def test_what_is_known_of_steps_and_places_is_obeyed(data: st.DataObject) -> None:
+def test_online_maps_with_faults_obey_assertions_and_stars(data: st.DataObject) -> None:
     """With asserted pairs of steps, or places with stars, the maps are those of solving anew."""
     trace = data.draw(small_traces(max_steps=5))
     prices = {
@@ -136,7 +136,7 @@ def test_what_is_known_of_steps_and_places_is_obeyed(data: st.DataObject) -> Non
         assert len(solution.maps) == len(anew.maps)
 
 
-def test_a_theory_without_an_axiom_is_solved_anew() -> None:
+def test_mapper_with_faults_solves_anew_without_an_axiom() -> None:
     theory = Theory.causal().replace(misread=0.4, without=("deterministic",))
     for _, solution in followed(Trace.from_steps("abaabb", ["travel"] * 5), theory):
         anew = solve(
@@ -146,7 +146,7 @@ def test_a_theory_without_an_axiom_is_solved_anew() -> None:
         assert {(m, m.faults) for m in solution.maps} == {(m, m.faults) for m in anew.maps}
 
 
-def test_a_wrong_view_is_told_and_excused() -> None:
+def test_mapper_reports_and_excuses_a_wrong_view() -> None:
     for mapper, solution in followed(circuit(30, wrong=17), BOTH):
         t, standing = solution.steps - 1, mapper.standing
         assert sum(hypothesis.weight for hypothesis in standing.hypotheses) == pytest.approx(1)
@@ -172,7 +172,7 @@ def test_a_wrong_view_is_told_and_excused() -> None:
 
 
 @pytest.mark.parametrize("fault", ["wrong", "jumps"])
-def test_a_robot_is_certain_again_and_right(fault: str) -> None:
+def test_mapper_becomes_certain_and_right_after_a_fault(fault: str) -> None:
     record = bench.run(rectangle_of_five(0, steps=60, **{fault: 1}), BOTH, limit=5)
     assert (record["noticed"], record["right_again"], record["right"], record["found"]) == (
         0,
@@ -182,7 +182,7 @@ def test_a_robot_is_certain_again_and_right(fault: str) -> None:
     )
 
 
-def test_a_star_that_is_misread_is_told() -> None:
+def test_mapper_reports_a_misread_star() -> None:
     stars = [(1, 0, 0, 0), (0, 0, 1, 0)] * 7
     stars[6] = (1, 1, 0, 0)
     trace = Trace.from_steps("abcd" * 3 + "ab", (["travel", "around"] * 7)[:13], stars=stars)
@@ -198,7 +198,7 @@ def test_a_star_that_is_misread_is_told() -> None:
     assert [str(fault) for fault in solution.maps[0].faults] == ["the star at step 6 is misread"]
 
 
-def test_without_time_there_is_a_map_and_a_belief() -> None:
+def test_mapper_with_faults_and_no_time_has_a_map_and_belief() -> None:
     """Every search is stopped at once, and only the belief continues.
 
     Its maps are consistent and have a bound, but they are never certain.
@@ -228,7 +228,7 @@ def one_of_the_maps(
 
 
 @pytest.mark.parametrize("in_a_step", [solving.solved, one_of_the_maps])
-def test_what_takes_too_long_for_a_step_is_solved_while_the_robot_drives(
+def test_slow_step_is_solved_in_the_background(
     in_a_step: Callable[..., Solved],
 ) -> None:
     """A stub stands in for the second process. Its answer is for fewer steps than there are."""
@@ -275,7 +275,7 @@ class Busy:
         return False
 
 
-def test_where_clingo_cannot_be_stopped_in_time_steps_do_not_wait_for_it_again() -> None:
+def test_steps_do_not_wait_again_for_a_slow_clingo() -> None:
     with (
         patch.object(solving, "BackgroundSearch", lambda *told: Busy()),
         patch.object(solving, "has_processors", return_value=True),
@@ -286,7 +286,7 @@ def test_where_clingo_cannot_be_stopped_in_time_steps_do_not_wait_for_it_again()
     assert answers[-1][0].searches == 1
 
 
-def test_a_process_of_its_own_solves_the_trace() -> None:
+def test_background_search_solves_the_trace() -> None:
     trace = circuit(20, wrong=17)
     meanwhile = BackgroundSearch(trace, BOTH, MEANWHILE, None, Speedups())
     found = meanwhile.result()
@@ -300,7 +300,7 @@ def test_a_process_of_its_own_solves_the_trace() -> None:
     assert not _under_way
 
 
-def test_displacements_that_come_later_are_used() -> None:
+def test_mapper_with_faults_uses_later_displacements() -> None:
     """Maps are searched anew if the trace changes the settled theory."""
     mapper = OnlineMapper(
         "corner", Theory.causal().replace(misread=1.5), odometry={"along": 0.02}, time_limit=None
@@ -315,7 +315,7 @@ def test_displacements_that_come_later_are_used() -> None:
     assert {(m, m.faults) for m in solution.maps} == {(m, m.faults) for m in anew.maps}
 
 
-def test_a_certain_map_may_leave_past_faults_undecided() -> None:
+def test_certain_map_may_leave_past_faults_undecided() -> None:
     """One of two actions in a row slipped. Nothing tells which one, but the map is certain."""
     for seed in range(40):
         for mapper, solution in followed(
@@ -332,7 +332,7 @@ def test_a_certain_map_may_leave_past_faults_undecided() -> None:
     pytest.fail("expected a trace whose maps differ in the step that slipped")
 
 
-def test_rivals_are_weighed_by_faults_and_by_what_they_assume() -> None:
+def test_rivals_are_weighed_by_faults_and_assumptions() -> None:
     trace = circuit(16)
     theory = Theory.causal().replace(misread=1.5, slipped=3)
     lead = ExtendedMap.of(solve(trace, theory).maps[0], trace, theory)
@@ -349,7 +349,7 @@ def test_rivals_are_weighed_by_faults_and_by_what_they_assume() -> None:
     assert shares[1] == pytest.approx(shares[0] / 4)  # a link more, to one of four dstates
 
 
-def test_a_refused_step_leaves_a_mapper_with_faults_unchanged() -> None:
+def test_refused_step_leaves_a_mapper_with_faults_unchanged() -> None:
     mapper = OnlineMapper("v0", BOTH, time_limit=None)
     before = mapper.observe("right", "v1")
     with pytest.raises(TraceError, match="action"):
@@ -360,7 +360,7 @@ def test_a_refused_step_leaves_a_mapper_with_faults_unchanged() -> None:
         _ = OnlineMapper("v0", Theory.causal()).standing
 
 
-def test_weights_sum_to_one_and_ties_are_told() -> None:
+def test_weights_sum_to_one_and_ties_are_named() -> None:
     """Both kinds have one price. At first it is not known which fault it was."""
     walk = [
         mapper.standing

@@ -159,7 +159,7 @@ def test_an_axiom_about_regions_has_a_sentence_and_a_source(axiom: encodings.Axi
     assert axiom.source
 
 
-def test_no_search_has_the_axioms_about_regions() -> None:
+def test_search_does_not_use_the_axioms_about_regions() -> None:
     assert not {axiom.name for axiom in encodings.region_axioms()} & {*PLAIN.axioms}
 
 
@@ -223,7 +223,7 @@ def test_encoding_checker_and_brute_force_agree_on_rooms(rooms: list[str], seed:
     assert as_set(ssh_map) == brute_regions.regions(ssh_map, trace, axioms_for_regions(theory))
 
 
-def test_a_floor_lies_behind_its_lift() -> None:
+def test_floor_is_a_region_behind_its_lift() -> None:
     up = Action("up", "lift")
     trace = Trace.from_steps(
         ["a", "b", "c", "lift", "up", "hall"], ["travel", "travel", "travel", up, "travel"]
@@ -246,7 +246,7 @@ def test_a_floor_lies_behind_its_lift() -> None:
         (lambda regions: (*regions[:-1], replace(regions[-1], inside=())), "region_beside"),
     ],
 )
-def test_the_checker_finds_wrong_regions(change, axiom: str) -> None:  # type: ignore[no-untyped-def]
+def test_checker_finds_wrong_regions(change, axiom: str) -> None:  # type: ignore[no-untyped-def]
     trace = trace_of(BLOCK)
     ssh_map = first_map(trace, PLAIN)
     assert not check(trace, ssh_map, PLAIN)
@@ -255,7 +255,7 @@ def test_the_checker_finds_wrong_regions(change, axiom: str) -> None:  # type: i
     assert axiom in {violation.axiom for violation in check(trace, wrong, PLAIN)}
 
 
-def test_the_checker_finds_a_missing_part_behind_a_place() -> None:
+def test_checker_finds_a_missing_part_behind_a_place() -> None:
     trace = trace_of(TOUR)
     ssh_map = first_map(trace, LOG)
     wrong = replace(ssh_map, regions=(ssh_map.regions or ())[:-1])
@@ -274,7 +274,7 @@ def test_places_right_and_left_of_a_path() -> None:
         replace(ssh_map, regions=None).right_of(0, 1)
 
 
-def test_regions_are_written_read_and_renumbered(tmp_path: Path) -> None:
+def test_regions_survive_a_round_trip_and_renumbering(tmp_path: Path) -> None:
     ssh_map = first_map(trace_of(BLOCK), PLAIN)
     ssh_map.save(tmp_path / "map.json")
     assert SSHMap.load(tmp_path / "map.json").regions == ssh_map.regions
@@ -295,7 +295,7 @@ def test_regions_are_written_read_and_renumbered(tmp_path: Path) -> None:
     assert turned.renumbered().regions == ssh_map.regions
 
 
-def test_files_without_regions_are_read() -> None:
+def test_maps_without_regions_are_read() -> None:
     data = first_map(trace_of(BLOCK), PLAIN).to_dict()
     del data["regions"]
     assert SSHMap.from_dict(data).regions is None
@@ -312,21 +312,21 @@ def test_files_without_regions_are_read() -> None:
         ("door", 9, r"places: expected some places of the map"),
     ],
 )
-def test_wrong_regions_in_a_file(field: str, value: object, message: str) -> None:
+def test_malformed_regions_are_refused(field: str, value: object, message: str) -> None:
     data = first_map(trace_of(BLOCK), PLAIN).to_dict()
     data["regions"][0][field] = value
     with pytest.raises(MapError, match=message):
         SSHMap.from_dict(data)
 
 
-def test_a_causal_map_has_no_regions() -> None:
+def test_causal_map_has_no_regions() -> None:
     trace = trace_of(CORNER)
     (ssh_map,) = solve(trace, Theory.causal())
     assert ssh_map.regions is None
     assert find_regions(ssh_map, trace, Theory.causal()) == ()
 
 
-def test_many_maps_share_the_time_for_regions(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_time_for_regions_is_shared_among_maps(monkeypatch: pytest.MonkeyPatch) -> None:
     trace = Trace.load(Path(__file__).parent.parent / "examples" / "aces3-route.jsonl")
     assert all(m.regions for m in solve(trace))
     monkeypatch.setattr("ssh_abduction.solver.regions.UNITS", UNITS // 20)

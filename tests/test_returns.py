@@ -42,7 +42,7 @@ def evidence_of(trace: Trace, **choices: object) -> Displacement:
 
 @settings(max_examples=8)
 @given(st.data())
-def test_what_is_known_of_a_trace_grows_with_it(data: st.DataObject) -> None:
+def test_pairs_and_counts_of_growing_traces_agree(data: st.DataObject) -> None:
     """Pairs and counts are the same in growing traces.
 
     Some steps lack a displacement, and traces go on from one prefix in two ways.
@@ -58,7 +58,7 @@ def test_what_is_known_of_a_trace_grows_with_it(data: st.DataObject) -> None:
         assert (grown.pairs, grown.count()) == (anew.pairs, anew.count())
 
 
-def test_the_reckoning_of_a_maze_grows_with_it() -> None:
+def test_dead_reckoning_of_a_growing_maze_agrees() -> None:
     trace = maze(4, 4, steps=60, seed=2, odometry=Odometry()).trace
     trace = replace(
         trace,
@@ -110,7 +110,7 @@ def joint_excess(returns: Returns, rows: np.ndarray, thresholds: dict[int, float
 @pytest.mark.parametrize(
     ("noise", "bend"), [("usual", 0.0), ("steady drift", 0.006), ("white", 0.0)]
 )
-def test_bounds_change_no_answer(noise: str, bend: float) -> None:
+def test_bounds_on_returns_change_no_refusal(noise: str, bend: float) -> None:
     """Each return in turn is the only new one.
 
     The thresholds are so low that many pairs are refused though their single returns are not, and
@@ -160,7 +160,7 @@ def square_alone(returns: Returns, row: np.ndarray) -> float:
     )
 
 
-def test_only_returns_that_end_later_are_asked_about_once_a_map_was_accepted() -> None:
+def test_accepted_prefix_is_not_checked_again() -> None:
     walk = maze(3, 3, steps=60, seed=6, odometry=Odometry(along=0.02))
     trace = walk.trace
     evidence = evidence_of(trace, reject=0.3)
@@ -179,7 +179,7 @@ def test_only_returns_that_end_later_are_asked_about_once_a_map_was_accepted() -
 
 
 @pytest.mark.parametrize("noise", ["usual", "white"])
-def test_bounds_change_nothing_that_the_judge_says(noise: str) -> None:
+def test_bounds_change_no_verdict_of_the_checker(noise: str) -> None:
     """The checker refuses the same pairs with its bound as without.
 
     The shares are so large that true maps are refused, too.

@@ -23,7 +23,7 @@ def names_in(file: str) -> set[str]:
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row[0][:60])
-def test_each_row_names_its_tests(row: list[str]) -> None:
+def test_each_row_names_existing_tests(row: list[str]) -> None:
     assert len(row) == 4
     assert all(cell.strip() for cell in row)
     file, _, names = row[3].strip("`").partition("::")

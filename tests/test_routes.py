@@ -47,7 +47,7 @@ def random_map(seed: int) -> SSHMap:
 
 @pytest.mark.parametrize("seed", range(12))
 @pytest.mark.parametrize("by", ["actions", "metres"])
-def test_no_sequence_of_actions_is_shorter(seed: int, by: str) -> None:
+def test_route_is_the_shortest_sequence_of_actions(seed: int, by: str) -> None:
     ssh_map = random_map(seed)
     leads = {(s, action): x for s, action, x in ssh_map.links}
     poses = ssh_map.fit.poses if ssh_map.fit else ()
@@ -81,7 +81,7 @@ def test_no_sequence_of_actions_is_shorter(seed: int, by: str) -> None:
         )
 
 
-def test_a_route_by_places_leads_back_along_a_street_that_was_driven_one_way(
+def test_route_by_places_uses_a_street_in_reverse(
     square: SSHMap,
 ) -> None:
     by_links = route(square, 0, "p3")
@@ -94,7 +94,7 @@ def test_a_route_by_places_leads_back_along_a_street_that_was_driven_one_way(
     assert by_places.metres == pytest.approx(10, abs=0.1)
 
 
-def test_no_route_by_places_leads_from_one_piece_of_a_map_to_another() -> None:
+def test_route_by_places_stays_in_one_piece() -> None:
     """Fewer paths are preferred, so both streets are one path. Nothing observed joins them."""
     drives = [
         Trace.from_steps(views, ["travel"], name=name)
@@ -114,7 +114,7 @@ def test_no_route_by_places_leads_from_one_piece_of_a_map_to_another() -> None:
             route(ssh_map, 0, far, by="places")
 
 
-def test_what_is_avoided_is_gone_round() -> None:
+def test_route_goes_around_avoided_dstates() -> None:
     dstates = tuple(DState(i, "v", i) for i in range(4))
     links = ((0, "a", 1), (1, "a", 3), (0, "b", 2), (2, "b", 0), (2, "c", 2), (2, "a", 1))
     ssh_map = SSHMap((0, 1, 2, 3), dstates, links, (0, 1, 2, 3), (MapPath(0, (0, 1)),))
@@ -134,7 +134,7 @@ def test_what_is_avoided_is_gone_round() -> None:
     assert route(detour, 0, 3, avoid=["p1"]).actions == ("b", "d")
 
 
-def test_rivals_agree_where_their_links_lead_to_the_same_views() -> None:
+def test_route_counts_rivals_that_agree() -> None:
     corridor = Trace.from_steps(
         ["end", "hall", "hall", "end", "end", "hall", "hall"],
         ["travel", "travel", "travel", "around", "travel", "around"],
@@ -172,17 +172,17 @@ def test_rivals_agree_where_their_links_lead_to_the_same_views() -> None:
         ),
     ],
 )
-def test_errors_name_the_range(arguments: dict[str, object], message: str) -> None:
+def test_route_errors_name_the_range(arguments: dict[str, object], message: str) -> None:
     with pytest.raises(MapError, match=message):
         route(solve(rectangle(8)).maps[0], **arguments)  # type: ignore[arg-type]
 
 
-def test_maps_without_paths_have_no_routes_by_places() -> None:
+def test_route_by_places_needs_paths() -> None:
     with pytest.raises(MapError, match="the map has no paths"):
         route(solve(rectangle(8), Theory.causal()).maps[0], 0, 1, by="places")
 
 
-def test_a_map_numbered_anew_keeps_its_poses(square: SSHMap) -> None:
+def test_renumbered_map_keeps_its_poses(square: SSHMap) -> None:
     assert square.renumbered().fit == square.fit
     turned = SSHMap(
         (1, 0),
@@ -195,7 +195,7 @@ def test_a_map_numbered_anew_keeps_its_poses(square: SSHMap) -> None:
     assert found.poses == (Pose(0.0, 0.0, 0.0), Pose(1.0, 2.0, 3.0))
 
 
-def test_the_command_prints_what_python_finds(
+def test_route_command_prints_the_result_of_python(
     square: SSHMap, tmp_path: object, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = f"{tmp_path}/map.json"
@@ -276,7 +276,7 @@ def maze(seed: int, side: int = 4, steps: int = 150) -> SSHMap:
     return with_regions(found.renumbered(), trace)
 
 
-def test_a_coarse_route_agrees_with_the_fine_one() -> None:
+def test_route_by_regions_agrees_with_the_plain_route() -> None:
     ssh_map = maze(2)
     assert ssh_map.regions
     told = 0
@@ -299,7 +299,7 @@ def test_a_coarse_route_agrees_with_the_fine_one() -> None:
     assert told
 
 
-def test_a_route_to_a_region_ends_at_its_nearest_place() -> None:
+def test_route_to_a_region_ends_at_its_nearest_place() -> None:
     ssh_map = maze(2)
     assert ssh_map.regions
     named = replace(ssh_map, names=(Name("region", 1, "west wing"),))
@@ -315,7 +315,7 @@ def test_a_route_to_a_region_ends_at_its_nearest_place() -> None:
         route(named, 0, "region99")
 
 
-def test_a_route_says_the_regions_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_route_prints_regions_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     solve(written("a T b R c T d L e T f")).save(tmp_path / "maps.json")
     ends = ["--from", "p0", "--to", "p3", "--by", "places"]
     assert main(["route", str(tmp_path / "maps.json"), *ends]) == 0

@@ -55,7 +55,7 @@ def least_by_trying(facilities: Facilities) -> float:
 
 @settings(max_examples=60)
 @given(st.integers(1, 6), st.sampled_from([2, 3]), st.integers(0, 10**6))
-def test_shares_are_a_lower_bound_of_all_clusterings(n: int, size: int, seed: int) -> None:
+def test_scatter_shares_bound_all_clusterings_from_below(n: int, size: int, seed: int) -> None:
     draw = np.random.default_rng(seed)
     points = draw.uniform(0, 2.5, (n, size)) * [1, 1, 0.3][:size]
     variances = draw.uniform(0.05, 0.15, (n, size)) * [1, 1, 0.1][:size]
@@ -66,7 +66,7 @@ def test_shares_are_a_lower_bound_of_all_clusterings(n: int, size: int, seed: in
     assert 0.7 * least <= shares.sum() <= least + 1e-6
 
 
-def test_shares_of_clusters_that_are_far_apart_are_the_cost_of_these() -> None:
+def test_scatter_shares_of_far_clusters_equal_their_cost() -> None:
     points = np.array([[0.0, 0, 3.1], [0.2, 0, -3.1], [9, 9, 0], [9, 9, 0.1], [9, 9, 2]])
     variances, kinds = np.full((5, 3), 0.04), np.zeros(5, dtype=int)
     facilities = Facilities(points, variances, kinds, np.zeros(5), PRICE)
@@ -120,7 +120,7 @@ def unsure(seed: int) -> Trace:
 @pytest.mark.parametrize(
     ("drawn", "misread"), [(off_its_places, 0.0), (in_pieces, 0.0), (unsure, 0.4), (unsure, 1.5)]
 )
-def test_no_map_costs_less_than_the_bound(
+def test_scatter_bound_is_below_the_least_cost(
     drawn: Callable[[int], Trace], misread: float, seed: int
 ) -> None:
     trace = drawn(seed)
@@ -143,7 +143,7 @@ def rounds(count: int) -> Trace:
     return replace(Trace.from_steps(views, actions, displacements=moves), odometry=OFF)
 
 
-def test_the_bound_is_near_the_least_cost_if_places_are_far_apart() -> None:
+def test_scatter_bound_is_near_the_cost_for_far_places() -> None:
     trace = rounds(1)
     theory = Theory.topological().replace(boundary="none", star="none", weigh="cost")
     solution = solve(trace, theory)
@@ -153,7 +153,7 @@ def test_the_bound_is_near_the_least_cost_if_places_are_far_apart() -> None:
     assert 0.55 * least <= bound_of(settle(trace, theory), least) < least
 
 
-def test_the_bound_of_eight_rounds_is_near_the_cost_if_the_track_can_hardly_bend() -> None:
+def test_scatter_bound_of_eight_exact_rounds_is_near_the_cost() -> None:
     trace = replace(rounds(8), odometry=EXACT)
     problem = settle(trace, Theory.topological().replace(boundary="none", star="none"))
     dstates = [t % 8 for t in range(len(trace))]
@@ -162,7 +162,7 @@ def test_the_bound_of_eight_rounds_is_near_the_cost_if_the_track_can_hardly_bend
     assert 0.85 * cost <= bound_of(problem, cost) < cost
 
 
-def test_pairs_that_evidence_keeps_apart_raise_the_bound() -> None:
+def test_pairs_kept_apart_raise_the_scatter_bound() -> None:
     """A bent track would bring steps together that the displacements say are at two places."""
     theory = Theory.topological().replace(boundary="none", star="none", weigh="cost")
     with patch.object(Problem, "pairs", NO_PAIRS):
@@ -170,14 +170,14 @@ def test_pairs_that_evidence_keeps_apart_raise_the_bound() -> None:
     assert bound_of(settle(rounds(2), theory), 1000) > 3 * low > 0
 
 
-def test_a_short_second_drive_hardly_lowers_the_bound() -> None:
+def test_short_second_drive_hardly_lowers_the_scatter_bound() -> None:
     theory = Theory.topological().replace(boundary="none", star="none", weigh="cost")
     both = together([rounds(1), rounds(1).prefix(5)], ["monday", "tuesday"])
     assert bound_of(settle(both, theory), 1000) > 0.95 * bound_of(settle(rounds(1), theory), 1000)
 
 
 @pytest.mark.slow
-def test_a_long_trace_with_faults_gets_a_bound() -> None:
+def test_long_trace_with_faults_gets_a_scatter_bound() -> None:
     trace = replace(rounds(8), odometry=EXACT)
     solution = solve(trace, Theory(misread=2.0, boundary="none", star="none"), time_limit=5)
     assert len(trace) > READABLE
@@ -185,7 +185,7 @@ def test_a_long_trace_with_faults_gets_a_bound() -> None:
     assert 0.4 * solution.weighed.nats <= solution.weighed.bound <= solution.weighed.nats
 
 
-def test_traces_and_theories_that_the_bound_is_not_for() -> None:
+def test_scatter_bound_is_off_for_other_traces_and_theories() -> None:
     trace = rounds(1)
     assert is_for(settle(trace))
     assert not is_for(settle(trace, Theory(jumped=2.0)))

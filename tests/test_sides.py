@@ -56,11 +56,13 @@ SHARED = "all maps know in 16 cases on which side of a path a place lies, and so
         ),
     ],
 )
-def test_why_a_place_lies_on_a_side(text: str, place: int, path: int, said: str) -> None:
+def test_explain_place_says_why_a_place_is_on_a_side(
+    text: str, place: int, path: int, said: str
+) -> None:
     assert str(explain_place(written(text), place, path)) == said
 
 
-def test_a_place_lists_its_sides_and_regions() -> None:
+def test_explain_place_lists_sides_and_regions() -> None:
     told = explain_place(written(BLOCK), 0).sentences
     assert [sentence.partition(":")[0] for sentence in told] == [
         "place 0 lies right of path 2+",
@@ -74,7 +76,7 @@ def test_a_place_lists_its_sides_and_regions() -> None:
 
 
 @pytest.mark.slow
-def test_how_many_minimal_maps_have_a_side() -> None:
+def test_explain_place_counts_maps_with_a_side() -> None:
     trace = Trace.load(ACES3)
     maps = solve(trace).maps
     for place in maps[0].places[::4]:
@@ -93,19 +95,19 @@ def test_how_many_minimal_maps_have_a_side() -> None:
             assert found.agree == agree
 
 
-def test_a_trace_without_a_map_says_nothing_of_places() -> None:
+def test_explain_place_of_an_impossible_trace_says_so() -> None:
     found = explain_place(written("a T b A c A d"), 0)
     assert str(found) == "the trace has no map, so nothing is known about place 0"
 
 
-def test_a_place_that_is_not_there() -> None:
+def test_explain_place_refuses_unknown_places_and_paths() -> None:
     with pytest.raises(MapError, match="place: expected a place of the first minimal map, got 9"):
         explain_place(written(CORNER), 9)
     with pytest.raises(MapError, match=r"path: .* got 7; the map has paths 0, 1 and 2"):
         explain_place(written(CORNER), 0, 7)
 
 
-def test_explain_in_the_shell(
+def test_explain_prints_sides_of_a_place(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -128,7 +130,7 @@ def test_show_lists_regions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert "\n  region 0: place 0, right of path 1+, behind place 1\n" in capsys.readouterr().out
 
 
-def test_sides_that_all_rivals_know_and_some() -> None:
+def test_shared_sides_separate_certain_from_possible_sides() -> None:
     found = shared_sides(Listing.of(solve(Trace.load(ACES3))))
     assert found is not None
     assert found.proven
@@ -145,7 +147,7 @@ def test_sides_that_all_rivals_know_and_some() -> None:
     assert shared_sides(Listing.of(solve(written(BLOCK), Theory.causal()))) is None
 
 
-def test_maps_that_differ_in_sides_only() -> None:
+def test_difference_finds_maps_that_differ_only_in_sides() -> None:
     ssh_map = solve(written(CORNER))[0]
     blind = replace(ssh_map, regions=())
     found = difference(ssh_map, blind)
@@ -171,7 +173,7 @@ def test_compare_names_sides_in_some_maps(
     assert (len(sides["forced"]), len(sides["possible"]), sides["proven"]) == (16, 15, True)
 
 
-def test_compare_two_files_that_differ_in_sides_only(
+def test_compare_prints_maps_that_differ_only_in_sides(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -184,7 +186,7 @@ def test_compare_two_files_that_differ_in_sides_only(
     assert "the first maps of both are the same, except:" in out
 
 
-def test_a_name_of_a_region_stands_everywhere(
+def test_name_of_a_region_is_shown_by_all_verbs(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -207,7 +209,7 @@ def test_a_name_of_a_region_stands_everywhere(
 
 
 @pytest.mark.slow
-def test_the_first_map_costs_no_more_than_a_known_one() -> None:
+def test_explain_place_without_time_uses_known_maps() -> None:
     """No time is left for a search, and a map without one has more places."""
     trace = Trace.load(ACES3)
     known = solve(trace).maps

@@ -83,13 +83,13 @@ def by_hand(world: World, pose: tuple[float, float, float], bearing: float, reac
 
 @settings(max_examples=15)
 @given(st.floats(0.3, 3.7), st.floats(0.3, 1.7), st.floats(-4, 4))
-def test_ranges_are_those_computed_beam_by_beam(x: float, y: float, heading: float) -> None:
+def test_ranges_equal_those_computed_beam_by_beam(x: float, y: float, heading: float) -> None:
     ranges = Laser().exact(RECTANGLE, np.array([[x, y, heading]]))[0]
     expected = [by_hand(RECTANGLE, (x, y, heading), b, 8.0) for b in BEARINGS]
     np.testing.assert_allclose(ranges, expected, atol=1e-9)
 
 
-def test_many_poses_at_once_are_the_same_as_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ranges_of_many_poses_equal_those_of_single_poses(monkeypatch: pytest.MonkeyPatch) -> None:
     poses = np.random.default_rng(0).uniform([0.3, 0.3, -3], [3.7, 1.7, 3], (50, 3))
     together = Laser().exact(RECTANGLE, poses)
     monkeypatch.setattr("simulator.laser._BLOCK", 180 * 8 * 7)
@@ -99,13 +99,13 @@ def test_many_poses_at_once_are_the_same_as_one_by_one(monkeypatch: pytest.Monke
     )
 
 
-def test_the_first_beam_is_at_the_right_and_the_last_at_the_left() -> None:
+def test_first_beam_is_on_the_right() -> None:
     ranges = Laser().exact(RECTANGLE, np.array([[1.0, 0.5, 0.0]]))[0]
     assert ranges[0] == pytest.approx(0.5, abs=0.01)
     assert ranges[-1] == pytest.approx(1.5, abs=0.01)
 
 
-def test_noise_dropouts_and_reach() -> None:
+def test_laser_has_noise_dropouts_and_reach() -> None:
     laser, rng = Laser(noise=0.01, reach=3.0, dropouts=0.02), np.random.default_rng(0)
     pose = np.array([[1.0, 1.0, 0.0]])
     scans = laser.scan(RECTANGLE, np.repeat(pose, 2000, axis=0), rng)
@@ -122,7 +122,7 @@ def test_noise_dropouts_and_reach() -> None:
 # Worlds
 
 
-def test_shipped_worlds_are_what_they_say() -> None:
+def test_shipped_worlds_have_the_documented_sizes() -> None:
     assert len(RECTANGLE.dstates) == 8
     assert (
         len({s.place for s in RECTANGLE.dstates}) == len({s.path for s in RECTANGLE.dstates}) == 4
@@ -133,7 +133,7 @@ def test_shipped_worlds_are_what_they_say() -> None:
     assert len(HALL.route) == 24
 
 
-def test_a_world_from_an_occupancy_map(tmp_path: Path) -> None:
+def test_occupancy_map_becomes_a_world(tmp_path: Path) -> None:
     cells = np.full((24, 44), 254, np.uint8)
     cells[[0, 1, -2, -1]] = cells[:, [0, 1, -2, -1]] = 0
     for head, body in (
@@ -192,12 +192,14 @@ def test_a_world_from_an_occupancy_map(tmp_path: Path) -> None:
         ({"dstates": [{"name": "a"}]}, r"dstates\[0\]: expected an object"),
     ],
 )
-def test_bad_worlds_name_the_field(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
+def test_malformed_world_is_refused_with_its_field(
+    changes: dict[str, Any], message: str, tmp_path: Path
+) -> None:
     with pytest.raises(SimulatorError, match=message):
         world_of(tmp_path, **changes)
 
 
-def test_worlds_that_are_not_there(tmp_path: Path) -> None:
+def test_unknown_world_names_are_refused(tmp_path: Path) -> None:
     with pytest.raises(
         SimulatorError,
         match=(
@@ -221,7 +223,7 @@ def test_worlds_that_are_not_there(tmp_path: Path) -> None:
 
 @settings(max_examples=30)
 @given(st.floats(0.45, 0.75), st.floats(0.45, 0.75), st.floats(-12, 12), st.sampled_from(range(4)))
-def test_sight_measures_the_corner_that_it_sees(
+def test_sight_measures_distances_and_tilt_of_a_corner(
     ahead: float, left: float, degrees: float, corner: int
 ) -> None:
     """Facing each corner of a room: distances and tilt, to a few millimetres and 0.1 degrees.
@@ -245,7 +247,7 @@ def test_sight_measures_the_corner_that_it_sees(
     assert seen.to_go(0.6) == pytest.approx(ahead - 0.6, abs=0.01)
 
 
-def test_an_image_of_nothing_shows_nothing() -> None:
+def test_sight_of_an_empty_image_is_empty() -> None:
     seen = sight(np.full(180, 8.0), 1.0, 8.0)
     assert (seen.front, seen.left, seen.right, seen.to_go(1.0), seen.offset(1.0)) == (
         None,
@@ -300,7 +302,7 @@ def test_control_never_reads_the_true_pose() -> None:
 
 
 @pytest.mark.slow
-def test_every_dstate_is_reached_in_order(circuits: Trace, tours: Trace) -> None:
+def test_simulated_tour_reaches_dstates_in_order(circuits: Trace, tours: Trace) -> None:
     assert [step.truth["dstate"] for step in circuits.steps] == [f"x{i % 8}" for i in range(48)]
     assert [a.name for a in circuits.actions[:8]] == list(RECTANGLE.route)
     once = [step.truth["dstate"] for step in tours.steps[:24]]
@@ -308,7 +310,7 @@ def test_every_dstate_is_reached_in_order(circuits: Trace, tours: Trace) -> None
     assert len(set(once)) == 20
 
 
-def test_errors_do_not_add_up(circuits: Trace) -> None:
+def test_hill_climbing_keeps_errors_bounded(circuits: Trace) -> None:
     """The spread of poses at the dstates is the same in the first and the last six circuits."""
     for poses in poses_by_dstate(circuits).values():
         off = np.abs(poses[:, :2] - poses[:, :2].mean(0)).max(1)
@@ -325,7 +327,7 @@ def test_errors_do_not_add_up(circuits: Trace) -> None:
     assert last.mean() < 1.5 * first.mean()
 
 
-def test_without_hill_climbing_errors_do_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_errors_grow_without_hill_climbing(monkeypatch: pytest.MonkeyPatch) -> None:
     """The test above can fail: after two sides by dead reckoning, the corner is lost."""
     rng = np.random.default_rng(0)
     ends = []
@@ -337,7 +339,7 @@ def test_without_hill_climbing_errors_do_add_up(monkeypatch: pytest.MonkeyPatch)
     assert np.std(ends, axis=0).max() > 0.05
 
 
-def test_odometry_drifts_and_is_not_the_truth(circuits: Trace) -> None:
+def test_odometry_drifts_away_from_the_truth(circuits: Trace) -> None:
     rng = np.random.default_rng(0)
     robot = SimulatedRobot(Body(), (0.0, 0.0, 0.0), rng)
     for _ in range(200):
@@ -396,7 +398,7 @@ def fixed_points(trace: Trace) -> list[tuple[float, float, float]]:
 
 @settings(max_examples=25)
 @given(POSES, POSES)
-def test_a_displacement_leads_from_one_pose_to_the_other(
+def test_displacement_between_poses_inverts_moved(
     start: tuple[float, float, float], end: tuple[float, float, float]
 ) -> None:
     x, y, heading = moved(start, displacement_between(start, end))
@@ -404,7 +406,7 @@ def test_a_displacement_leads_from_one_pose_to_the_other(
     assert math.remainder(heading - end[2], math.tau) == pytest.approx(0, abs=1e-9)
 
 
-def test_noise_has_the_covariance_that_the_odometry_says() -> None:
+def test_reported_noise_has_the_stated_covariance() -> None:
     rng, displacement, odometry = (
         np.random.default_rng(0),
         (6.0, -8.0, 0.5),
@@ -415,7 +417,7 @@ def test_noise_has_the_covariance_that_the_odometry_says() -> None:
     np.testing.assert_allclose(np.cov(told.T), odometry.covariance(displacement), atol=0.015)
 
 
-def test_errors_that_repeat_make_a_line_an_arc() -> None:
+def test_constant_drift_bends_a_line_into_an_arc() -> None:
     """After ten metres straight ahead, reported 10 % too long, the heading is off by 10 bends."""
     exact, rng = Odometry(0, 0, 0, 0, 0, 0, 0, 0), np.random.default_rng(0)
     pose = (0.0, 0.0, 0.0)
@@ -427,7 +429,7 @@ def test_errors_that_repeat_make_a_line_an_arc() -> None:
     np.testing.assert_allclose(at_once, arc, atol=0.1)
 
 
-def test_the_covariance_of_a_report_is_that_of_its_errors() -> None:
+def test_covariance_of_a_report_equals_that_of_its_errors() -> None:
     rng = np.random.default_rng(0)
     errors = []
     for _ in range(600):
@@ -449,7 +451,7 @@ def test_the_covariance_of_a_report_is_that_of_its_errors() -> None:
     np.testing.assert_allclose(np.cov(found.T), np.eye(3), atol=0.2)
 
 
-def test_worn_wheels_report_too_long_ways_and_unequal_ones_a_drift() -> None:
+def test_wheel_errors_scale_distances_and_bend_the_track() -> None:
     robot = SimulatedRobot(
         Body(slip=0, wander=0, odometry=0, scale=0.1, bend=0.02),
         (0.0, 0.0, 0.0),
@@ -467,7 +469,7 @@ def test_worn_wheels_report_too_long_ways_and_unequal_ones_a_drift() -> None:
     assert robot.odometry == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
 
 
-def test_displacements_are_the_motions_between_the_dstates(circuits: Trace, tours: Trace) -> None:
+def test_displacements_equal_motions_between_dstates(circuits: Trace, tours: Trace) -> None:
     """Displacements of wheels lead between true poses; those of a map lead between fixed points."""
     for trace in (circuits, tours):
         assert trace.steps[0].displacement is None
@@ -482,7 +484,7 @@ def test_displacements_are_the_motions_between_the_dstates(circuits: Trace, tour
         assert 0.15 < (travels**2).mean() < 1.2
 
 
-def test_the_shares_of_a_step_are_those_of_its_motions() -> None:
+def test_covariance_of_a_step_sums_its_motions() -> None:
     """Without hill-climbing, the chi-square by the noise model has its degrees of freedom."""
     rng = np.random.default_rng(0)
     body = Body(wander=0, odometry=0.05)
@@ -505,7 +507,7 @@ def test_the_shares_of_a_step_are_those_of_its_motions() -> None:
     assert 0.8 < (along**2).mean() < 1.2
 
 
-def test_wrong_scale_and_steady_drift_are_in_the_trace_and_in_its_odometry() -> None:
+def test_trace_declares_scale_and_drift_of_the_body() -> None:
     plain = simulate(RECTANGLE, 5, seed=7)
     trace = simulate(RECTANGLE, 5, seed=7, body=Body(scale=0.1, bend=0.0035))
     assert trace.odometry is not None
@@ -526,7 +528,7 @@ def test_wrong_scale_and_steady_drift_are_in_the_trace_and_in_its_odometry() -> 
 @pytest.mark.parametrize(
     ("name", "value"), [("scale", 0.6), ("bend", -0.7), ("odometry", -0.1), ("scale", math.nan)]
 )
-def test_an_odometry_that_nobody_can_drive_with(name: str, value: float) -> None:
+def test_body_refuses_extreme_odometry_errors(name: str, value: float) -> None:
     with pytest.raises(
         SimulatorError,
         match=rf"body\.{name}: expected a number from .* to 0\.5.*, got .*; choose a smaller error",
@@ -534,7 +536,7 @@ def test_an_odometry_that_nobody_can_drive_with(name: str, value: float) -> None
         Body(**{name: value})
 
 
-def test_the_openings_seen_are_those_that_are_there(tours: Trace) -> None:
+def test_stars_equal_the_true_openings(tours: Trace) -> None:
     straight = {"P1": "ES", "P2": "EWS", "P3": "EWS", "E": "W", "D1": "N", "D2": "N", "D3": "N"}
     headings = {"north": "NESW", "east": "ESWN", "south": "SWNE", "west": "WNES"}
     for step in tours.steps:
@@ -542,12 +544,12 @@ def test_the_openings_seen_are_those_that_are_there(tours: Trace) -> None:
         assert step.star == tuple(float(side in straight[place]) for side in headings[heading])
 
 
-def test_the_same_seed_gives_the_same_trace() -> None:
+def test_equal_seeds_give_equal_traces() -> None:
     assert simulate(RECTANGLE, 2, seed=7) == simulate(RECTANGLE, 2, seed=7)
     assert simulate(RECTANGLE, 2, seed=7) != simulate(RECTANGLE, 2, seed=8)
 
 
-def test_traces_of_tours_survive_files(tmp_path: Path) -> None:
+def test_simulated_traces_survive_a_round_trip(tmp_path: Path) -> None:
     trace = simulate(RECTANGLE, 2, seed=7)
     trace.save(tmp_path / "run.jsonl")
     assert Trace.load(tmp_path / "run.jsonl") == trace
@@ -555,7 +557,7 @@ def test_traces_of_tours_survive_files(tmp_path: Path) -> None:
     assert all(step.view is None for step in trace.steps)
 
 
-def test_images_at_even_distances() -> None:
+def test_simulate_every_takes_images_at_even_distances() -> None:
     trace = simulate(RECTANGLE, 3, seed=7, every=0.5)
     poses = np.array([step.truth["pose"][:2] for step in trace.steps])
     assert len(trace) == pytest.approx(3 * 7.2 / 0.5, rel=0.15)
@@ -575,13 +577,13 @@ def test_clutter_moves_between_tours_only() -> None:
 # What cannot be driven
 
 
-def test_a_start_inside_a_wall(tmp_path: Path) -> None:
+def test_start_inside_a_wall_is_refused(tmp_path: Path) -> None:
     for start in ([0.1, 1, 0], [4, 1, 0], [9, 9, 0]):
         with pytest.raises(SimulatorError, match=r"start: expected a place 0\.2 m off the walls"):
             simulate(world_of(tmp_path, start=start))
 
 
-def test_a_route_into_a_wall(tmp_path: Path) -> None:
+def test_route_into_a_wall_is_refused(tmp_path: Path) -> None:
     with pytest.raises(
         SimulatorError,
         match=r"travel at \(3\.\d\d, 1\.\d\d\): expected a free way ahead, got a wall",
@@ -589,7 +591,7 @@ def test_a_route_into_a_wall(tmp_path: Path) -> None:
         simulate(world_of(tmp_path, route=["travel"]), tours=2)
 
 
-def test_a_gap_through_which_the_robot_escapes(tmp_path: Path) -> None:
+def test_world_with_a_gap_in_its_walls_is_refused(tmp_path: Path) -> None:
     corridor = {
         "polygons": [],
         "segments": [[0, 0, 9, 0], [0, 2, 9, 2], [0, 0, 0, 2]],
@@ -603,7 +605,7 @@ def test_a_gap_through_which_the_robot_escapes(tmp_path: Path) -> None:
         simulate(world_of(tmp_path, **corridor), tours=2)
 
 
-def test_no_route_and_no_tours(tmp_path: Path) -> None:
+def test_empty_route_and_zero_tours_are_refused(tmp_path: Path) -> None:
     with pytest.raises(SimulatorError, match="route: expected at least one action"):
         simulate(world_of(tmp_path, route=[]))
     with pytest.raises(SimulatorError, match="tours: expected a whole number from 1 to 100,000"):

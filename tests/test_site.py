@@ -13,7 +13,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 
 
-def test_examples_are_blocks_of_code() -> None:
+def test_docstring_examples_become_blocks_of_code() -> None:
     assert docstrings.with_fences("It adds.\n\n>>> 1 + 1\n2\n\nArgs:\n    x: A number.") == (
         "It adds.\n\n```pycon\n>>> 1 + 1\n2\n```\n\nArgs:\n    x: A number."
     )
@@ -33,12 +33,12 @@ def test_examples_are_blocks_of_code() -> None:
         ("formats.md#maps", "formats.md#maps"),
     ],
 )
-def test_links_out_of_the_pages_lead_to_github(link: str, shown: str) -> None:
+def test_links_to_other_files_lead_to_github(link: str, shown: str) -> None:
     assert hooks.to_github(f"See [there]({link}).", "contributing.md") == f"See [there]({shown})."
     assert hooks.to_github("[up](../index.md)", "tutorials/logs.md") == "[up](../index.md)"
 
 
-def test_all_names_that_pages_import_have_a_page() -> None:
+def test_names_imported_in_pages_have_a_reference_page() -> None:
     imported = set()
     for page in (ROOT / "README.md", *(ROOT / "docs").rglob("*.md")):
         for text in re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL):
@@ -85,14 +85,14 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("tag", ["", *BROKEN])
-def test_broken_links_and_foreign_files_of_pages_are_found(tag: str, tmp_path: Path) -> None:
+def test_site_check_finds_broken_links_and_foreign_files(tag: str, tmp_path: Path) -> None:
     (tmp_path / "a.html").write_text(SOUND + tag)
     (tmp_path / "b.html").write_text('<h2 id="there"></h2>')
     (tmp_path / "s.css").write_text("p { background: url(data:image/png;base64,AA) }")
     assert list(check.problems(tmp_path)) == ([BROKEN[tag]] if tag else [])
 
 
-def test_style_sheets_that_load_from_elsewhere_are_found(tmp_path: Path) -> None:
+def test_site_check_finds_style_sheets_that_load_from_elsewhere(tmp_path: Path) -> None:
     (tmp_path / "s.css").write_text(
         "@import 'https://x.example/a.css'; p { background: url(\"no.png\") }"
     )
@@ -102,7 +102,7 @@ def test_style_sheets_that_load_from_elsewhere_are_found(tmp_path: Path) -> None
     ]
 
 
-def test_each_page_is_once_in_the_navigation() -> None:
+def test_each_page_is_in_the_navigation_once() -> None:
     listed = re.findall(
         r"^ +- (?:.*: )?([\w/-]+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE
     )

@@ -94,5 +94,5 @@ def test_modules_and_classes_are_small() -> None:
         ("class A:\n    def fit(self):\n        self.x = self.y_ = 1", "A: fit makes x"),
     ],
 )
-def test_what_is_too_large_is_found(text: str, fault: str) -> None:
+def test_faults_of_finds_modules_and_classes_that_are_too_large(text: str, fault: str) -> None:
     assert [*faults_of(text)] == [fault]

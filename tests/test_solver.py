@@ -82,7 +82,7 @@ def clock() -> Iterator[Callable[[float], None]]:
 
 @pytest.mark.parametrize("theory", THEORIES.values(), ids=THEORIES)
 @pytest.mark.parametrize("tour", ["square", "tee", "comb"])
-def test_prefixes_give_what_solving_at_once_gives(tour: str, theory: Theory) -> None:
+def test_maps_by_prefixes_equal_those_of_the_whole_trace(tour: str, theory: Theory) -> None:
     world, place, heading, actions = TOURS[tour]
     trace = drive(world, place, heading, actions, stars=theory.level == "topological")
     by_prefix, at_once = (
@@ -99,7 +99,7 @@ def test_prefixes_give_what_solving_at_once_gives(tour: str, theory: Theory) -> 
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_prefixes_of_random_machines(seed: int) -> None:
+def test_maps_by_prefixes_of_random_machines_equal_whole_traces(seed: int) -> None:
     trace = wandering(seed, rooms=4, length=40, views=3)
     by_prefix, at_once = (
         solve(trace, Theory.causal(), max_maps=None, speedups=Speedups(prefixes=p))
@@ -113,7 +113,7 @@ def test_prefixes_of_random_machines(seed: int) -> None:
 @given(
     traces(max_steps=8).flatmap(lambda trace: theories(trace).map(lambda theory: (trace, theory)))
 )
-def test_prefixes_from_one_step_on(case: tuple[Trace, Theory]) -> None:
+def test_maps_by_prefixes_from_one_step_equal_whole_traces(case: tuple[Trace, Theory]) -> None:
     """Try every prefix, from the shortest on, so that replay fails if it can."""
     trace, theory = case
     with pytest.MonkeyPatch.context() as patch:
@@ -128,9 +128,7 @@ def test_prefixes_from_one_step_on(case: tuple[Trace, Theory]) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_streaming_lists_no_map_twice_and_misses_none(
-    seed: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_streamed_maps_are_complete_and_unique(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """With nothing held back, maps stream from a prefix that is too short for others."""
     trace = wandering(seed, rooms=5, length=30, views=3)
     at_once = solve(trace, Theory.causal(), max_maps=None, speedups=Speedups(prefixes=False))
@@ -148,7 +146,9 @@ def test_streaming_lists_no_map_twice_and_misses_none(
         ((rectangle(8), "causal"), "theory: expected a Theory, got 'causal'"),
     ],
 )
-def test_arguments_of_another_kind(arguments: tuple[Any, ...], message: str) -> None:
+def test_functions_refuse_arguments_of_wrong_types(
+    arguments: tuple[Any, ...], message: str
+) -> None:
     for function in (
         solve,
         Search,
@@ -192,9 +192,7 @@ def test_arguments_of_another_kind(arguments: tuple[Any, ...], message: str) -> 
         (lambda: Trace.from_steps(["a"], [], stars=[{}]), "star"),
     ],
 )
-def test_arguments_of_another_kind_are_errors_of_the_package(
-    call: Callable[[], Any], message: str
-) -> None:
+def test_wrong_types_raise_errors_of_the_package(call: Callable[[], Any], message: str) -> None:
     with pytest.raises(AbductionError, match=re.escape(message)):
         call()
 
@@ -206,7 +204,7 @@ def test_max_maps_must_be_a_whole_number(maps: Any) -> None:
 
 
 @pytest.mark.parametrize("theory", THEORIES.values(), ids=THEORIES)
-def test_fifty_circuits_need_no_longer_prefix_than_two(theory: Theory) -> None:
+def test_fifty_circuits_need_the_prefix_of_two(theory: Theory) -> None:
     two, fifty = solve(rectangle(16), theory), solve(rectangle(400), theory)
     assert fifty.effort.prefix == two.effort.prefix < 16
     assert fifty.cost == two.cost
@@ -215,7 +213,7 @@ def test_fifty_circuits_need_no_longer_prefix_than_two(theory: Theory) -> None:
 
 
 @pytest.mark.parametrize("theory", THEORIES.values(), ids=THEORIES)
-def test_a_thousand_circuits(theory: Theory) -> None:
+def test_thousand_circuits_need_a_short_prefix(theory: Theory) -> None:
     trace = rectangle(8_000)
     solution = solve(trace, theory)
     assert solution.status is Status.OPTIMAL
@@ -224,7 +222,7 @@ def test_a_thousand_circuits(theory: Theory) -> None:
     assert check(trace, solution.maps[0], theory) == ()
 
 
-def test_a_surprise_after_many_circuits_is_not_missed() -> None:
+def test_new_view_after_many_circuits_gets_a_dstate() -> None:
     """50 circuits and then another view. The closed map is wrong, and the answer has a dstate for
     the new view."""
     circuits = rectangle(48)
@@ -240,7 +238,7 @@ def test_a_surprise_after_many_circuits_is_not_missed() -> None:
     )  # after a loop of four the view is v0, so no loop may be closed: 48 dstates + 1
 
 
-def test_at_most_max_maps_are_listed() -> None:
+def test_solve_lists_at_most_max_maps() -> None:
     world, place, heading, actions = TOURS["comb"]
     trace = drive(world, place, heading, actions[:14])
     theory = Theory(boundary="none", path_order="partial", prefer=("paths", "places", "dstates"))
@@ -257,7 +255,7 @@ def test_at_most_max_maps_are_listed() -> None:
     assert (exactly.count, exactly.complete, exactly.stopped) == (30, True, None)
 
 
-def test_a_stream_of_millions_starts_at_once() -> None:
+def test_first_of_millions_of_maps_comes_at_once() -> None:
     """One and a half circuits have 20,289 consistent maps without sides. Two and a half circuits
     have far too many to list."""
     theory = Theory(boundary="none", path_order="partial", prefer=())
@@ -267,7 +265,7 @@ def test_a_stream_of_millions_starts_at_once() -> None:
     assert search.count == 100
 
 
-def test_nothing_preferred_means_all_consistent_maps() -> None:
+def test_empty_prefer_lists_all_consistent_maps() -> None:
     trace = written("a T a T a")
     theory = Theory.causal().replace(prefer=())
     assert (
@@ -275,7 +273,7 @@ def test_nothing_preferred_means_all_consistent_maps() -> None:
     )  # of the partitions of three steps, {0,1}{2} alone breaks determinism
 
 
-def test_time_limit_leaves_the_best_map_and_its_bound() -> None:
+def test_time_limit_returns_the_best_map_and_bound() -> None:
     trace = too_hard()
     solution = solve(trace, Theory.causal(), time_limit=1)
     assert solution.stopped == "time limit"
@@ -288,7 +286,7 @@ def test_time_limit_leaves_the_best_map_and_its_bound() -> None:
     assert check(trace, solution.maps[0], Theory.causal()) == ()
 
 
-def test_no_time_at_all_is_unknown_not_unsatisfiable() -> None:
+def test_solve_without_time_and_greedy_is_unknown() -> None:
     solution = solve(drive(*TOURS["comb"]), time_limit=1e-9, speedups=Speedups.without("greedy"))
     assert (solution.status, solution.stopped, solution.maps, solution.cost) == (
         Status.UNKNOWN,
@@ -299,7 +297,7 @@ def test_no_time_at_all_is_unknown_not_unsatisfiable() -> None:
 
 
 @pytest.mark.parametrize("theory", THEORIES.values(), ids=THEORIES)
-def test_no_time_at_all_still_leaves_a_map_and_a_bound(theory: Theory) -> None:
+def test_solve_without_time_has_a_map_and_bound(theory: Theory) -> None:
     trace = drive(*TOURS["comb"])
     solution, best = solve(trace, theory, time_limit=1e-9), solve(trace, theory, max_maps=1)
     assert (solution.status, solution.stopped, solution.count) == (Status.FEASIBLE, "time limit", 1)
@@ -327,13 +325,13 @@ def test_time_limit_while_listing_keeps_the_proof() -> None:
     assert solution.count == 2
 
 
-def test_memory_limit_stops_with_a_status() -> None:
+def test_memory_limit_stops_the_search() -> None:
     solution = solve(drive(*TOURS["comb"]), memory_limit=1, speedups=Speedups.without("greedy"))
     assert (solution.status, solution.stopped) == (Status.UNKNOWN, "memory limit")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals")
-def test_ctrl_c_leaves_the_best_map(tmp_path: Path) -> None:
+def test_ctrl_c_returns_the_best_map(tmp_path: Path) -> None:
     program = textwrap.dedent("""
         import signal, sys
         # Ctrl-C is ignored if the tests run in the background.
@@ -358,7 +356,7 @@ def test_ctrl_c_leaves_the_best_map(tmp_path: Path) -> None:
         assert process.wait(100) == 0
 
 
-def test_a_stream_that_is_left_does_not_abort_python() -> None:
+def test_unfinished_stream_does_not_abort_python() -> None:
     """A search of clingo still runs in a thread when Python ends."""
     program = textwrap.dedent("""
         import sys
@@ -393,7 +391,7 @@ def test_progress_is_reported() -> None:
         ({"memory_limit": 0}, "memory_limit (--memory-limit)"),
     ],
 )
-def test_limits_that_make_no_sense(choices: dict[str, int], name: str) -> None:
+def test_solve_refuses_wrong_limits(choices: dict[str, int], name: str) -> None:
     with pytest.raises(SolverError, match=f"^{re.escape(name)}: expected"):
         solve(rectangle(4), **choices)  # type: ignore[arg-type]
 
@@ -415,7 +413,7 @@ def test_limits_that_make_no_sense(choices: dict[str, int], name: str) -> None:
         ({"prefer": 5}, "prefer: expected a list of names, got 5"),
     ],
 )
-def test_theories_that_make_no_sense(choices: dict[str, object], message: str) -> None:
+def test_theory_refuses_wrong_fields(choices: dict[str, object], message: str) -> None:
     with pytest.raises(TheoryError) as error:
         Theory.topological().replace(**choices)
     assert str(error.value).startswith(message)
@@ -432,7 +430,7 @@ def test_theories_survive_a_round_trip() -> None:
         assert Theory.from_dict(theory.to_dict()) == theory
 
 
-def test_what_a_theory_asks_of_a_trace() -> None:
+def test_solve_refuses_traces_that_lack_what_the_theory_needs() -> None:
     unkinded = Trace.from_steps(["a", "b"], ["jump"])
     with pytest.raises(TraceError, match=r"step 0: action\.kind: expected"):
         solve(unkinded)
@@ -456,14 +454,14 @@ def maps_of_all_tours() -> list[tuple[Trace, Theory, SSHMap]]:
 
 
 @pytest.mark.slow
-def test_a_map_predicts_the_trace_it_was_made_for() -> None:
+def test_replay_of_a_map_predicts_its_trace() -> None:
     for trace, theory, ssh_map in maps_of_all_tours():
         replayed = Log(trace, settle(trace, theory).theory).replay(ssh_map.labels)
         assert (replayed.labels, replayed.outcome) == (ssh_map.labels, Outcome.PREDICTED)
         assert links_of(ssh_map.labels, trace) == ssh_map.links
 
 
-def test_replay_stops_where_the_map_knows_nothing_or_is_wrong() -> None:
+def test_replay_stops_at_an_unknown_or_contradicted_step() -> None:
     trace = written("a T b A b T a T c")
     log = Log(trace, Theory.causal())
     assert log.replay((0, 1, 2)) == log.replay((0, 1, 2), known=3)
@@ -473,7 +471,7 @@ def test_replay_stops_where_the_map_knows_nothing_or_is_wrong() -> None:
     )  # a T leads to b, but c was seen
 
 
-def test_mutated_maps_fail_the_check() -> None:
+def test_checker_refuses_mutated_maps() -> None:
     """In any map, swapped labels, a dropped link or a reversed order is a violation."""
     mutants = 0
     for trace, theory, ssh_map in maps_of_all_tours():
@@ -497,7 +495,7 @@ def test_mutated_maps_fail_the_check() -> None:
     assert mutants > 50
 
 
-def test_nothing_that_infers_reads_the_truth() -> None:
+def test_shuffled_truth_changes_no_answer() -> None:
     route = Trace.load(Path(__file__).parent.parent / "examples" / "aces3-route.jsonl")[:16]
     truths = [step.truth for step in route.steps]
     assert any(truths)
@@ -512,7 +510,7 @@ def test_nothing_that_infers_reads_the_truth() -> None:
     assert solve(shuffled).maps == solve(bare).maps == solve(route).maps
 
 
-def test_a_prefix_that_grew_half_way_is_not_asked_for() -> None:
+def test_growth_continues_after_a_limit_with_the_same_maps() -> None:
     """After a limit has stopped the growth, growing on has the same result as growing at once."""
     trace = drive(*TOURS["comb"])
     theory = settle(trace).theory
@@ -539,7 +537,7 @@ def test_a_prefix_that_grew_half_way_is_not_asked_for() -> None:
     )
 
 
-def test_a_stop_while_maps_are_held_back_gives_them(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupt_releases_maps_that_were_held_back(monkeypatch: pytest.MonkeyPatch) -> None:
     theory = Theory(boundary="none", path_order="partial", prefer=("paths", "places", "dstates"))
     search = Search(drive(*TOURS["comb"]), theory, max_maps=None)
     honest = search._parts.prefixes.engine.maps_of_cost
@@ -562,7 +560,7 @@ def test_a_stop_while_maps_are_held_back_gives_them(monkeypatch: pytest.MonkeyPa
     assert solution.status is Status.OPTIMAL
 
 
-def test_a_stop_while_the_prefix_grows_gives_the_maps_that_replayed(
+def test_interrupt_during_growth_returns_replayed_maps(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(prefixes, "FIRST_PREFIX", 2)
@@ -586,14 +584,14 @@ def test_a_stop_while_the_prefix_grows_gives_the_maps_that_replayed(
     assert max(given) > 1  # one is always known
 
 
-def test_a_search_runs_once() -> None:
+def test_search_can_be_iterated_once() -> None:
     search = Search(rectangle(4))
     assert len(list(search)) == 1
     with pytest.raises(SolverError, match="iterated once"):
         list(search)
 
 
-def test_costs_are_right_where_a_map_cannot_show_them() -> None:
+def test_cost_counts_places_that_a_map_cannot_show() -> None:
     """Without one_place a dstate may be at many places. The map shows the first one, and the cost
     counts all."""
     solution = solve(
@@ -605,7 +603,7 @@ def test_costs_are_right_where_a_map_cannot_show_them() -> None:
     assert (solution.cost.places, solution.bound.places, solution.count) == (5, 5, 11)
 
 
-def test_the_time_of_the_caller_does_not_count() -> None:
+def test_time_of_the_caller_does_not_count() -> None:
     theory = Theory(boundary="none", path_order="partial", prefer=("paths", "places", "dstates"))
     search = Search(drive(*TOURS["comb"]), theory, max_maps=5, time_limit=1000)
     with clock() as later:
@@ -614,7 +612,7 @@ def test_the_time_of_the_caller_does_not_count() -> None:
     assert (search.count, search.stopped) == (5, "maps limit")
 
 
-def test_the_clock_runs_on_for_an_explanation() -> None:
+def test_time_limit_includes_the_explanation() -> None:
     search = Search(Trace.from_steps("abcd", ["travel", "around", "around"]), time_limit=1000)
     with clock() as later:
         assert list(search) == []
@@ -625,7 +623,7 @@ def test_the_clock_runs_on_for_an_explanation() -> None:
     assert search.stopped == "time limit"
 
 
-def test_an_explanation_can_be_interrupted() -> None:
+def test_explanation_can_be_interrupted() -> None:
     trace = Trace.from_steps("abcd", ["travel", "around", "around"])
     with pytest.raises(Interrupted):
         explain(trace, stop=lambda: True)
@@ -633,7 +631,7 @@ def test_an_explanation_can_be_interrupted() -> None:
     assert explain(trace, stop=lambda: next(asked) > 10**6) == explain(trace)
 
 
-def test_two_searches_at_once() -> None:
+def test_searches_in_threads_give_the_same_answers() -> None:
     """In threads of their own, where no signal arrives."""
     with ThreadPoolExecutor(2) as pool:
         answers = list(pool.map(lambda n: solve(rectangle(n)).cost, [8, 16, 8, 16, 24, 32]))
@@ -652,7 +650,7 @@ def shape(ssh_map: SSHMap) -> tuple[object, ...]:
 @given(
     traces(max_steps=8).flatmap(lambda trace: theories(trace).map(lambda theory: (trace, theory)))
 )
-def test_renaming_and_mirroring_leave_the_maps_alone(case: tuple[Trace, Theory]) -> None:
+def test_renaming_and_mirroring_do_not_change_maps(case: tuple[Trace, Theory]) -> None:
     trace, theory = case
     shapes = {shape(m) for m in solve(trace, theory, max_maps=None).maps}
     stars = [step.star for step in trace.steps] if trace.has_stars else None
@@ -673,7 +671,7 @@ def test_renaming_and_mirroring_leave_the_maps_alone(case: tuple[Trace, Theory])
     assert {shape(m) for m in solve(mirror, theory, max_maps=None).maps} == shapes
 
 
-def test_a_map_of_a_prefix_goes_on_when_time_is_over() -> None:
+def test_map_of_a_prefix_is_extended_at_the_time_limit() -> None:
     """Unknown steps get new dstates. There are far fewer than if only a short prefix was mapped."""
     trace = maze(4, 4, steps=500, seed=0, loops=0.5, stars=True).trace
     grow = FramedEngine.grow
@@ -696,7 +694,7 @@ def test_a_map_of_a_prefix_goes_on_when_time_is_over() -> None:
     assert len(found[250].maps[0].dstates) < 0.5 * len(found[8].maps[0].dstates)
 
 
-def test_the_search_for_a_further_map_ends_soon() -> None:
+def test_search_ends_after_the_last_requested_map() -> None:
     """The search ends after the last map asked for, although the next one would take long."""
     trace = maze(2, 2, steps=200, seed=0).trace
     every = solve(trace, Theory.causal(), max_maps=None)

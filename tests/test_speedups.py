@@ -74,7 +74,7 @@ def machines(draw: st.DrawFn, most_steps: int = 14) -> Trace:
 
 @settings(max_examples=12)
 @given(machines(), st.sets(st.sampled_from(NAMES)), st.data())
-def test_any_choice_of_speedups_lists_the_maps_of_the_plain_encoding(
+def test_any_speedups_give_the_maps_of_the_plain_encoding(
     trace: Trace, off: set[str], data: st.DataObject
 ) -> None:
     """Prefixes, waiting times and buffers are so small that short traces use them all."""
@@ -153,7 +153,7 @@ def reads_of(case: str) -> list[str]:
     return [name for name in NAMES if name in read]
 
 
-def test_each_speedup_is_asked_for_in_some_case() -> None:
+def test_each_speedup_is_used_in_some_case() -> None:
     """Otherwise the cases below would not test the speed-up."""
     read = {name for case in CASES for name in reads_of(case)}
     # Only the online mapper asks for `processes`. tests/test_onto.py has cases with `digest`, and
@@ -163,7 +163,7 @@ def test_each_speedup_is_asked_for_in_some_case() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
-def test_each_speedup_that_is_read_off_alone(case: str) -> None:
+def test_switching_off_each_speedup_changes_no_answer(case: str) -> None:
     trace, theory = CASES[case]
     with hurried():
         expected = solve(trace, theory, max_maps=None)
@@ -174,7 +174,7 @@ def test_each_speedup_that_is_read_off_alone(case: str) -> None:
 
 
 @pytest.mark.parametrize("most", [1, 2, 5])
-def test_as_many_maps_as_asked_for(most: int) -> None:
+def test_lazy_search_lists_as_many_maps_as_requested(most: int) -> None:
     """Equal spurs off a ring. With lazy links and buffers, the search lists as many maps as asked
     for, and no map twice."""
     trace = Trace.from_steps(
@@ -191,7 +191,7 @@ def test_as_many_maps_as_asked_for(most: int) -> None:
 
 @settings(max_examples=25)
 @given(machines(most_steps=40))
-def test_merging_greedily_gives_a_map(trace: Trace) -> None:
+def test_greedy_merging_gives_a_map(trace: Trace) -> None:
     theory = Theory.causal()
     with (
         patch.object(named.NamedLabels, "grow", side_effect=KeyboardInterrupt),
@@ -204,7 +204,7 @@ def test_merging_greedily_gives_a_map(trace: Trace) -> None:
 
 @settings(max_examples=25)
 @given(machines(most_steps=30))
-def test_apart_steps_are_apart_in_no_map_together(trace: Trace) -> None:
+def test_apart_matrix_and_clique_equal_their_definitions(trace: Trace) -> None:
     """The matrix equals its definition, step by step. The cliques are compared with all cliques, by
     networkx."""
     log = Log(trace, Theory.causal())
@@ -230,7 +230,7 @@ def test_apart_steps_are_apart_in_no_map_together(trace: Trace) -> None:
 
 
 @pytest.mark.parametrize("period", [1, 2, 7])
-def test_continuations_of_circuits(period: int) -> None:
+def test_continuations_of_circuits_are_equal(period: int) -> None:
     """The steps have nearly the whole trace in common, so it takes many doublings to distinguish
     them."""
     seen = [step % period for step in range(1000)]
@@ -239,7 +239,7 @@ def test_continuations_of_circuits(period: int) -> None:
     assert continuations.apart().tolist() == (np.subtract.outer(seen, seen) != 0).tolist()
 
 
-def test_a_search_without_greedy_merging_has_a_bound_when_time_is_over() -> None:
+def test_clique_is_the_bound_of_an_interrupted_search() -> None:
     """The clique is a bound before clingo has any answer."""
     trace = Trace.from_steps("abcabd", ["travel"] * 5)
     with patch.object(choosing, "FEW_STEPS", 0):
@@ -258,7 +258,7 @@ def test_unknown_speedups_are_an_error() -> None:
         Speedups.without("magic")
 
 
-def test_a_removed_speedup_is_left_out_with_a_warning(capsys: pytest.CaptureFixture[str]) -> None:
+def test_removed_speedup_is_ignored_with_a_warning(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.warns(DeprecationWarning, match="threads is removed"):
         assert Speedups.without("threads,lazy") == Speedups(lazy=False)
     assert main(["solve", str(aces.PATH), "--set", "without_speedups=threads"]) == 0
@@ -283,14 +283,14 @@ def test_steps_merged_by_evidence_make_a_map(trace: Trace) -> None:
             assert dstates_merged(chart, labels) == labels
 
 
-def test_dstates_that_are_one_are_merged() -> None:
+def test_dstates_merged_joins_equal_dstates() -> None:
     """A machine of two states. Only odd and even visits differ."""
     log = Log(trace := Trace.from_steps("ababababa", ["go"] * 8), Theory.causal())
     chart = Chart.of_steps(log, len(trace))
     assert dstates_merged(chart, [0, 1, 2, 3, 0, 1, 2, 3, 0]) == [0, 1, 0, 1, 0, 1, 0, 1, 0]
 
 
-def test_a_limit_leaves_a_map_of_merged_steps() -> None:
+def test_interrupted_search_returns_a_map_of_merged_steps() -> None:
     """If clingo is slow and no guess is annealed, the map is smaller than a greedy one."""
     walk = maze(5, 5, steps=1600, seed=0)
     with (
@@ -311,7 +311,7 @@ def test_a_limit_leaves_a_map_of_merged_steps() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0])
-def test_a_limit_leaves_the_small_map_of_a_guess(seed: int) -> None:
+def test_interrupted_search_returns_the_small_map_of_a_guess(seed: int) -> None:
     """A machine without turns."""
     walk = moore(12, 2, steps=800, seed=seed)
     more_links = name_program.NameProgram.more_links
@@ -334,7 +334,7 @@ def test_a_limit_leaves_the_small_map_of_a_guess(seed: int) -> None:
 
 
 @pytest.mark.parametrize("off", ["", "lazy"])
-def test_maps_found_before_a_limit_strikes_are_given(off: str) -> None:
+def test_maps_found_before_a_limit_are_returned(off: str) -> None:
     """Maps are held back until clingo's links are known to be enough, also the map that showed the
     minimum."""
     found = named.NamedLabels._answers_of
@@ -352,7 +352,7 @@ def test_maps_found_before_a_limit_strikes_are_given(off: str) -> None:
         assert check(walk.trace, ssh_map, Theory.causal()) == ()
 
 
-def test_a_guess_that_takes_too_much_memory_is_not_begun() -> None:
+def test_annealing_that_needs_too_much_memory_is_skipped() -> None:
     walk = moore(8, 2, steps=100, seed=0)
     chart = Chart.of_steps(Log(walk.trace, Theory.causal()), 101)
     for most in ("ENTRIES", "TABLE"):
@@ -362,7 +362,7 @@ def test_a_guess_that_takes_too_much_memory_is_not_begun() -> None:
             assert list(annealed_steps(chart, [0], [[0]] * 101)) == []
 
 
-def test_what_cannot_be_stopped_is_not_begun_where_time_is_short() -> None:
+def test_program_of_names_is_not_loaded_if_time_is_short() -> None:
     """Clingo does not get the rules for names if the limit would end before it can be stopped.
 
     The clique is a bound by then.

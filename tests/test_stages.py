@@ -38,7 +38,7 @@ def started(limit: float | None = None) -> Watch:
 
 @settings(max_examples=8)
 @given(st.data())
-def test_a_change_of_engine_changes_no_answer(data: st.DataObject) -> None:
+def test_change_of_engine_changes_no_answer(data: st.DataObject) -> None:
     """The engine that settles dstates first goes on at once."""
     trace = data.draw(traces(), label="trace")
     theory = data.draw(theories(trace), label="theory")
@@ -60,7 +60,7 @@ def test_a_change_of_engine_changes_no_answer(data: st.DataObject) -> None:
         ]
 
 
-def test_listing_is_not_paused() -> None:
+def test_listing_has_no_stage_limit() -> None:
     """The cost is found before it is time to change the engine."""
     trace = maze(2, 2, steps=30, seed=0).trace
     listed = Prefixes.minimal_maps
@@ -80,7 +80,7 @@ def test_listing_is_not_paused() -> None:
     [Theory.topological(), Theory(next_place=True), Theory(all_on_paths=True)],
     ids=["", "next", "on paths"],
 )
-def test_a_sketch_with_frames_is_smaller(theory: Theory) -> None:
+def test_sketch_with_frames_is_smaller(theory: Theory) -> None:
     trace = maze(3, 3, steps=400, seed=0).trace
     first, *rest = trace.steps
     sizes = []
@@ -94,7 +94,7 @@ def test_a_sketch_with_frames_is_smaller(theory: Theory) -> None:
     assert framed < homing / 2
 
 
-def test_a_mapper_without_time_still_has_a_small_map() -> None:
+def test_online_mapper_without_time_has_a_small_map() -> None:
     """The sketch is small enough. The robot was in 27 dstates."""
     trace = maze(3, 3, steps=120, seed=0).trace
     mapper = OnlineMapper(trace.steps[0].view or "", time_limit=0.01)
@@ -106,7 +106,7 @@ def test_a_mapper_without_time_still_has_a_small_map() -> None:
     assert check(trace, answer.maps[0], answer.theory) == ()
 
 
-def test_a_stage_limit_raises_once() -> None:
+def test_stage_limit_raises_once() -> None:
     watch = started(60)
     watch.stage_ends = -1
     with pytest.raises(StageTimeError):

@@ -46,7 +46,7 @@ def fields(visits: list[Visit]) -> list[tuple[object, ...]]:
 
 
 @pytest.mark.parametrize("name", ["fork", pytest.param("rounds in a room", marks=pytest.mark.slow)])
-def test_a_stream_has_the_visits_of_the_whole_log(name: str) -> None:
+def test_streamed_visits_equal_those_of_the_whole_log(name: str) -> None:
     log = drive(name)
     streamed = list(stream_visits(iter(log.scans)))
     assert len(streamed) >= 3
@@ -54,7 +54,7 @@ def test_a_stream_has_the_visits_of_the_whole_log(name: str) -> None:
     assert fields(streamed) == fields(list(find_visits(log, follow(log))))
 
 
-def test_a_visit_is_final_within_the_promised_distance() -> None:
+def test_visit_is_final_within_the_promised_distance() -> None:
     log, fed = log_of(FORK, [(1, 0), (18, 0), (10, 0), (10, 8), (10, 0), (1, 0)])[0], 0
 
     def scans() -> Iterator[Scan | Damage]:

@@ -124,7 +124,9 @@ def answer(trace: Trace, theory: Theory, expected: Expected) -> tuple[Expected, 
         if row is not None
     ],
 )
-def test_small_traces(trace: Trace, theory: Theory, expected: Expected, count: int) -> None:
+def test_small_traces_have_the_known_numbers_of_maps(
+    trace: Trace, theory: Theory, expected: Expected, count: int
+) -> None:
     assert answer(trace, theory, expected) == (expected, count)
 
 
@@ -153,7 +155,7 @@ def test_next_place_leaves_one_map(text: str, theory: Theory) -> None:
         ],
     ],
 )
-def test_rectangle_with_eight_views(
+def test_rectangle_with_eight_views_has_the_known_maps(
     actions: int, theory: Theory, expected: Expected, count: int
 ) -> None:
     assert answer(rectangle(actions, views=8), theory, expected) == (expected, count)
@@ -288,7 +290,7 @@ def cornered(trace: Trace) -> Trace:
         if expected is not None
     ],
 )
-def test_notched_rectangle_by_number_of_actions(
+def test_notched_rectangle_has_the_known_numbers_of_maps(
     theory: Theory, actions: int, expected: Expected, count: int
 ) -> None:
     trace = rectangle(actions)
@@ -299,7 +301,7 @@ def test_notched_rectangle_by_number_of_actions(
 
 @pytest.mark.parametrize("theory", [P0, P1, P2, P3])
 @pytest.mark.parametrize("actions", LENGTHS)
-def test_the_mirror_image_has_mirrored_maps(theory: Theory, actions: int) -> None:
+def test_mirrored_trace_has_equal_maps(theory: Theory, actions: int) -> None:
     clockwise, anticlockwise = (solved(rectangle(actions, turn=turn), theory) for turn in "RL")
     assert {m.labels for m in clockwise.maps} == {m.labels for m in anticlockwise.maps}
     assert {m.dstates for m in clockwise.maps} == {m.dstates for m in anticlockwise.maps}
@@ -362,7 +364,9 @@ ENVIRONMENTS: list[tuple[str, Theory, Expected, int]] = [
 
 
 @pytest.mark.parametrize(("tour", "theory", "expected", "count"), ENVIRONMENTS)
-def test_simulated_environments(tour: str, theory: Theory, expected: Expected, count: int) -> None:
+def test_simulated_environments_have_the_known_maps(
+    tour: str, theory: Theory, expected: Expected, count: int
+) -> None:
     assert answer(drive(*TOURS[tour], stars=theory.star != "none"), theory, expected) == (
         expected,
         count,
@@ -380,7 +384,7 @@ def test_simulated_environments(tour: str, theory: Theory, expected: Expected, c
         (P3.replace(star="frame"), (19, 10, 4), 4),
     ],
 )
-def test_aces3_route(theory: Theory, expected: Expected, count: int) -> None:
+def test_aces3_route_has_the_known_maps(theory: Theory, expected: Expected, count: int) -> None:
     route = Trace.load(Path(__file__).parent.parent / "examples" / "aces3-route.jsonl")
     assert answer(route, theory, expected) == (expected, count)
 
@@ -388,7 +392,7 @@ def test_aces3_route(theory: Theory, expected: Expected, count: int) -> None:
 @pytest.mark.parametrize(
     ("first", "second", "actions"), [(0, 4, 4), (1, 5, 5), (2, 6, 6), (3, 7, 7)]
 )
-def test_half_a_circuit_tells_aliased_dstates_apart(first: int, second: int, actions: int) -> None:
+def test_steps_of_half_a_circuit_differ_in_all_maps(first: int, second: int, actions: int) -> None:
     """Section 6.2: with 4 to 7 actions no two steps of one view are equal in any consistent map."""
     for ssh_map in solve(rectangle(actions), P2.replace(prefer=()), max_maps=None).maps:
         assert ssh_map.labels[first] != ssh_map.labels[second]
@@ -397,7 +401,9 @@ def test_half_a_circuit_tells_aliased_dstates_apart(first: int, second: int, act
 @pytest.mark.parametrize(
     ("actions", "equal"), [(8, {(0, 8)}), (9, {(0, 8), (1, 9)}), (10, {(0, 8), (1, 9), (2, 10)})]
 )
-def test_which_equalities_are_possible(actions: int, equal: set[tuple[int, int]]) -> None:
+def test_possible_equalities_of_a_circuit_equal_the_table(
+    actions: int, equal: set[tuple[int, int]]
+) -> None:
     """Section 6.2: sentences that hold in at least one consistent map."""
     maps = solve(rectangle(actions), P2.replace(prefer=()), max_maps=None).maps
     assert {

@@ -71,7 +71,7 @@ def joint_traces(draw: st.DrawFn, closures: bool = False) -> Trace:
 
 @settings(max_examples=12)
 @given(st.data())
-def test_the_solver_lists_the_joint_maps_of_the_brute_force(data: st.DataObject) -> None:
+def test_joint_maps_equal_the_brute_force(data: st.DataObject) -> None:
     trace = data.draw(joint_traces(), label="trace")
     theory = data.draw(theories(trace), label="theory")
     first_prefix = data.draw(st.sampled_from([1, 3, prefixes.FIRST_PREFIX]), label="first prefix")
@@ -88,7 +88,7 @@ def test_the_solver_lists_the_joint_maps_of_the_brute_force(data: st.DataObject)
 @pytest.mark.slow
 @settings(max_examples=5)
 @given(st.data())
-def test_the_cheapest_joint_maps_are_those_of_plain_least_squares(data: st.DataObject) -> None:
+def test_cheapest_joint_maps_equal_plain_least_squares(data: st.DataObject) -> None:
     drawn = joint_traces(closures=True).filter(lambda trace: trace.has_displacements)
     trace = data.draw(drawn, label="trace")
     theory = data.draw(theories(trace, fixed=("displacement",)), label="theory")
@@ -98,7 +98,7 @@ def test_the_cheapest_joint_maps_are_those_of_plain_least_squares(data: st.DataO
 
 @settings(max_examples=8)
 @given(st.data())
-def test_the_checker_rejects_joint_maps_that_the_brute_force_does_not_find(
+def test_checker_rejects_joint_maps_outside_the_brute_force(
     data: st.DataObject,
 ) -> None:
     checker_rejects_foreign_maps(data, data.draw(joint_traces(), label="trace"))
@@ -108,7 +108,7 @@ MONDAY = Trace.from_steps("abcd", ["travel", "around", "travel"], name="monday")
 TUESDAY = Trace.from_steps("bcd", ["around", "travel"], name="tuesday")
 
 
-def test_drives_are_joined_and_split() -> None:
+def test_together_joins_and_splits_drives() -> None:
     joint = together([MONDAY, TUESDAY, MONDAY[:1]], names=["monday", "tuesday", "again"])
     assert [(d.name, d.first, d.stop) for d in drives_of(joint)] == [
         ("monday", 0, 4),
@@ -126,7 +126,7 @@ def test_drives_are_joined_and_split() -> None:
     assert drives_of(MONDAY)[0].name == "monday"
 
 
-def test_a_joint_trace_is_saved_and_read(tmp_path: Path) -> None:
+def test_joint_trace_survives_a_round_trip(tmp_path: Path) -> None:
     joint = together([MONDAY, TUESDAY])
     joint.save(tmp_path / "joint.jsonl")
     read = Trace.load(tmp_path / "joint.jsonl")
@@ -158,7 +158,7 @@ OTHER = Trace.from_steps("ab", [{"name": "travel", "kind": "turn", "turn": "left
         ([MONDAY, TUESDAY], ["travel", "b"], "'travel' in all traces, got 'the name of a drive'"),
     ],
 )
-def test_traces_that_do_not_fit_are_refused(parts: Any, names: Any, said: str) -> None:
+def test_together_refuses_traces_that_do_not_fit(parts: Any, names: Any, said: str) -> None:
     with pytest.raises(TraceError, match=said):
         together(parts, names)
 
@@ -172,7 +172,7 @@ def test_drives_keep_the_noise_of_their_own_odometry() -> None:
     assert joint.odometry == precise.odometry
 
 
-def test_drives_keep_what_all_headers_say() -> None:
+def test_joint_trace_keeps_common_header_fields() -> None:
     one = replace(MONDAY, extra={"site": "a", "beams": {"first": -90, "step": 1}})
     other = replace(TUESDAY, extra={"site": "b", "beams": {"first": -90, "step": 1}})
     assert together([one, other]).extra == {"beams": {"first": -90, "step": 1}}
@@ -182,7 +182,7 @@ def test_drives_keep_what_all_headers_say() -> None:
         together(seen)
 
 
-def test_actions_that_slipped_are_numbered_over_all_drives() -> None:
+def test_slipped_actions_are_numbered_over_all_drives() -> None:
     slipped = replace(
         MONDAY, steps=(replace(MONDAY[0], action=Action.that_slipped(0)), *MONDAY.steps[1:])
     )
@@ -191,7 +191,7 @@ def test_actions_that_slipped_are_numbered_over_all_drives() -> None:
     assert [t for t, a in enumerate(joint.actions) if a == Action.that_slipped(t)] == [0, 4]
 
 
-def test_a_trace_given_twice_is_noticed() -> None:
+def test_together_warns_of_equal_traces() -> None:
     with pytest.warns(UserWarning, match="traces 1 and 2 have the same steps"):
         together([MONDAY, MONDAY], names=["monday", "again"])
     with pytest.warns(UserWarning, match=r"the same steps \(monday, monday\); give"):
@@ -199,7 +199,7 @@ def test_a_trace_given_twice_is_noticed() -> None:
     assert [drive.name for drive in drives_of(joint)] == ["monday", "tuesday", "monday-2"]
 
 
-def test_other_names_and_other_units_are_noticed() -> None:
+def test_together_warns_of_other_action_names_and_units() -> None:
     go = Trace.from_steps("ab", [{"name": "go", "kind": "travel"}], name="other")
     with pytest.warns(
         UserWarning,
@@ -211,7 +211,7 @@ def test_other_names_and_other_units_are_noticed() -> None:
         together([replace(MOVED, name="m"), millimetres])
 
 
-def test_the_first_step_of_a_drive_has_no_displacement_and_a_new_name() -> None:
+def test_start_of_a_drive_has_a_new_name_and_no_displacement() -> None:
     start = Action("tuesday", "start")
     with pytest.raises(
         TraceError, match="step tuesday:0: displacement: expected none on the first"
@@ -221,7 +221,7 @@ def test_the_first_step_of_a_drive_has_no_displacement_and_a_new_name() -> None:
         Trace.from_steps("aba", [start, start])
 
 
-def test_drives_that_share_a_place_have_one_map() -> None:
+def test_drives_with_a_common_place_get_one_map() -> None:
     """Tuesday adds nothing to the map of Monday. Nothing links the end of Monday to Tuesday."""
     solution = solve([MONDAY, TUESDAY])
     assert [ssh_map.dstate_at for ssh_map in solution.maps] == [(0, 1, 2, 3, 1, 2, 3)]
@@ -234,7 +234,7 @@ def test_drives_that_share_a_place_have_one_map() -> None:
     )
 
 
-def test_drives_that_share_nothing_are_pieces(
+def test_drives_without_common_views_are_pieces(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     far = Trace.from_steps("xyz", ["travel", "around"], name="far")
@@ -257,9 +257,7 @@ def test_drives_that_share_nothing_are_pieces(
         Solution.from_dict(data)
 
 
-def test_the_command_line_solves_traces_together(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_solve_together_in_the_shell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     files = [str(tmp_path / f"{trace.name}.jsonl") for trace in (MONDAY, TUESDAY)]
     for trace, file in zip((MONDAY, TUESDAY), files, strict=True):
         replace(trace, name=None).save(file)
@@ -275,7 +273,7 @@ def test_the_command_line_solves_traces_together(
     assert "--front: expected one trace" in capsys.readouterr().err
 
 
-def test_a_fault_between_drives_is_refused() -> None:
+def test_fault_at_the_start_of_a_drive_is_refused() -> None:
     """No action led to the first step of a drive, so none can have slipped there."""
     theory = Theory.causal().replace(slipped=1.0)
     solution = solve([MONDAY, TUESDAY], theory)
@@ -287,13 +285,13 @@ def test_a_fault_between_drives_is_refused() -> None:
     assert any("the trace never does" in v.message for v in check(solution.trace, linked, theory))
 
 
-def test_a_driving_robot_makes_one_drive() -> None:
+def test_online_mapper_refuses_a_second_drive() -> None:
     mapper = OnlineMapper("a")
     with pytest.raises(TraceError, match="got the start of a drive"):
         mapper.observe(Action("tuesday", "start"), "b")
 
 
-def test_a_localiser_is_lost_where_a_drive_starts() -> None:
+def test_localiser_starts_anew_with_each_drive() -> None:
     solution = solve([MONDAY, TUESDAY])
     assert solution.trace is not None
     beliefs = list(Localiser(solution.maps[0]).beliefs(solution.trace))
@@ -304,7 +302,7 @@ def test_a_localiser_is_lost_where_a_drive_starts() -> None:
 
 
 @pytest.mark.filterwarnings("ignore:views. trace")
-def test_joins_of_drives_are_forced_possible_or_excluded(
+def test_joins_of_drives_are_certain_possible_or_excluded(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """By views alone, the b that Tuesday sees may be Monday's first b or the second one."""
@@ -335,7 +333,7 @@ def test_joins_of_drives_are_forced_possible_or_excluded(
     assert json.loads(capsys.readouterr().out)["drives"][0]["excluded"] == 7
 
 
-def test_steps_are_named_by_their_drives(
+def test_shell_accepts_step_names_with_drives(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for trace in (MONDAY, TUESDAY):
@@ -370,7 +368,7 @@ MAZES = [*of_mazes(3, 20, range(3), truth.Noise(Odometry(**truth.NOISE)))]
 
 
 @pytest.mark.parametrize("known", MAZES[1:], ids=[known.name for known in MAZES[1:]])
-def test_a_narrow_beam_finds_a_joint_map_as_cheap_as_the_true_one(known: truth.Known) -> None:
+def test_narrow_beam_finds_a_joint_map_as_cheap_as_the_true_one(known: truth.Known) -> None:
     """Three drives start anywhere in a maze, with any heading."""
     problem = settle(known.trace, Theory())
     weighing = Misfit(problem)
@@ -387,7 +385,7 @@ def test_a_narrow_beam_finds_a_joint_map_as_cheap_as_the_true_one(known: truth.K
 
 
 @pytest.mark.parametrize(("seed", "steps"), [(405, 20), (400, 30)])
-def test_a_false_join_that_is_cheap_at_first_leaves_the_true_one(seed: int, steps: int) -> None:
+def test_beam_keeps_a_true_join_that_costs_more_at_first(seed: int, steps: int) -> None:
     """A true join may cost more than false ones for some steps."""
     (known,) = of_mazes(3, steps, [seed], truth.Noise(Odometry(**truth.NOISE)))
     problem = settle(known.trace, Theory())
@@ -395,7 +393,7 @@ def test_a_false_join_that_is_cheap_at_first_leaves_the_true_one(seed: int, step
     assert truth.is_true(next(beam.maps()), known)
 
 
-def test_a_drive_that_meets_others_at_one_place_may_face_four_ways() -> None:
+def test_drive_that_shares_one_place_gets_four_headings() -> None:
     (known,) = of_mazes(3, 2, [0], truth.Noise(Odometry(**truth.NOISE)), drives=1)
     problem = settle(known.trace, Theory())
     first = Beam(problem, Log(problem.trace, problem.theory, problem.pairs), 1)._first()
@@ -407,7 +405,7 @@ def test_a_drive_that_meets_others_at_one_place_may_face_four_ways() -> None:
 
 
 @pytest.mark.parametrize("known", MAZES, ids=[known.name for known in MAZES])
-def test_the_checker_and_the_solver_have_one_misfit_of_joint_maps(known: truth.Known) -> None:
+def test_misfit_of_joint_maps_equals_that_of_the_checker(known: truth.Known) -> None:
     """From wrong headings of the drives, Gauss-Newton would end in another minimum."""
     names, places = truth.partition(known.dstates), truth.partition(known.places)
     where = dict(zip(names, places, strict=True))
@@ -416,7 +414,7 @@ def test_the_checker_and_the_solver_have_one_misfit_of_joint_maps(known: truth.K
 
 
 @pytest.mark.filterwarnings("ignore:views. trace")
-def test_worlds_are_cut_where_the_robot_jumped(tmp_path: Path) -> None:
+def test_benchmark_worlds_are_cut_at_jumps(tmp_path: Path) -> None:
     walk = Trace.from_steps("abcd", ["travel", "jump1", "travel"])
     steps = [replace(s, truth={"dstate": k}) for k, s in enumerate(walk.steps)]
     replace(walk, steps=tuple(steps)).save(tmp_path / "mall.jsonl")
@@ -429,7 +427,7 @@ def test_worlds_are_cut_where_the_robot_jumped(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("at", [0, 1])
 @pytest.mark.parametrize("ahead", [5.0, 10.0])
-def test_a_closure_between_drives_says_which_places_they_share(at: int, ahead: float) -> None:
+def test_closure_between_drives_decides_their_common_places(at: int, ahead: float) -> None:
     """A corridor with four places that look alike, and a second drive past two of them."""
     monday = Trace.from_steps("aaaa", ["travel"] * 3, displacements=[(5.0, 0.0, 0.0)] * 3)
     tuesday = Trace.from_steps("aa", ["travel"], displacements=[(5.0, 0.0, 0.0)])
@@ -451,7 +449,7 @@ THERE = Trace.from_steps("abcd", ["travel", "around", "travel"], name="monday")
 BACK = Trace.from_steps("dcba", ["around", "travel", "around"], name="tuesday")
 
 
-def test_words_name_steps_by_their_drives(tmp_path: Path) -> None:
+def test_sentences_name_steps_by_their_drives(tmp_path: Path) -> None:
     joint, solution = together([THERE, BACK]), solve([THERE, BACK])
     said = "the dstates of steps tuesday:0 and tuesday:3 differ; the places of steps tuesday:0–3"
     assert said in solution.summary
@@ -474,7 +472,7 @@ def test_words_name_steps_by_their_drives(tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:traces 1 and 2 have the same steps")
-def test_between_drives_no_loop_closes() -> None:
+def test_explain_pair_across_drives_has_no_loop() -> None:
     """Nothing is known of how the first step of a drive relates to those of another one."""
     there = Trace.from_steps("ab", ["travel"], displacements=[(5, 0, 0)], name="monday")
     joint = together([there, replace(there, name="tuesday")], names=["monday", "tuesday"])
@@ -482,7 +480,7 @@ def test_between_drives_no_loop_closes() -> None:
     assert explain_pair(joint, 2, 3).loop == "the loop of 5 m closes 5.0 m off"
 
 
-def test_verbs_take_the_trace_in_a_file_of_maps(
+def test_verbs_read_the_trace_in_a_file_of_maps(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     maps = str(tmp_path / "maps.json")
@@ -508,7 +506,7 @@ def test_compare_names_steps_by_their_drives() -> None:
     assert told[1].startswith("dstates: the first map groups steps monday:3 and tuesday:0; the")
 
 
-def test_a_step_of_a_drive_is_a_number_that_can_be_pickled() -> None:
+def test_named_step_is_a_number_and_survives_pickle() -> None:
     steps = named_steps(drives_of(together([THERE, BACK])), 8)
     assert steps == tuple(range(8))
     assert [*map(str, pickle.loads(pickle.dumps(steps)))][3:5] == ["monday:3", "tuesday:0"]
@@ -524,7 +522,7 @@ def test_at_most_twelve_weights_are_printed() -> None:
 
 
 @pytest.mark.parametrize("words", [[], ["--json"]])
-def test_what_differs_is_told_by_the_steps_of_drives(
+def test_solve_names_differences_by_steps_of_drives(
     words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The route through ACES3 is cut into two drives that share some places."""

@@ -52,7 +52,7 @@ def noisy(tmp_path: Path) -> str:
     return str(tmp_path / "noisy.jsonl")
 
 
-def test_the_library_is_silent(capfd: pytest.CaptureFixture[str]) -> None:
+def test_library_prints_nothing_by_default(capfd: pytest.CaptureFixture[str]) -> None:
     assert any(
         isinstance(handler, logging.NullHandler)
         for handler in logging.getLogger("ssh_abduction").handlers
@@ -61,7 +61,7 @@ def test_the_library_is_silent(capfd: pytest.CaptureFixture[str]) -> None:
     assert capfd.readouterr() == ("", "")
 
 
-def test_the_log_says_what_is_found_and_proven(caplog: pytest.LogCaptureFixture) -> None:
+def test_log_names_found_maps_and_proofs(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.DEBUG, "ssh_abduction"):
         solution = solve(Trace.load(ACES))
     told = [record.getMessage() for record in caplog.records]
@@ -81,7 +81,7 @@ def test_the_log_says_what_is_found_and_proven(caplog: pytest.LogCaptureFixture)
     assert "StepEngine is given 23 of 23 steps" in at_debug
 
 
-def test_the_log_names_the_engines_that_are_tried(caplog: pytest.LogCaptureFixture) -> None:
+def test_log_names_the_engines(caplog: pytest.LogCaptureFixture) -> None:
     circuits = rectangle(40)
     with caplog.at_level(logging.INFO, "ssh_abduction"):
         for theory in (Theory.causal(), Theory.causal().replace(misread=1.5), Theory.topological()):
@@ -90,7 +90,7 @@ def test_the_log_names_the_engines_that_are_tried(caplog: pytest.LogCaptureFixtu
     assert engines == ["CausalEngine", "FaultyEngine", "StepEngine"]
 
 
-def test_verbose_tells_and_twice_tells_more(tee: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_verbose_twice_logs_more_than_once(tee: str, capsys: pytest.CaptureFixture[str]) -> None:
     plain, none = lines(capsys, "solve", tee)
     some_out, some = lines(capsys, "solve", tee, "-v")
     before_out, before = lines(capsys, "-v", "solve", tee)
@@ -109,7 +109,9 @@ def test_verbose_tells_and_twice_tells_more(tee: str, capsys: pytest.CaptureFixt
     ]
 
 
-def test_quiet_leaves_errors_alone(noisy: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_quiet_hides_warnings_but_not_errors(
+    noisy: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     out, told = lines(capsys, "solve", noisy, "--theory", "causal", "--json")
     assert len(told) == 1
     assert "looks like noise" in told[0]
@@ -124,14 +126,14 @@ def test_quiet_leaves_errors_alone(noisy: str, capsys: pytest.CaptureFixture[str
     ]
 
 
-def test_quiet_and_verbose_contradict_each_other(capsys: pytest.CaptureFixture[str]) -> None:
+def test_quiet_with_verbose_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
         main(["solve", "-q", "-v", ACES])
     assert "not allowed with argument -q/--quiet" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("verb", VERBS)
-def test_every_verb_takes_them(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_verb_has_quiet_and_verbose(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="0"):
         main([verb, "--help"])
     out = capsys.readouterr().out
@@ -139,7 +141,7 @@ def test_every_verb_takes_them(verb: str, capsys: pytest.CaptureFixture[str]) ->
     assert "-v, --verbose" in out
 
 
-def test_lines_of_progress_come_now_and_then(
+def test_progress_lines_come_at_intervals(
     tee: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert lines(capsys, "solve", tee)[1] == []
@@ -171,9 +173,7 @@ EAGER = (
 
 
 @pytest.mark.parametrize(("words", "mixed"), [((), True), (("--json",), False)])
-def test_progress_never_comes_between_the_lines_of_an_answer_for_programs(
-    words: tuple[str, ...], mixed: bool, tee: str
-) -> None:
+def test_progress_is_not_mixed_into_json(words: tuple[str, ...], mixed: bool, tee: str) -> None:
     command = [sys.executable, "-c", EAGER, "solve", tee, *words]
     done = subprocess.run(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=True
@@ -183,7 +183,7 @@ def test_progress_never_comes_between_the_lines_of_an_answer_for_programs(
         assert json.loads(done.stdout)["count"] == 1
 
 
-def test_a_view_cannot_steer_the_terminal_by_the_log(
+def test_log_escapes_control_characters_of_views(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     trace = Trace.from_steps(["\x1b[2J", "b"], ["travel"], name="\x1b[31m\nname")
@@ -207,7 +207,7 @@ def test_a_view_cannot_steer_the_terminal_by_the_log(
         ("completion bsh", "bash"),
     ],
 )
-def test_a_misspelt_word_gets_a_suggestion(
+def test_misspelt_word_gets_a_suggestion(
     words: str, meant: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit, match="2"):
@@ -219,9 +219,7 @@ def test_a_misspelt_word_gets_a_suggestion(
     "words",
     ["frobnicate", "solve trace.jsonl --xyzzy", "solve a b --set star=\x1b[2J", "check a b c"],
 )
-def test_no_suggestion_is_made_for_unknown_words(
-    words: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_unknown_word_gets_no_suggestion(words: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
         main(words.split(" "))
     err = capsys.readouterr().err
@@ -230,7 +228,7 @@ def test_no_suggestion_is_made_for_unknown_words(
 
 
 @pytest.mark.parametrize("shell", SHELLS)
-def test_completions_know_every_verb_and_its_options(
+def test_completion_scripts_have_every_verb_and_option(
     shell: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out, _ = lines(capsys, "completion", shell)
@@ -249,7 +247,7 @@ def test_completions_know_every_verb_and_its_options(
         ("solve exa", ["example.jsonl"]),
     ],
 )
-def test_bash_completes(
+def test_bash_completion_completes_words(
     typed: str, completed: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out, _ = lines(capsys, "completion", "bash")
@@ -268,7 +266,7 @@ def test_bash_completes(
     assert done.stdout.split() == completed
 
 
-def test_without_shtab_it_is_named(
+def test_missing_shtab_is_named(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     imported = builtins.__import__
@@ -286,7 +284,7 @@ def test_without_shtab_it_is_named(
     ]
 
 
-def test_the_bootstrap_loop_tells_its_stages(caplog: pytest.LogCaptureFixture) -> None:
+def test_bootstrap_learner_logs_its_stages(caplog: pytest.LogCaptureFixture) -> None:
     from simulator.tours import simulate
     from simulator.world import World
     from ssh_abduction.learning.learner import BootstrapLearner

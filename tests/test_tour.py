@@ -47,18 +47,18 @@ def shortest(
 @pytest.mark.parametrize(
     "actions", [("right", "travel"), ("right", "left", "travel"), (*TURNS, "travel")]
 )
-def test_a_tour_is_as_short_as_can_be_where_every_end_is_expected(actions: tuple[str, ...]) -> None:
+def test_tour_is_the_shortest_if_all_ends_are_known(actions: tuple[str, ...]) -> None:
     trace = Trace.from_steps(["end", "wall"], ["travel"], stars=ENDS)
     tour = next_tour(solve(trace).maps[0], trace, actions=actions)
     assert len(tour) == shortest(TWO, ("b", 1), {("a", 1), ("b", 1), ("a", "E")}, actions)
 
 
-def test_a_robot_drives_on_before_it_looks_around_where_it_will_come_back() -> None:
+def test_tour_travels_before_turning_at_a_place_it_revisits() -> None:
     alone = Trace.from_steps(["end"], [], stars=ENDS[:1])
     assert next_tour(solve(alone).maps[0], alone, actions=(*TURNS, "travel")) == ("travel",)
 
 
-def test_nothing_is_left_where_all_was_tried() -> None:
+def test_tour_is_empty_if_all_was_tried() -> None:
     driven = Trace.from_steps(
         ["end", "wall", "back", "wall back", "end"],
         ["travel", "around", "travel", "around"],
@@ -69,7 +69,7 @@ def test_nothing_is_left_where_all_was_tried() -> None:
     assert next_tour(ssh_map, driven, actions=["right"]) != ()
 
 
-def test_what_cannot_be_done_there_is_not_planned() -> None:
+def test_tour_plans_only_possible_actions() -> None:
     alone = Trace.from_steps(["end"], [], stars=ENDS[:1])
     assert (
         next_tour(
@@ -79,7 +79,7 @@ def test_what_cannot_be_done_there_is_not_planned() -> None:
     )
 
 
-def test_gateways_tell_where_turns_lead() -> None:
+def test_tour_knows_where_turns_to_gateways_lead() -> None:
     turns = [
         Action("right 1", "turn", "right", gateway=1),
         Action("left 1", "turn", "left", gateway=1),
@@ -102,14 +102,14 @@ def test_gateways_tell_where_turns_lead() -> None:
     )  # the ends are expected, and still to be tried
 
 
-def test_actions_that_say_nothing_of_themselves_are_tried_where_they_were_not() -> None:
+def test_tour_tries_unknown_actions_only_if_named() -> None:
     trace = Trace.from_steps(["a", "b", "a"], ["p", "p"])
     ssh_map = solve(trace, Theory.causal()).maps[0]
     assert next_tour(ssh_map, trace, theory=Theory.causal()) == ()
     assert next_tour(ssh_map, trace, theory=Theory.causal(), actions=["q"]) == ("q",)
 
 
-def test_returns_are_doubted_until_enough_is_seen_there() -> None:
+def test_tour_confirms_returns_by_further_steps() -> None:
     explorer = Explorer(Streetwalker(RING, "a", "E"), time_limit=None)
     doubts = 0
     for _ in range(16):

@@ -26,7 +26,7 @@ def written(folder: Path, *lines: str) -> Path:
     return path
 
 
-def test_a_trace_survives_a_round_trip(tmp_path: Path) -> None:
+def test_trace_survives_a_round_trip(tmp_path: Path) -> None:
     lines = [
         '{"format": "ssh-trace", "version": 1, "name": "n", "images": "i.npz",'
         ' "robot": {"wheels": 4}}',
@@ -47,7 +47,7 @@ def test_a_trace_survives_a_round_trip(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 2  # no draft is left behind
 
 
-def test_standard_actions_need_no_object() -> None:
+def test_standard_actions_are_plain_words() -> None:
     trace = Trace.from_steps("abcde", ["travel", "right", "left", "around"])
     assert [(a.kind, a.turn) for a in trace.actions] == [
         ("travel", None),
@@ -89,11 +89,13 @@ def test_fields_may_come_in_any_order(tmp_path: Path) -> None:
         (None, None),
     ],
 )
-def test_openings(star: tuple[float, ...] | None, openings: tuple[bool, ...] | None) -> None:
+def test_openings_of_a_star_at_right_angles(
+    star: tuple[float, ...] | None, openings: tuple[bool, ...] | None
+) -> None:
     assert Step(view="a", star=star).openings == openings
 
 
-def test_bearings_that_share_a_quarter() -> None:
+def test_bearings_in_one_quarter_are_refused() -> None:
     with pytest.raises(TraceError, match="merge the openings"):
         _ = Step(view="a", star=(0, 30)).openings
 
@@ -271,7 +273,7 @@ BAD: dict[str, tuple[list[str], str]] = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_files_say_file_line_field_and_how_to_mend_it(case: str, tmp_path: Path) -> None:
+def test_malformed_trace_error_names_line_field_and_remedy(case: str, tmp_path: Path) -> None:
     lines, message = BAD[case]
     path = written(tmp_path, *lines)
     with pytest.raises(TraceError) as error:
@@ -283,7 +285,7 @@ def test_bad_files_say_file_line_field_and_how_to_mend_it(case: str, tmp_path: P
     assert ";" in text or "(" in text  # how to mend it
 
 
-def test_broken_json_in_line_4711(tmp_path: Path) -> None:
+def test_broken_json_error_names_the_line(tmp_path: Path) -> None:
     path = written(tmp_path, HEADER, *[STEP] * 4709, '{"view": "a", "action": travel}', LAST)
     with pytest.raises(
         TraceError,
@@ -292,26 +294,26 @@ def test_broken_json_in_line_4711(tmp_path: Path) -> None:
         Trace.load(path)
 
 
-def test_an_empty_file(tmp_path: Path) -> None:
+def test_empty_trace_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "t").write_bytes(b"")
     with pytest.raises(TraceError, match=r"1: header: expected .* got an empty file"):
         Trace.load(tmp_path / "t")
 
 
-def test_a_binary_file(tmp_path: Path) -> None:
+def test_binary_trace_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "t").write_bytes(bytes(range(256)) * 100)
     with pytest.raises(TraceError, match="is this a binary file"):
         Trace.load(tmp_path / "t")
 
 
-def test_a_folder_and_a_missing_file(tmp_path: Path) -> None:
+def test_folder_and_missing_file_are_refused_as_traces(tmp_path: Path) -> None:
     with pytest.raises(TraceError, match="Is a directory; check the path"):
         Trace.load(tmp_path)
     with pytest.raises(TraceError, match="No such file or directory; check the path"):
         Trace.load(tmp_path / "nothing")
 
 
-def test_a_line_without_end_is_not_read_into_memory(
+def test_endless_line_is_not_read_into_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A sparse file of 1 GB stands for a line of that length."""
@@ -324,13 +326,13 @@ def test_a_line_without_end_is_not_read_into_memory(
     assert trace_file.LONGEST_LINE == 16 * 2**20
 
 
-def test_a_byte_order_mark_is_no_harm(tmp_path: Path) -> None:
+def test_trace_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
     path = tmp_path / "t"
     path.write_text("\ufeff" + HEADER + "\r\n" + LAST + "\r\n\r\n", encoding="utf-8")
     assert Trace.load(path).views == ("b",)
 
 
-def test_saving_to_nowhere(tmp_path: Path) -> None:
+def test_saving_into_a_missing_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(TraceError, match="cannot write the trace"):
         Trace.from_steps(["a"], []).save(tmp_path / "no" / "t.jsonl")
 
@@ -344,12 +346,12 @@ def test_saving_to_nowhere(tmp_path: Path) -> None:
         (["a", "b"], [7], "action: expected a name"),
     ],
 )
-def test_bad_steps(views: list[str], actions: list[str], message: str) -> None:
+def test_from_steps_refuses_wrong_steps(views: list[str], actions: list[str], message: str) -> None:
     with pytest.raises(TraceError, match=message):
         Trace.from_steps(views, actions)
 
 
-def test_views_may_be_numbers_of_numpy() -> None:
+def test_views_may_be_numpy_integers() -> None:
     """As clusterings give them."""
     trace = Trace.from_steps(np.array([3, 0, 3]), ["travel", "travel"])
     assert trace == Trace.from_steps([3, 0, 3], ["travel", "travel"])
@@ -358,7 +360,7 @@ def test_views_may_be_numbers_of_numpy() -> None:
         Trace.from_steps(np.array([True, False]), ["travel"])
 
 
-def test_a_prefix_ends_without_an_action() -> None:
+def test_prefix_ends_without_an_action() -> None:
     trace = Trace.from_steps("abc", ["travel", "right"], name="n")
     assert trace.prefix(2) == Trace.from_steps("ab", ["travel"], name="n")
     assert trace.prefix(3) == trace
@@ -370,7 +372,7 @@ def test_a_prefix_ends_without_an_action() -> None:
     | st.binary(max_size=50).map(lambda line: f"{HEADER}\n".encode() + line)
     | st.text(max_size=200).map(lambda text: f"{HEADER}\n{text}".encode())
 )
-def test_any_file_is_a_trace_or_a_clear_error(data: bytes) -> None:
+def test_any_bytes_are_a_trace_or_a_clear_error(data: bytes) -> None:
     import tempfile
 
     with tempfile.NamedTemporaryFile() as file:
@@ -385,7 +387,7 @@ def test_any_file_is_a_trace_or_a_clear_error(data: bytes) -> None:
         assert "\n" not in message
 
 
-def test_traces_can_be_keys() -> None:
+def test_traces_are_hashable() -> None:
     traces = [Trace.from_steps("ab", ["travel"], name="n") for _ in range(2)]
     assert len(set(traces)) == 1
     truthful = Step(view="a", truth={"place": [1]}, extra={"x": []})
@@ -403,18 +405,18 @@ def test_traces_can_be_keys() -> None:
         ("x", None, "left"),
     ],
 )
-def test_actions_that_make_no_sense(name: str, kind: str, turn: str) -> None:
+def test_malformed_actions_are_refused(name: str, kind: str, turn: str) -> None:
     with pytest.raises(TraceError, match=r"^action\.(name|kind|turn): expected"):
         Action(name, kind, turn)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("view", [1.5, True, 2**40, "a\0"])
-def test_steps_that_make_no_sense(view: str) -> None:
+def test_malformed_steps_are_refused(view: str) -> None:
     with pytest.raises(TraceError, match=r"^view: expected"):
         Step(view=view)
 
 
-def test_what_json_cannot_hold_is_not_written(tmp_path: Path) -> None:
+def test_save_refuses_values_that_json_cannot_hold(tmp_path: Path) -> None:
     with pytest.raises(TraceError, match="expected values that JSON can hold"):
         Trace((Step(view="a", truth=float("inf")),)).save(tmp_path / "t.jsonl")
     assert list(tmp_path.iterdir()) == []
@@ -422,7 +424,7 @@ def test_what_json_cannot_hold_is_not_written(tmp_path: Path) -> None:
         Trace.load("a\0b")
 
 
-def test_an_action_prints_and_compares() -> None:
+def test_actions_print_and_compare() -> None:
     assert Action.of("travel") == Action("travel", "travel")
     assert Action.of({"name": "left", "kind": "turn"}).turn == "left"
     assert Action.of(Action("x")) == Action("x")
@@ -449,7 +451,7 @@ def test_displacements_and_odometry_survive_a_round_trip(tmp_path: Path) -> None
     assert '"odometry"' not in "".join(trace.without_displacements().to_lines())
 
 
-def test_covariance_follows_the_way_of_a_step() -> None:
+def test_covariance_is_turned_to_the_direction_of_a_step() -> None:
     odometry = Odometry(along=0.1, across=0.01, heading=0.01, turning=0.1, position=0.0, angle=0.0)
     (xx, xy, _), (_, yy, _), (_, _, heading) = odometry.covariance(
         (0.0, 10.0, math.pi / 2)

@@ -98,7 +98,7 @@ def evaluated(folder: Path, text: str, trace: Trace, *options: str) -> int:
         lambda text: text.removesuffix("\n"),
     ],
 )
-def test_each_form_of_the_format_is_read(form: Callable[[str], str], tmp_path: Path) -> None:
+def test_trajectory_is_read_in_each_form_of_tum(form: Callable[[str], str], tmp_path: Path) -> None:
     poses = told_poses(read(tmp_path, form(tum())).told_to(trace_at()))
     assert [pose and pose[:2] for pose in poses] == [pytest.approx((x, 0), abs=1e-9) for x in STOPS]
     assert [pose and abs(pose[2]) for pose in poses] == pytest.approx(
@@ -106,7 +106,7 @@ def test_each_form_of_the_format_is_read(form: Callable[[str], str], tmp_path: P
     )
 
 
-def test_the_command_judges_by_the_trajectory(
+def test_evaluate_judges_by_a_trajectory(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert evaluated(tmp_path, tum(), trace_at(), "--json") == 0
@@ -121,7 +121,7 @@ def test_the_command_judges_by_the_trajectory(
     assert json.loads(json.dumps(by_python.to_dict())) == found
 
 
-def test_a_pose_is_where_the_dstate_is_and_other_truth_stays(tmp_path: Path) -> None:
+def test_pose_at_a_step_includes_the_offset_of_its_dstate(tmp_path: Path) -> None:
     trajectory = read(tmp_path, line(0, 1, 2, math.pi / 2) + line(1, 1, 4, math.pi / 2))
     told = trajectory.told_to(trace_at((0.5, 0.0), (2.0, 0.5, 0.25)))
     assert told_poses(told) == [
@@ -154,7 +154,7 @@ def test_a_pose_is_where_the_dstate_is_and_other_truth_stays(tmp_path: Path) -> 
         (9.6, None),
     ],
 )
-def test_between_two_poses_the_robot_is_on_the_way(
+def test_poses_are_interpolated_in_time(
     time: float, pose: tuple[float, float, float] | None
 ) -> None:
     at = Trajectory([(0.0, (0.0, 0.0, 3.0)), (0.5, (1.0, 0.0, -3.0)), (9.0, (7.0, 0.0, 0.0))]).at(
@@ -218,7 +218,7 @@ def test_between_two_poses_the_robot_is_on_the_way(
         ("a\0b", TIMES, "true.tum"),
     ],
 )
-def test_a_trajectory_that_does_not_fit_is_an_error(
+def test_trajectory_that_does_not_fit_is_refused(
     text: str,
     times: tuple[float | None, ...],
     message: str,
@@ -233,13 +233,13 @@ def test_a_trajectory_that_does_not_fit_is_an_error(
     assert printed.err.startswith("ssh-abduction: ")
 
 
-def test_a_binary_file_is_no_trajectory(tmp_path: Path) -> None:
+def test_binary_trajectory_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(TraceError, match="expected a trajectory in TUM format, got another file"):
         read(tmp_path, b"\xff\xfe\0\x01")
 
 
 @pytest.mark.filterwarnings("default")
-def test_steps_without_truth_are_counted(
+def test_note_counts_steps_without_truth(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert evaluated(tmp_path, tum(), trace_at((*TIMES[:3], 5.0, None))) == 0
@@ -249,7 +249,7 @@ def test_steps_without_truth_are_counted(
 
 
 @pytest.mark.filterwarnings("default")
-def test_where_nothing_is_judged_that_is_said(
+def test_evaluate_says_that_no_pair_can_be_judged(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert evaluated(tmp_path, tum(), trace_at((TIMES[0], None, None, None, None))) == 0
@@ -273,12 +273,12 @@ def test_where_nothing_is_judged_that_is_said(
         "".join(f"{t} 0 0 {t} 0 0 0 1\n" for t in range(9)),
     ],
 )
-def test_a_trajectory_off_the_floor_gives_a_warning(text: str, tmp_path: Path) -> None:
+def test_trajectory_off_the_floor_gives_a_warning(text: str, tmp_path: Path) -> None:
     with pytest.warns(TrajectoryWarning, match="expected a trajectory on a floor"):
         read(tmp_path, text)
 
 
-def test_a_trajectory_is_no_file_of_relations(
+def test_trajectory_given_as_relations_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Both have eight numbers a line. A trajectory that was read as relations judged no pair."""

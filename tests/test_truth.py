@@ -30,7 +30,7 @@ def reckoned(trace: Trace, start: tuple[float, float, float]) -> list[tuple[floa
     return poses
 
 
-def test_a_maze_has_the_displacements_of_its_cells() -> None:
+def test_maze_displacements_lead_from_cell_to_cell() -> None:
     walk = maze(4, 4, steps=40, seed=3, odometry=EXACT)
     cells = [state for state in walk.truth if isinstance(state, tuple)]
     start = (CELL * cells[0][0], CELL * cells[0][1], math.pi / 2 * (1 - cells[0][2]))
@@ -42,7 +42,7 @@ def test_a_maze_has_the_displacements_of_its_cells() -> None:
     assert walk.trace.without_displacements() == maze(4, 4, steps=40, seed=3).trace
 
 
-def test_the_noise_of_a_maze_is_along_the_way() -> None:
+def test_maze_noise_is_along_the_motion() -> None:
     ways = [
         step.displacement
         for seed in range(20)
@@ -54,7 +54,7 @@ def test_the_noise_of_a_maze_is_along_the_way() -> None:
     assert travels[:, 2].std() == pytest.approx(0.002 * 11, rel=0.15)
 
 
-def test_the_route_of_aces3_has_the_displacements_of_its_layout() -> None:
+def test_aces3_displacements_fit_its_layout() -> None:
     (known,) = truth.aces3([0], truth.Noise(EXACT))
     assert (len(set(known.dstates)), len(set(known.places))) == (22, 9)
     poses = reckoned(known.trace, (*truth.ACES3["N"], 0.0))
@@ -67,7 +67,7 @@ def test_the_route_of_aces3_has_the_displacements_of_its_layout() -> None:
     ] == [23.5, 0.0]
 
 
-def test_a_map_is_true_if_its_dstates_and_its_places_are() -> None:
+def test_map_is_true_if_its_dstates_and_places_are() -> None:
     (known,) = truth.mazes(2, 20, [1], truth.Noise(NOISE))
     ssh_map = next(
         ssh_map
@@ -86,7 +86,7 @@ def test_a_map_is_true_if_its_dstates_and_its_places_are() -> None:
 
 
 @pytest.mark.slow
-def test_the_table_says_which_maps_are_true(capsys: pytest.CaptureFixture[str]) -> None:
+def test_truth_benchmark_counts_true_maps(capsys: pytest.CaptureFixture[str]) -> None:
     """On the route of ACES3, 19 dstates explain views and openings alone. None of these maps is
     true."""
     options = truth.arguments().parse_args(["--family", "aces3", "--seeds", "1", "--stars"])
@@ -102,7 +102,7 @@ def test_the_table_says_which_maps_are_true(capsys: pytest.CaptureFixture[str]) 
     assert "| 22, 9, 6 | 1 of 1 |" in capsys.readouterr().out
 
 
-def test_joins_are_reliable_where_their_probabilities_are_their_shares() -> None:
+def test_reliability_compares_probabilities_with_shares() -> None:
     half = [(0.5, True), (0.5, False)]
     assert truth.reliability(half) == (0.0, 0.25)
     assert truth.reliability([(1.0, False)]) == (1.0, 1.0)
@@ -113,7 +113,7 @@ def test_joins_are_reliable_where_their_probabilities_are_their_shares() -> None
     assert truth.reliability([*half, (0.9, True), (0.9, True)]) == pytest.approx((0.05, 0.13))
 
 
-def test_what_is_refused_of_true_maps_is_counted() -> None:
+def test_reject_benchmark_counts_refused_true_maps() -> None:
     """A true map is hardly ever refused. It is always refused with the displacements of another
     route. Errors that repeat make the scale wrong."""
     white, repeating = reject.walks(3, 30, 7)

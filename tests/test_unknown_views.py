@@ -38,7 +38,7 @@ def hidden(trace: Trace, steps: set[int]) -> Trace:
 
 @settings(max_examples=12)
 @given(st.data())
-def test_solver_and_checker_agree_with_the_brute_force(data: st.DataObject) -> None:
+def test_maps_with_unknown_views_equal_the_brute_force(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=6), label="trace")
     steps = data.draw(
         st.sets(st.integers(0, len(trace) - 1), min_size=1, max_size=3), label="hidden"
@@ -76,7 +76,7 @@ def test_hiding_a_view_never_raises_the_cost(data: st.DataObject) -> None:
         assert costs[1] <= costs[0]
 
 
-def test_an_unknown_step_does_not_make_two_views_one() -> None:
+def test_unknown_step_does_not_merge_two_views() -> None:
     """The step between could be at either dstate, but not at both."""
     trace = Trace.from_steps(["a", None, "b"], ["stay", "stay"])
     found = solve(trace, Theory.causal(), max_maps=None)
@@ -86,7 +86,7 @@ def test_an_unknown_step_does_not_make_two_views_one() -> None:
     assert [s.view for s in found.maps[0].dstates] == ["a", "b"]
 
 
-def test_a_dstate_that_was_never_seen_has_no_view(
+def test_dstate_without_a_known_view_has_none(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     trace = Trace.from_steps([None if t == 2 else view for t, view in enumerate(CORRIDOR)], DRIVEN)
@@ -114,7 +114,7 @@ def test_a_dstate_that_was_never_seen_has_no_view(
     assert "expected a trace whose views are all known" in capsys.readouterr().err
 
 
-def test_a_null_is_unknown_and_a_missing_field_is_an_error(tmp_path: Path) -> None:
+def test_null_view_is_unknown_and_a_missing_view_an_error(tmp_path: Path) -> None:
     path = tmp_path / "trace.jsonl"
     path.write_text(
         HEAD + '{"view": "a", "action": "go"}\n{"view": null, "action": "go"}\n{"view": "null"}\n'
@@ -153,7 +153,7 @@ def test_a_stretch_without_any_view_may_contradict_what_a_person_says(
 @pytest.mark.parametrize(
     "theory", [Theory.causal(), Theory.topological(), Theory.circumscriptive()]
 )
-def test_there_is_a_map_when_the_time_is_over(theory: Theory) -> None:
+def test_unknown_views_at_the_time_limit_give_a_map(theory: Theory) -> None:
     trace = drive(*TOURS["comb"])
     trace = hidden(trace, set(range(1, len(trace), 3)))
     found = solve(trace, theory, time_limit=1e-9)
@@ -161,7 +161,7 @@ def test_there_is_a_map_when_the_time_is_over(theory: Theory) -> None:
     assert check(trace, found.maps[0], theory) == ()
 
 
-def test_no_speedup_that_reads_views_is_on() -> None:
+def test_speedups_that_read_views_are_off() -> None:
     theory = settle(Trace.from_steps(["a", None], ["travel"])).theory
     kept = {
         "path_names",
@@ -176,14 +176,14 @@ def test_no_speedup_that_reads_views_is_on() -> None:
     assert {row.name for row in TABLE if row.holds_for(theory)} <= kept
 
 
-def test_while_a_robot_drives_each_view_is_known() -> None:
+def test_online_mapper_refuses_unknown_views() -> None:
     with pytest.raises(TraceError, match="view: expected one while a robot drives, got none"):
         OnlineMapper("a", Theory.causal()).observe("go", None)  # type: ignore[arg-type]
     with pytest.raises(TraceError, match="view: expected one while a robot drives, got none"):
         OnlineMapper(None, Theory.causal())  # type: ignore[arg-type]
 
 
-def test_rivals_are_not_told_apart_by_what_was_never_seen() -> None:
+def test_unknown_views_do_not_separate_rivals() -> None:
     trace = Trace.from_steps(["a", None, "a", "b", "a"], ["x", "y", "x", "y"])
     solution = solve(trace, Theory.causal().replace(prefer=()), max_maps=None)
     assert solution.count > 1
@@ -196,7 +196,7 @@ def test_rivals_are_not_told_apart_by_what_was_never_seen() -> None:
     )
 
 
-def test_no_proof_rests_on_what_was_never_seen() -> None:
+def test_certificate_does_not_use_unknown_views() -> None:
     trace = Trace.from_steps(["a", None, "b"], ["go", "go"])
     assert solve(trace, Theory.causal()).certificate is None
     assert check_bound(trace, {"clique": [0, 1], "words": [], "refuted": []}).faults

@@ -121,7 +121,7 @@ def test_reprs_are_short() -> None:
 
 
 @pytest.mark.parametrize("kind", SOLVED)
-def test_no_repr_is_long(kind: str) -> None:
+def test_reprs_have_a_limited_length(kind: str) -> None:
     trace, solution = solved(kind)
     values = [
         trace,
@@ -143,14 +143,14 @@ def test_no_repr_is_long(kind: str) -> None:
         assert "\n" not in repr(value)
 
 
-def test_a_long_value_of_a_theory_and_an_image_are_cut() -> None:
+def test_reprs_cut_long_theories_and_images() -> None:
     pairs = [(t, t + 1) for t in range(1000)]
     assert len(repr(Theory.causal().replace(same=pairs))) < 2 * LONG
     assert repr(Trace.from_steps(["a" * 1000], [])) == "<Trace: 1 step, 1 view, 0 actions>"
     assert len(repr(Certificate(tuple(range(1000))))) <= LONG
 
 
-def test_a_solution_is_a_sequence_of_its_maps() -> None:
+def test_solution_is_a_sequence_of_its_maps() -> None:
     assert len(aces.solution()) == aces.solution().count == 4
     assert (
         list(aces.solution())
@@ -172,7 +172,7 @@ def test_a_solution_is_a_sequence_of_its_maps() -> None:
         none[0]
 
 
-def test_traces_are_sliced() -> None:
+def test_traces_can_be_sliced() -> None:
     assert ACES[3] is ACES.steps[3]
     assert ACES[-1] is ACES.steps[22]
     assert ACES[:20] == ACES.prefix(20)
@@ -190,7 +190,7 @@ def test_traces_are_sliced() -> None:
     assert solve(RECTANGLE[8:200]).cost == solve(RECTANGLE).cost
 
 
-def test_a_slice_of_a_trace_has_no_displacement_that_led_to_it() -> None:
+def test_slice_of_a_trace_drops_its_first_displacement() -> None:
     trace = in_metres()[0]
     part = trace[3:6]
     assert [step.displacement for step in part] == [
@@ -204,7 +204,7 @@ def test_a_slice_of_a_trace_has_no_displacement_that_led_to_it() -> None:
 
 
 @pytest.mark.parametrize("index", [23, -24, 10**30])
-def test_a_step_that_there_is_not_names_the_range(index: int) -> None:
+def test_wrong_step_index_names_the_range(index: int) -> None:
     with pytest.raises(
         RangeError, match=r"^steps: expected 0 to 22, or -23 to -1 from the end, got "
     ):
@@ -223,14 +223,12 @@ def test_a_step_that_there_is_not_names_the_range(index: int) -> None:
         (True, TypeError, "whole number"),
     ],
 )
-def test_a_slice_that_is_no_trace_is_an_error(
-    wrong: Any, error: type[Exception], said: str
-) -> None:
+def test_empty_or_stepped_slice_is_an_error(wrong: Any, error: type[Exception], said: str) -> None:
     with pytest.raises(error, match=said):
         ACES[wrong]
 
 
-def test_the_version_is_that_of_the_package() -> None:
+def test_version_equals_that_of_the_project() -> None:
     assert (
         ssh_abduction.__version__
         == tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
@@ -255,20 +253,20 @@ def test_the_version_is_that_of_the_package() -> None:
         lambda: aces.solution()[9],
     ],
 )
-def test_bad_input_is_a_value_error(bad: Callable[[], object]) -> None:
+def test_bad_input_raises_a_value_error(bad: Callable[[], object]) -> None:
     with pytest.raises(ValueError, match="expected") as caught:
         bad()
     assert isinstance(caught.value, AbductionError)
 
 
-def test_errors_not_caused_by_bad_input_are_no_value_errors() -> None:
+def test_internal_errors_are_not_value_errors() -> None:
     assert not issubclass(InternalError, ValueError)
     assert not issubclass(AbductionError, ValueError)
     assert all(issubclass(error, ValueError) for error in (LearnerError, SimulatorError))
 
 
 @pytest.mark.parametrize("kind", SOLVED)
-def test_a_solution_survives_files(kind: str, tmp_path: Path) -> None:
+def test_solution_survives_a_round_trip(kind: str, tmp_path: Path) -> None:
     trace, solution = solved(kind)
     file = tmp_path / "maps.json"
     solution.save(file)
@@ -286,7 +284,7 @@ def test_a_solution_survives_files(kind: str, tmp_path: Path) -> None:
     assert pickle.loads(pickle.dumps(loaded)) == solution
 
 
-def test_values_are_loaded_without_a_solver() -> None:
+def test_values_load_without_a_solver() -> None:
     program = (
         "import sys; from ssh_abduction import Solution, SSHMap, Theory, Trace; "
         "from ssh_abduction.solver import Backbone, Certificate, Cost, Progress, Status; "
@@ -298,7 +296,7 @@ def test_values_are_loaded_without_a_solver() -> None:
     assert shown.strip() == "[]"
 
 
-def test_what_the_shell_prints_is_what_is_saved(
+def test_solve_json_equals_the_saved_solution(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from ssh_abduction.cli import main
@@ -328,7 +326,9 @@ def test_what_the_shell_prints_is_what_is_saved(
     assert capsys.readouterr().out.startswith("4 of 4 maps satisfy")
 
 
-def test_why_there_is_no_map_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_saved_solution_keeps_the_explanation(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     from ssh_abduction.cli import main
 
     IMPOSSIBLE.save(tmp_path / "trace.jsonl")
@@ -399,7 +399,7 @@ def saved() -> dict[str, Any]:
         ({"warnings": [3]}, r"warnings\[0\]: expected a sentence"),
     ],
 )
-def test_wrong_fields_of_a_solution_file_are_named(
+def test_malformed_solution_file_is_refused_with_its_field(
     fields: dict[str, Any] | Callable[[], dict[str, Any]], said: str, tmp_path: Path
 ) -> None:
     """`fields` replace those of a file that is right; `...` leaves one out."""
@@ -423,7 +423,7 @@ def test_wrong_fields_of_a_solution_file_are_named(
         (dict, "maps: expected what solve --json"),
     ],
 )
-def test_a_file_that_is_no_solution_is_refused(
+def test_file_without_a_solution_is_refused(
     data: Callable[[], Any], said: str, tmp_path: Path
 ) -> None:
     refuses(data(), said, tmp_path)
@@ -447,13 +447,13 @@ def refuses(data: object, said: str, folder: Path) -> None:
         ("\0", "broken JSON"),
     ],
 )
-def test_a_file_that_is_no_json_is_refused(text: str, said: str, tmp_path: Path) -> None:
+def test_solution_file_that_is_not_json_is_refused(text: str, said: str, tmp_path: Path) -> None:
     (tmp_path / "maps.json").write_text(text)
     with pytest.raises(MapError, match=said):
         Solution.load(tmp_path / "maps.json")
 
 
-def test_a_huge_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_huge_solution_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     aces.solution().save(tmp_path / "maps.json")
     monkeypatch.setattr("ssh_abduction.data.map_file.LARGEST", 2**20)
     assert Solution.load(tmp_path / "maps.json") == aces.solution()
@@ -461,7 +461,7 @@ def test_a_huge_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         Solution.load("/dev/zero")
 
 
-def test_maps_of_another_trace_are_named(tmp_path: Path) -> None:
+def test_solution_of_another_trace_is_refused(tmp_path: Path) -> None:
     aces.solution().save(tmp_path / "maps.json")
     with pytest.raises(
         MapError,
@@ -479,7 +479,7 @@ def test_maps_of_another_trace_are_named(tmp_path: Path) -> None:
         Solution.load(tmp_path / "none.json", ACES)
 
 
-def test_single_maps_say_what_they_are(tmp_path: Path) -> None:
+def test_single_map_and_solution_files_are_distinguished(tmp_path: Path) -> None:
     aces.solution().save(tmp_path / "maps.json")
     aces.solution()[0].save(tmp_path / "map.json")
     assert SSHMap.load(tmp_path / "map.json") == aces.solution()[0]
@@ -494,7 +494,7 @@ def test_single_maps_say_what_they_are(tmp_path: Path) -> None:
     ) == [aces.solution()[0]]
 
 
-def test_a_solution_without_the_maps_that_were_found_is_not_written(tmp_path: Path) -> None:
+def test_incomplete_solution_is_not_saved(tmp_path: Path) -> None:
     search = Search(ACES)
     first = next(kept := iter(search))
     assert len(list(kept)) == 3

@@ -57,7 +57,7 @@ def aces_poses(spacing: float = 1.0) -> np.ndarray:
     return np.array([*poses, (*at[ACES_ROUTE[-1]], 0.0)])
 
 
-def test_the_route_of_aces_is_recognised_and_another_is_refused() -> None:
+def test_aces_route_is_recognised_and_another_refused() -> None:
     poses = aces_poses()
     truth = Truth.of_aces(poses)
     assert [visit.place for visit in truth.visits] == ACES_ROUTE
@@ -65,7 +65,7 @@ def test_the_route_of_aces_is_recognised_and_another_is_refused() -> None:
         Truth.of_aces(poses[::-1])
 
 
-def test_a_trace_with_the_names_of_true_places_has_the_true_map() -> None:
+def test_trace_with_true_place_names_has_the_true_map() -> None:
     """The route of aces3-route.jsonl on scans has the same names and the same evaluation."""
     shipped = Trace.load(ROOT / "examples" / "aces3-route.jsonl")
     poses = aces_poses()
@@ -102,7 +102,7 @@ def test_a_trace_with_the_names_of_true_places_has_the_true_map() -> None:
     )
 
 
-def test_events_are_matched_to_visits_one_by_one() -> None:
+def test_events_are_matched_to_visits_one_to_one() -> None:
     poses = np.array([(float(x), 0.0, 0.0) for x in range(40)])
     truth = Truth(poses, visits_of({"A": (5, 0), "B": (20, 0)}, poses))
     assert truth.visits == (Visit("A", 2, 8), Visit("B", 17, 23))
@@ -119,7 +119,7 @@ def test_events_are_matched_to_visits_one_by_one() -> None:
     assert not judged(Events((5, 18), ("a", "a")), truth).isomorphic
 
 
-def test_passes_without_an_event_are_noticed() -> None:
+def test_passes_without_an_event_are_counted() -> None:
     way = [*range(14), *range(13, -1, -1), *range(14)]
     truth = Truth(np.array([(float(x), 0.0, 0.0) for x in way]))
     # The robot came back to 6 m twice, with an event once, as seen from either event there. It came
@@ -127,7 +127,7 @@ def test_passes_without_an_event_are_noticed() -> None:
     assert passes(Events((6, 13, 34), ("a", "b", "a")), truth) == (5, 2)
 
 
-def test_events_in_buildings_are_at_doors_or_in_rooms(tmp_path: Path) -> None:
+def test_events_in_plans_are_at_doors_or_in_rooms(tmp_path: Path) -> None:
     told = {
         "poses": [[x, 0.0, 0.0] for x in (0, 1.2, 2, 2.6, 5, 5.5, 9)],
         "scans": ["room 0", "room 0", "room 1", "room 1", "room 1", "room 1", "room 1"],
@@ -155,7 +155,7 @@ def test_events_in_buildings_are_at_doors_or_in_rooms(tmp_path: Path) -> None:
     assert truth.doorways == (Visit("door 0", 1, 3),)  # in and out by one door counts once
 
 
-def test_branches_that_hardly_leave_their_junction_are_cut_off() -> None:
+def test_short_branches_of_a_skeleton_are_removed() -> None:
     drawn = """
         .....#.......
         .....#.......
@@ -177,7 +177,7 @@ def test_branches_that_hardly_leave_their_junction_are_cut_off() -> None:
     ]  # no branch is a metre longer than its junction is from a wall
 
 
-def test_a_ring_has_one_node() -> None:
+def test_skeleton_of_a_ring_has_one_node() -> None:
     thin = np.zeros((6, 8), dtype=bool)
     thin[1:5, 1:7] = True
     thin[2:4, 2:6] = False
@@ -188,7 +188,7 @@ def test_a_ring_has_one_node() -> None:
     )
 
 
-def test_a_narrow_part_of_an_edge_is_a_door() -> None:
+def test_narrow_part_of_an_edge_is_a_door() -> None:
     width = np.full(100, 1.0)
     width[40:43], width[60:100] = (
         (0.6, 0.5, 0.6),
@@ -220,7 +220,7 @@ def crossing() -> RobotLog:
     )
 
 
-def test_the_skeleton_of_a_crossing_has_five_nodes() -> None:
+def test_skeleton_of_a_crossing_has_five_nodes() -> None:
     pytest.importorskip("skimage")
     log = crossing()
     poses = poses_of(log, "corrected")
@@ -242,7 +242,7 @@ def test_the_skeleton_of_a_crossing_has_five_nodes() -> None:
 
 
 @pytest.mark.skipif(not LOGS.exists(), reason="needs ../shared/data")
-def test_the_corrected_poses_of_aces_pass_the_nine_places_in_the_known_order() -> None:
+def test_corrected_poses_of_aces_pass_its_places_in_order() -> None:
     assert len(truth_of(LOGS / "aces-corrected.log.gz").visits) == 15
 
 
@@ -260,7 +260,7 @@ def line(*corners: tuple[float, float], spacing: float = 0.25) -> np.ndarray:
         pytest.param([(0, 0), (8, 0)], [(0, 0), (4, 0)], False, id="only half of the way"),
     ],
 )
-def test_courses_are_one_if_they_are_near_each_other_everywhere(
+def test_courses_are_one_if_near_everywhere(
     first: list[tuple[float, float]], second: list[tuple[float, float]], one: bool
 ) -> None:
     assert courses.is_one(line(*first), line(*second)) is one
@@ -276,7 +276,7 @@ def test_courses_are_one_if_they_are_near_each_other_everywhere(
         pytest.param([(0, 0), (20, 0), (0, 0)], [], id="there and back"),
     ],
 )
-def test_a_drive_parts_where_its_second_pass_leaves_the_first(
+def test_partings_are_found_where_a_second_pass_leaves_the_first(
     way: list[tuple[float, float]], parted: list[tuple[float, float]]
 ) -> None:
     found = courses.partings(line(*way))
@@ -284,7 +284,7 @@ def test_a_drive_parts_where_its_second_pass_leaves_the_first(
     assert all(math.dist(a, b) < 1.0 for a, b in zip(found, parted, strict=True))
 
 
-def test_pairs_of_visits_and_of_travels_are_counted() -> None:
+def test_pairs_of_visits_and_travels_are_counted() -> None:
     """A robot drives twice around a square. The map joins the visits of the first corner only."""
     corners = [(0, 0), (10, 0), (10, 10), (0, 10)] * 2 + [(0, 0)]
     poses = np.array([(x, y, 0.0) for x, y in corners])
@@ -337,7 +337,7 @@ def corridor_map(places: str, paths: str, drive: str) -> tuple[Trace, SSHMap, li
         ("haha", "pqr", "HAHB", {3: "1", 6: "1", 9: "2"}, ["B"], ["1 and 2"]),
     ],
 )
-def test_rooms_and_doors_need_places_or_edges_of_their_own(
+def test_rooms_and_doors_need_their_own_places_or_edges(
     places: str,
     paths: str,
     drive: str,
@@ -349,7 +349,7 @@ def test_rooms_and_doors_need_places_or_edges_of_their_own(
     assert told == {"rooms": missing, "doors": confused}
 
 
-def test_waypoints_fill_rooms_and_no_edge_crosses_a_wall() -> None:
+def test_waypoints_fill_rooms_and_edges_cross_no_wall() -> None:
     """Two rooms of 4 x 4 m with a wall between them, and no door."""
     free = np.zeros((45, 95), bool)
     free[2:42, 2:42] = free[2:42, 52:92] = True

@@ -43,7 +43,7 @@ def labelled(labels: Sequence[int], places: Sequence[int | None]) -> SSHMap:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_pairs_are_those_that_are_counted_naively(seed: int) -> None:
+def test_pairs_of_visits_equal_naive_counts(seed: int) -> None:
     rng = random.Random(seed)
     kinds = [rng.choice(["travel", "travel", "turn"]) for _ in range(11)]
     poses: list[list[float] | None] = []
@@ -101,7 +101,7 @@ def test_pairs_are_those_that_are_counted_naively(seed: int) -> None:
         assert (map_pairs.joined, map_pairs.right) == (naive["joined"], naive["right"])
 
 
-def test_a_turn_is_no_return_and_neither_is_the_next_door() -> None:
+def test_turns_and_next_places_are_no_returns() -> None:
     trace = posed(
         [[0, 0, 0], [0, 0, 1.6], [1.5, 0, 0], [9, 0, 0], [1, 0, 3.1]],
         ["turn", "travel", "travel", "travel"],
@@ -137,7 +137,7 @@ def circle(turns: int) -> tuple[list[Pose], list[Relation]]:
     ]
 
 
-def test_relations_are_composed_along_the_shortest_way() -> None:
+def test_relations_are_composed_along_the_shortest_chain() -> None:
     poses, related = circle(2)
     times = [0.0, 30.25, 120.0, 235.0, 260.0]
     seen = Relations(related).between(times, 1)
@@ -156,7 +156,7 @@ def test_relations_are_composed_along_the_shortest_way() -> None:
     assert seen[4] is None  # long after the last time
 
 
-def test_relations_judge_where_poses_are_missing(
+def test_relations_judge_visits_without_poses(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     _, related = circle(2)
@@ -212,7 +212,7 @@ def test_relations_judge_where_poses_are_missing(
     assert row.split()[:6] == ["1", "2", "4", "1", "0.250", "0.333"]
 
 
-def test_relations_of_another_log_are_noticed(
+def test_relations_of_another_log_give_a_warning(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     poses, related = circle(2)
@@ -250,7 +250,7 @@ def test_relations_of_another_log_are_noticed(
     assert "poses and relations agree on 6 of 10 pairs of visits" in said.out
 
 
-def test_names_and_poses_are_judged_where_both_are_asked_for(
+def test_evaluate_judges_names_and_poses(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     trace = posed([[0, 0, 0], [9, 0, 0], [1, 0, 0]], ["travel", "travel"])
@@ -292,13 +292,13 @@ def test_names_and_poses_are_judged_where_both_are_asked_for(
         ("\udcff", "relations: expected a text of relations, got another file"),
     ],
 )
-def test_relations_that_cannot_be_used(lines: str, message: str, tmp_path: Path) -> None:
+def test_malformed_relations_are_refused(lines: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "relations").write_bytes(lines.encode(errors="surrogateescape"))
     with pytest.raises(TraceError, match=f"{re.escape(message)}"):
         Relations.load(tmp_path / "relations")
 
 
-def test_poses_and_times_that_cannot_be_used() -> None:
+def test_malformed_poses_and_times_are_refused() -> None:
     ssh_map = labelled([0, 1], [0, 1])
     with pytest.raises(
         TraceError,
@@ -333,7 +333,7 @@ def test_poses_and_times_that_cannot_be_used() -> None:
 
 
 @pytest.mark.skipif(not FREIBURG.exists(), reason="needs ../shared/data")
-def test_the_relations_of_freiburg_agree_with_the_corrected_poses() -> None:
+def test_relations_of_freiburg_agree_with_corrected_poses() -> None:
     lines = [line.split() for line in (FREIBURG / "fr079.log").read_text().splitlines()]
     poses = [tuple(map(float, line[2:5])) for line in lines if line[0] == "VERTEX2"][::12]
     times = [float(line[-3]) for line in lines if line[0] == "ROBOTLASER1"][::12]

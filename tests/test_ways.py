@@ -58,7 +58,7 @@ def bare_theories(draw: st.DrawFn) -> Theory:
 
 @settings(max_examples=5)
 @given(st.data())
-def test_the_maps_of_the_plain_encoding(data: st.DataObject) -> None:
+def test_frameless_maps_equal_those_of_the_plain_encoding(data: st.DataObject) -> None:
     """Clingo gets the paths that an answer contradicts, or only incompatible links. It starts with
     few names. A minimal map is known or not."""
     trace = data.draw(traces(max_steps=6), label="trace").without_stars().without_displacements()
@@ -88,7 +88,7 @@ def test_the_maps_of_the_plain_encoding(data: st.DataObject) -> None:
 
 @settings(max_examples=4)
 @given(st.data())
-def test_what_is_refused_together_is_what_the_plain_encoding_is_told(data: st.DataObject) -> None:
+def test_forbidden_pairs_of_returns_equal_rules_of_the_plain_encoding(data: st.DataObject) -> None:
     """Forbid two returns of a minimal map, to dstates or to places. The other maps are those of the
     readable encodings with the same rule."""
     trace = data.draw(traces(max_steps=9), label="trace").without_stars()
@@ -128,7 +128,7 @@ def test_what_is_refused_together_is_what_the_plain_encoding_is_told(data: st.Da
         assert engine.forbid(refused)
 
 
-def test_a_limit_while_labels_are_listed_is_a_limit() -> None:
+def test_limit_during_listing_of_labels_stops_the_search() -> None:
     """Labels with the fewest dstates are listed after such a map is known. A known map ends the
     search, but not the list."""
     trace = maze(3, 3, steps=30, seed=0).trace
@@ -154,7 +154,7 @@ def maps_of_a_maze() -> frozenset[SSHMap]:
 
 
 @pytest.mark.parametrize("off", ["", "clique", "lazy", "core_guided"])
-def test_a_maze_without_stars(off: str) -> None:
+def test_maze_without_stars_has_the_known_maps(off: str) -> None:
     """All minimal maps of forty steps, with all speed-ups. The bound has a certificate."""
     trace = maze(2, 2, steps=40, seed=1).trace
     with patch.object(choosing, "STEPWISE", -1.0):
@@ -170,7 +170,7 @@ def test_a_maze_without_stars(off: str) -> None:
     assert bound.dstates + len(bound.refuted) == found.cost.dstates
 
 
-def test_the_route_of_a_robot() -> None:
+def test_aces3_route_without_stars_has_the_known_maps() -> None:
     """As the table of docs/explanation/theory.md has it: (19, 9, 4), 38 maps."""
     trace = Trace.load(EXAMPLES / "aces3-route.jsonl")
     with patch.multiple(choosing, STEPWISE=-1.0, FEW_STEPS=0):
@@ -191,7 +191,7 @@ def maps_of_the_route() -> tuple[SSHMap, ...]:
 
 
 @pytest.mark.parametrize("settled", [False, True], ids=["step by step", "dstates first"])
-def test_maps_that_are_refused_do_not_count_among_those_that_are_listed(settled: bool) -> None:
+def test_refused_maps_do_not_count_as_listed(settled: bool) -> None:
     """Two steps may not be at one place, though they are in most minimal maps. A few maps are no
     complete list, and all remaining maps are found."""
     trace, theory = (
@@ -224,7 +224,7 @@ def test_maps_that_are_refused_do_not_count_among_those_that_are_listed(settled:
 
 
 @pytest.mark.slow
-def test_few_of_many_maps() -> None:
+def test_max_maps_cuts_the_list_of_a_frameless_search() -> None:
     trace = maze(2, 2, steps=120, seed=2).trace
     with patch.object(choosing, "STEPWISE", -1.0):
         few, every = solve(trace, max_maps=3), solve(trace, max_maps=None)
@@ -240,7 +240,7 @@ def test_few_of_many_maps() -> None:
 
 
 @pytest.mark.parametrize("name", ["forget", "fits", "_control_for"])
-def test_an_interrupt_while_dstates_are_sought_leaves_the_known_map(name: str) -> None:
+def test_interrupt_keeps_the_known_map(name: str) -> None:
     """At any time, the map that was known before is the answer."""
     trace = maze(2, 2, steps=120, seed=1).trace
     with (
@@ -252,7 +252,7 @@ def test_an_interrupt_while_dstates_are_sought_leaves_the_known_map(name: str) -
     assert check(trace, found.maps[0], found.theory) == ()
 
 
-def test_a_later_search_continues_from_an_engine_without_frames() -> None:
+def test_later_search_continues_from_a_frameless_engine() -> None:
     """The first search of a mapper may have many steps. What it proved holds for later steps."""
     trace = maze(2, 2, steps=30, seed=1).trace
     first = trace.prefix(26)
@@ -268,7 +268,7 @@ def test_a_later_search_continues_from_an_engine_without_frames() -> None:
     )
 
 
-def test_a_known_map_whose_places_are_refused_is_no_answer(
+def test_known_map_with_refused_places_is_not_returned(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Also if the search ends early, as the known map has as few dstates as the bound."""

@@ -131,7 +131,7 @@ def subsets(steps: list[int]) -> list[tuple[int, ...]]:
 
 @settings(max_examples=4)
 @given(st.data())
-def test_faults_are_weighed_beside_misfit(data: st.DataObject) -> None:
+def test_faults_and_misfit_are_weighed_together(data: st.DataObject) -> None:
     trace = data.draw(
         traces(max_steps=3).filter(lambda trace: trace.has_displacements), label="trace"
     )
@@ -168,7 +168,7 @@ PRICES = [(8.0, 8.0, 0.0), (1.0, 2.0, 0.5), (3.0, 0.0, 0.0)]
 
 @settings(max_examples=5)
 @given(st.data())
-def test_the_cheapest_maps_are_those_of_plain_least_squares(data: st.DataObject) -> None:
+def test_cheapest_maps_equal_plain_least_squares(data: st.DataObject) -> None:
     trace = data.draw(
         traces(closures=True).filter(lambda trace: trace.has_displacements), label="trace"
     )
@@ -179,12 +179,12 @@ def test_the_cheapest_maps_are_those_of_plain_least_squares(data: st.DataObject)
 @pytest.mark.parametrize(
     "prices", [(-1, 8, 0), (math.nan, 8, 0), ("dear", 8, 0), ("8", 8, 0), (8, 8), 8, (0, 8, 0)]
 )
-def test_prices_are_three_numbers(prices: object) -> None:
+def test_prices_must_be_three_numbers(prices: object) -> None:
     with pytest.raises(TheoryError, match=r"prices: expected .*, got"):
         Theory(prices=prices)  # type: ignore[arg-type]
 
 
-def test_maps_are_counted_where_there_is_no_misfit_to_weigh() -> None:
+def test_weigh_cost_without_displacements_counts_maps() -> None:
     solution = solve(Trace.from_steps("aba", ["travel", "travel"]), Theory(weigh="cost"))
     assert solution.theory.weigh == "count"
     assert any("no displacements" in warning for warning in solution.warnings)
@@ -211,7 +211,7 @@ def weighed_route(route: truth.Known) -> Solution:
     return solve(route.trace, time_limit=100)
 
 
-def test_the_cheapest_map_is_true_where_the_smallest_is_not(
+def test_cheapest_map_is_true_and_the_smallest_is_not(
     route: truth.Known, weighed_route: Solution
 ) -> None:
     counted = solve(route.trace, Theory(weigh="count"), time_limit=100)
@@ -223,7 +223,7 @@ def test_the_cheapest_map_is_true_where_the_smallest_is_not(
     assert weighed_route.confidence > 0.9
 
 
-def test_probabilities_are_of_steps_of_the_trace(weighed_route: Solution) -> None:
+def test_probability_refuses_unknown_steps(weighed_route: Solution) -> None:
     assert weighed_route.probability(0, 12) > 0.9
     assert weighed_route.probability(0, 1) < 0.1
     with pytest.raises(SolverError, match="second: expected a whole number from 0 to 19, got 20"):
@@ -241,7 +241,7 @@ def test_probabilities_are_of_steps_of_the_trace(weighed_route: Solution) -> Non
         )
 
 
-def test_costs_are_written_and_read(weighed_route: Solution, tmp_path: Path) -> None:
+def test_weighed_costs_survive_a_round_trip(weighed_route: Solution, tmp_path: Path) -> None:
     weighed_route.save(tmp_path / "maps.json")
     read = Solution.load(tmp_path / "maps.json", weighed_route.trace)
     assert read.weighed is not None
@@ -255,7 +255,7 @@ def test_costs_are_written_and_read(weighed_route: Solution, tmp_path: Path) -> 
     ("name", "said"),
     [("nats", "weighed.bound: expected"), ("rivals", "weighed.rivals[0]: expected")],
 )
-def test_false_costs_are_found(weighed_route: Solution, name: str, said: str) -> None:
+def test_check_finds_false_costs(weighed_route: Solution, name: str, said: str) -> None:
     assert weighed_route.trace is not None
     data = weighed_route.to_dict()
     maps = list(weighed_route.maps)
@@ -269,7 +269,7 @@ def test_false_costs_are_found(weighed_route: Solution, name: str, said: str) ->
     assert any(said in claim for claim in found)
 
 
-def test_a_stopped_search_does_not_claim_to_be_sure(route: truth.Known) -> None:
+def test_stopped_search_is_not_sure(route: truth.Known) -> None:
     with patch.object(beams, "WIDTHS", {1: 0.8, beams.BROAD: 0.0}):  # no broad beam
         solution = solve(route.trace, time_limit=0.5)
     assert solution.status is Status.FEASIBLE
@@ -283,7 +283,7 @@ def test_a_stopped_search_does_not_claim_to_be_sure(route: truth.Known) -> None:
     assert "no other map was found, so it is unknown which joins are doubtful" in alone.sentence
 
 
-def test_more_returns_never_fit_better_and_a_core_is_minimal(route: truth.Known) -> None:
+def test_misfit_grows_with_returns_and_cores_are_minimal(route: truth.Known) -> None:
     problem = settle(route.trace, Theory())
     misfit = Misfit(problem)
     smallest = solve(route.trace, Theory(weigh="count"), max_maps=1).maps[0]
@@ -302,7 +302,7 @@ def test_more_returns_never_fit_better_and_a_core_is_minimal(route: truth.Known)
 
 @settings(max_examples=10)
 @given(st.data())
-def test_the_checker_and_the_solver_have_one_misfit(data: st.DataObject) -> None:
+def test_misfit_equals_that_of_the_checker(data: st.DataObject) -> None:
     """Errors of displacements and poses of dstates give the same number."""
     seed = data.draw(st.integers(0, 10_000), label="seed")
     (known,) = truth.mazes(3, 12, [seed], truth.Noise(Odometry(**DEFAULT)))
@@ -323,7 +323,7 @@ def test_the_checker_and_the_solver_have_one_misfit(data: st.DataObject) -> None
     ("factor", "offset", "least", "most"),
     [(1.0, 0.01, 1.0, 1.0), (0.6, 0.01, 1.5, 2.25), (0.6, 0.0, math.inf, math.inf)],
 )
-def test_misfits_may_exceed_what_is_said_where_the_robot_is_off_its_dstates(
+def test_excess_of_the_misfit_is_estimated(
     route: truth.Known,
     weighed_route: Solution,
     factor: float,
@@ -341,7 +341,7 @@ def test_misfits_may_exceed_what_is_said_where_the_robot_is_off_its_dstates(
         assert least <= search._weighing._excess() <= most
 
 
-def test_an_excess_misfit_makes_the_best_map_less_sure() -> None:
+def test_excess_of_the_misfit_lowers_confidence() -> None:
     rivals = Rival(10.0, (0, 1, 0), (0, 1, 0)), Rival(14.0, (0, 1, 2), (0, 1, 2))
     sure, less = (Weighed(0.0, 0.0, rivals, True, 0.0, excess) for excess in (1.0, 2.0))
     assert sure.weights == pytest.approx([1 / (1 + math.exp(-4)), 1 / (1 + math.exp(4))])
@@ -353,7 +353,7 @@ def test_an_excess_misfit_makes_the_best_map_less_sure() -> None:
         Weighed.from_dict(read, {**less.to_dict(), "excess": 0.5}, 3)
 
 
-def test_steps_that_may_be_one_are_named_if_no_join_is_as_doubtful() -> None:
+def test_sentence_names_the_most_probable_missed_join() -> None:
     """The best map keeps steps 1 and 3 apart, and a rival joins them."""
     best = Rival(10.0, (0, 1, 0, 2), (0, 1, 0, 2))
     rivals = best, Rival(11.0, (0, 1, 0, 1), (0, 1, 0, 1))
@@ -369,7 +369,7 @@ def test_steps_that_may_be_one_are_named_if_no_join_is_as_doubtful() -> None:
     assert replace(weighed, doubt="the track is unreliable").missed is None
 
 
-def test_costs_in_doubt_make_no_map_sure() -> None:
+def test_doubted_costs_give_no_confidence() -> None:
     rivals = (Rival(10.0, (0, 1, 0), (0, 1, 0)),)
     sure = Weighed(10.0, 0.0, rivals, True, 0.0)
     doubted = replace(sure, doubt="the track is unreliable")
@@ -383,7 +383,7 @@ def test_costs_in_doubt_make_no_map_sure() -> None:
         Weighed.from_dict(read, {**doubted.to_dict(), "doubt": 3}, 3)
 
 
-def test_drives_are_not_surely_one_place_by_chance() -> None:
+def test_drives_that_share_one_place_are_not_sure() -> None:
     """A rival that lays fewer drives on each other is less improbable than its cost says."""
     drives = (Drive("monday", 0, 2), Drive("tuesday", 2, 4))
     joined, other, apart = (0, 1, 0, 1), (0, 1, 1, 2), (0, 1, 2, 3)
@@ -395,7 +395,7 @@ def test_drives_are_not_surely_one_place_by_chance() -> None:
     assert sure.probability(0, 2) == sure.confidence
 
 
-def test_each_drive_apart_is_a_rival() -> None:
+def test_estimated_rivals_take_each_drive_apart() -> None:
     joined = Rival(0.0, (0, 1, 2, 0, 1, 2, 3, 1), (0, 1, 2, 0, 1, 2, 3, 1))
     drives = (Drive("one", 0, 3), Drive("two", 3, 6), Drive("three", 6, 8))
     known = estimated(joined, range(8), drives, lambda dstates, _: 20.0 * len({*dstates}), 10.0)
@@ -407,12 +407,12 @@ def test_each_drive_apart_is_a_rival() -> None:
     ]
 
 
-def test_a_robot_that_drives_counts() -> None:
+def test_online_mapper_refuses_weigh_cost() -> None:
     with pytest.raises(TheoryError, match="weigh: expected count while a robot drives"):
         OnlineMapper("a", Theory(weigh="cost"))
 
 
-def test_each_map_is_listed_once() -> None:
+def test_maps_of_least_cost_are_listed_once() -> None:
     """Two side corridors may be on one path, in two ways. So several maps have the least cost."""
     go, left, back = (10.0, 0.0, 0.0), (0.0, 0.0, math.pi / 2), (0.0, 0.0, math.pi)
     side = [("left", left), ("travel", go), ("around", back), ("travel", go), ("left", left)]
@@ -425,7 +425,7 @@ def test_each_map_is_listed_once() -> None:
 
 
 @pytest.mark.slow
-def test_maps_of_one_cost_are_minimal_whatever_their_paths(tmp_path: Path) -> None:
+def test_maps_of_equal_cost_are_all_minimal(tmp_path: Path) -> None:
     """Two drives share a corner of a square, but nothing says which. Paths cost nothing."""
     square = [(10, 0, 0), (0, 0, math.pi / 2)] * 4
     first = Trace.from_steps("abababa", ["travel", "left"] * 3, displacements=square[:6], name="k")

@@ -36,7 +36,7 @@ def at(ssh_map: SSHMap) -> list[int | None]:
 
 @settings(max_examples=6)
 @given(st.data())
-def test_near_minimal_maps_are_those_of_the_brute_force(data: st.DataObject) -> None:
+def test_near_minimal_maps_equal_the_brute_force(data: st.DataObject) -> None:
     """Each map once, in the order of cost, each with its own cost."""
     trace = data.draw(traces(max_steps=6), label="trace")
     theory = data.draw(theories(trace), label="theory")
@@ -59,7 +59,7 @@ def test_near_minimal_maps_are_those_of_the_brute_force(data: st.DataObject) -> 
         assert check(trace, ssh_map, theory) == ()
 
 
-def test_the_brute_force_for_near_minimal_maps_begins_with_the_minimal_ones() -> None:
+def test_near_minimal_brute_force_starts_with_minimal_maps() -> None:
     trace = Trace.from_steps("abaab", ["travel", "around", "travel", "right"])
     counts, keys = minimal_maps(trace, Theory.topological())
     near = near_minimal_maps(trace, Theory.topological(), 2)
@@ -72,7 +72,7 @@ def test_the_brute_force_for_near_minimal_maps_begins_with_the_minimal_ones() ->
 
 
 @pytest.mark.slow
-def test_the_true_map_of_the_real_route_is_within_three_dstates() -> None:
+def test_true_map_of_aces3_is_within_three_dstates() -> None:
     """With stars, and places before paths, it is one of the best twelve that have 22 dstates."""
     trace = Trace.load(ACES3)
     true = [
@@ -100,7 +100,7 @@ def test_the_true_map_of_the_real_route_is_within_three_dstates() -> None:
     assert right.index(True) >= 12
 
 
-def test_without_an_order_behind_dstates_all_maps_of_so_few_dstates_are_listed() -> None:
+def test_within_one_lists_all_maps_if_only_dstates_are_preferred() -> None:
     """Then the levels are those of clingo, with at most one dstate more than the least."""
     route = Trace.load(ACES3)[:16]
     solution = solve(route, Theory(prefer=("dstates",)), max_maps=None, within=1)
@@ -108,7 +108,7 @@ def test_without_an_order_behind_dstates_all_maps_of_so_few_dstates_are_listed()
 
 
 @pytest.mark.parametrize(("maps", "levels"), [(7, [2, 3, 2]), (11, [2, 3, 6])])
-def test_maps_come_in_the_order_of_their_cost_up_to_as_many_as_are_asked_for(
+def test_near_minimal_maps_are_ordered_by_cost_and_cut_at_max_maps(
     maps: int, levels: list[int]
 ) -> None:
     solution = solve(Trace.load(ACES3)[:16], max_maps=maps, within=3)
@@ -122,7 +122,7 @@ def test_maps_come_in_the_order_of_their_cost_up_to_as_many_as_are_asked_for(
 @pytest.mark.parametrize(
     "theory", [Theory.causal(), Theory.topological(), Theory.topological().replace(star="frame")]
 )
-def test_near_minimal_maps_of_a_longer_trace_are_those_that_a_rule_for_their_number_lets_pass(
+def test_near_minimal_maps_equal_those_under_a_rule_for_their_size(
     theory: Theory,
 ) -> None:
     """The minimal maps are replayed from a prefix; for the others the whole trace is asked.
@@ -145,7 +145,7 @@ def test_near_minimal_maps_of_a_longer_trace_are_those_that_a_rule_for_their_num
     assert set(solution.maps[: least.count]) == set(solve(trace, theory, max_maps=None).maps)
 
 
-def test_what_was_found_is_kept_where_a_limit_cuts_the_list() -> None:
+def test_interrupted_list_keeps_the_maps_found() -> None:
     search = Search(Trace.load(ACES3), Theory(star="none"), max_maps=None, within=3)
     found = []
     for ssh_map in search:
@@ -167,7 +167,7 @@ def test_within_may_exceed_the_number_of_steps() -> None:
 
 
 @pytest.mark.parametrize("within", [-1, 1.5, True, "2", None])
-def test_a_wrong_within_is_an_error(within: object) -> None:
+def test_wrong_within_is_an_error(within: object) -> None:
     with pytest.raises(
         SolverError, match=r"within \(--set within=K\): expected a whole number, 0 or more, got"
     ):
@@ -182,7 +182,7 @@ def near() -> dict[str, Any]:
     return dict(json.loads(printed.getvalue()))
 
 
-def test_the_json_says_what_each_map_costs(near: dict[str, Any]) -> None:
+def test_json_has_the_cost_of_each_near_minimal_map(near: dict[str, Any]) -> None:
     assert near["within"] == 3
     assert near["cost"] == {"dstates": 19, "places": 10, "paths": 4}
     assert [(level["cost"]["dstates"], level["count"]) for level in near["levels"]] == [
@@ -208,7 +208,7 @@ def test_the_json_says_what_each_map_costs(near: dict[str, Any]) -> None:
         ({"maps": [4, 0]}, "expected 20 to 23 dstates in map 2, as within is 3, got 19"),
     ],
 )
-def test_a_file_of_near_minimal_maps_is_not_taken_at_its_word(
+def test_check_finds_false_claims_on_near_minimal_maps(
     near: dict[str, Any], change: dict[str, Any], fault: str | None
 ) -> None:
     """If `change` has maps, these are the numbers of the maps to list."""
@@ -220,7 +220,7 @@ def test_a_file_of_near_minimal_maps_is_not_taken_at_its_word(
     assert (fault in "; ".join(false)) if fault else not false
 
 
-def test_a_map_that_does_not_cost_what_it_is_said_to_cost_is_found(near: dict[str, Any]) -> None:
+def test_check_finds_a_map_with_a_false_cost(near: dict[str, Any]) -> None:
     maps = [SSHMap.from_dict(ssh_map) for ssh_map in near["maps"]]
     wrong = [ssh_map | {"cost": near["cost"]} for ssh_map in near["maps"]]
     trace = Trace.load(ACES3)
