@@ -45,7 +45,7 @@ class StepOptions:
         time_limit: Seconds for each step. A step may take a little longer. None waits for the exact
             answer.
         max_maps: Keep at most this many minimal maps; None keeps all.
-        speedups: The speed-ups that are on.
+        speedups: Flags that say which speed-ups of the solver to use.
     """
 
     time_limit: float | None
@@ -82,10 +82,10 @@ def solved(
     speedups: Speedups,
     watch: Watch | None = None,
 ) -> Solved:
-    """Run `solve` on a trace with a settled theory, and return the needed parts of the solution.
+    """Run `solve` on a trace, and return the needed parts of the solution.
 
-    `limit` is in seconds. `watch` is not used; `in_process` passes one to each function that it
-    runs.
+    In the theory no field is "auto". `limit` is in seconds. `watch` is not used. It is a parameter
+    because `in_process` passes a watch to each function that it runs.
     """
     found = solve(
         trace, theory.of_steps(0, len(trace)), time_limit=limit, max_maps=maps, speedups=speedups
@@ -133,11 +133,11 @@ def _end(watch: Watch, thread: threading.Thread) -> None:
 
 
 class FaultSolver:
-    """Solves a growing trace, allowing faults, again after enough new steps.
+    """Solves a growing trace with faults, again and again, each time after enough new steps.
 
     Args:
         options: The time limit and the other options of a step.
-        searches: The number to start counting searches from.
+        searches: The number from which to count searches.
 
     Attributes:
         searches: Number of searches so far, except those in the background.
@@ -163,8 +163,8 @@ class FaultSolver:
     def solve(self, trace: Trace, theory: Theory, has_map: bool) -> Solved | None:
         """Solve the trace within the time limit of a step, or in the background.
 
-        The theory is settled. If `has_map`, and the last search was slow, the search runs
-        in the background.
+        In the theory no field is "auto". If `has_map`, and the last search was slow, the search
+        runs in the background.
         """
         steps, options = len(trace), self._options
         limit = options.time_limit

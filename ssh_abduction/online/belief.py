@@ -56,8 +56,8 @@ class Observation:
     """How well an observation o fits each of N dstates x. `localiser.py` defines f and q.
 
     Attributes:
-        where: The ids of k dstates, (k,), or a slice of all dstates.
-        ratio: f(o|x) / q(o) for each of these dstates, (k,). For all other dstates it is 0.
+        where: The ids of k dstates, of shape (k,), or a slice of all dstates.
+        ratio: f(o|x) / q(o) for each of these dstates, of shape (k,). For all others it is 0.
         novel: Probability, given o, that an unknown place looks like no dstate of the map. A
             priori, the N + 1 cases are equally likely: it looks like one of the dstates, or none.
     """
@@ -75,7 +75,7 @@ class Belief:
     """The probabilities that a robot is at each dstate of a map, or nowhere in it.
 
     Attributes:
-        probabilities: The probability of each dstate by id, (N,), read-only. Together with
+        probabilities: The probability of each dstate by id, of shape (N,), read-only. Together with
             `nowhere` they sum to 1.
         nowhere: Probability that the robot is at no dstate of the map.
         normaliser: Probability of the last observation by the belief before it, divided by its

@@ -40,9 +40,9 @@ class Links:
     """Where one action a leads from each of the N dstates.
 
     Attributes:
-        leads: The probabilities p(x'|x,a), (N, N). Row x' is the end, column x the start. The
-            column of a dstate sums to 1, or is 0 if it is unknown where a leads from there.
-        missing: 1 for each dstate from which it is unknown where a leads, else 0, (N,).
+        leads: The probabilities p(x'|x,a), of shape (N, N). Row x' is the end, column x the start.
+            The column of a dstate sums to 1, or is 0 if it is unknown where a leads from there.
+        missing: 1 for each dstate from which it is unknown where a leads, else 0. Shape (N,).
     """
 
     leads: sparse.csr_array
@@ -84,7 +84,7 @@ class Moves:
         return self._links.get(move)
 
     def _turn(self, degrees: int) -> Links:
-        """Find where a turn leads: to the dstates at the same place that face that way."""
+        """Find where a turn leads: to dstates of its place about `degrees` further clockwise."""
         sources, targets, angles = self._pairs
         off = (angles - degrees + 180) % 360 - 180
         near = np.abs(off) <= FACING * SPREAD
@@ -122,7 +122,7 @@ def _has_turns_of_its_own(ssh_map: SSHMap) -> bool:
 def _links_of(
     sources: NDArray[np.intp], targets: NDArray[np.intp], weights: NDArray[np.float64], number: int
 ) -> Links:
-    """Make the links of one action from relative weights of pairs of dstates, (n,)."""
+    """Make the links of one action from the relative weights of n pairs of dstates."""
     totals = np.bincount(sources, weights, number)
     missing = np.where(totals > 0, 0.0, 1.0)
     return Links(

@@ -395,7 +395,7 @@ class Explorer:
 
     @property
     def _known(self) -> dict[str, Any]:
-        """What plans need to know besides maps."""
+        """The arguments of the planners besides maps: trace, theory, and what the robot can do."""
         trace, theory = self.mapper.trace, self.mapper.theory
         can = self._abilities
         return {"trace": trace, "theory": theory, "actions": can.ever.values(), "can": can.names}
@@ -426,7 +426,7 @@ def _are_alike(maps: tuple[SSHMap, ...]) -> bool:
 
 
 class Abilities:
-    """The actions that a robot can do: now, ever, and wherever it sees a view and a star.
+    """The actions that a robot can do: now, at any time, and whenever it sees a view and a star.
 
     Attributes:
         here: The actions that the robot can do now, by name.

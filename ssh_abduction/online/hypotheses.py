@@ -65,7 +65,7 @@ class ExtendedMap:
 
     @classmethod
     def of(cls, ssh_map: SSHMap, trace: Trace, theory: Theory) -> ExtendedMap:
-        """Make the hypothesis that a map of the trace, or of its first steps, stands for."""
+        """Make the hypothesis that a map of the trace, or of its first steps, is true."""
         wrong = {fault.step for fault in ssh_map.faults if fault.kind != "slipped"}
         looks: dict[int, Seen] = {}
         for t, label in enumerate(ssh_map.dstate_at):
@@ -136,7 +136,7 @@ class ExtendedMap:
     def ways_on(self, action: str, step: Step, seen: Seen, theory: Theory) -> Iterator[ExtendedMap]:
         """Yield the extensions of this rival by one step. Those without extra cost come first.
 
-        `action` is the name of the action before the step, and the theory is settled.
+        `action` is the name of the action before the step. In the theory no field is "auto".
         """
         t, there = len(self.labels), self.links.get((self.here, action))
         alike = [s for s, shown in enumerate(self.shows) if shown == seen]

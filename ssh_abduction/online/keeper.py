@@ -185,7 +185,7 @@ class IncrementalSolver:
 
     Args:
         options: The time limit and the other options of a step.
-        searches: The number to start counting searches from.
+        searches: The number from which to count searches.
 
     Attributes:
         searches: Number of searches so far.
@@ -209,10 +209,10 @@ class IncrementalSolver:
         self._next_search = 0
 
     def maps(self, trace: Trace, theory: Theory, known: SSHMap | None) -> tuple[SSHMap, ...]:
-        """Search for the minimal maps of a trace by a settled theory.
+        """Search for the minimal maps of a trace.
 
-        If a minimal map is `known`, only the others are searched for. Return the minimal
-        maps, or the best map found in time, as `solution.status` says.
+        In the theory no field is "auto". If a minimal map is `known`, only the others are searched
+        for. Return the minimal maps, or the best map found in time, as `solution.status` says.
         """
         self.searches += 1
         search = Search.continuing(

@@ -140,8 +140,8 @@ class Localiser:
 
         Args:
             view: The view, for a localiser without a recogniser.
-            image: The image, (d,), for a localiser with a recogniser: laser ranges in metres, or
-                another kind of image that the recogniser was trained on.
+            image: The image, of shape (d,), for a localiser with a recogniser: laser ranges in
+                metres, or another kind of image that the recogniser was trained on.
 
         Raises:
             TraceError: The view is malformed.
@@ -166,8 +166,8 @@ class Localiser:
             action: The action, or its name. If the turns of the map are named by their angles, such
                 as "turn 91.3", give a turn as an Action with its bearing.
             view: The view after it, for a localiser without a recogniser.
-            image: The image after it, (d,), for a localiser with a recogniser: laser ranges in
-                metres, or another kind of image that the recogniser was trained on.
+            image: The image after it, of shape (d,), for a localiser with a recogniser: laser
+                ranges in metres, or another kind of image that the recogniser was trained on.
 
         Raises:
             TraceError: The action or the view is malformed.
@@ -220,7 +220,7 @@ class Localiser:
         yield from (self._of_view(step.view) for step in trace)
 
     def _observation(self, view: View | None, image: ArrayLike | None) -> Observation | None:
-        """Make an observation of a view or an image; None if there is neither."""
+        """Make an observation from a view or an image; None if there is neither."""
         if self._seen is not None:
             if image is None:
                 return None
@@ -237,9 +237,10 @@ class Localiser:
         return None if view is None else self._shown.get(view, NOVEL)
 
     def _spread(self, ratios: NDArray[np.float64]) -> Observation:
-        """Make an observation of an image, from f(o|x) / q(o) for each dstate x that is known.
+        """Make an observation of an image, from the ratios f(o|x) / q(o) of the known dstates x.
 
-        For a dstate that the recogniser knows no image of, the ratio is 1, as at an unknown place.
+        The recogniser was trained on images of these dstates. All others have the ratio 1, as an
+        unknown place has.
         """
         assert self._seen is not None
         spread = np.ones(self._number)
@@ -330,7 +331,7 @@ class Localiser:
         )
 
     def _products(self, expected: Belief, seen: Observation | None) -> NDArray[np.float64]:
-        """Multiply the probability of each dstate x by p(o|x) / q(o), (N,)."""
+        """Multiply the probability of each dstate x by p(o|x) / q(o). The result is (N,)."""
         p = expected.probabilities
         if seen is None:
             return p.copy()

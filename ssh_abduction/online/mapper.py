@@ -104,7 +104,7 @@ class OnlineMapper:
         time_limit: Seconds for each step. A step may take a little longer, as clingo cannot be
             stopped while it grounds. None waits for the exact answer.
         max_maps: Keep at most this many maps; None keeps all.
-        speedups: The speed-ups that are on. None of them changes the answer.
+        speedups: Flags that say which speed-ups to use. None of them changes the answer.
 
     Attributes:
         trace: The steps so far.

@@ -69,8 +69,8 @@ class MoveGraph:
     def nodes(self, name: int | str, field: str) -> tuple[set[Node], str]:
         """Return the dstates that a user names, and words for them, such as "place 3".
 
-        A name is the number of a dstate; or a place or region for all dstates there: "p3",
-        "region2", or its name. `field` is the parameter that has it, for messages. Raises
+        `name` is the number of a dstate; or "p3", "region2", or the name of a place or region, for
+        all dstates there. `field` is the name of the user's parameter, for messages. Raises
         MapError, which lists what exists.
         """
         count, text = len(self.map.dstates), str(name)
@@ -116,7 +116,7 @@ class MoveGraph:
     ) -> list[Node] | None:
         """Return the nodes of the shortest way from some nodes to others; None if there is none.
 
-        The way has both ends, and does not visit the nodes that are `closed`.
+        The way includes both ends, and does not visit the nodes that are `closed`.
         """
         # If all dstates of a place are closed, close its other courses, too.
         closed_places = {
@@ -240,7 +240,10 @@ class MoveGraph:
         return path is not None and path == other and way != other_way
 
     def _cost(self, source: Node, target: Node, move: float) -> float:
-        """Compute the cost of a move."""
+        """Compute the cost of an edge.
+
+        For a route by places, this is `move` and, if the edge changes the place, a travel's cost.
+        """
         if self.by == "actions":
             return 1.0
         if self.by == "metres":
@@ -249,7 +252,10 @@ class MoveGraph:
         return move + (self._travel_cost if travels else 0.0)
 
     def _only_action(self, *, onward: bool) -> str | None:
-        """The only action along paths or, if not `onward`, around on them; None if not one."""
+        """Return the action that goes on along paths or, if not `onward`, turns around on them.
+
+        None if the links of the map have no such action, or several.
+        """
         dstates, names = self.map.dstates, set()
         for source, action, target in self.map.links:
             s, x = dstates[source], dstates[target]

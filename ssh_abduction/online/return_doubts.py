@@ -66,7 +66,7 @@ class ReturnDoubts:
         """Find the best map without a return. Stop doubting the return if there is none.
 
         `dstates` is the number of dstates of a minimal map. A map counts if it has at most `margin`
-        dstates more, and is found in time. Otherwise return None. The theory is settled.
+        dstates more, and is found in time. Otherwise return None. In the theory no field is "auto".
         """
         kind = "different" if theory.level == "causal" else "elsewhere"
         denied = theory.replace(**{kind: (*getattr(theory, kind), doubt)})

@@ -252,7 +252,7 @@ class RivalMaps:
         return Scale.of(self._theory, RARE, dstates, len(self._views)).shares(rivals)
 
     def _sentence(self, t: int, lead: ExtendedMap, there: int, seen: Seen) -> str:
-        """Describe step t, which contradicts the best map, where it expected the dstate `there`."""
+        """Describe step t, which contradicts the best map: the map expected dstate `there`."""
         kinds = [kind for kind in ("misread", "slipped") if getattr(self._theory, kind)]
         expected = lead.shows[there]
         what = (

@@ -357,7 +357,8 @@ class Leg:
         region: The id of the region; None for a path.
         door: The place through which the route leaves or enters the region; None for a path.
         path: The id of the path; None for a region.
-        starts: The side of the path in direction +1 where the route starts: "right" or "left".
+        starts: The side from which the route passes the path: "right" or "left" of direction +1;
+            None for a region.
     """
 
     move: Literal["leave", "enter", "pass"]

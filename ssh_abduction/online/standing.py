@@ -156,7 +156,7 @@ class Confidence:
     def _hypotheses(
         self, rivals: Sequence[ExtendedMap], shares: Sequence[float]
     ) -> tuple[PossibleMap, ...]:
-        """Make hypotheses of the most probable rivals, and one for all others together."""
+        """Make hypotheses from the most probable rivals, and one from all others together."""
         order = sorted(range(len(shares)), key=lambda i: -shares[i])
         first = order if len(order) <= LISTED else order[: LISTED - 1]
         listed = [
