@@ -1,7 +1,9 @@
 """Measure how much each kind of evidence helps to find the true map of a trace.
 
-The ladder is a list of theories. The first theory uses views alone. Each further theory, a rung of
-the ladder, adds one kind of evidence: stars (the openings seen), displacements, planarity.
+The ladder is a list of theories, its rungs. The first rung uses views alone. Each further rung adds
+one kind of evidence: "+ star" adds stars (the openings seen), "+ pairs" adds displacements, each
+pair of steps tested alone, "+ geometry" tests two such pairs together, and "+ planarity" demands
+that the map can be drawn without a crossing.
 
 >>> from ssh_abduction import Theory, Trace
 >>> from ssh_abduction.evaluation.ladder import ladder
@@ -33,10 +35,10 @@ from ssh_abduction.theory.theory import Theory, checked_theory
 
 @dataclass(frozen=True, slots=True)
 class Rung:
-    """The result of one theory of the ladder, which adds one kind of evidence.
+    """The result of one rung of the ladder: a theory with one more kind of evidence.
 
     Attributes:
-        name: The evidence that the rung adds, for example "+ star".
+        name: "views", "+ star", "+ pairs", "+ geometry" or "+ planarity".
         solution: The minimal maps by the evidence of this rung and all rungs before.
         evaluation: The accuracy of these maps; None if the trace has no truth, if there is no map,
             or if the ladder was interrupted.
@@ -112,8 +114,9 @@ class UnderWay:
 def rungs(trace: Trace, theory: Theory, stars: bool = True) -> Iterator[tuple[str, Theory]]:
     """List the theories of the ladder. Each one adds a kind of evidence that the trace has.
 
-    Yield the name and the theory of each rung. The stars, displacements and planarity of the first
-    theory are replaced. `stars` says whether there is a rung for stars, if the trace has some.
+    Yield the name and the theory of each rung. They replace what `theory` says about stars,
+    displacements and planarity. `stars` says whether there is a rung for stars, if the trace has
+    some.
     """
     jumped = theory.jumped
     theory = theory.replace(star="none", displacement="none", planar=False, jumped=0)
@@ -145,8 +148,8 @@ def ladder(
     """Solve a trace with one theory after the other, each with one more kind of evidence.
 
     Args:
-        theory: The theory to start from; Theory.topological() by default. The ladder replaces its
-            stars, displacements and planarity.
+        theory: The theory to start from; Theory.topological() by default. The ladder replaces what
+            it says about stars, displacements and planarity.
         time_limit: Seconds for each rung; None for no limit.
         max_maps: List and evaluate at most this many minimal maps on each rung; None for all.
         stars: Whether there is a rung for stars, if the trace has some.

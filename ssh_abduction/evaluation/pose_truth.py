@@ -259,7 +259,7 @@ def told_poses(trace: Trace) -> list[Pose | None]:
 
 
 class _PoseTruth:
-    """The truth by poses. `told` says for each step whether its pose is known, (n,)."""
+    """The truth by poses. `known` flags the steps with a true pose, in an array of shape (n,)."""
 
     name = "poses"
 
@@ -275,17 +275,18 @@ class _PoseTruth:
         self._poses = np.array([(math.nan,) * 3 if pose is None else pose for pose in poses])
 
     def seen_from(self, step: int) -> tuple[Array, Array, Array]:
-        """Compare the poses of all steps with the pose of one step, (n,).
+        """Compare the poses of all steps with the pose of one step.
 
-        The result is distances in metres, differences of headings in degrees, and possible errors
-        of the distances in metres. Values are NaN if a pose is unknown.
+        The result is three arrays of shape (n,): distances in metres, differences of headings in
+        degrees, and possible errors of the distances in metres. Values are NaN if a pose is
+        unknown.
         """
         dx, dy, turned = (self._poses - self._poses[step]).T
         return np.hypot(dx, dy), _degrees(turned), np.zeros(len(dx))
 
 
 class _Related:
-    """The truth by relations. `told` says whether related times are near each step, (n,)."""
+    """The truth by relations. `known` flags the steps near related times, in an (n,) array."""
 
     name = "relations"
 
@@ -333,10 +334,11 @@ def _degrees(radians: Array) -> Array:
 def _verdicts(
     truth: _PoseTruth | _Related, visit: Steps, near: float, turned: float
 ) -> tuple[Verdicts, Verdicts]:
-    """Judge each pair of visits, (v, v), and each pair of steps of different visits, (n, n).
+    """Judge each pair of v visits, and each pair of n steps of different visits.
 
-    Poses at one place are at most `near` metres apart, and headings at one dstate at most `turned`
-    degrees. The row is the earlier one of a pair. All other entries are UNKNOWN.
+    The result is two matrices, v x v and n x n. The row is the earlier one of a pair; entries below
+    the diagonal are UNKNOWN. Poses at one place are at most `near` metres apart, and headings at
+    one dstate at most `turned` degrees.
     """
     steps = np.arange(len(visit))
     # A visit has the pose of the first of its steps whose pose is known.
@@ -364,7 +366,7 @@ def _verdicts(
 
 
 def _pairs(verdicts: Verdicts, visit: Steps) -> JudgedPairs:
-    """Count pairs by verdict. `verdicts` is (n, n); `visit` has the visit of each row, (n,)."""
+    """Count the verdicts in an n x n matrix on pairs. `visit` has the visit of each row."""
     counts = Counter(verdicts[visit[:, None] < visit].tolist())
     return JudgedPairs(
         counts[APART] + counts[RETURN], counts[RETURN], counts[STAYED], counts[UNKNOWN]
@@ -390,7 +392,7 @@ def _evaluated(ssh_map: SSHMap, visit: Steps, places: Verdicts, dstates: Verdict
 
 
 def _joined(one: NDArray[np.bool_], verdicts: Verdicts, things: int) -> MapPairs:
-    """Count the judged pairs. `one`, (n, n), is true for pairs that the map joins."""
+    """Count the judged pairs. `one`, an n x n matrix, is true for pairs that the map joins."""
     right = int((one & (verdicts == RETURN)).sum())
     return MapPairs(
         things,

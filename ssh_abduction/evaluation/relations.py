@@ -133,8 +133,8 @@ class Relations:
     ) -> list[tuple[Pose, float] | None]:
         """Return the pose at each moment, in seconds, in the frame of the moment `origin`.
 
-        With it comes the length in metres of the way along which relations were composed.
-        None if relations do not lead there, or the moment is not near related times.
+        Each pose comes with the length, in metres, of the way along which relations were composed.
+        None if relations do not lead to a moment, or the moment is not near related times.
         """
         moments = [self._near(time) for time in times]
         start = moments[origin]

@@ -99,7 +99,7 @@ def faults_in_words(ssh_map: SSHMap) -> dict[int, str]:
 
 
 def link_names(ssh_map: SSHMap) -> dict[tuple[int, int], str]:
-    """Join the names of actions from one dstate to another by commas, by (start, end)."""
+    """Return the names of the actions, joined by commas, for each pair (start, end) of dstates."""
     actions = gathered(
         ((source, target), action) for source, action, target in ssh_map.links if source != target
     )

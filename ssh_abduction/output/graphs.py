@@ -29,20 +29,25 @@ def to_networkx(
 ) -> nx.Graph[Any]:
     """Convert a map to a graph of networkx.
 
+    There are three kinds of graphs:
+
+    - "causal" is a MultiDiGraph. Each dstate (distinctive state: a place and a heading) is a node
+      with the attributes view, place, path, direction, heading, floor, place_name and path_name.
+      Each link is an edge with the attribute action. Unknown attributes are left out.
+    - "topological" is a bipartite Graph with the nodes ("place", p) and ("path", h). Each place on
+      a path gives an edge with the attribute index, its position in the order of the path.
+    - "places" is a MultiGraph. Each place is a node with the attributes pos (x to the right, y up),
+      dstates, and floor if there are floors. Each pair of neighbours on a path gives an edge with
+      the path's id as its key. The attributes of the edge are path; order, the index of the first
+      neighbour; travelled, whether the robot went from one to the other; and metres, if the map has
+      poses. `graph.graph["metric"]` says whether positions are metres.
+
+    In the last two kinds, the attribute name has the name that a person gave to a place or path. If
+    the map lists regions, `graph.graph["regions"]` has them as dicts, and the nodes of dstates and
+    places have the ids of their regions as the attribute regions.
+
     Args:
-        level: The kind of graph. "causal" is a MultiDiGraph. Each dstate (distinctive state: a
-            place and a heading) is a node with the attributes view, place, path, direction,
-            heading, floor, place_name and path_name. Each link is an edge with the attribute
-            action. Unknown attributes are left out. If the map lists regions, nodes have their ids
-            as the attribute regions, and `graph["regions"]` has the regions as dicts. The other
-            kinds have these, too. "topological" is a bipartite Graph with the nodes ("place", p)
-            and ("path", h). Each place on a path gives an edge with the attribute index, its
-            position in the order of the path. "places" is a MultiGraph. Each place is a node with
-            the attributes pos (x to the right, y up) and dstates. Each two neighbours on a path
-            give an edge with the path's id as its key. Its attributes are path; order, the index of
-            the first neighbour; travelled, whether the robot went from one to the other; and
-            metres, if the map has poses. Places and paths that a person named have the attribute
-            name. The attribute `graph["metric"]` says whether positions are metres.
+        level: The kind of graph: "causal", "topological" or "places", as below.
         turns: How actions turn, as in `to_svg`. It decides the positions of "places" if the map has
             no poses.
 
@@ -139,7 +144,7 @@ def _topological(ssh_map: SSHMap) -> nx.Graph[Any]:
 
 
 def _places(ssh_map: SSHMap, turns: Trace | Turns | None) -> nx.MultiGraph[Any]:
-    """Make the graph of places, with an edge for each two neighbours on a path."""
+    """Make the graph of places, with an edge for each pair of neighbours on a path."""
     from ssh_abduction.output.layout import layout, travelled  # loads scipy
 
     found = layout(ssh_map, turns)

@@ -66,7 +66,7 @@ class Layout:
 
 
 def layout(ssh_map: SSHMap, turns: Trace | Turns | None = None) -> Layout:
-    """Choose positions for drawing a map: its poses if it has any, else computed ones.
+    """Choose positions for drawing a map: its poses if it can be drawn at them, else computed ones.
 
     `turns` says how actions turn, as in `to_svg`. Raises MapError for a value that is no turn.
     """
@@ -172,7 +172,10 @@ def travelled(ssh_map: SSHMap, path: MapPath) -> list[tuple[int, int]]:
 
 
 def untravelled(ssh_map: SSHMap, path: MapPath) -> list[tuple[int, int]]:
-    """List the neighbours on a path between which nobody travelled, but that ways connect."""
+    """List the neighbours on a path that are on one floor, but between which nobody travelled.
+
+    In a map without floors, they are in one piece of the map.
+    """
     streets = travelled(ssh_map, path)
     parts = ssh_map.floors or ssh_map.pieces
     part = {ssh_map.dstates[s].place: i for i, part in enumerate(parts) for s in part}
@@ -210,9 +213,10 @@ class _Drawing:
             self.segments.union((path, p), (path, q))
 
     def layout(self) -> Layout:
-        """Choose the drawing with the fewest wrong turns and bent streets out of four.
+        """Make four drawings, and choose the one with the fewest wrong turns and bent streets.
 
-        Whole paths are straight, or only their segments. Headings are robust, or not.
+        In two of them, whole paths are straight; in the others, only segments. One drawing of each
+        two takes robust headings.
         """
         if not self.map.places:
             return self._spread()

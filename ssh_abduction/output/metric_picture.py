@@ -222,7 +222,7 @@ class _Picture:
     def label(
         self, label: str, spots: Iterable[Point], colour: str, size: float, weight: str = "normal"
     ) -> list[str]:
-        """Draw a label at the first point where it overlaps nothing; else nothing."""
+        """Draw a label at the first point where it overlaps nothing. Draw none if there is none."""
         w, h = self.half(label, size)
         for x, y in spots:
             if all(

@@ -1,9 +1,9 @@
 """Find positions of spots by a linear program, given the headings of the streets between them.
 
 A spot is a place, or a dstate (a place and a heading) whose place is unknown. A street should be
-at least one unit long, and otherwise short. A street that leaves its heading costs much. If two
-streets overlap or cross, the program is solved again with one street on a side of the other. This
-drawing is taken if it costs less than the crossing.
+at least one unit long, and otherwise short. A street that deviates from its heading costs much. If
+two streets overlap or cross, the program is solved again with one street on a side of the other.
+This drawing is taken if it costs less than the crossing.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ Streets: TypeAlias = Mapping[tuple[int, int], tuple[float, float]]
 _Condition: TypeAlias = tuple[dict[int, float], float]
 _Points: TypeAlias = NDArray[np.float64]
 
-# Costs. A unit of a street's length costs 1. Each unit by which a street leaves its heading costs
-# ASTRAY, and each unit by which it is too short costs SHORT. Two streets that overlap or cross cost
-# CROSSING.
+# Costs. A unit of a street's length costs 1. Each unit by which a street deviates from its heading
+# costs ASTRAY, and each unit by which it is too short costs SHORT. Two streets that overlap or
+# cross cost CROSSING.
 ASTRAY, SHORT, CROSSING = 300.0, 600.0, 60.0
 LOOSE = 0.001  # the factor for the costs of a street that the robot never travelled
-CROOKED = 0.1  # a street that leaves its heading by more units than this looks bent
+CROOKED = 0.1  # a street that deviates from its heading by more units than this looks bent
 NEAR, APART = 0.5, 1.0  # streets nearer than NEAR are moved to a distance of APART
 PARALLEL = 0.1  # the largest sine of the angle between streets that count as parallel
 # The program is solved at most WORK / streets times, or FEWEST times if that is more. The limit is
@@ -41,10 +41,11 @@ BEAM = 3
 
 @dataclass(frozen=True, slots=True)
 class _StreetDrawing:
-    """A drawing in the search that separates streets: its cost, and the positions, (spots, 2).
+    """A drawing in the search that separates streets.
 
-    `conditions` are the inequalities that were added, `left_alone` the pairs of streets that may
-    stay near or cross.
+    `value` is its cost, and `at` has the positions of the spots, of shape (spots, 2). `conditions`
+    are the inequalities that were added, `left_alone` the pairs of streets that may stay near or
+    cross.
     """
 
     value: float
@@ -56,8 +57,8 @@ class _StreetDrawing:
 class StreetProgram:
     """The linear program that puts spots along the headings of streets and separates streets.
 
-    Its variables are x and y of each spot, then for each street the distance by which it leaves its
-    heading, then for each street the length by which it is too short.
+    Its variables are x and y of each spot, then for each street the distance by which it deviates
+    from its heading, then for each street the length by which it is too short.
 
     Args:
         spots: The ids of the spots.
@@ -83,7 +84,7 @@ class StreetProgram:
 
     @property
     def bent(self) -> int:
-        """The number of travelled streets that leave their headings or are too short."""
+        """The number of travelled streets that deviate from their headings or are too short."""
         way = self.at[self.ends[:, 1]] - self.at[self.ends[:, 0]]
         astray = np.maximum(
             np.abs(np.sum(way * self.across, axis=1)), 1 - np.sum(way * self.along, axis=1)
@@ -131,7 +132,11 @@ class StreetProgram:
         return cost
 
     def _solved(self, more: Sequence[_Condition]) -> tuple[_Points, float]:
-        """Solve with more inequalities: positions, (spots, 2), and cost (inf if contradictory)."""
+        """Solve the program with more inequalities. Return the positions of the spots and the cost.
+
+        The positions are of shape (spots, 2). The cost is inf if the inequalities contradict each
+        other.
+        """
         n = len(self.spots)
         if not len(self.ends):
             return np.zeros((n, 2)), 0.0
@@ -178,20 +183,23 @@ class StreetProgram:
 
 
 def _difference(p: int, q: int, way: NDArray[np.float64]) -> dict[int, float]:
-    """Express the distance from spot p to spot q along a direction, as factors of variables."""
+    """Express the distance from spot p to spot q along a direction, as factors of variables.
+
+    The result is a dict from the index of a variable to its factor.
+    """
     x, y = float(way[0]), float(way[1])
     return {2 * int(q): x, 2 * int(q) + 1: y, 2 * int(p): -x, 2 * int(p) + 1: -y}
 
 
 def _side(a: _Points, b: _Points, c: _Points) -> NDArray[np.float64]:
-    """For each line from a to b, (n, 2), find the side of point c: positive on the left, (n,)."""
+    """For each of n lines from a to b, find the side of point c: positive on the left."""
     (ux, uy), (vx, vy) = (b - a).T, (c - a).T
     side: NDArray[np.float64] = ux * vy - uy * vx
     return side
 
 
 def _distance(p: _Points, a: _Points, b: _Points) -> NDArray[np.float64]:
-    """The distance of each point p, (n, 2), from the line segment between a and b, (n,)."""
+    """The distance of each of n points p from the line segment between a and b."""
     way = b - a
     length = np.maximum(np.sum(way * way, axis=1), 1e-12)
     share = np.clip(np.sum((p - a) * way, axis=1) / length, 0, 1)

@@ -22,7 +22,7 @@ class Claim:
     Attributes:
         text: The claim.
         paper: The value in the paper.
-        here: A function that writes the value of a run.
+        here: A function that writes the value of a run as text.
         holds: A function that tells whether the claim holds in a run.
         ours: Whether the claim is not in the paper. Then it follows from the argument of the paper,
             or it is about this robot alone.
@@ -174,7 +174,7 @@ def _triple(found: FoundMaps) -> str:
 
 
 def _trend(run: SeedRun) -> float:
-    """How much the largest offset grows over a run, by a straight line, as a share of its mean."""
+    """The growth of the largest offset over a run, as a share of its mean, by a linear fit."""
     largest = np.array([max(row[:2]) for row in run.spread])
     slope = np.polyfit(np.arange(len(largest)), largest, 1)[0]
     return float(slope * len(largest) / largest.mean())

@@ -162,7 +162,7 @@ class SeedRun:
             labels. The keys are the sources of the labels: "clustering alone", "map", "truth".
         contrast: Results without a part of the method.
         spread: For each tour, the largest offset of a pose from the mean pose of its dstate, in x
-            and y (metres) and heading (radians), (tours, 3).
+            and y (metres) and heading (radians). Shape (tours, 3).
     """
 
     seed: int
@@ -215,12 +215,12 @@ def measure(name: str, seed: int) -> SeedRun:
 
 
 def true_dstates(trace: Trace) -> NDArray[Any]:
-    """Read the name of the true dstate of each step, (n,). This is for evaluation only."""
+    """Read the name of the true dstate of each step. This is for evaluation only."""
     return np.array([step.truth["dstate"] for step in trace.steps])
 
 
 def one_to_one(labels: NDArray[Any], truth: NDArray[Any]) -> bool:
-    """Tell whether labels and true dstates, both (n,), are equal up to renaming."""
+    """Tell whether the labels of n steps and their true dstates are equal up to renaming."""
     return bool((labels >= 0).all()) and len(set(zip(labels, truth, strict=True))) == len(
         set(labels)
     ) == len(set(truth))
@@ -232,8 +232,8 @@ def rate(
     """Measure how often a recogniser that learns labels recognises the true dstate.
 
     The rate is cross-validated in ten folds. A recognised label counts as the true dstate that
-    has this label most often in the training part. The ranges are in metres, (n, d), the labels
-    and the truth (n,).
+    has this label most often in the training part. `ranges`, of shape (n, d), are in metres;
+    `labels` and `truth` are of shape (n,).
     """
     found = []
     for train, test in StratifiedKFold(10, shuffle=True, random_state=seed).split(ranges, truth):
@@ -292,7 +292,7 @@ def _contrast(e: PaperExperiment, seed: int, trace: Trace, alone: NDArray[Any], 
 
 
 def _step(trace: Trace) -> float:
-    """The |dx| + |dy| of the route for each step of a trace, to space images evenly, in metres."""
+    """The distance at which to take images evenly: |dx| + |dy| per step on average, in metres."""
     poses = np.array([step.truth["pose"][:2] for step in trace.steps])
     return round(float(np.abs(np.diff(poses, axis=0)).sum() / len(poses)), 2)
 
@@ -381,8 +381,8 @@ def _driven(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[Any]]:
     """Simulate all tours in the rectangle with this notch.
 
-    Return three arrays of one row a step: the mean pose at its true dstate, (n, 3); the offset of
-    its own pose from this mean, (n, 3); and the name of the dstate, (n,).
+    Return three arrays with a row for each of n steps: the mean pose at its true dstate, of shape
+    (n, 3); the offset of its own pose from this mean, of shape (n, 3); and the name of the dstate.
     """
     trace = simulate(notched(notch), EXPERIMENTS["notched-rectangle"].tours, seed)
     truth = true_dstates(trace)

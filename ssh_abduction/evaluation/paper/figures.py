@@ -87,7 +87,10 @@ def draw_quality(
 
 
 def draw_learning(path: str | Path, curves: Mapping[str, LearningCurve]) -> None:
-    """Draw recognition rates, three at most, against images: mean and range over the folds."""
+    """Draw at most three learning curves: recognition rates by the number of images.
+
+    A line is the mean over the folds, and a band the range.
+    """
     figure, axes = _pyplot().subplots(figsize=(5.5, 3.2))
     for (name, curve), colour in zip(curves.items(), (BLUE, ORANGE, GREEN), strict=False):
         axes.fill_between(
@@ -164,7 +167,7 @@ def draw_views(
 ) -> None:
     """Draw the images of each view on top of each other, as the robot sees them.
 
-    Images are ranges in metres, (n, d). Titles tell the true dstates.
+    Images are ranges in metres, of shape (n, d). Titles name the true dstates.
     """
     names = sorted(set(views.tolist()))
     columns = min(5, len(names))
@@ -199,8 +202,9 @@ def draw_telling(
     column.
 
     Args:
-        ranges: Ranges in metres, (n, d), over the half circle ahead, the first at the right.
-        labels: The dstate of each scan, (n,).
+        ranges: Ranges in metres, of shape (n, d), over the half circle ahead, the first at the
+            right.
+        labels: The dstate of each scan, of shape (n,).
         found: For each pair of dstates, how much each beam helps to distinguish them.
     """
     methods = list(next(iter(found.values())).methods)

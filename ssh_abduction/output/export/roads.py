@@ -65,8 +65,8 @@ class Road:
     Attributes:
         start: The id of the stop where it begins.
         end: The id of the stop where it ends.
-        length: The straight distance in metres, or in units of the layout; by way of hidden stops,
-            if there are any.
+        length: The straight distance in metres, or in units of the layout. If hidden stops lie
+            between, the way leads through them.
         action: The name of the robot's action; None if the robot travelled only the other way.
         path: The path that the road is along; None if there is none.
         direction: The direction along this path, +1 or -1; None if there is none.
@@ -230,7 +230,10 @@ def _regions_at(ssh_map: SSHMap, place: int | None) -> tuple[tuple[int, ...], tu
 
 
 def _streets(ssh_map: SSHMap) -> dict[tuple[int, int], Way]:
-    """Find action, path and direction of travels between places, both ways (no action back)."""
+    """Find the action, path and direction from each place to each place that a travel connects.
+
+    Both directions are included. The action is None if the robot only travelled the other way.
+    """
     ends: dict[tuple[int, int], Way] = {}
     for path in ssh_map.paths:
         index = {place: i for i, place in enumerate(path.order)}
