@@ -33,8 +33,8 @@ class Action:
         turn: The direction of a turn: "right", "left" or "around".
         extra: Fields of the trace file that this package does not know.
         gateway: For a turn right or left, the number of the gateway (way out of a place) that it
-            ends at. They are counted from 1 in the direction of the turn, without one straight
-            ahead.
+            ends at. Gateways are counted from 1 in the direction of the turn. One straight ahead is
+            not counted.
         bearing: The angle of a turn in degrees, clockwise. If it is given, it sets `turn`.
     """
 
@@ -103,7 +103,7 @@ class Action:
 
     @staticmethod
     def that_slipped(step: int) -> Action:
-        """Make the action that replaces an action that did not do what its name says.
+        """Make the action that takes the place of one that did not do what its name says.
 
         Args:
             step: The step where the action was done. Its number is in the name of the new action,
@@ -163,7 +163,7 @@ class Action:
 
     @staticmethod
     def of(value: Action | str | Mapping[str, Any]) -> Action:
-        """Make an action of its name, or of a mapping with some of its fields.
+        """Make an action from its name, or from a mapping with some of its fields.
 
         The names travel, right, left and around also set `kind` and `turn`.
 
@@ -190,7 +190,7 @@ STANDARD_ACTIONS: dict[str, Action] = {
 
 
 def parse_action(value: Any, where: str) -> Action:
-    """Make an action of its name, or of an object with its fields. Raises TraceError.
+    """Make an action from its name, or from an object with its fields. Raises TraceError.
 
     `where` has file, line and field, for messages.
     """

@@ -67,7 +67,7 @@ class Closure:
 
     @classmethod
     def of(cls, value: Any) -> Closure:
-        """Make a closure of an object with the fields steps, displacement and covariance.
+        """Make a closure from an object with the fields steps, displacement and covariance.
 
         Raises:
             TraceError: If a field is missing, unknown or wrong.
@@ -102,7 +102,7 @@ def match_in_words(closure: Closure, first: int, last: int) -> str:
 
 
 def parse_closures(value: Any) -> tuple[Closure, ...]:
-    """Make closures of the list in the header of a trace file; none of None.
+    """Make closures from the list in the header of a trace file; none from None.
 
     Raises TraceError, which names the entry and the field.
     """
@@ -120,7 +120,10 @@ def parse_closures(value: Any) -> tuple[Closure, ...]:
 
 
 def checked_closures(value: Any, steps: int, source: str | None) -> tuple[Closure, ...]:
-    """Return closures, each pair of steps once, or raise TraceError. `steps` is their number."""
+    """Return closures if they are valid for a trace of `steps` steps, or raise TraceError.
+
+    Each pair of steps may have only one closure.
+    """
     where = named(source or "trace")
     if not isinstance(value, Sequence) or isinstance(value, str | bytes):
         raise TraceError(
@@ -146,7 +149,7 @@ def checked_closures(value: Any, steps: int, source: str | None) -> tuple[Closur
 
 
 def closures_among(closures: Sequence[Closure], steps: Sequence[int]) -> tuple[Closure, ...]:
-    """Return the closures between these steps, given in order, renumbered from 0."""
+    """Return the closures between these ascending steps. The steps are renumbered from 0."""
     number = {step: k for k, step in enumerate(steps)}
     kept = [c for c in closures if c.first in number and c.last in number]
     return tuple(

@@ -321,7 +321,7 @@ def _names(traces: Sequence[Trace], names: Iterable[str] | None) -> list[str]:
 
 
 def _names_of(traces: Sequence[Trace], *numbers: int) -> str:
-    """The names of some traces, in brackets; empty if one has none."""
+    """The names of the traces with these numbers, in brackets; empty if one has no name."""
     names = [_name(traces[i]) for i in numbers]
     return f" ({', '.join(map(str, names))})" if all(names) else ""
 
@@ -452,7 +452,7 @@ def _with_covariances(trace: Trace) -> Trace:
 
 
 def _header(name: str) -> Callable[[Trace], object]:
-    """Make a function that reads a field of the header, if some image is in the trace itself."""
+    """Make a function that reads a field about images from the header; None without images."""
 
     def read(trace: Trace) -> object:
         has_images = any(step.image is not None for step in trace.steps)

@@ -170,7 +170,7 @@ def save_file(
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Make a JSON object of pairs. Raise ValueError if a field is given twice."""
+    """Make a JSON object from pairs. Raise ValueError if a field is given twice."""
     fields = dict(pairs)
     if len(fields) < len(pairs):
         names = [name for name, _ in pairs]
@@ -180,7 +180,7 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _integer(text: str) -> int:
-    """Make an int of the digits in JSON. Raise ValueError if it is too long."""
+    """Make an int from the digits in JSON. Raise ValueError if it is too long."""
     if len(text) > LONGEST_NUMBER:
         raise ValueError(f"a number of more than {LONGEST_NUMBER} digits; shorten it")
     return int(text)

@@ -65,8 +65,8 @@ def with_allowed_headings(
 ) -> SSHMap | None:
     """Replace the headings of a map by headings that all stars of the trace allow.
 
-    None if the stars (gateways seen) of some place allow none. `axioms` names those that hold,
-    and `changes` says whether gateways may change between drives.
+    None if the stars (gateways seen) of some place allow none. `axioms` has the names of the
+    theory's axioms, and `changes` says whether gateways may change between drives.
     """
     onward = _onward_of(trace, ssh_map, axioms)
     found = allowed_headings(*sights_of(trace, ssh_map, onward, changes), axioms)
@@ -83,12 +83,12 @@ def sights_of(
     onward: Callable[[DState], tuple[int, ...]],
     changes: bool = False,
 ) -> tuple[list[Sight], dict[tuple[Sight, Sight], set[Action]]]:
-    """List the sights of a map (dstates with stars), and the turns from sight to sight at one
-    place.
+    """List the sights of a map (dstates with stars), and the turns between them.
 
-    The sights are sorted by first step. A dict has, for pairs of sights, the turns that lead
-    from the first sight to the second. `onward` returns `Sight.onward` for a dstate. With
-    `changes`, gateways may change between drives, and each drive has sights of its own.
+    The sights are sorted by first step. The turns are a dict. Its keys are pairs of sights at one
+    place, and its values are the turns that lead from the first sight to the second. `onward`
+    returns `Sight.onward` for a dstate. With `changes`, gateways may change between drives, and
+    each drive has sights of its own.
     """
     states = {s.id: s for s in reversed(ssh_map.dstates)}
     sights: dict[tuple[int, Star, int], Sight] = {}
@@ -154,8 +154,8 @@ def allowed_headings(
 ) -> dict[int, int]:
     """Find headings of dstates, in degrees, that the stars (gateways seen) allow.
 
-    The sights are sorted by first step. Headings that their dstates have are ignored. Dstates
-    of places that no frame fits are missing.
+    The sights are sorted by first step. Headings that the dstates already have are ignored. The
+    result lacks the dstates of places that no frame fits.
     """
     found: dict[int, int] = {}
     for seen in by_place(sights).values():
@@ -185,11 +185,10 @@ class Facing:
 def facing(
     trace: Trace, ssh_map: SSHMap, axioms: Collection[str], changes: bool = False
 ) -> Facing | None:
-    """Find which way the dstates of a map face, from the stars (gateways seen). Paths of the map
-    may still be merged.
+    """Find which way the dstates of a map face, from the stars (gateways seen).
 
-    None if no frame fits the stars of some place. The headings of the map are ignored. `axioms`
-    and `changes` are as in `with_allowed_headings`.
+    Paths of the map may still be merged. None if no frame fits the stars of some place. The
+    headings of the map are ignored. `axioms` and `changes` are as in `with_allowed_headings`.
     """
     sights, turns = sights_of(trace, ssh_map, lambda s: (), changes)
     found = Facing({}, [], [])
@@ -275,7 +274,7 @@ def _fitted(
     """Fit frames and shifts as `frames_that_fit` does, with a cache.
 
     Maps of growing prefixes have many places in common. Dstates that differ only in their heading
-    are equal, so `headings` is an argument of its own.
+    count as equal in the cache, so `headings` is an argument of its own.
     `made` has pairs of these sights, and the turns that lead from the first to the second.
     """
     turns = {(a, b): actions for a, b, actions in made}
@@ -327,7 +326,7 @@ def _fitted(
 
 @lru_cache(maxsize=2**12)
 def _frames(star: Star, most: int) -> tuple[Frame, ...]:
-    """The frames of a star, also with up to `most` gateways that are open on other drives only."""
+    """The frames of a star, also with up to `most` gateways that only other drives saw open."""
     if not most:
         return star.frames
     every = (wider for frame in star.frames for wider in frame.with_closed)
@@ -375,7 +374,7 @@ def changes_in(trace: Trace, ssh_map: SSHMap, axioms: Collection[str]) -> Iterat
 def changes_of(
     sights: Sequence[Sight], turns: Turns, axioms: Collection[str]
 ) -> Iterator[GatewayChange]:
-    """Yield the gateways that change between drives, if the dstates have these headings."""
+    """Yield the gateways that change between drives, by the headings of the sights' dstates."""
     for place, seen in by_place(sights).items():
         fitted = frames_that_fit(seen, turns, axioms) or []
         first_of = {s.drive: k for k, s in reversed([*enumerate(seen)])}

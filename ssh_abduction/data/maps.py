@@ -338,7 +338,7 @@ class SSHMap:
 
     @classmethod
     def from_dict(cls, data: Any, where: str = "map") -> SSHMap:
-        """Make a map of the plain data of `to_dict`.
+        """Make a map from the plain data of `to_dict`.
 
         Args:
             data: The plain data.
@@ -372,7 +372,10 @@ class SSHMap:
 
 
 def _changed(fault: Fault) -> tuple[int | None, ...]:
-    """What distinguishes two faults "changed" at one step: place and gateway; else empty."""
+    """Return the place and gateway of a fault "changed", as one step may have several such faults.
+
+    Empty for other faults.
+    """
     if fault.kind != "changed":
         return ()
     return (fault.place, fault.gateway if fault.bearing is None else fault.bearing)
@@ -398,7 +401,7 @@ def checked_maps(values: object) -> tuple[SSHMap, ...]:
 
 
 def maps_of(data: Any, where: str) -> list[SSHMap]:
-    """Make maps of JSON from `solve --json` (several maps) or from `SSHMap.save` (one map).
+    """Make maps from the JSON of `solve --json` (several maps) or of `SSHMap.save` (one map).
 
     Raises MapError, which names the field.
     """

@@ -79,7 +79,7 @@ class Odometry:
 
     @classmethod
     def of(cls, value: Any) -> Odometry:
-        """Make Odometry of a mapping with some of its fields. The other fields get their defaults.
+        """Make Odometry from a mapping with some of its fields. Others get their defaults.
 
         Raises:
             TraceError: If a field is wrong.

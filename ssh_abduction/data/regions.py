@@ -71,7 +71,7 @@ def described(region: Region, called: Callable[[str, int], str]) -> str:
 
 
 def of_members(members: Mapping[Reason, Collection[int]]) -> tuple[Region, ...]:
-    """Make a region of each different set of places, and find which regions contain which.
+    """Make a region from each different set of places, and find which regions contain which.
 
     The largest comes first. `members` has, for each reason to make a region, the places of the
     region. An empty set makes no region. All directed paths that bound a set are its bounds.

@@ -1,4 +1,4 @@
-"""By which angles a robot may have turned between two frames of one place.
+"""Find by which angles a robot may have turned between two frames of one place.
 
 A frame is the gateways that are seen at a step, each with a bearing in tolerance (`star.py`). The
 gateways of two frames match in clockwise order, by some shift of their slots.
@@ -91,9 +91,10 @@ def turns_so(action: Action, before: Frame, found: frozenset[int]) -> bool:
 def ways(first: Frame, then: Frame, shift: int, found: frozenset[int]) -> tuple[bool, bool]:
     """Return two flags: may the robot face the same way in both sights, and opposite ways?
 
-    The flags are true if the robot may have turned by 0, or 180, degrees (`found` has all possible
-    turns). They are also true if gateways that are declared opposite match in this way: they are on
-    one path, which may bend. Gateway k of `then` is k + shift of `first`.
+    The flags are true if the robot may have turned by 0, or by 180, degrees (`found` has all
+    possible turns). Gateways that are declared opposite are on one path, which may bend. So the
+    first flag is also true if the robot faces the same one of them in both sights, and the second
+    flag if it faces the other one. Gateway k of `then` is k + shift of `first`.
     """
     alike, opposite = (
         bool(found)
@@ -115,7 +116,7 @@ def ways(first: Frame, then: Frame, shift: int, found: frozenset[int]) -> tuple[
 
 
 def leads(frame: Frame, towards: int) -> bool:
-    """Whether the robot's path may go on by some gateway ahead (`towards` 0) or behind (180)."""
+    """Whether the robot's path may go on through a gateway ahead (`towards` 0) or behind (180)."""
     return passes(frame) is not None or any(
         angle_between(bearing, towards) <= 2 * spread + ROUNDING
         for bearing, spread in zip(frame.bearings, frame.spreads, strict=True)

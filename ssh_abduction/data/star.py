@@ -105,9 +105,8 @@ class Frame:
     def nth(self, turn: str | None, number: int) -> int | None:
         """Return the slot (index) of the n-th gateway on a side; None if there are fewer.
 
-        n counts from 1.
-
-        "right" counts clockwise. A gateway straight ahead is not counted.
+        `number` is n, from 1. With `turn` "right", gateways are counted clockwise, else
+        counterclockwise. A gateway straight ahead is not counted.
         """
         beside = [k for k in range(self.slots) if not (self.faces(k) or self.is_closed(k))]
         order = beside if turn == "right" else beside[::-1]
@@ -153,7 +152,7 @@ class Star:
 
     @classmethod
     def of(cls, entries: Sequence[Entry]) -> Star:
-        """Make a star of the entries that a trace has for it.
+        """Make a star from the entries that a trace has for it.
 
         Args:
             entries: Four of 0, 1 or None (ahead, right, back, left; None if not observed), or any
@@ -209,7 +208,7 @@ class Star:
         return None
 
     def frame(self, kept: list[int]) -> Frame:
-        """Make a frame of the gateways with these indices."""
+        """Make a frame from the gateways with these indices."""
         clockwise = sorted(
             kept, key=lambda k: (self.gateways[k].bearing + self.gateways[k].spread) % 360
         )

@@ -106,7 +106,7 @@ class Step:
         displacement: Sequence[float] | None = None,
         covariance: Sequence[Sequence[float]] | None = None,
     ) -> Step:
-        """Make a step of some of its fields.
+        """Make a step from some of its fields.
 
         Args:
             view: The view; None if it is unknown.

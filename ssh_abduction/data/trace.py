@@ -100,7 +100,7 @@ class Trace:
         self._check_actions()
 
     def _check_actions(self) -> None:
-        """Check that all steps but the last have an action, and that a name means one action."""
+        """Check that all steps but the last have an action, and that equal names are one action."""
         last = len(self.steps) - 1
         types: dict[str, tuple[int, Action]] = {}
         for i, step in enumerate(self.steps):
@@ -272,7 +272,7 @@ class Trace:
         odometry: Odometry | Mapping[str, Any] | None = None,
         name: str | None = None,
     ) -> Trace:
-        """Make a trace of n + 1 views and the n actions between them.
+        """Make a trace from n + 1 views and the n actions between them.
 
         Args:
             views: The view of each step; None if it is unknown.

@@ -185,7 +185,7 @@ def _header(record: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 
 def _step(record: Mapping[str, Any], where: str, actions: dict[str, Action]) -> Step:
-    """Make a step of the object on a line. Equal actions become one object, kept in `actions`."""
+    """Make a step from the object on a line. Equal actions become one object, kept in `actions`."""
     given = {name: record.get(name) for name in _STEP_FIELDS}
     if given["view"] is not None:
         given["view"] = checked_view(given["view"], f"{where}: view")

@@ -57,7 +57,8 @@ def _plain(value: Any) -> Any:
 def in_output(name: str) -> Callable[..., Any]:
     """Load and return the function with this name in `ssh_abduction.output`.
 
-    Values make HTML for notebooks by it. `ssh_abduction.output` imports this package.
+    Maps and traces use this to make HTML for notebooks. It is not imported at the top, because
+    `ssh_abduction.output` imports this package.
     """
     function: Callable[..., Any] = getattr(import_module("ssh_abduction.output"), name)
     return function
