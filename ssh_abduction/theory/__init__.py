@@ -1,4 +1,4 @@
-"""Theories: which axioms hold, in which encodings they are, and which speed-ups they allow."""
+"""Theories: sets of axioms, the encodings of the axioms, and the speed-ups that a theory allows."""
 
 from ssh_abduction.theory.fields import CAUSAL, CHOICES, COUNTS, Count
 from ssh_abduction.theory.speedups import Speedups

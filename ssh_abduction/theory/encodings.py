@@ -112,7 +112,7 @@ def axioms() -> tuple[Axiom, ...]:
 
 @cache
 def region_axioms() -> tuple[Axiom, ...]:
-    """Return the axioms by which regions follow from a map. No search for maps has them."""
+    """Return the axioms by which regions follow from a map. Searches for maps do not use them."""
     return tuple(axioms_in(Path(path("regions")).read_text(encoding="utf-8"), "regions"))
 
 

@@ -33,7 +33,7 @@ class Overlap:
         """Find the drives that closures connect.
 
         Args:
-            theory: The theory, which has the price.
+            theory: The theory, which sets the price.
         """
         starts = starts_of(trace)
         self.price = theory.price_of_laying
@@ -47,7 +47,7 @@ class Overlap:
 
     @property
     def unit_of_step(self) -> list[int]:
-        """For each step, a number of its drive. Drives connected by closures have the same one."""
+        """A number of the drive of each step. Drives connected by closures have the same number."""
         return [self._tied[drive] for drive in self._drive]
 
     def is_tied(self, drive: int) -> bool:

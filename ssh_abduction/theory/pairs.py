@@ -34,7 +34,7 @@ class Pairs:
         elsewhere: Iterable[tuple[int, int]] = (),
         one: Iterable[tuple[int, int]] = (),
     ) -> Pairs:
-        """Make Pairs of pairs of steps in any order. Those of `elsewhere` are apart, too."""
+        """Make Pairs from pairs of steps in any order. Those of `elsewhere` are apart, too."""
         away = list(elsewhere)
         return Pairs(_earlier([*apart, *away]), _earlier(away), _earlier(one))
 
@@ -61,10 +61,10 @@ class Pairs:
     def allow(
         self, step: int, labels: Sequence[int], place_of: Sequence[int | None] | None = None
     ) -> bool:
-        """Whether the pairs of a step and earlier steps allow the step its label.
+        """Whether what is known about a step and earlier steps allows the label of the step.
 
-        `place_of` has the place of each dstate, if known. Without it, steps that are
-        `elsewhere` only have different dstates.
+        `labels` has the dstate of each step, and `place_of` the place of each dstate, if known.
+        Without `place_of`, steps of `elsewhere` are only tested for different dstates.
         """
         if step not in self.asked_for:
             return True

@@ -105,7 +105,7 @@ def clockwise_orders(
 ) -> list[tuple[End, ...]]:
     """List the clockwise orders of some ends that are allowed. Each begins with the first end.
 
-    An order that is not allowed has no allowed order with more ends.
+    If `allows` rejects an order, it must also reject each order of more ends that contains it.
     """
     orders: list[tuple[End, ...]] = [()]
     for end in ends:
@@ -123,7 +123,7 @@ def _one_place_more(
 ) -> Iterator[dict[Place, Ends]]:
     """Draw one more place, in each possible way by the clockwise `orders` around it.
 
-    The place is a neighbour of a drawn place, and has the fewest possible ways of all neighbours.
+    The place is a neighbour of a drawn place. Of all neighbours, it has the fewest possible ways.
     """
     near = {
         place_of[end ^ 1]: None

@@ -86,7 +86,7 @@ class Rules:
 
     @classmethod
     def of(cls, value: Any) -> Rules:
-        """Make Rules of the path of a file, or of a dict with `name` and `text`.
+        """Make Rules from the path of a file, or from a dict with `name` and `text`.
 
         Rules are returned as they are. Raises TheoryError if the file cannot be read, or
         has wrong characters.
@@ -117,7 +117,7 @@ class Rules:
 
     @classmethod
     def all_of(cls, value: Any) -> tuple[Rules, ...]:
-        """Make a tuple of Rules of one value as for `of`, or of a list. Raises TheoryError.
+        """Make a tuple of Rules from one value, as for `of`, or a list. Raises TheoryError.
 
         A text may contain several paths, separated by commas.
         """

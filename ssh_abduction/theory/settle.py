@@ -41,14 +41,14 @@ class Problem:
 
     @classmethod
     def of(cls, trace: Trace, theory: Theory) -> Problem:
-        """Make a problem of a trace and a theory in which no field is "auto"."""
+        """Make a problem from a trace and a theory in which no field is "auto"."""
         return cls(trace, theory, evidence_of(theory))
 
     @cached_property
     def pairs(self) -> Pairs:
         """Which steps are one dstate, different dstates, or at different places, by the evidence.
 
-        Evidence that may be wrong, because the theory allows a fault of it, is left out.
+        Evidence that may be wrong, because the theory allows faults of this kind, is left out.
         """
         return pairs_of(self.trace, self.theory, self.evidence)
 
@@ -58,9 +58,10 @@ class Problem:
         return Overlap(self.trace, self.theory)
 
     def changed(self, trace: Trace | None = None, theory: Theory | None = None) -> Problem:
-        """Return this problem with another trace or settled theory; None keeps it.
+        """Return this problem with another trace or theory; None keeps the old one.
 
-        The results of its evidence, such as excluded pairs of steps, are reused.
+        In the theory no field is "auto". The results of the evidence, such as excluded pairs of
+        steps, are reused.
         """
         theory = theory or self.theory
         return Problem(trace or self.trace, theory, evidence_of(theory, self.evidence))
@@ -151,8 +152,8 @@ def _no_view(trace: Trace) -> TraceError:
 def _weigh_of(theory: Theory, displacement: str) -> Literal["cost", "count"]:
     """Choose how to compare maps: by their cost in nats, or by their counts.
 
-    Without displacements there is no misfit, so maps are compared by counts. With `auto` they are,
-    too, if the user chose in `prefer` what to minimise.
+    Without displacements there is no misfit, so maps are compared by counts. They are also compared
+    by counts if `weigh` is "auto" and the user chose in `prefer` what to minimise.
     """
     chosen = theory.weigh == "cost" or (
         theory.weigh == "auto" and theory.prefer == AUTO and can_weigh(theory)

@@ -244,7 +244,7 @@ class Theory:
 
     @cached_property
     def axioms(self) -> tuple[str, ...]:
-        """The names of the axioms that hold. Those of the user's own rules come last.
+        """The names of the axioms of this theory. Those of the user's own rules come last.
 
         With star=auto, axioms about stars are left out; with displacement=auto, those about
         displacements.
@@ -403,7 +403,7 @@ class Theory:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Theory:
-        """Make a theory of the data that `to_dict` wrote.
+        """Make a theory from the data that `to_dict` wrote.
 
         Missing fields get their values in the preset: `causal` if level is causal, else
         `topological`.

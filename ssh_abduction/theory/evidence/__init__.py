@@ -9,8 +9,8 @@ Each kind of evidence is a module of this folder, with an encoding of the same n
 {2: frozenset({0})}
 
 `KINDS` lists the kinds. A kind gives pairs of steps that are known to be equal or different
-(`pairs`). They prune the domains of all engines, which ask clingo for maps. So evidence makes
-solving faster. Some knowledge is about whole maps only. A kind uses it to check each map that
+(`pairs`). These pairs prune the domains of all engines, which ask clingo for maps. So evidence
+makes solving faster. Some knowledge is about whole maps only. Then a kind checks each map that
 clingo finds (`refuse`).
 """
 
@@ -53,9 +53,9 @@ __all__ = [
 
 
 def evidence_of(theory: Theory, known: Iterable[Evidence] = ()) -> tuple[Evidence, ...]:
-    """Make an object for each kind of evidence that a settled theory uses.
+    """Make an object for each kind of evidence that a theory uses.
 
-    The results of evidence that is `known` are reused.
+    In the theory no field is "auto". The results of evidence that is `known` are reused.
     """
     made = [kind.of(theory) for kind in KINDS if kind.axiom in theory.axioms]
     before = {type(evidence): evidence for evidence in known}
@@ -80,9 +80,10 @@ def said_by(
 
 
 def pairs_of(trace: Trace, theory: Theory, evidence: Iterable[Evidence] | None = None) -> Pairs:
-    """Return which pairs of steps the evidence of a settled theory shows to be equal or different.
+    """Return which pairs of steps the evidence of a theory shows to be equal or different.
 
-    Evidence that may be wrong, because the theory allows a fault of it, is left out.
+    In the theory no field is "auto". Evidence that may be wrong, because the theory allows faults
+    of this kind, is left out.
     """
     kinds = evidence_of(theory) if evidence is None else evidence
     return Pairs.joined([e.pairs(trace) for e in kinds if e.axiom in theory.hard])

@@ -1,6 +1,6 @@
 """The error at the end of a loop of the trace: by odometry, the robot is not back where it was.
 
-A *course* is the part of a map that the displacements of a trace depend on.
+Displacements test only a part of a map: the labels of steps, and the places of dstates.
 """
 
 from __future__ import annotations
@@ -48,16 +48,16 @@ class Closing:
         )
 
 
-class Course(NamedTuple):
-    """The parts of a map that displacements depend on: labels of steps, and places of dstates."""
+class PlacedLabels(NamedTuple):
+    """The part of a map that displacements test: labels of steps, and places of dstates."""
 
     labels: tuple[int, ...]
     places: tuple[int | None, ...]
 
     @staticmethod
-    def of(labels: tuple[int, ...], places: tuple[int | None, ...]) -> Course:
-        """Make a course of some labels. Places of dstates above the largest label are dropped."""
-        return Course(labels, places[: max(labels, default=-1) + 1])
+    def of(labels: tuple[int, ...], places: tuple[int | None, ...]) -> PlacedLabels:
+        """Combine labels with places. Places of dstates above the largest label are dropped."""
+        return PlacedLabels(labels, places[: max(labels, default=-1) + 1])
 
 
 def hold(

@@ -50,10 +50,11 @@ class Displacement(Evidence):
         joint: The most returns that are tested together: 1 or 2.
         returns: How many returns may be true.
         has_places: Whether maps have places.
-        turns_stay: Whether a test of two visits says something about all steps of these visits.
+        turns_stay: Whether no steps of two visits are at one place if their first steps are not,
+            because turns stay at their place.
         has_one_view: Whether a dstate has only one view.
         may_be_wrong: Whether a map may treat displacements as wrong.
-        known: The returns of the last traces.
+        known: The tested returns of the last few traces, for reuse.
     """
 
     name: ClassVar[str] = "displacement"
@@ -123,7 +124,7 @@ class Displacement(Evidence):
         return replace(self, returns=0).returns_of(trace).count()
 
     def returns_of(self, trace: Trace) -> Returns:
-        """Make the returns of a trace, or return them if they were made before.
+        """Test the returns of a trace, or return the earlier result for this trace.
 
         The last few traces are remembered, because several parts of a search need them. If a trace
         has grown, the results about its first steps are reused.

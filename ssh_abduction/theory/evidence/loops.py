@@ -427,12 +427,12 @@ def chi_squares(closing: Array, covariance: Array) -> tuple[Array, Array]:
 
 
 def vectors_turned(vectors: Array, angles: Array) -> Array:
-    """Turn vectors, ... x 2, counterclockwise by angles in radians."""
+    """Turn vectors of shape (..., 2) counterclockwise by angles in radians."""
     cos, sin = np.cos(angles), np.sin(angles)
     x, y = vectors[..., 0], vectors[..., 1]
     return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
 
 def _quarter_turned(vectors: Array) -> Array:
-    """Turn vectors, ... x 2, counterclockwise by a right angle."""
+    """Turn vectors of shape (..., 2) counterclockwise by a right angle."""
     return np.stack([-vectors[..., 1], vectors[..., 0]], axis=-1)

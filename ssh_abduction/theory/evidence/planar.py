@@ -370,7 +370,7 @@ def _join(same: NodeClasses[Arm], first: Arm, second: Arm) -> None:
 
 
 def fewest(moves: list[int], cross: Callable[[list[int]], bool]) -> list[int]:
-    """Return a minimal subset of the travels and turns (by their first steps) that crosses."""
+    """Return a minimal subset of travels and turns, by their first steps, whose edges cross."""
     size = max(1, len(moves) // 2)
     while True:
         begin = 0

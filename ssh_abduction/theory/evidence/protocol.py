@@ -57,12 +57,12 @@ class Evidence(Protocol):
     def pairs(self, trace: Trace) -> Pairs:
         """Return the pairs of steps that are known, before the search, to be equal or different.
 
-        If a map of the trace is cut to its first steps, the pairs must still hold there.
+        The pairs must also be true in each map of the first steps of the trace.
         """
         return NO_PAIRS
 
     def facts(self, trace: Trace, start: int, stop: int) -> str:
-        """Return further facts of the steps from `start` to before `stop`, as a text for clingo."""
+        """Return further facts about the steps from `start` to before `stop`, as clingo text."""
         return ""
 
     def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:

@@ -17,7 +17,7 @@ from ssh_abduction.data.drives import drives_of, named_steps
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
-from ssh_abduction.theory.evidence.closing import Closing, Course, hold
+from ssh_abduction.theory.evidence.closing import Closing, PlacedLabels, hold
 from ssh_abduction.theory.evidence.protocol import Equality
 from ssh_abduction.theory.pairs import NO_PAIRS, Earlier, Pairs
 
@@ -59,7 +59,7 @@ class Returns:
             trace, before.reckoning if before else None
         )
         # Accepted maps, the last one last.
-        self._accepted: dict[Course, Together] = dict(before._accepted) if before else {}
+        self._accepted: dict[PlacedLabels, Together] = dict(before._accepted) if before else {}
         # Sets of two returns, the last one last.
         self._refused: list[frozenset[Equality]] = list(before._refused) if before else []
         self._pairs: Pairs | None = before._pairs if before else None
@@ -97,9 +97,10 @@ class Returns:
         return [0, *(t for t, action in enumerate(self.trace.actions, 1) if action.kind != "turn")]
 
     def _tested(self, since: int = 0) -> _Tested:
-        """The first and last steps of possible returns, from `since` on, to places and dstates.
+        """The first and last steps of possible returns to places (True) and to dstates (False).
 
-        Loops are left out if a displacement is missing on the way, or if the heading is lost.
+        Only returns that end at step `since` or later are included. Returns are left out if a
+        displacement is missing on the way, or if the heading is lost.
         """
         views: dict[object, list[int]] = defaultdict(list)
         for t, step in enumerate(self.trace.steps):
@@ -111,7 +112,10 @@ class Returns:
         }
 
     def _loops_within(self, groups: Sequence[Sequence[int]], since: int = 0) -> tuple[Steps, Steps]:
-        """The first and last steps of loops within each sorted group that end since `since`."""
+        """The first and last steps of loops that end at step `since` or later.
+
+        Both ends of a loop are in the same group of steps. Groups are sorted.
+        """
         import numpy as np
 
         begins = self.reckoning.begins
@@ -200,7 +204,10 @@ class Returns:
         return list(zip(first.tolist(), last.tolist(), strict=True))
 
     def _steps_of_visits(self, elsewhere: Earlier, since: int) -> Iterator[tuple[int, int]]:
-        """Yield the pairs of steps of visits to different places that views do not distinguish."""
+        """Yield the pairs of steps with equal views, of visits that are at different places.
+
+        If a dstate may have several views, all pairs of steps of such visits are yielded.
+        """
         if not self.evidence.turns_stay:
             return
         end = dict(zip(self.arrivals, [*self.arrivals[1:], len(self.trace)], strict=True))
@@ -224,7 +231,7 @@ class Returns:
     def _returns_among(
         self, labels: Sequence[int], places: Sequence[int | None], since: int = 0
     ) -> Steps:
-        """List returns as `_returns_of`. Here `places` has the place of each step, not dstate."""
+        """List returns as `_returns_of`, but `places` has the place of each step."""
         import numpy as np
 
         at_dstate: dict[int, list[int]] = defaultdict(list)
@@ -252,8 +259,8 @@ class Returns:
         import numpy as np
 
         labels, places = ssh_map.dstate_at, tuple(s.place for s in ssh_map.dstates)
-        course = Course.of(labels, places)
-        if course in self._accepted:
+        tested = PlacedLabels.of(labels, places)
+        if tested in self._accepted:
             return None
         if (
             known := next(
@@ -261,7 +268,7 @@ class Returns:
             )
         ) is not None:
             return known
-        before = self._accepted.pop(Course.of(labels[:since], places), None)
+        before = self._accepted.pop(PlacedLabels.of(labels[:since], places), None)
         rows = self._returns_of(labels, places, since if before else 0)
         if before:
             rows = np.concatenate([before.rows, rows])
@@ -274,7 +281,7 @@ class Returns:
             )
             self._refused = [*self._refused[-REMEMBERED:], refused]
             return refused
-        self._accepted[course] = together
+        self._accepted[tested] = together
         if len(self._accepted) > REMEMBERED:
             del self._accepted[next(iter(self._accepted))]
         return None
