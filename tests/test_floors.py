@@ -18,7 +18,7 @@ from test_property import agree, checker_rejects_foreign_maps
 from simulator.errors import SimulatorError
 from simulator.tours import record, simulate
 from simulator.world import World
-from ssh_abduction import SSHMap, Theory, Trace, solve
+from ssh_abduction import SSHMap, Theory, Trace, explain_trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data import Action, MapError, TheoryError, TraceError, together
 from ssh_abduction.online import route
@@ -110,6 +110,15 @@ def test_stretches_with_a_common_place_are_one_floor() -> None:
     assert floors.refuse(trace, wrong) is None
     pairs = floors.pairs(trace)
     assert pairs.elsewhere == {1: frozenset({0}), 2: frozenset({1}), 3: frozenset({2})}
+
+
+def test_explain_trace_suggests_no_lift_before_a_displacement() -> None:
+    stars = [(1, 0, 0, 0)] * 3
+    moved = [None, (0.0, 0.0, -1.57)]
+    trace = Trace.from_steps("aaa", [UP, "right"], stars=stars, displacements=moved)
+    explained = explain_trace(trace)
+    assert explained.clash is not None
+    assert {mend.instead for mend in explained.mends if mend.kind == "action"} == {"'travel'"}
 
 
 def test_checker_judges_the_floors_of_a_map() -> None:

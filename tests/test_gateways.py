@@ -55,6 +55,8 @@ def test_a_star_survives_a_round_trip(tmp_path: Path) -> None:
     expected[2]["star"][2] = 270.0  # an object with only a bearing
     assert again == expected
     assert trace.steps[2].star == (0, Gateway(180, 90, None, None))
+    trace.save(tmp_path / "again.jsonl")
+    assert Trace.load(tmp_path / "again.jsonl") == trace
 
 
 def test_stars_and_turns_that_fit_right_angles() -> None:

@@ -363,8 +363,8 @@ def _entry(value: Any, count: int, four: bool, where: str) -> Entry:
     return plain_number(value)
 
 
-def _gateway(value: Mapping[str, Any], count: int, where: str) -> Gateway:
-    """Check and return a gateway that is given as an object."""
+def _gateway(value: Mapping[str, Any], count: int, where: str) -> Gateway | float:
+    """Check a gateway that is given as an object. Return its bearing if that says everything."""
     if unknown := [name for name in value if name not in _FIELDS]:
         raise TraceError(
             f"{where}: expected fields out of {', '.join(_FIELDS)}, got {brief(unknown[0])}; "
@@ -396,9 +396,10 @@ def _gateway(value: Mapping[str, Any], count: int, where: str) -> Gateway:
             f"{where}.opposite: expected the index of a gateway, 0 to {count - 1}, "
             f"got {brief(opposite)}; count from 0"
         )
-    return Gateway(
+    gateway = Gateway(
         float(bearing), float(spread), None if opposite is None else int(opposite), is_open
     )
+    return gateway.bearing if gateway == Gateway(gateway.bearing) else gateway
 
 
 def _check_opposite(i: int, entry: Entry, star: Sequence[Entry], where: str) -> None:

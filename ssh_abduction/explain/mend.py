@@ -262,8 +262,12 @@ class TraceQuestion(LimitedQuestion[TraceExplanation]):
                 yield _star(changed), _with_step(self.trace, t, changed), self.theory
 
     def _with_actions(self, t: int) -> Iterator[tuple[str | None, Trace, Theory]]:
-        """Yield alternatives to the action of a step: other actions, and an unknown one."""
+        """Yield alternatives to the action of a step: other actions, and an unknown one.
+
+        A lift is none if the next step has a displacement, as no displacement leads to a floor.
+        """
         step = self.trace.steps[t]
+        moves = self.trace.steps[t + 1].displacement is not None
         known = {action.name: action for action in self.trace.actions if not action.starts}
         if self.theory.level == "topological":
             kinds = {(action.kind, action.turn) for action in known.values()}
@@ -273,7 +277,8 @@ class TraceQuestion(LimitedQuestion[TraceExplanation]):
                 if (a.kind, a.turn) not in kinds and a.name not in known
             }
         for action in known.values():
-            if step.action is not None and action.name != step.action.name:
+            is_other = step.action is not None and action.name != step.action.name
+            if is_other and not (moves and action.breaks_frame):
                 yield (
                     repr(action.name),
                     _with_step(self.trace, t, replace(step, action=action)),
