@@ -67,6 +67,23 @@ class Counts(NamedTuple):
     excuses: int
 
 
+def partitions(size: int) -> Iterator[Labels]:
+    """All ways to divide things into groups: the group of each, numbered by first member."""
+    if size == 0:
+        yield ()
+        return
+    for labels in partitions(size - 1):
+        for last in range(max(labels, default=-1) + 2):
+            yield (*labels, last)
+
+
+def divisions(size: int) -> Iterator[list[list[int]]]:
+    """All ways to divide things into groups: the members of each group."""
+    for labels in partitions(size):
+        groups = range(max(labels, default=-1) + 1)
+        yield [[i for i, label in enumerate(labels) if label == group] for group in groups]
+
+
 def key(ssh_map: SSHMap) -> Key:
     """A map without its witnesses. Dstates, places and paths are numbered by first visit. At its
     first step a path is faced in direction +1."""

@@ -15,6 +15,7 @@ from hypothesis import HealthCheck, settings
 from threadpoolctl import threadpool_limits
 from worlds import rectangle
 
+from ssh_abduction import SSHMap, Trace, solve
 from ssh_abduction.cli import jobs, verbosity, view
 
 # Hypothesis has no deadlines, because clingo takes a hundred times as long for some random traces
@@ -75,6 +76,14 @@ def without_processes(
     """`in_this_process`, for a whole test."""
     with in_this_process():
         yield
+
+
+@pytest.fixture(scope="session")
+def square() -> SSHMap:
+    """Four places around a square of ten metres. The robot drives round once and turns around."""
+    moves = [(10, 0, 0), (0, 0, 1.5708)] * 4
+    trace = Trace.from_steps("abababab" + "a", ["travel", "left"] * 4, displacements=moves)
+    return solve(trace).maps[0]
 
 
 @pytest.fixture

@@ -42,6 +42,14 @@ def leave_a_temporary_file(number: int, there: str, given_up: Callable[[], bool]
         time.sleep(0.05)
 
 
+def until(condition: Callable[[], bool]) -> None:
+    """Wait until a condition holds."""
+    ends = time.monotonic() + 100
+    while not condition():
+        assert time.monotonic() < ends
+        time.sleep(0.02)
+
+
 def sleep(number: int, seconds: float, given_up: Callable[[], bool]) -> int:
     """Return the number after some seconds, or when the task is given up."""
     ends = time.monotonic() + seconds

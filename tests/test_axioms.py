@@ -150,7 +150,9 @@ def test_leaving_out_one_axiom_changes_the_answer(axiom: str) -> None:
     assert answer(trace, theory.replace(without=(axiom,))) == without_it
 
 
-@pytest.mark.parametrize("axiom", encodings.axioms(), ids=lambda a: a.name)
+@pytest.mark.parametrize(
+    "axiom", [*encodings.axioms(), *encodings.region_axioms()], ids=lambda a: a.name
+)
 def test_an_axiom_has_a_sentence_and_a_source(axiom: Any) -> None:
     assert re.fullmatch(r"[A-Z].*\.", axiom.sentence)
     assert axiom.source

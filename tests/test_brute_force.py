@@ -5,36 +5,11 @@ from __future__ import annotations
 
 import pytest
 from brute_force import consistent_maps, key, minimal_maps
+from worlds import rectangle, written
 
 from ssh_abduction.data.maps import DState, MapPath, SSHMap
-from ssh_abduction.data.trace import STANDARD_ACTIONS, Action, Trace
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory.theory import Theory
-
-LETTERS = {
-    "T": STANDARD_ACTIONS["travel"],
-    "R": STANDARD_ACTIONS["right"],
-    "L": STANDARD_ACTIONS["left"],
-    "A": STANDARD_ACTIONS["around"],
-    "Tm": Action("m", "travel"),
-    "Tk": Action("k", "travel"),
-}
-
-
-def read(text: str) -> Trace:
-    """A trace in the notation of docs/explanation/theory.md: views and letters of actions
-    alternate."""
-    words = text.split()
-    return Trace.from_steps(words[::2], [LETTERS[word] for word in words[1::2]])
-
-
-def rectangle(actions: int, views: int = 4) -> Trace:
-    """The notched rectangle, clockwise: turns right and travels alternate, and `views` views
-    repeat."""
-    return Trace.from_steps(
-        [f"v{i % views}" for i in range(actions + 1)],
-        [LETTERS["RT"[i % 2]] for i in range(actions)],
-    )
-
 
 PATHS_FIRST = ("paths", "places", "dstates")
 P0 = Theory.causal()
@@ -80,7 +55,7 @@ TABLE = {
 @pytest.mark.parametrize("name", TABLE)
 def test_small_worlds(name: str) -> None:
     text, causal, *others = TABLE[name]
-    trace = read(text)
+    trace = written(text)
     if causal is not None:
         dstates, _, _, number = triple(trace, P0)
         assert (dstates, number) == causal
@@ -91,7 +66,7 @@ def test_small_worlds(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["G1", "G2"])
 def test_next_place_makes_the_map_unique(name: str) -> None:
-    assert triple(read(TABLE[name][0]), P2.replace(next_place=True)) == (5, 3, 1, 1)
+    assert triple(written(TABLE[name][0]), P2.replace(next_place=True)) == (5, 3, 1, 1)
 
 
 @pytest.mark.parametrize(
@@ -149,7 +124,7 @@ def test_frames_tell_headings_apart() -> None:
 )
 def test_every_map_is_listed_once(theory: Theory) -> None:
     for text, *_ in TABLE.values():
-        keys = [found for found, _ in consistent_maps(read(text), theory)]
+        keys = [found for found, _ in consistent_maps(written(text), theory)]
         assert len(keys) == len(set(keys))
 
 

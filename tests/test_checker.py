@@ -8,8 +8,10 @@ from itertools import permutations, product
 
 import numpy as np
 import pytest
+from brute_force import partitions
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from worlds import written
 
 from ssh_abduction.checker.checker import AXIOMS, COHERENCE, Violation, check
 from ssh_abduction.data.closure import Closure
@@ -19,24 +21,11 @@ from ssh_abduction.theory import encodings
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory
 
-ACTIONS = {
-    "T": "travel",
-    "R": "right",
-    "L": "left",
-    "A": "around",
-    "U": {"name": "up", "kind": "lift"},
-}
 ALL_OPEN = (1, 1, 1, 1)
 TOPOLOGICAL = Theory.topological()
 NO_SIDES = TOPOLOGICAL.replace(boundary="none")
 GATEWAYS = TOPOLOGICAL.replace(star="gateways")
 ONE_SIDE = TOPOLOGICAL.replace(symmetric_sides=False)
-
-
-def seen(text: str, stars: list[tuple[int, ...]] | None = None) -> Trace:
-    """The trace written as `view action view …` with the actions T, R, L, A."""
-    words = text.split()
-    return Trace.from_steps(words[::2], [ACTIONS[a] for a in words[1::2]], stars=stars)
 
 
 def links(trace: Trace, labels: tuple[int, ...]) -> tuple[tuple[int, str, int], ...]:
@@ -102,16 +91,16 @@ def case(theory: Theory, trace: Trace, *spec: str, also: str = "") -> Case:
 
 # A closed notched rectangle: path 0 is the side that leads back to the first corner, for dstate 0
 # faces along it.
-NOTCHED = seen("v0 R v1 T v2 R v3 T " * 2 + "v0")
-NOTCHED_TWICE = seen("v0 R v1 T v2 R v3 T " * 4 + "v0")
+NOTCHED = written("v0 R v1 T v2 R v3 T " * 2 + "v0")
+NOTCHED_TWICE = written("v0 R v1 T v2 R v3 T " * 4 + "v0")
 RECTANGLE = ("0:0+ 0:1+ 1:1+ 1:2+ 2:2+ 2:3+ 3:3+ 3:0+", "30 01 12 23")
-CORRIDOR = seen("a T b A c T d A a")
-STARRED = seen(
+CORRIDOR = written("a T b A c T d A a")
+STARRED = written(
     "a T b A c T d A a", [(1, 0, 0, 0), (0, 0, 1, 0), (1, 0, 0, 0), (0, 0, 1, 0), (1, 0, 0, 0)]
 )
-HALF = seen("v0 R v1 T v2 R v3 T v0")
+HALF = written("v0 R v1 T v2 R v3 T v0")
 LENS = ("0 1 2 3 4", "0 0:0+ 1:0+ 1:1+ 0:1+", "01 10")
-FORK = seen("a T b A c T d")
+FORK = written("a T b A c T d")
 
 CORRECT = {
     "notched rectangle, one circuit": case(TOPOLOGICAL, NOTCHED, "0 1 2 3 4 5 6 7 0", *RECTANGLE),
@@ -153,9 +142,9 @@ CORRECT = {
     ),
     "causal": case(Theory.causal(), CORRIDOR, "0 1 2 3 0", ". . . ."),
     "causal, aliased": case(Theory.causal(), HALF, "0 1 2 3 0", ". . . ."),
-    "spin": case(TOPOLOGICAL, seen("a R b R c R d R a"), "0 1 2 3 0", "0 0 0 0"),
+    "spin": case(TOPOLOGICAL, written("a R b R c R d R a"), "0 1 2 3 0", "0 0 0 0"),
     "spin with frame": case(
-        TOPOLOGICAL, seen("a R b R c R d R a", [ALL_OPEN] * 5), "0 1 2 3 0", "0^0 0^1 0^2 0^3"
+        TOPOLOGICAL, written("a R b R c R d R a", [ALL_OPEN] * 5), "0 1 2 3 0", "0^0 0^1 0^2 0^3"
     ),
     "fork, partial": case(
         TOPOLOGICAL.replace(path_order="partial"), FORK, "0 1 2 3", "0:0+ 1:0+ 1:0- 2:0-", "021"
@@ -176,59 +165,59 @@ CORRECT = {
     "lens, excused the other way round": Case(
         TOPOLOGICAL.replace(boundary="defeasible"), HALF, chart(HALF, *LENS, excused=((1, 0),))
     ),
-    "one step": case(TOPOLOGICAL, seen("a"), "0", "0"),
+    "one step": case(TOPOLOGICAL, written("a"), "0", "0"),
 }
 
 SPUN = replace(
-    seen("a R a"),
+    written("a R a"),
     steps=tuple(
-        replace(s, displacement=(0, 0, -1.5) if t else None) for t, s in enumerate(seen("a R a"))
+        replace(s, displacement=(0, 0, -1.5) if t else None) for t, s in enumerate(written("a R a"))
     ),
 )
 SHIFTED = replace(
-    seen("a R a"), closures=(Closure(0, 1, (2, 0, 0), tuple(map(tuple, np.eye(3) * 0.01))),)
+    written("a R a"), closures=(Closure(0, 1, (2, 0, 0), tuple(map(tuple, np.eye(3) * 0.01))),)
 )
 BROKEN = {
     "one_pose": case(TOPOLOGICAL, SPUN, "0 0", "0"),
     "closure": case(TOPOLOGICAL, SHIFTED, "0 0", "0"),
-    "other_floor": case(TOPOLOGICAL, seen("a U b"), "0 1", "0 0"),
+    "other_floor": case(TOPOLOGICAL, written("a U b"), "0 1", "0 0"),
     "path_on_one_floor": case(
-        TOPOLOGICAL, seen("a T b U c T d"), "0 1 2 3", "0:0+ 1:0+ 2:0+ 3:0+", "0123"
+        TOPOLOGICAL, written("a T b U c T d"), "0 1 2 3", "0:0+ 1:0+ 2:0+ 3:0+", "0123"
     ),
     "one_star": case(
-        Theory.causal().replace(star="alike"), seen("a R a", [(0, 90), (0, 120)]), "0 0", "."
+        Theory.causal().replace(star="alike"), written("a R a", [(0, 90), (0, 120)]), "0 0", "."
     ),
-    "asserted": case(TOPOLOGICAL.replace(different=[(0, 2)]), seen("a R a R a"), "0 0 0", "0"),
+    "asserted": case(TOPOLOGICAL.replace(different=[(0, 2)]), written("a R a R a"), "0 0 0", "0"),
     # After turning back, past the place before.
     "planar": case(
         TOPOLOGICAL.replace(planar=True),
-        seen("a T b T c A d T e"),
+        written("a T b T c A d T e"),
         "0 1 2 3 4",
         "0:0+ 1:0+ 2:0+ 2:0- 0:0-",
         "012",
     ),
-    "functional_view": case(TOPOLOGICAL, seen("a R b"), "0 0", "0"),
-    "deterministic": case(TOPOLOGICAL, seen("a R b R a R c"), "0 1 0 2", "0 0 0"),
-    "one_place": case(TOPOLOGICAL, seen("a"), "0", "."),
-    "turn_stays": case(TOPOLOGICAL, seen("a R b"), "0 1", "0 1"),
-    "travel_leaves": case(TOPOLOGICAL, seen("a T a"), "0 0", "0:0+", "0"),
-    "travel_follows_path": case(TOPOLOGICAL, seen("a T b"), "0 1", "0 1:0+", "1"),
-    "one_course": case(TOPOLOGICAL, seen("a"), "0", "0:0?", "-"),
-    "turn_around_reverses": case(TOPOLOGICAL, seen("a T b A c"), "0 1 2", "0:0+ 1:0+ 1", "01"),
+    "functional_view": case(TOPOLOGICAL, written("a R b"), "0 0", "0"),
+    "deterministic": case(TOPOLOGICAL, written("a R b R a R c"), "0 1 0 2", "0 0 0"),
+    "one_place": case(TOPOLOGICAL, written("a"), "0", "."),
+    "turn_stays": case(TOPOLOGICAL, written("a R b"), "0 1", "0 1"),
+    "travel_leaves": case(TOPOLOGICAL, written("a T a"), "0 0", "0:0+", "0"),
+    "travel_follows_path": case(TOPOLOGICAL, written("a T b"), "0 1", "0 1:0+", "1"),
+    "one_course": case(TOPOLOGICAL, written("a"), "0", "0:0?", "-"),
+    "turn_around_reverses": case(TOPOLOGICAL, written("a T b A c"), "0 1 2", "0:0+ 1:0+ 1", "01"),
     "turn_changes_path": case(
-        NO_SIDES, seen("a T b R c T d"), "0 1 2 3", "0:0+ 1:0+ 1:0- 2:0-", "021"
+        NO_SIDES, written("a T b R c T d"), "0 1 2 3", "0:0+ 1:0+ 1:0- 2:0-", "021"
     ),
     "one_dstate_per_course": case(
-        TOPOLOGICAL, seen("a T b A c A d"), "0 1 2 3", "0:0+ 1:0+ 1:0- 1:0+", "01"
+        TOPOLOGICAL, written("a T b A c A d"), "0 1 2 3", "0:0+ 1:0+ 1:0- 1:0+", "01"
     ),
-    "on_path": case(NO_SIDES, seen("a T b R c T d"), "0 1 2 3", "0:0+ 1:0+ 1:1+ 2:1+", "012 12"),
-    "travel_orders": case(TOPOLOGICAL, seen("a T b"), "0 1", "0:0+ 1:0+", "10"),
+    "on_path": case(NO_SIDES, written("a T b R c T d"), "0 1 2 3", "0:0+ 1:0+ 1:1+ 2:1+", "012 12"),
+    "travel_orders": case(TOPOLOGICAL, written("a T b"), "0 1", "0:0+ 1:0+", "10"),
     "order_asymmetric": case(
-        TOPOLOGICAL, seen("a T b T a"), "0 1 0", "0:0+ 1:0+", "01", also="travel_orders"
+        TOPOLOGICAL, written("a T b T a"), "0 1 0", "0:0+ 1:0+", "01", also="travel_orders"
     ),
     "order_transitive": case(
         TOPOLOGICAL,
-        seen("a T b T c T a"),
+        written("a T b T c T a"),
         "0 1 2 0",
         "0:0+ 1:0+ 2:0+",
         "012",
@@ -240,15 +229,15 @@ BROKEN = {
     "next_place": case(
         TOPOLOGICAL.replace(next_place=True), FORK, "0 1 2 3", "0:0+ 1:0+ 1:0- 2:0-", "021"
     ),
-    "all_on_paths": case(TOPOLOGICAL.replace(all_on_paths=True), seen("a"), "0", "0"),
-    "course_needs_travel": case(TOPOLOGICAL, seen("a"), "0", "0:0+", "0"),
+    "all_on_paths": case(TOPOLOGICAL.replace(all_on_paths=True), written("a"), "0", "0"),
+    "course_needs_travel": case(TOPOLOGICAL, written("a"), "0", "0:0+", "0"),
     "branch_side": case(ONE_SIDE, HALF, *LENS, also="side_of_branch path_between_sides"),
     "side_of_branch": case(ONE_SIDE, HALF, *LENS, also="branch_side path_between_sides"),
     "path_between_sides": case(ONE_SIDE, HALF, *LENS, also="branch_side side_of_branch"),
     # Back through the crossing, to a place that is behind on both paths.
     "symmetric_sides": case(
         TOPOLOGICAL,
-        seen("a T b R c T d A e T f T g"),
+        written("a T b R c T d A e T f T g"),
         "0 1 2 3 4 5 6",
         "0:0+ 1:0+ 1:1+ 2:1+ 2:1- 1:1- 0:1-",
         "01 012",
@@ -257,7 +246,7 @@ BROKEN = {
     # Place 2 is reached by leaving path 0 to the right at place 1, and to the left at place 3.
     "sides_disjoint": case(
         ONE_SIDE,
-        seen("a T b R c T d A e T f R b T g L h T i"),
+        written("a T b R c T d A e T f R b T g L h T i"),
         "0 1 2 3 4 5 1 6 7 8",
         "0:0+ 1:0+ 1:1+ 2:1+ 2:1- 1:1- 3:0+ 3:2+ 2:2+",
         "013 12 32",
@@ -265,20 +254,25 @@ BROKEN = {
     ),
     "star_pattern": case(
         TOPOLOGICAL.replace(star="pattern"),
-        seen("a R b", [(1, 0, 0, 0), (1, 1, 0, 0)]),
+        written("a R b", [(1, 0, 0, 0), (1, 1, 0, 0)]),
         "0 1",
         "0 0",
     ),
-    "star_frame": case(TOPOLOGICAL, seen("a R b", [(1, 0, 0, 0), (1, 0, 0, 0)]), "0 1", "0^0 0^1"),
-    "one_heading": case(TOPOLOGICAL, seen("a", [ALL_OPEN]), "0", "0"),
-    "turn_rotates": case(TOPOLOGICAL, seen("a R b", [ALL_OPEN] * 2), "0 1", "0^0 0^2"),
+    "star_frame": case(
+        TOPOLOGICAL, written("a R b", [(1, 0, 0, 0), (1, 0, 0, 0)]), "0 1", "0^0 0^1"
+    ),
+    "one_heading": case(TOPOLOGICAL, written("a", [ALL_OPEN]), "0", "0"),
+    "turn_rotates": case(TOPOLOGICAL, written("a R b", [ALL_OPEN] * 2), "0 1", "0^0 0^2"),
     "one_dstate_per_heading": case(
-        TOPOLOGICAL, seen("a R b R c R d R e", [ALL_OPEN] * 5), "0 1 2 3 4", "0^0 0^1 0^2 0^3 0^0"
+        TOPOLOGICAL,
+        written("a R b R c R d R e", [ALL_OPEN] * 5),
+        "0 1 2 3 4",
+        "0^0 0^1 0^2 0^3 0^0",
     ),
     # Two right turns, but the way back is taken for another path.
     "path_goes_straight": case(
         TOPOLOGICAL,
-        seen("a T b R c R d T e", [ALL_OPEN] * 5),
+        written("a T b R c R d T e", [ALL_OPEN] * 5),
         "0 1 2 3 4",
         "0:0+^0 1:0+^0 1^1 1:1+^2 2:1+^0",
         "01 12",
@@ -286,30 +280,36 @@ BROKEN = {
     # Round a triangle: place 0 has a gateway less when it is seen again.
     "gateway_frame": case(
         GATEWAYS,
-        seen("a T b R c T d R e T f", [(0, 60), (180, 120), (0, 60), (180, 120), (0, 60), (180,)]),
+        written(
+            "a T b R c T d R e T f", [(0, 60), (180, 120), (0, 60), (180, 120), (0, 60), (180,)]
+        ),
         "0 1 2 3 4 5",
         "0:0+^0 1:0+^0 1:1+^120 2:1+^0 2:2+^120 0:2+^240",
         "01 12 20",
     ),
-    "gateway_heading": case(GATEWAYS, seen("a", [(0, 120)]), "0", "0"),
-    "gateway_turn": case(GATEWAYS, seen("a L b", [(0, 120), (0, 240)]), "0 1", "0^0 0^120"),
+    "gateway_heading": case(GATEWAYS, written("a", [(0, 120)]), "0", "0"),
+    "gateway_turn": case(GATEWAYS, written("a L b", [(0, 120), (0, 240)]), "0 1", "0^0 0^120"),
     "gateway_dstate": case(
         GATEWAYS,
-        seen("a R b L c", [(0, 120), (0, 240), (0, 120)]),
+        written("a R b L c", [(0, 120), (0, 240), (0, 120)]),
         "0 1 2",
         "0^0 0^120 0^0",
         also="gateway_frame",
     ),
     "gateway_path": case(
         GATEWAYS,
-        seen("a T b R c R d T e", [(0,), (70, 180), (0, 110), (0, 250), (180,)]),
+        written("a T b R c R d T e", [(0,), (70, 180), (0, 110), (0, 250), (180,)]),
         "0 1 2 3 4",
         "0:0+^0 1:0+^0 1^70 1:1+^180 2:1+^0",
         "01 12",
         also="gateway_frame",
     ),
     "gateway_end": case(
-        GATEWAYS, seen("a T b T c", [(0,), (180,), (180,)]), "0 1 2", "0:0+^0 1:0+^0 2:0+^0", "012"
+        GATEWAYS,
+        written("a T b T c", [(0,), (180,), (180,)]),
+        "0 1 2",
+        "0:0+^0 1:0+^0 2:0+^0",
+        "012",
     ),
 }
 HIDDEN = (
@@ -395,7 +395,7 @@ def test_partial_order_follows_from_travels_only(order: str, listed: str) -> Non
 
     Place 0 is ahead there only if the list decides, and not a travel.
     """
-    trace = seen("a T b A c T d R e T f A g T h T i A j T e T f A g T h R d")
+    trace = written("a T b A c T d R e T f A g T h T i A j T e T f A g T h R d")
     states = "0:0+ 1:0+ 1:0- 2:0- 2:1+ 3:1+ 3:1- 2:1- 0:1- 0:1+"
     forked = case(
         ONE_SIDE.replace(path_order=order),
@@ -670,16 +670,6 @@ def test_checker_never_raises_on_a_mutated_map(
 # All maps of tiny traces, against the numbers in docs/explanation/theory.md
 
 
-def growths(n: int) -> Iterator[tuple[int, ...]]:
-    """The partitions of n things, each numbered by first member."""
-    if n == 0:
-        yield ()
-        return
-    for head in growths(n - 1):
-        for last in range(max(head, default=-1) + 2):
-            yield (*head, last)
-
-
 def courses_of(
     supported: list[bool], edges: list[tuple[int, int, int]]
 ) -> Iterator[tuple[tuple[int, int] | None, ...]]:
@@ -714,7 +704,7 @@ def courses_of(
 def all_maps(trace: Trace) -> Iterator[list[SSHMap]]:
     """All maps of a trace whose places and courses fit the turns and travels, with every order."""
     kinds = [a.turn or a.kind for a in trace.actions]
-    for labels in growths(len(trace)):
+    for labels in partitions(len(trace)):
         views = [trace.views[labels.index(i)] for i in range(max(labels) + 1)]
         if [views[i] for i in labels] != list(trace.views) or len(
             {(a, k) for a, k in zip(labels, kinds, strict=False)}
@@ -725,7 +715,7 @@ def all_maps(trace: Trace) -> Iterator[list[SSHMap]]:
             any(k == "travel" and i in (a, b) for a, k, b in moves) for i in range(len(views))
         ]
         edges = [(a, b, 1) for a, k, b in moves if k == "travel"]
-        for places in growths(len(views)):
+        for places in partitions(len(views)):
             if any((places[a] == places[b]) == (k == "travel") for a, k, b in moves):
                 continue
             for courses in courses_of(supported, edges):
@@ -770,7 +760,7 @@ def test_checker_counts_the_maps_of_the_notched_rectangle(
 def test_checker_reads_a_long_trace_once() -> None:
     """The checker never walks a corridor of 3,000 places once for each step or pair of places."""
     circuits = 400
-    trace = seen("v0 R v1 T v2 R v3 T " * (2 * circuits) + "v0")
+    trace = written("v0 R v1 T v2 R v3 T " * (2 * circuits) + "v0")
     labels = " ".join(map(str, [*range(8)] * circuits + [0]))
     assert check(trace, chart(trace, labels, *RECTANGLE)) == ()
     long = 3000

@@ -8,6 +8,7 @@ from itertools import pairwise
 from typing import Any
 
 import pytest
+import truth
 from worlds import HEADINGS, TEE, Streets, streets
 
 from ssh_abduction import Explorer, Theory, solve
@@ -77,11 +78,6 @@ class Machine:
         self.at = self.ends[self.at][action.name]
 
 
-def partition(names: Collection[Any]) -> list[int]:
-    numbers: dict[Any, int] = {}
-    return [numbers.setdefault(name, len(numbers)) for name in names]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("world", "start", "margin"),
@@ -103,7 +99,7 @@ def test_explorer_ends_after_trying_all_streets(world: Streets, start: str, marg
         (place, HEADINGS.index(heading)) for place, ways in world.items() for heading in ways
     }
     for ssh_map in found.solution.maps:
-        assert partition(ssh_map.labels) == partition(robot.been)
+        assert truth.partition(ssh_map.labels) == truth.partition(robot.been)
 
 
 def test_explorer_is_unique_if_solve_lists_one_map() -> None:
@@ -119,7 +115,9 @@ def test_explorer_is_unique_if_solve_lists_one_map() -> None:
             listed = solve(explorer.trace, Theory.causal(), max_maps=None).maps
             found = explorer.result
             assert found.is_unique == (len({m.labels for m in listed}) == 1)
-            assert found.is_true == ([partition(m.labels) for m in listed] == [partition(been)])
+            assert found.is_true == (
+                [truth.partition(m.labels) for m in listed] == [truth.partition(been)]
+            )
             seen.add((found.is_unique, found.is_true))
     assert seen == {(False, False), (True, False), (True, True)}
 

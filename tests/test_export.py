@@ -27,14 +27,6 @@ from ssh_abduction.output.export.roads import TURN, Road, Roads, Stop
 from ssh_abduction.output.export.tmap2 import tmap2
 
 
-@pytest.fixture(scope="module")
-def square() -> SSHMap:
-    moves = [(10, 0, 0), (0, 0, 1.5708)] * 4
-    return solve(
-        Trace.from_steps("abababab" + "a", ["travel", "left"] * 4, displacements=moves)
-    ).maps[0]
-
-
 def nav2_graph(
     text: str,
 ) -> tuple[dict[int, tuple[float, float]], dict[int, tuple[int, int, float]]]:

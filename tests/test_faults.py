@@ -7,14 +7,14 @@ import json
 import random
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import replace
 from itertools import accumulate, pairwise, product
 from pathlib import Path
 from unittest.mock import patch
 
 import pytest
-from brute_force import key, minimal_maps
+from brute_force import key, minimal_maps, partitions
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from instances import faulty_machine
@@ -62,14 +62,6 @@ SHARE = {None: 1.0, 0.9: 0.478, 0.4: 0.1}
 
 def price_of(misread: int, step: Step) -> int:
     return max(round(misread * SHARE[step.confidence]), 1)
-
-
-def partitions(steps: int) -> Iterator[tuple[int, ...]]:
-    """All labellings of this many steps, numbered by first visit."""
-    found: list[tuple[int, ...]] = [()]
-    for _ in range(steps):
-        found = [(*labels, new) for labels in found for new in range(max(labels, default=-1) + 2)]
-    yield from found
 
 
 def votes(

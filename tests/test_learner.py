@@ -174,11 +174,6 @@ def test_learner_warns_of_an_incomplete_list_of_maps() -> None:
         labels_of(maps)
 
 
-def test_learner_accepts_a_clusterer_of_scikit_learn(run: Trace) -> None:
-    clusterer = ViewClusterer(clusterer=AgglomerativeClustering(linkage="complete"), k_max=10)
-    assert one_to_one(BootstrapLearner(VIEWS_ALONE, clusterer).fit(run).labels_, true_dstates(run))
-
-
 def test_the_learner_is_an_estimator(run: Trace) -> None:
     clusterer = ViewClusterer(k_max=6, random_state=0)
     learner = BootstrapLearner(VIEWS_ALONE, clusterer, time_limit=100)
@@ -249,6 +244,7 @@ def test_learner_fits_several_traces_with_one_map(run: Trace) -> None:
     [
         GaussianMixture(4, covariance_type="spherical", random_state=0),
         AgglomerativeClustering(n_clusters=None, distance_threshold=6.0),
+        ViewClusterer(clusterer=AgglomerativeClustering(linkage="complete"), k_max=10),
     ],
 )
 def test_learner_accepts_any_clusterer(run: Trace, clusterer: Any) -> None:

@@ -134,18 +134,21 @@ def test_every_exported_name_exists() -> None:
         assert getattr(ssh_abduction, name).__name__ == name
 
 
-def test_docstrings_run() -> None:
+@pytest.mark.parametrize(
+    ("folder", "least"), [("ssh_abduction", 50), ("perception", 20), ("simulator", 10)]
+)
+def test_docstrings_run(folder: str, least: int) -> None:
     import doctest
     import importlib
 
     attempted = 0
-    for path in sorted((ROOT / "ssh_abduction").rglob("*.py")):
-        if "\n>>> " in path.read_text():
+    for path in sorted((ROOT / folder).rglob("*.py")):
+        if ">>> " in path.read_text():
             name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
             result = doctest.testmod(importlib.import_module(name))
             assert result.failed == 0, name
             attempted += result.attempted
-    assert attempted > 50
+    assert attempted > least
 
 
 def test_citation_and_changelog_have_the_package_version() -> None:

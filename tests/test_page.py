@@ -10,7 +10,7 @@ import shutil
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import combinations, product
 from pathlib import Path
@@ -19,6 +19,7 @@ from typing import Any
 import aces
 import numpy as np
 import pytest
+from in_processes import until
 
 from ssh_abduction import Localiser, Solution, SSHMap, Theory, Trace, solve, view_page
 from ssh_abduction.cli import main
@@ -429,13 +430,6 @@ def test_server_starts_from_the_maps_of_the_page() -> None:
 
 def sleep(*arguments: object) -> None:
     time.sleep(60)
-
-
-def until(happened: Callable[[], bool]) -> None:
-    end = time.monotonic() + 100
-    while not happened():
-        assert time.monotonic() < end
-        time.sleep(0.02)
 
 
 def test_server_solves_and_explains_under_assumptions(server: PageServer) -> None:

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from sklearn.cluster import AgglomerativeClustering
 from sklearn.preprocessing import FunctionTransformer
-from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from perception.appearance import PanoramaTransformer, features_of
 from perception.errors import PerceptionError
@@ -37,12 +36,6 @@ SMALL = Camera(rows=12, columns=60, paint=Paint(5, repeated=True), hours=(7.0, 1
 @pytest.fixture(scope="module")
 def run() -> Trace:
     return simulate(ROOM, tours=5, seed=500, camera=SMALL)
-
-
-@parametrize_with_checks([PanoramaTransformer()])
-@pytest.mark.filterwarnings("ignore")
-def test_transformer_keeps_the_rules_of_scikit_learn(estimator: Any, check: Any) -> None:
-    check(estimator)
 
 
 def test_wall_heights_in_a_panorama_fit_laser_ranges(

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from unittest.mock import patch
 import pytest
 from aces import ACES
 from coarse import hall
-from in_processes import from_here, from_there
+from in_processes import from_here, from_there, until
 from worlds import TOURS, drive
 
 from perception.readers.writers import write_carmen
@@ -235,11 +234,3 @@ def test_killed_worker_is_an_error() -> None:
     killed = patch.object(workers, "answers", lambda *_: iter([workers.Lost(0, late=False)]))
     with killed, pytest.raises(AbductionError, match="expected an answer, got a killed process"):
         list(report._each(divmod, [(9, 4), (9, 3)], 2))
-
-
-def until(condition: Callable[[], bool]) -> None:
-    """Wait until a condition holds."""
-    ends = time.monotonic() + SOON
-    while not condition():
-        assert time.monotonic() < ends
-        time.sleep(0.02)

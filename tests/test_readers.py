@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import importlib
 import io
 import math
 import os
@@ -908,12 +907,3 @@ def test_logs_of_real_robots_are_read(name: str) -> None:
         displacement_between(log.scans[0].corrected or START, log.scans[-1].corrected or START),
     )
     assert math.hypot(*end[:2]) > 0.5  # And it drifts.
-
-
-def test_docstrings_run() -> None:
-    import doctest
-
-    for name in ("scans", "carmen_survey", "writers"):
-        result = doctest.testmod(importlib.import_module(f"perception.readers.{name}"))
-        assert result.failed == 0
-        assert result.attempted > 0

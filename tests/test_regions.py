@@ -153,12 +153,6 @@ def test_every_axiom_about_regions_has_a_case() -> None:
     assert set(CASES) == set(re.findall(r"axiom\((\w+)\)[,.]", text)) > names
 
 
-@pytest.mark.parametrize("axiom", encodings.region_axioms(), ids=lambda a: a.name)
-def test_an_axiom_about_regions_has_a_sentence_and_a_source(axiom: encodings.Axiom) -> None:
-    assert re.fullmatch(r"[A-Z].*\.", axiom.sentence)
-    assert axiom.source
-
-
 def test_search_does_not_use_the_axioms_about_regions() -> None:
     assert not {axiom.name for axiom in encodings.region_axioms()} & {*PLAIN.axioms}
 

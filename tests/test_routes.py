@@ -19,14 +19,6 @@ from ssh_abduction.data.maps import DState, Fit, MapPath, Pose
 from ssh_abduction.solver import with_regions
 
 
-@pytest.fixture(scope="module")
-def square() -> SSHMap:
-    """Four places around a square of ten metres. The robot drives round once and turns around."""
-    moves = [(10, 0, 0), (0, 0, 1.5708)] * 4
-    trace = Trace.from_steps("abababab" + "a", ["travel", "left"] * 4, displacements=moves)
-    return solve(trace).maps[0]
-
-
 def random_map(seed: int) -> SSHMap:
     """Links between six dstates by chance, with poses."""
     chance = random.Random(seed)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from unittest.mock import patch
 
 import numpy as np
 import pytest
+from brute_force import divisions
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -29,17 +30,6 @@ EXACT = Odometry(0.01, 0.005, 0.001, 0.001, 0.01, 0.001, 0.001, 0.0001, offset=0
 QUARTER = math.pi / 2
 
 
-def partitions(items: Sequence[int]) -> Iterator[list[list[int]]]:
-    """Yield all ways to divide items into sets."""
-    if not items:
-        yield []
-        return
-    for rest in partitions(items[1:]):
-        yield [[items[0]], *rest]
-        for k in range(len(rest)):
-            yield [*rest[:k], [items[0], *rest[k]], *rest[k + 1 :]]
-
-
 def least_by_trying(facilities: Facilities) -> float:
     """Compute the least cost of all clusterings. Headings are near 0."""
     points, weights = facilities.points, 1 / facilities.variances
@@ -50,7 +40,7 @@ def least_by_trying(facilities: Facilities) -> float:
         fees = min(facilities.fees[cluster][kinds != kind].sum() for kind in kinds)
         return facilities.price + float((w * (p - mean) ** 2).sum()) / 2 + float(fees)
 
-    return min(sum(map(cost, parts)) for parts in partitions(range(len(points))))
+    return min(sum(map(cost, parts)) for parts in divisions(len(points)))
 
 
 @settings(max_examples=60)

@@ -613,13 +613,3 @@ def test_empty_route_and_zero_tours_are_refused(tmp_path: Path) -> None:
     for every in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(SimulatorError, match="every: expected a number of metres above 0"):
             simulate(RECTANGLE, every=every)
-
-
-def test_docstrings_run() -> None:
-    import doctest
-    import importlib
-
-    for name in ("freespace", "odometer", "panorama", "plan_tours", "world"):
-        result = doctest.testmod(importlib.import_module(f"simulator.{name}"))
-        assert result.failed == 0
-        assert result.attempted > 0

@@ -12,10 +12,11 @@ from itertools import combinations, pairwise
 from pathlib import Path
 
 import pytest
+from test_evaluate import labelled
 
-from ssh_abduction import SSHMap, Trace
+from ssh_abduction import Trace
 from ssh_abduction.cli import main
-from ssh_abduction.data import DState, TraceError
+from ssh_abduction.data import TraceError
 from ssh_abduction.data.odometry import Pose, displacement_between
 from ssh_abduction.evaluation import evaluate_visits
 from ssh_abduction.evaluation.relations import Relation, Relations
@@ -35,11 +36,6 @@ def posed(poses: Sequence[object], kinds: Sequence[str], times: Sequence[float] 
             for step, pose, extra in zip(seen.steps, poses, extras, strict=True)
         ),
     )
-
-
-def labelled(labels: Sequence[int], places: Sequence[int | None]) -> SSHMap:
-    dstates = tuple(DState(i, "v", place, None, None) for i, place in enumerate(places))
-    return SSHMap(tuple(labels), dstates, (), tuple(sorted({p for p in places if p is not None})))
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -3,7 +3,7 @@ and sees the openings."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from ssh_abduction import Trace
 
@@ -19,14 +19,14 @@ QUARTERS = {"R": 1, "A": 2, "L": 3}
 Streets = dict[str, dict[str, str]]
 
 
-def written(text: str) -> Trace:
+def written(text: str, stars: Sequence[Iterable[float]] | None = None) -> Trace:
     """A trace in the notation of the tables: views and actions alternate, such as "a T b R c".
 
     T followed by letters is a travel of its own.
     """
     words = text.split()
     actions = [ACTIONS.get(a) or {"name": a, "kind": "travel"} for a in words[1::2]]
-    return Trace.from_steps(words[0::2], actions)
+    return Trace.from_steps(words[0::2], actions, stars=stars)
 
 
 def rectangle(actions: int, views: int = 4, turn: str = "R") -> Trace:
