@@ -76,7 +76,7 @@ class SolveQuestion(FileQuestion):
         limit: Seconds for each trace; None for no limit.
         maps: The largest number of maps to list; 0 for all.
         memory: MiB that the process may use; None for no limit.
-        speedups: The speed-ups that are on.
+        speedups: Flags that say which speed-ups to use.
         json: Whether lines are JSON.
         within: The number of dstates by which a listed map may exceed the minimum.
     """

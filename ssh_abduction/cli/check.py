@@ -153,7 +153,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _refuse_bound(resolved: Theory, solved: Theory | None) -> None:
-    """Raise MapError if, by the theory to check or that of the file, a clique proves no bound."""
+    """Raise MapError if a clique proves no bound for the theory to check, or that of the file."""
     if resolved.has_faults or (solved is not None and solved.has_faults):
         raise MapError(
             "bound: expected a theory without faults (misread, slipped), as a clique of steps "
@@ -167,7 +167,7 @@ def _refuse_bound(resolved: Theory, solved: Theory | None) -> None:
 
 
 def _axioms_of(theory: Theory) -> Theory:
-    """Return a theory with a default objective, so that two theories compare by axioms alone."""
+    """Return a theory with the default objective, to compare theories by their axioms alone."""
     return theory.replace(prefer=AUTO, weigh="count")
 
 
@@ -304,7 +304,7 @@ def _false_of_all(data: Mapping[str, Any], trace: Trace) -> Iterator[str]:
 
 
 def _is_near(said: Any, right: Any) -> bool:
-    """Whether all numbers in two nested values are almost equal, as machines round differently."""
+    """Whether all numbers in two nested values are almost equal. Machines round differently."""
     if isinstance(right, Mapping):
         return (
             isinstance(said, Mapping)

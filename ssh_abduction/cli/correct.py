@@ -1,4 +1,4 @@
-"""ssh-abduction correct MAPS: say what an existing map has wrong."""
+"""ssh-abduction correct MAPS: say what is wrong in an existing map."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def add_parser(verbs: Verbs) -> None:
     parser = verbs.add(
         "correct",
         run,
-        "say what a map has wrong",
+        "say what is wrong in a map",
         "Correct a map. The corrections are saved in corrections.yaml beside the map. solve obeys "
         "them if it writes into that folder (solve --output) or is given the file "
         "(solve --corrections).",

@@ -176,7 +176,7 @@ def _pairs(pairs: MapPairs | None) -> list[object]:
 
 
 def _headline(found: Evaluation, may_be_more: bool) -> str:
-    """Say which map is the true one. `may_be_more`: not all minimal maps are listed."""
+    """Say which map is the true one. `may_be_more` says if minimal maps may be missing."""
     of = f"{counted(len(found.maps), 'maps')}{', and there may be more' if may_be_more else ''}"
     if found.rank is not None:
         return f"{of}: map {found.rank} is the true one"
@@ -196,7 +196,7 @@ def _truth(found: Evaluation, steps: int) -> str:
 
 
 def _row(number: int, one: MapEvaluation) -> list[object]:
-    """Make the row of a map, which has this number, in the table."""
+    """Make the table row of the map with this number."""
     counts = [
         UNKNOWN
         if (count := getattr(one, kind)) is None

@@ -1,4 +1,4 @@
-"""ssh-abduction import LOG: make a trace of a robot's log."""
+"""ssh-abduction import LOG: make a trace from a robot's log."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def add_parser(verbs: Verbs) -> None:
     parser = verbs.add(
         "import",
         run,
-        "make a trace of a robot's log",
+        "make a trace from a robot's log",
         "Read a robot's log of laser scans and odometry, find the distinctive places that it "
         "passed, and write a trace with views, stars, displacements and actions. Corrected "
         "poses in the log become the truth, which only the command 'evaluate' uses.",

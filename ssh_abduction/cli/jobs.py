@@ -136,5 +136,8 @@ def final_code(codes: Sequence[int], asked: int, stop: StopFlag, files: str) -> 
 def solved_in_worker(
     number: int, path: str, question: FileQuestion, content: Any, given_up: Callable[[], bool]
 ) -> Any:
-    """In a worker process, answer a question about one file. Content None: not loaded yet."""
+    """In a worker process, answer a question about one file.
+
+    `content` is None if the file is not loaded yet.
+    """
     return question.answer(number, path, content, given_up)

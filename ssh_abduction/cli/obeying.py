@@ -1,4 +1,4 @@
-"""Names and corrections of a person, as solve obeys and reports them."""
+"""Make a search obey the corrections of a person, and report how it did."""
 
 from __future__ import annotations
 
@@ -108,8 +108,8 @@ class Obeying:
     def blamed(self, explanation: Explanation | None) -> list[str]:
         """List the corrections that may be the reason why the trace has no map.
 
-        Each correction is dropped in turn. If the steps of the explanation still have no map, it
-        is not to blame, and it is not listed.
+        Each correction is dropped in turn. If the steps of the explanation still have no map, this
+        correction is not to blame, and it is not listed.
         """
         said = self.corrections.known_in(drives_of(self.trace)) if self.corrections else None
         if explanation is None or said is None:
@@ -138,7 +138,7 @@ class Obeying:
         return explain(trace[stretch.start : stretch.stop], part) is not None
 
     def _seen(self, said: Said | Passage) -> str:
-        """Say what the robot saw at the steps of a pair."""
+        """Say what the robot saw at the steps of a pair; empty for a gateway."""
         if isinstance(said, Passage):
             return ""
         drives = drives_of(self.trace)

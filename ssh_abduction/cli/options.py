@@ -169,9 +169,9 @@ def add_maps(parser: Parser) -> None:
 def add_trace(parser: Parser, needs: str = "") -> None:
     """Add the argument `trace`. If the user leaves it out, the trace beside the maps is taken.
 
-    `needs` says in the help what the verb needs, such as " with images". The copy of the trace
-    in a file of maps lacks this, so the verb calls `trace_of`. If `needs` is empty, the copy
-    suffices, and the verb calls `solved_trace`.
+    `needs` says in the help what the trace must have, such as " with images". The copy of the trace
+    in a file of maps has no images and no truth, so such a verb calls `trace_of`. If `needs` is
+    empty, the copy suffices, and the verb calls `solved_trace`.
     """
     by = "map" if needs else "solve -o or map"
     parser.add(

@@ -154,8 +154,9 @@ def _has_maps(file: str) -> bool:
 def on_ctrl_c(action: Callable[[], None] | None) -> Iterator[None]:
     """While the block runs, call `action` at Ctrl-C and SIGTERM instead of ending the program.
 
-    None ignores these signals, also in processes started meanwhile. While the block runs, the Guard
-    of the whole program receives no signals. So code that may ignore `action` needs its own Guard.
+    If `action` is None, these signals are ignored, also in processes started meanwhile. While the
+    block runs, the Guard of the whole program receives no signals. So code that may ignore `action`
+    needs its own Guard.
     """
     if threading.current_thread() is not threading.main_thread():
         yield  # Python lets only the main thread handle signals

@@ -278,7 +278,7 @@ class Parser(argparse.ArgumentParser):
         return [f"--{new}={value}"]
 
     def _drops(self, word: str, rest: list[str], notes: list[str]) -> bool:
-        """Drop an option without a successor, with its value, and note it; False for others."""
+        """Drop an option that has no new form, with its value, and note it; False for others."""
         is_set = word == "--set" and bool(rest)
         flag, equals, _ = (f"--{rest[0]}" if is_set else word).partition("=")
         now, why = WITHDRAWN.get(flag[2:].replace("-", "_"), ("", ""))

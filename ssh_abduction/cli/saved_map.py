@@ -1,4 +1,4 @@
-"""A saved map, as the verbs name, correct and solve see it, with its corrections."""
+"""A saved map with its corrections, for the verbs name, correct and solve."""
 
 from __future__ import annotations
 
@@ -102,7 +102,8 @@ class SavedMap:
     def step_of_name(self, kind: str, step: str) -> str:
         """Return the step to which the name of a place, path or region belongs.
 
-        `kind` and `step` say which thing. If it has no name yet, return `step`.
+        It is the place, path or region of `step`, as `kind` says. If it has no name yet, return
+        `step`.
         """
         number = self._at(kind, step)
         names = self.corrections.known_in(self.drives).names
@@ -118,11 +119,12 @@ class SavedMap:
             raise MapError(f"{error}; or a place such as p4") from None
 
     def gateway(self, text: str) -> tuple[tuple[str, float], ...]:
-        """Return the steps at which the robot faced a gateway, each with degrees clockwise.
+        """Return the steps at the place of a gateway, each with the gateway's direction.
 
-        Degrees count from ahead. The text is a place and a direction on the drawn map, such as "p4
-        north"; or a step and a direction from the robot, such as "monday:12 left" or "monday:12
-        135". Raises MapError if the map has no such place or step, or no headings there.
+        Directions are degrees clockwise from ahead. The text is a place and a direction on the
+        drawn map, such as "p4 north"; or a step and a direction from the robot, such as "monday:12
+        left" or "monday:12 135". Raises MapError if the map has no such place or step, or no
+        headings there.
         """
         where, _, way = text.strip().rpartition(" ")
         kind, step = self.thing(where.strip()) if where else ("", "")
@@ -146,7 +148,10 @@ class SavedMap:
         return self._seen_from(best, self._rounded(drawn[best] - COMPASS[way], text))
 
     def _seen_from(self, label: int, way: float) -> tuple[tuple[str, float], ...]:
-        """List the steps at a dstate's place with degrees of a gateway, by their headings."""
+        """List the steps at a dstate's place, each with the direction of a gateway from there.
+
+        Directions are degrees clockwise from ahead. `way` is the direction from the dstate.
+        """
         here = self.map.dstates[label]
         unit = 90 if self.in_quarters else 1
         ways = {
@@ -172,7 +177,7 @@ class SavedMap:
         }
 
     def _rounded(self, degrees: float, text: str) -> float:
-        """Round a direction to degrees or, if stars have four directions, to the nearest one."""
+        """Round a direction to whole degrees or, if stars have four directions, to one of these."""
         if not self.in_quarters:
             return round(degrees) % 360.0
         quarter = round(degrees / 90)

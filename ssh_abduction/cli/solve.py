@@ -239,7 +239,7 @@ def _joint(paths: Sequence[str]) -> Trace:
 
 
 class _Text:
-    """Prints the result of a search for people. `kept` has the first maps."""
+    """Prints the result of a search as text for people. `kept` has the first maps."""
 
     def __init__(self, search: Search, obeying: Obeying) -> None:
         self.kept: list[SSHMap] = []
@@ -395,8 +395,8 @@ def _lines(
 def _progress(prints_meanwhile: bool) -> Iterator[Any]:
     """Show a line of progress on stderr while the block runs, if stderr is a terminal.
 
-    Yield a function that shows a Progress. Yield None if no progress is shown: stderr is no
-    terminal, `prints_meanwhile` and the output goes to a terminal, or progress is logged.
+    Yield a function that shows a Progress. Yield None if no progress is shown, in these cases:
+    stderr is no terminal, progress is logged, or maps are printed to a terminal meanwhile.
     """
     if (
         not sys.stderr.isatty()

@@ -95,7 +95,7 @@ def pair(text: str) -> tuple[int, int]:
 
 
 def _labelled(options: argparse.Namespace) -> tuple[Any, Any, Any]:
-    """Return the images, (n, d), and the dstates of labelled steps, and a new recogniser."""
+    """Return the images of labelled steps, n x d, their dstates, and a new recogniser."""
     from perception.recognition import recogniser
 
     images, labels, _, features = _mapped(options)
@@ -142,7 +142,7 @@ def run_train(options: argparse.Namespace) -> int:
 
 
 def run_learning_curve(options: argparse.Namespace) -> int:
-    """Run the verb `learning-curve`: print the share of recognised images by training images."""
+    """Run the verb `learning-curve`: print recognition rates by the number of training images."""
     from perception.recognition import learning_curve
 
     check_picture(options.plot)
