@@ -21,7 +21,7 @@ from typing import Any
 
 import pytest
 from coarse import hall
-from worlds import TOURS, drive, rectangle
+from worlds import ENDLESS, TOURS, drive, rectangle
 
 from perception.readers.writers import write_carmen
 from ssh_abduction import Theory, Trace
@@ -34,16 +34,6 @@ from ssh_abduction.solver.asp import workers
 from ssh_abduction.theory import Speedups
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
-ENDLESS = [
-    "--set",
-    "boundary=none",
-    "--set",
-    "path_order=partial",
-    "--set",
-    "prefer=",
-    "-n",
-    "0",
-]  # a theory in which slow.jsonl has maps without end
 QUESTION = SolveQuestion(
     Theory.topological(), limit=None, maps=100, memory=None, speedups=Speedups(), json=False
 )
@@ -140,19 +130,8 @@ def without_seconds(text: str) -> str:
 def test_batch_prints_one_line_a_trace_in_order(
     traces: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert (
-        main(
-            [
-                "solve",
-                "tee.jsonl",
-                "broken.jsonl",
-                "quick.jsonl",
-                "missing.jsonl",
-                "impossible.jsonl",
-            ]
-        )
-        == 1
-    )
+    names = "tee", "broken", "quick", "missing", "impossible"
+    assert main(["solve", *(f"{name}.jsonl" for name in names)]) == 1
     out, err = capsys.readouterr()
     tee, broken, quick, missing, impossible = out.splitlines()
     assert without_seconds(tee) == (
@@ -310,21 +289,8 @@ def test_cluster_without_workers_warns_and_ends_at_the_limit(
     monkeypatch.setattr(Client, "wait_for_workers", lambda *_, **__: None)  # there was one
     with LocalCluster(n_workers=0, processes=False, dashboard_address=":0") as cluster:
         address = cluster.scheduler_address
-        assert (
-            main(
-                [
-                    "solve",
-                    "quick.jsonl",
-                    "tee.jsonl",
-                    "quick.jsonl",
-                    "--time-limit",
-                    "0.3",
-                    "--scheduler",
-                    address,
-                ]
-            )
-            == 1
-        )
+        command = f"solve quick.jsonl tee.jsonl quick.jsonl --time-limit 0.3 --scheduler {address}"
+        assert main(command.split()) == 1
     out, err = capsys.readouterr()
     told = (
         rf"scheduler: expected a worker, got none for \d s; start one with: dask worker {address}"
@@ -407,21 +373,8 @@ def test_all_logs_are_mapped_once_after_a_worker_is_killed(
     monkeypatch.setattr(mapping, "MapQuestion", KilledOnce)
     write_carmen(quick, hall()[:80])
     shutil.copy(quick, deadly)
-    command = [
-        "map",
-        quick,
-        deadly,
-        "-o",
-        str(tmp_path / "runs"),
-        "--set",
-        "ladder=false",
-        "--time-limit",
-        "1000",
-        "--scheduler",
-        scheduler,
-        "--jobs",
-        "1",
-    ]
+    command = ["map", quick, deadly, "-o", str(tmp_path / "runs"), "--set", "ladder=false"]
+    command += ["--time-limit", "1000", "--scheduler", scheduler, "--jobs", "1"]
     capsys.readouterr()
     for said in ("4 places", "done already"):
         assert main(command) == 0
@@ -455,21 +408,10 @@ def test_worker_stops_when_the_client_disconnects(traces: Path, scheduler_here: 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux forgets the peak of memory")
 def test_memory_limit_applies_to_each_trace(traces: Path) -> None:
-    command = shlex.join(
-        [
-            sys.executable,
-            "-m",
-            "ssh_abduction",
-            "solve",
-            "quick.jsonl",
-            "slow.jsonl",
-            "quick.jsonl",
-            *ENDLESS,
-            "--json",
-        ]
-    )
-    # run by a shell: a process inherits the peak of the one that starts it, which is large here
-    command += " --memory-limit 80; exit"
+    paths = ["quick.jsonl", "slow.jsonl", "quick.jsonl"]
+    words = [sys.executable, "-m", "ssh_abduction", "solve", *paths, *ENDLESS, "--json"]
+    # Run it by a shell: a process inherits the peak of the one that starts it, which is large here.
+    command = f"{shlex.join(words)} --memory-limit 80; exit"
     done = subprocess.run(command, shell=True, capture_output=True, text=True, check=False)
     lines = [json.loads(line) for line in done.stdout.splitlines()]
     assert [line.get("stopped") for line in lines] == [None, "memory limit", None]
@@ -539,15 +481,8 @@ def test_progress_bar_is_shown_on_a_terminal(seen: bool, traces: Path) -> None:
     import pty
 
     master, slave = pty.openpty()
-    command = [
-        sys.executable,
-        "-m",
-        "ssh_abduction",
-        "solve",
-        "quick.jsonl",
-        "broken.jsonl",
-        "tee.jsonl",
-    ]
+    paths = ["quick.jsonl", "broken.jsonl", "tee.jsonl"]
+    command = [sys.executable, "-m", "ssh_abduction", "solve", *paths]
     environment = {**os.environ, "TERM": "xterm", "COLUMNS": "60"}
     with subprocess.Popen(
         command, stdout=slave if seen else subprocess.PIPE, stderr=slave, env=environment, text=True

@@ -20,7 +20,7 @@ import aces
 import networkx as nx
 import pytest
 from aces import ACES
-from worlds import TOURS, drive, rectangle
+from worlds import ENDLESS, TOURS, drive, rectangle
 
 from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.cli import main
@@ -75,16 +75,8 @@ def test_json_of_solve_has_the_documented_fields(solved: Path) -> None:
 
 def test_max_maps_cuts_the_list(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     route = saved(drive(*TOURS["comb"]), tmp_path)
-    flags = [
-        "--set",
-        "boundary=none",
-        "--set",
-        "path_order=partial",
-        "--set",
-        "prefer=paths,places,dstates",
-        "--json",
-    ]
-    assert main(["solve", route, "-n", "5", *flags]) == 0
+    prefer = "--set=prefer=paths,places,dstates"
+    assert main(["solve", route, *ENDLESS, prefer, "-n", "5", "--json"]) == 0
     data = json.loads(capsys.readouterr().out)
     assert (data["count"], len(data["maps"]), data["complete"]) == (5, 5, False)
 
@@ -92,36 +84,12 @@ def test_max_maps_cuts_the_list(tmp_path: Path, capsys: pytest.CaptureFixture[st
 def test_set_accepts_every_field_of_a_theory(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    flags = [
-        *(
-            "--theory",
-            "circumscriptive",
-            "--set",
-            "boundary=defeasible",
-            "--set",
-            "symmetric_sides=false",
-            "--set",
-            "path_order=partial",
-            "--set",
-            "next_place=true",
-            "--set",
-            "planar=true",
-        ),
-        *(
-            "--set",
-            "all_on_paths=false",
-            "--set",
-            "star=pattern",
-            "--set",
-            "prefer=places,excuses",
-            "--set",
-            "without=on_path",
-            "--set",
-            "level=topological",
-        ),
-        *("--set", "displacement=none", "--set", "reject=0.01", "--set", "joint=1"),
-        *("--set", "weigh=count", "--set", "prices=7,6,0.5"),
-    ]
+    fields = (
+        "boundary=defeasible symmetric_sides=false path_order=partial next_place=true planar=true "
+        "all_on_paths=false star=pattern prefer=places,excuses without=on_path level=topological "
+        "displacement=none reject=0.01 joint=1 weigh=count prices=7,6,0.5"
+    )
+    flags = ["--theory", "circumscriptive", *(f"--set={field}" for field in fields.split())]
     route = saved(drive(*TOURS["square"], stars=True), tmp_path)
     assert main(["solve", route, "-n", "1", "--json", *flags]) == 0
     expected = Theory(
@@ -199,18 +167,7 @@ def test_solve_prints_a_map_without_proof(
 @pytest.mark.skipif(sys.platform == "win32", reason="signals")
 def test_ctrl_c_prints_the_maps_found_so_far(tmp_path: Path) -> None:
     path = saved(rectangle(12), tmp_path)
-    flags = [
-        "--set",
-        "boundary=none",
-        "--set",
-        "path_order=partial",
-        "--set",
-        "prefer=",
-        "-n",
-        "0",
-        "--json",
-    ]
-    command = [sys.executable, "-m", "ssh_abduction", "solve", path, *flags]
+    command = [sys.executable, "-m", "ssh_abduction", "solve", path, *ENDLESS, "--json"]
     with (
         (tmp_path / "out.json").open("w") as out,
         subprocess.Popen(command, stdout=out, stderr=subprocess.PIPE, text=True) as process,
@@ -531,17 +488,8 @@ def test_progress_shows_on_a_terminal(tmp_path: Path) -> None:
 
     path = saved(too_hard(), tmp_path)
     master, slave = pty.openpty()
-    command = [
-        sys.executable,
-        "-m",
-        "ssh_abduction",
-        "solve",
-        path,
-        "--theory",
-        "causal",
-        "--time-limit",
-        "1",
-    ]
+    command = [sys.executable, "-m", "ssh_abduction", "solve", path]
+    command += ["--theory", "causal", "--time-limit", "1"]
     environment = {**os.environ, "TERM": "xterm", "COLUMNS": "160"}
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=slave, env=environment

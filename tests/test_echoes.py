@@ -284,20 +284,8 @@ def test_import_and_map_share_notes_and_options(
             assert "Scan matching and odometry disagree" in text
             assert "\x1b" not in text
     else:
-        main(
-            [
-                verb,
-                str(path),
-                *out,
-                "--set",
-                "fov=180",
-                "--set",
-                "no_return=5",
-                "--set=mount=0,0,0",
-                "--set",
-                "zero_is=unknown",
-            ]
-        )
+        settings = "fov=180", "no_return=5", "mount=0,0,0", "zero_is=unknown"
+        main([verb, str(path), *out, *(f"--set={setting}" for setting in settings)])
         said = capsys.readouterr().err
         assert "Scans come from" in said
         assert "repeat" not in said

@@ -338,26 +338,11 @@ def test_solve_prints_faults(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     RECTANGLE.save("trace.jsonl")
-    assert (
-        main(
-            [
-                "solve",
-                "trace.jsonl",
-                "--theory",
-                "causal",
-                "--set",
-                "misread=1.5",
-                "--set",
-                "slipped=3",
-            ]
-        )
-        == 0
-    )
+    command = ["solve", "trace.jsonl", "--theory", "causal", "--set", "misread=1.5"]
+    assert main([*command, "--set", "slipped=3"]) == 0
     said = capsys.readouterr().out
     assert "4 dstates, and the view at step 9 is misread: v0, expected v1" in said
-    assert (
-        main(["solve", "trace.jsonl", "--theory", "causal", "--set", "misread=1.5", "--json"]) == 0
-    )
+    assert main([*command, "--json"]) == 0
     text = capsys.readouterr().out
     Path("maps.json").write_text(text)
     answer = json.loads(text)
@@ -494,10 +479,8 @@ def test_solve_prints_the_front(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     RECTANGLE.save("trace.jsonl")
-    assert (
-        main(["solve", "trace.jsonl", "--front", "2", "--theory", "causal", "--set", "misread=1.5"])
-        == 0
-    )
+    command = ["solve", "trace.jsonl", "--theory", "causal", "--set", "misread=1.5"]
+    assert main([*command, "--front", "2"]) == 0
     said = capsys.readouterr().out
     assert re.search(
         r"^  1 +4 +knee +the view at step 9 is misread: v0, expected v1$", said, re.MULTILINE
@@ -507,21 +490,7 @@ def test_solve_prints_the_front(
     assert [point["dstates"] for point in json.loads(capsys.readouterr().out)["front"]] == [13, 4]
     assert main(["solve", "trace.jsonl", "--front", "2", "--theory", "topological"]) == 1
     assert "expected a causal theory" in capsys.readouterr().err
-    assert (
-        main(
-            [
-                "solve",
-                "trace.jsonl",
-                "--theory",
-                "causal",
-                "--set",
-                "misread=1.5",
-                "--set",
-                "within=1",
-            ]
-        )
-        == 1
-    )
+    assert main([*command, "--set", "within=1"]) == 1
     assert "within: expected 0 where faults are allowed" in capsys.readouterr().err
 
 

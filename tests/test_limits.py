@@ -142,16 +142,8 @@ def test_own_rules_with_huge_grounding_stop_at_the_limit(noisy: Path, tmp_path: 
         "n(1..400). large(X,Y,Z) :- n(X), n(Y), n(Z).\n#program step(t).\n:- same(I,t), "
         "large(I,I,I)."
     )  # 64 million atoms
-    command = [
-        sys.executable,
-        "-m",
-        "ssh_abduction",
-        "solve",
-        str(noisy),
-        f"--set=rules={rules}",
-        "--time-limit=0.3",
-        "--json",
-    ]
+    command = [sys.executable, "-m", "ssh_abduction", "solve", str(noisy), "--json"]
+    command += [f"--set=rules={rules}", "--time-limit=0.3"]
     done = subprocess.run(command, capture_output=True, timeout=SOON, check=False)
     assert (done.returncode, json.loads(done.stdout)["stopped"]) == (30, "time limit")
 

@@ -672,34 +672,13 @@ def test_localise_prints_beliefs(files: Path, capsys: pytest.CaptureFixture[str]
     head, columns, *rows = capsys.readouterr().out.splitlines()
     assert "lost at step" in head
     assert "the belief collapsed at step 15" in head
-    assert columns.split() == [
-        "step",
-        "action",
-        "seen",
-        "dstate",
-        "probability",
-        "nowhere",
-        "entropy",
-        "normaliser",
-    ]
-    assert len(rows) == 30
-    assert (
-        main(
-            [
-                "localise",
-                maps,
-                other,
-                "--trace",
-                str(files / "mapped.jsonl"),
-                "--set",
-                "zero_one=true",
-                "--set",
-                "misread=0.2",
-                "--json",
-            ]
-        )
-        == 0
+    assert " ".join(columns.split()) == (
+        "step action seen dstate probability nowhere entropy normaliser"
     )
+    assert len(rows) == 30
+    settings = ["--set=zero_one=true", "--set=misread=0.2", "--json"]
+    trace = str(files / "mapped.jsonl")
+    assert main(["localise", maps, other, "--trace", trace, *settings]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["chances"] == {"misread": 0.2, "slipped": 0.0, "unmapped": 0.0, "reentered": 1.0}
 

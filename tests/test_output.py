@@ -251,21 +251,8 @@ def test_failed_picture_loses_no_other_output(
     assert json.loads(captured.out)["folds"] == 2
     assert captured.err.count("\n") == 1
     clustered = tmp_path / "views.jsonl"
-    assert (
-        main(
-            [
-                "cluster",
-                learnt[2],
-                "--k",
-                "2",
-                "-o",
-                str(clustered),
-                "--plot",
-                str(tmp_path / "none" / "x.png"),
-            ]
-        )
-        == 1
-    )
+    plot = ["--plot", str(tmp_path / "none" / "x.png")]
+    assert main(["cluster", learnt[2], "--k", "2", "-o", str(clustered), *plot]) == 1
     assert Trace.load(clustered)
     assert "chosen" in capsys.readouterr().out
 
@@ -398,16 +385,8 @@ def test_ctrl_c_while_modules_load_prints_no_traceback(
     (tmp_path / "sitecustomize.py").write_text(CTRL_C_AT.format(module=module))
     path = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
     words = [word.replace("~", " ") for word in program.split(" ")]
-    command = [
-        sys.executable,
-        *words,
-        "simulate",
-        "notched-rectangle",
-        "--route",
-        "around,around",
-        "-o",
-        str(tmp_path / "out"),
-    ]
+    command = [sys.executable, *words, "simulate", "notched-rectangle", "--route", "around,around"]
+    command += ["-o", str(tmp_path / "out")]
     if module.startswith("sklearn"):
         command[-6:] = ["recognise", str(tmp_path / "none"), ACES]
     done = subprocess.run(

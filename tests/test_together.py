@@ -340,15 +340,8 @@ def test_shell_accepts_step_names_with_drives(
         trace.save(tmp_path / f"{trace.name}.jsonl")
     files = [str(tmp_path / f"{name}.jsonl") for name in ("monday", "tuesday")]
     joint = str(tmp_path / "joint.jsonl")
-    options = [
-        "--together",
-        "--set",
-        f"joint_trace={joint}",
-        "--json",
-        "--different",
-        "monday:1,tuesday:0",
-    ]
-    assert main(["solve", *files, *options]) == 0
+    options = ["--together", f"--set=joint_trace={joint}", "--different=monday:1,tuesday:0"]
+    assert main(["solve", *files, *options, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["theory"]["different"] == [[1, 4]]
     assert main(["explain", joint, "monday:1", "tuesday:0", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["steps"] == [1, 4]

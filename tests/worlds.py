@@ -15,6 +15,8 @@ ACTIONS = {
     "A": "around",
     "U": {"name": "up", "kind": "lift"},
 }
+# Options of `solve` by which short traces have maps without end.
+ENDLESS = ["--set=boundary=none", "--set=path_order=partial", "--set=prefer=", "-n", "0"]
 QUARTERS = {"R": 1, "A": 2, "L": 3}
 Streets = dict[str, dict[str, str]]
 
