@@ -20,8 +20,9 @@ fits the trace. `regions` checks the regions of a map that lists them.
 
 A map lists one place, one course (path and direction) and one heading for each dstate, even if the
 theory leaves out the axiom that forbids several. The other axioms are checked on the listed ones.
-A map also lists the order of the places along each path. It lists no sides of paths and no rings of
-travels: the modules `sides` and `order` describe how the axioms about these are checked.
+A map also lists the order of the places along each path. It lists no sides of paths, and no travels
+that lead around a ring of places. The module `sides` describes how the axioms about sides are
+checked, and `reading.Order` how those about orders are.
 """
 
 from __future__ import annotations
@@ -99,7 +100,7 @@ def check(trace: Trace, ssh_map: SSHMap, theory: Theory | None = None) -> tuple[
 def violations(trace: Trace, ssh_map: SSHMap, theory: Theory) -> Iterator[Violation]:
     """Find violations one by one, so that a caller can stop at the first one.
 
-    The map may be malformed. The theory has all its defaults resolved for this trace.
+    The map may be malformed. In the theory no field is "auto".
     """
     reading = Reading(trace, ssh_map, theory)
     checks = [(COHERENCE, test) for test in coherence.CHECKS] + [

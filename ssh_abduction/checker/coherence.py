@@ -31,7 +31,7 @@ def labels_are_dstates(m: Reading) -> Found:
 def numbered_by_first_visit(m: Reading) -> Found:
     """Check that dstates, places and paths are numbered 0, 1, 2, … by first visit.
 
-    Each of them must be visited, and each path must be first faced in direction +1.
+    Each of them must be visited. When the robot first faced along a path, it faced direction +1.
     """
     yield from _numbered(
         "dstates", [s.id for s in m.map.dstates], [(i, s.id) for i, s in m.visited]

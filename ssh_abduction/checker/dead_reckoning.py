@@ -95,7 +95,7 @@ class ErrorFilter:
         return _onward(self.pose[last, :2] - self.pose[first, :2])
 
     def since(self, first: Any, last: Any) -> Array:
-        """Compute the covariance, (m, 3, 3), that noise between `first` and `last` causes."""
+        """Compute the covariance at `last`, (m, 3, 3), that the noise since `first` causes."""
         onward = self.onward(first, last)
         covariance: Array = self.white[last] - onward @ self.white[first] @ onward.swapaxes(-1, -2)
         return covariance

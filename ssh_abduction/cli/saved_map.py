@@ -80,7 +80,7 @@ class SavedMap:
         return file
 
     def thing(self, text: str) -> tuple[str, str]:
-        """Return the kind of what a person names, and the first step at it. Raises MapError.
+        """Find what a person names: return its kind, and the first step there. Raises MapError.
 
         The text is a place, path or region by its number, such as "p4" or "path 2"; or a
         step such as "monday:12", for the place where the robot was.
@@ -102,8 +102,8 @@ class SavedMap:
     def step_of_name(self, kind: str, step: str) -> str:
         """Return the step to which the name of a place, path or region belongs.
 
-        It is the place, path or region of `step`, as `kind` says. If it has no name yet, return
-        `step`.
+        `kind` says whether this is the place, path or region of `step`. If it has no name yet,
+        return `step`.
         """
         number = self._at(kind, step)
         names = self.corrections.known_in(self.drives).names

@@ -63,7 +63,7 @@ def telling(options: argparse.Namespace, for_programs: bool) -> Iterator[None]:
 
 
 def progress_bar() -> Any:
-    """Make a bar of progress by rich, on stderr. It shows nothing if stderr is no terminal."""
+    """Make a progress bar on stderr with rich. It shows nothing if stderr is no terminal."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 

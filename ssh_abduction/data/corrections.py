@@ -114,14 +114,14 @@ class Passage:
 class Corrections:
     """Names and corrections of a person, with the drives that they are about.
 
-    It is immutable. `solve` finds only maps that agree with it.
+    They are immutable. `solve` finds only maps that agree with them.
 
     Attributes:
         drives: The fingerprint of each drive, by its name.
         names: The names.
         pairs: Pairs of steps that are said to be at one place or dstate, or not to be.
-        gateways: Gateways that are open or closed.
-        source: The file that it was read from.
+        gateways: Gateways that the person says are open or closed.
+        source: The file that the corrections were read from.
     """
 
     drives: Mapping[str, str] = field(default_factory=dict)
@@ -229,7 +229,7 @@ class Corrections:
             )
 
     def known_in(self, drives: Sequence[Drive]) -> Corrections:
-        """Return only the sentences whose steps are all of these drives.
+        """Return these corrections without the sentences about steps of other drives.
 
         Raises:
             MapError: A sentence names a drive that these corrections do not list, or a step that

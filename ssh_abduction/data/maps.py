@@ -6,8 +6,8 @@ path is the one that the robot first faced. So two maps of a trace are equal exa
 same up to renaming.
 
 Equality compares the dstates with their places and paths, the links, and the faults. It does not
-compare the orders of paths, the headings, and the excused pairs. These only show that the map is
-consistent, and for one map several may do so. Nor does equality compare the fit, and the regions,
+compare the orders of paths, the headings, and the excused pairs: these only show that the map is
+consistent, and one map may have several of them. Nor does equality compare the fit and the regions,
 which follow from the rest and the trace.
 """
 

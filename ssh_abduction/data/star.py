@@ -83,7 +83,7 @@ class Frame:
         bearings: The bearing of each slot, in degrees clockwise from straight ahead.
         spreads: How many degrees each bearing may be off.
         opposite: For each slot, the slot where the same path goes on; None if the star gives none.
-        hashed: The hash of the bearings. Frames are often hashed, and few share these.
+        hashed: The hash of the bearings, stored because frames are often hashed.
     """
 
     bearings: tuple[float, ...]
@@ -138,7 +138,7 @@ class Star:
 
     Attributes:
         gateways: The gateways.
-        hashed: The hash of their bearings. Stars are often hashed, and few share these.
+        hashed: The hash of their bearings, stored because stars are often hashed.
     """
 
     gateways: tuple[Gateway, ...]

@@ -263,7 +263,7 @@ def _is_number(field: str) -> bool:
 
 
 def _pose(fields: Sequence[str], where: str) -> tuple[float, Pose, float, float]:
-    """Read a line: seconds, pose on the floor, height in metres, and the cosine of its lean."""
+    """Read a line: seconds, pose on the floor, height in metres, and cosine of the robot's lean."""
     if len(fields) != len(FIELDS) or not all(map(_is_number, fields)):
         hint = {
             12: "; this looks like a file of KITTI, which has no times",

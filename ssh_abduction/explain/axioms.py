@@ -39,7 +39,7 @@ class _ModelMap(NamedTuple):
     ssh_map: SSHMap
 
     def has(self, equalities: Collection[Equality]) -> bool:
-        """Tell whether all these equalities hold in the model."""
+        """Tell whether all these (in)equalities of steps hold in the model."""
         named = {"dstate": self.labels, "place": self.places}
         return all((named[e.of][e.first] == named[e.of][e.second]) == e.holds for e in equalities)
 
@@ -339,7 +339,7 @@ class Axioms:
         return displacement.returns_of(self._trace).refused_at(answer.labels, answer.places, step)
 
     def _forbid(self, refusal: Refusal, where: clingo.Symbol | None = None) -> None:
-        """Add a constraint that these equalities do not all hold, while `where` is true."""
+        """Add a constraint: while the atom `where` is true, these equalities do not all hold."""
         name = f"told_{self._refusals}"
         self._refusals += 1
         self._control.add(name, [], facts.forbidden_equalities(refusal, where))

@@ -37,8 +37,8 @@ def explain_trace(
 
     An observation is a view, a star (openings), an action, a displacement, or an asserted pair.
     First the shortest stretch of the trace without a map is found. Each observation in this stretch
-    is then replaced by other values from the trace, or dropped. It is a mend if the whole trace
-    then has a map.
+    is then replaced by other values from the trace, or dropped. Such a change is a mend if it gives
+    the whole trace a map.
 
     Args:
         trace: The trace, with views.

@@ -304,7 +304,10 @@ class Explorer:
         return Exploration(len(self.trace) - 1, ending, unique, is_true, solution, rival)
 
     def _ending(self, unique: bool) -> Ending:
-        """Say why the exploration ended, or would end now. `unique`: all minimal maps are alike."""
+        """Say why the exploration ended, or would end now.
+
+        `unique` says whether all minimal maps are alike.
+        """
         if self.solution.status is Status.UNSATISFIABLE:
             return "contradicted"
         if not self._is_stuck:

@@ -91,7 +91,8 @@ def paragraph(sentence: str) -> str:
 def html_table(head: Sequence[str], rows: Iterable[Iterable[object]], more: str = "rows") -> str:
     """Make an HTML table of at most ROWS rows, whose cells become plain text.
 
-    If rows are left out, a sentence below says how many. `more` is the word for rows in it.
+    If rows are left out, a sentence below says how many. `more` is the word for rows in
+    that sentence.
     """
     listed = list(rows)
     names = "".join(f"<th>{html_text(name)}</th>" for name in head)

@@ -28,7 +28,7 @@ def to_dot(ssh_map: SSHMap) -> str:
 
 
 def _clusters(ssh_map: SSHMap, places: set[int], after: int, indent: str = "  ") -> list[str]:
-    """Write clusters for places, and around them for the regions behind one place.
+    """Write a cluster for each place and, around these, one for each region behind one place.
 
     Of two such regions, one contains the other, or they have no place in common. The largest come
     first.

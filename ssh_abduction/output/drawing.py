@@ -76,7 +76,7 @@ def svg_text(
 
 
 def circle(x: float, y: float, radius: float, fill: str, stroke: str, width: object = 2) -> str:
-    """Draw a circle with a line of a colour and width around it."""
+    """Draw a filled circle with an outline of a colour and width."""
     spot = {"cx": f"{x:.1f}", "cy": f"{y:.1f}", "r": f"{radius:.1f}"}
     return element("circle", **spot, fill=fill, stroke=stroke, stroke_width=width)
 

@@ -90,7 +90,7 @@ def _draw_links(axes: Any, ssh_map: SSHMap, found: Layout) -> None:
 def _draw_dstate(
     axes: Any, s: DState, pose: tuple[float, float, float | None], unit: float
 ) -> tuple[float, float]:
-    """Draw a dstate as a triangle ahead of its place, or as its number. Return the place."""
+    """Draw a dstate as a triangle ahead of its place, or as its number. Return where it is."""
     x, y, heading = pose
     middle = {"ha": "center", "va": "center"}
     if s.place is None or heading is None:

@@ -1,7 +1,7 @@
 """Draw the regions of a map: bands along the streets of a region behind one place, and titles.
 
-Regions beside paths overlap each other. The titles of places name them, which browsers show
-under the pointer.
+Regions beside paths overlap each other. So they are only named in the titles of places, which
+browsers show under the pointer.
 """
 
 from __future__ import annotations

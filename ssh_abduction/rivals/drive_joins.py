@@ -38,8 +38,8 @@ class DriveJoin:
     Attributes:
         first: The number of the step in its own drive.
         second: The number of the other step in its own drive.
-        share: The share of the maps, 0 to 1, in which both are at one place. If maps were weighed
-            and their costs can be trusted, this is the probability that they are.
+        share: The share of the maps, 0 to 1, in which both are at one place. If maps were compared
+            by cost in nats, and these costs can be trusted, this is the probability that they are.
     """
 
     first: int

@@ -167,7 +167,7 @@ def nearest_of(
 
 
 def reached_from(moves: Iterable[StanceMove], start: int) -> set[int]:
-    """Find all stances (place, heading) that moves lead to from `start`, and `start`."""
+    """Find all stances (place, heading) that moves from `start` reach, including `start`."""
     return followed_from(((move.source, move.target) for move in moves), start)
 
 

@@ -247,7 +247,7 @@ def leads_of(ssh_map: SSHMap, number: int) -> dict[int, dict[str, int]]:
 def with_ends(
     links: Mapping[int, Mapping[str, int]], ends: Sequence[tuple[int, str, int]]
 ) -> dict[int, dict[str, int]]:
-    """Copy links and add others (dstate, action, end). Actions are sorted by name."""
+    """Copy links, and add `ends`: (dstate, action, end). Actions are sorted by name."""
     found: dict[int, dict[str, int]] = {s: dict(tried) for s, tried in links.items()}
     for source, action, target in ends:
         found[source][action] = target

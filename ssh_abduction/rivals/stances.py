@@ -28,7 +28,7 @@ class StanceMove:
         source: The number of the stance before the action.
         action: The action.
         target: The number of the stance after the action. If `how` is "unknown", this is a guess: a
-            travel comes back through the same gateway, and any other action does nothing.
+            travel comes back through the same gateway, and any other action changes nothing.
         how: How the target is known. "known": the action was tried. "implied": the axioms imply it,
             for a turn at a place with a frame. "expected": a turn by the angle that the star shows,
             or a travel back the way that the robot came. "unknown": anything else.

@@ -34,8 +34,8 @@ _INSIDE = re.compile(r"%\*|\*%|%[^\n]*")
 class Rules:
     """A file of rules.
 
-    The text gets line feeds as line ends, and no byte order mark.
-    `ssh_abduction.solver.asp.rules` checks that clingo can read it.
+    Line ends of the text are converted to line feeds, and a byte order mark is removed.
+    `ssh_abduction.solver.asp.rules` checks that clingo can read the text.
 
     Attributes:
         name: The name of the file, for messages.

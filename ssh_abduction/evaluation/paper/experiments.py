@@ -4,8 +4,9 @@ Worlds, robot and laser are fixed in `simulator/`. Runs differ only in the seed 
 measures how well clusters of images are separated. U measures how well the dstate determines the
 view: it is 1 if all images of a dstate have one view.
 
-Other notches and other spreads of poses show how large the notch must be, and how small the spread,
-for the method to work.
+The notched rectangle is a room with a notch in one wall. Runs with other depths of the notch, and
+other spreads of poses, show how deep the notch must be, and how small the spread, for the method to
+work.
 """
 
 from __future__ import annotations

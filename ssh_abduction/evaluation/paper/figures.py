@@ -261,9 +261,10 @@ def draw_spread(path: str | Path, spread: Sequence[Sequence[float]]) -> None:
 def draw_outcomes(
     path: str | Path, outcomes: Sequence[NotchOutcome], here: tuple[float, float]
 ) -> None:
-    """Draw k, U, the map and the recognition rate over the notch and the spread of poses.
+    """Draw the outcomes for several depths of the notch and several spreads of poses.
 
-    Results as in the paper get a frame. A cross marks the notch and the scale of the experiment.
+    There is a panel each for k, U, whether the map is right, and the recognition rate. Results as
+    in the paper get a frame. A cross marks the notch and the scale of the experiment.
     """
     notches = sorted({o.notch for o in outcomes})
     scales = sorted({o.scale for o in outcomes})

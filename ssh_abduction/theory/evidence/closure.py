@@ -51,7 +51,7 @@ class Closures(Evidence):
         return Pairs.of(self._refused(trace, False), self._refused(trace, True))
 
     def _refused(self, trace: Trace, places: bool) -> Iterator[tuple[int, int]]:
-        """Yield the pairs of steps, as places or as dstates, of the closures that are rejected."""
+        """Yield the steps of the closures that rule out one place (`places`), or one dstate."""
         if not trace.closures or (places and not self.has_places):
             return
         from scipy.special import gammainccinv
