@@ -17,7 +17,7 @@ from ssh_abduction import OnlineMapper, SSHMap, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.cli import main
-from ssh_abduction.data.errors import TraceError
+from ssh_abduction.data.errors import MapError, TraceError
 from ssh_abduction.output import to_dot, to_graphml, to_svg
 from ssh_abduction.rivals.comparison import compare
 from ssh_abduction.rivals.explore import next_experiment
@@ -201,3 +201,14 @@ def test_certificate_does_not_use_unknown_views() -> None:
     assert solve(trace, Theory.causal()).certificate is None
     assert check_bound(trace, {"clique": [0, 1], "words": [], "refuted": []}).faults
     assert not check_bound(trace, {"clique": [0, 2], "words": [], "refuted": []}).faults
+
+
+def test_compare_takes_solutions_that_fill_in_unknown_views_differently() -> None:
+    views = ["a", "a", "b", "a", None, "b", None]
+    trace = Trace.from_steps(views, ["travel", "around"] * 3)
+    one, other = solve(trace), solve(trace, Theory.causal())
+    others = compare(one, other).others
+    assert others is not None
+    assert (others.here, len(others.there)) == ((1,), len(other))
+    with pytest.raises(MapError, match="the view None at step 4, as the first maps have, got 'a'"):
+        compare(one[0], other[0])

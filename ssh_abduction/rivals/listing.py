@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
 from ssh_abduction.checker.joins import Join, joins_in_words
-from ssh_abduction.data.checks import a_flag, a_path, a_text, an_instance
+from ssh_abduction.data.checks import a_path, a_text, an_instance
 from ssh_abduction.data.corrections_file import named_beside
 from ssh_abduction.data.drives import Drive, pieces_in_words, with_named_faults
 from ssh_abduction.data.errors import MapError, brief, is_whole, named
@@ -39,6 +39,9 @@ from ssh_abduction.solver import (
 )
 from ssh_abduction.theory.theory import Theory
 
+# How to mend maps that show different views at a step.
+ONE_TRACE = "compare maps of one trace (if it has unknown views, give solutions, not their maps)"
+
 
 @dataclass(frozen=True, slots=True)
 class Listing:
@@ -57,6 +60,8 @@ class Listing:
         by_minimality: The joins of the first map that no axiom and no observation forces, if known.
         drives: The drives of a joint trace; empty if there is one drive.
         warnings: Sentences about what is suspicious in the trace, if known.
+        one_view: Whether each dstate has one view, and the views of all steps are known. Then a map
+            shows what was seen at each step.
     """
 
     maps: tuple[SSHMap, ...]
@@ -69,6 +74,7 @@ class Listing:
     by_minimality: tuple[Join, ...] = ()
     drives: tuple[Drive, ...] = ()
     warnings: tuple[str, ...] = ()
+    one_view: bool = True
 
     @property
     def steps(self) -> int:
@@ -122,8 +128,9 @@ class Listing:
                 by_minimality=source.by_minimality,
                 drives=source.drives,
                 warnings=source.warnings,
+                one_view=_has_one_view(source.theory),
             )
-            return listing.checked(one_view=_has_one_view(source.theory))
+            return listing.checked()
         if isinstance(source, SSHMap):
             source = [source]
         if isinstance(source, str | os.PathLike | Mapping) or not isinstance(source, Iterable):
@@ -251,20 +258,16 @@ class Listing:
             joins_in(read, answer if maps else {}, steps, drives),
             drives,
             warnings_in(read, answer),
+            theory is None or _has_one_view(theory),
         )
-        return listing.checked(one_view=theory is None or _has_one_view(theory))
+        return listing.checked()
 
-    def checked(self, *, one_view: bool = True) -> Listing:
+    def checked(self) -> Listing:
         """Return the listing if its maps can be those of one trace.
-
-        Args:
-            one_view: Whether each dstate has one view. Then a map shows the view of each step, and
-                these views are compared.
 
         Raises:
             MapError: There are no maps, or they are maps of several traces.
         """
-        a_flag("one_view", one_view, MapError)
         if not self.maps:
             raise MapError(
                 f"{self.source}: expected maps, got none; see the status that solve gave"
@@ -277,7 +280,7 @@ class Listing:
                     f"{self._name(i)}: expected {self.steps} steps, as {self._name(0)} has, got "
                     f"{len(ssh_map.dstate_at)}; {mend}"
                 )
-            if not one_view:
+            if not self.one_view:
                 continue
             seen = _seen(ssh_map)
             first = first or seen
@@ -286,23 +289,26 @@ class Listing:
         return self
 
     def check_same_trace(self, other: Listing) -> None:
-        """Raise MapError if the maps of another listing have other numbers of steps or views."""
+        """Raise MapError if the maps of another listing cannot be of the same trace."""
         an_instance(
             "other", other, Listing, MapError, mend="make one with Listing.of or Listing.load"
         )
+        ours = "the first maps" if self.source == "maps" else f"the maps of {self.source}"
         if other.steps != self.steps:
             mend = "compare maps of one trace"
             raise MapError(
-                f"{other.source}: expected {self.steps} steps, as the maps of {self.source} have, "
-                f"got {other.steps}; {mend}"
+                f"{other.source}: expected {self.steps} steps, as {ours} have, got {other.steps}; "
+                f"{mend}"
             )
+        if not (self.one_view and other.one_view):
+            return
         for t, (here, there) in enumerate(
             zip(_seen(self.maps[0]), _seen(other.maps[0]), strict=True)
         ):
             if here != there:
                 raise MapError(
-                    f"{other.source}: expected the view {brief(here)} at step {t}, as the maps of "
-                    f"{self.source} have, got {brief(there)}; compare maps of one trace"
+                    f"{other.source}: expected the view {brief(here)} at step {t}, as {ours} "
+                    f"have, got {brief(there)}; {ONE_TRACE}"
                 )
 
     def number(self, name: str) -> int:
@@ -341,7 +347,7 @@ class Listing:
         step = next(t for t, (a, b) in enumerate(zip(first, seen, strict=True)) if a != b)
         raise MapError(
             f"{self._name(i)}: expected the view {brief(first[step])} at step {step}, as "
-            f"{self._name(0)} has, got {brief(seen[step])}; compare maps of one trace"
+            f"{self._name(0)} has, got {brief(seen[step])}; {ONE_TRACE}"
         )
 
 
