@@ -1,7 +1,7 @@
 """What one fault does to a driving robot: steps until its map is certain again, and right.
 
     python benchmarks/recovery.py [--only PATTERN] [--seeds 20] [--first 800] [--limit 0.5]
-                                  [--without SPEEDUP] [--out RESULTS.jsonl]
+                                  [--out RESULTS.jsonl]
 
 Each run has one fault, at a random step that is not among the first or last five. Steps are counted
 from the step at which the fault becomes visible: the step with the wrong view, or the first step
@@ -14,9 +14,8 @@ map has exactly the true fault and the true labels, except the label of the step
 (fault_cases.py). It may be found in the first map, or in another minimal map. Often nothing shows
 which of two consecutive actions slipped.
 
-Between two steps the robot drives. In this time, the mapper continues a solve that a step did not
-finish. "Truth dearer" counts the runs in which the truth costs more than the minimum. CPU
-milliseconds are those of `observe`.
+"Truth dearer" counts the runs in which the truth costs more than the minimum. CPU milliseconds are
+those of `observe`.
 """
 
 from __future__ import annotations
@@ -48,7 +47,6 @@ from ssh_abduction import OnlineMapper, SSHMap, Theory, Trace
 from ssh_abduction.online.hypotheses import ExtendedMap
 from ssh_abduction.solver import Cost
 from ssh_abduction.solver.asp.facts import answer_maps
-from ssh_abduction.theory.speedups import Speedups
 
 COLUMNS = (
     "noticed",
@@ -137,16 +135,6 @@ def main() -> None:
         help="seconds that a step may take (default 0.5)",
     )
     parser.add_argument(
-        "--drive",
-        type=float,
-        default=0.05,
-        metavar="S",
-        help="seconds the robot drives between two steps (default 0.05)",
-    )
-    parser.add_argument(
-        "--without", nargs="*", default=(), metavar="SPEEDUP", help="switch these speed-ups off"
-    )
-    parser.add_argument(
         "--out", type=Path, metavar="RESULTS.jsonl", help="file for the result of each run"
     )
     options = parser.parse_args()
@@ -154,7 +142,7 @@ def main() -> None:
     for name, (make, theory) in FAMILIES.items():
         if re.search(options.only, name):
             records = [
-                run(make(seed), theory, options.limit, options.drive, seed, options.without)
+                run(make(seed), theory, options.limit, seed)
                 for seed in range(options.first, options.first + options.seeds)
             ]
             print(f"| {name} | {' | '.join(cells(records))} |", flush=True)
@@ -165,23 +153,14 @@ def main() -> None:
                     )
 
 
-def run(
-    case: Case,
-    theory: Theory,
-    limit: float,
-    drive: float = 0.0,
-    seed: int = 0,
-    without: Sequence[str] = (),
-) -> Record:
+def run(case: Case, theory: Theory, limit: float, seed: int = 0) -> Record:
     """Give a trace with one fault to a mapper, step by step.
 
     Args:
         case: The trace.
         theory: The theory.
         limit: Seconds that a step may take.
-        drive: Seconds that the robot drives between two steps.
         seed: Seed of the case, for the record.
-        without: Speed-ups that are off.
 
     Returns:
         A dict with the step at which the fault shows, the steps until the mapper noticed it and was
@@ -189,19 +168,11 @@ def run(
     """
     trace = case.walk.trace
     shown = min([*case.wrong, *case.misseen, *(t + 1 for t in case.jumps)])
-    mapper = OnlineMapper(
-        trace.views[0],
-        theory,
-        star=trace.steps[0].star,
-        time_limit=limit,
-        speedups=Speedups.without(without),
-    )
+    mapper = OnlineMapper(trace.views[0], theory, star=trace.steps[0].star, time_limit=limit)
     noticed = again = None
     right_again = False
     milliseconds = []
     for t, (action, step) in enumerate(zip(trace.actions, trace.steps[1:], strict=True), 1):
-        if mapper.solution.stopped == "time limit":  # Only then is there a solve to continue.
-            time.sleep(drive)
         began = time.process_time()
         solution = mapper.observe(action, trace.views[t], star=step.star)
         milliseconds.append(1000 * (time.process_time() - began))

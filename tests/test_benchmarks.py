@@ -31,7 +31,7 @@ ROOT = Path(__file__).parent.parent
 STORED = sorted((ROOT / "benchmarks" / "results").glob("*.json"))
 ALWAYS = {"instance", "theory", "tool", "seed", "status", "reason"}
 MEASURED = {"images", "true_dstates", "seconds", "cpu", "memory"}
-ELSEWHERE = {"digest", "processes"}  # measured by benchmarks/onto.py and recovery.py
+ELSEWHERE = {"digest"}  # measured by benchmarks/onto.py
 OURS = {"dstates", "bound", "proven", "prefix", "ground", "solve", "rules", "atoms"}
 
 

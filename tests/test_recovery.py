@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any
-from unittest.mock import patch
 
 import pytest
 import recovery as bench
@@ -19,13 +17,8 @@ from ssh_abduction import OnlineMapper, Solution, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data import TheoryError, TraceError
 from ssh_abduction.online import Belief
-from ssh_abduction.online import background as solving
-from ssh_abduction.online.background import MEANWHILE, BackgroundSearch, Solved
 from ssh_abduction.online.hypotheses import ExtendedMap, Scale
-from ssh_abduction.online.recovery import Recovery
 from ssh_abduction.solver import Status
-from ssh_abduction.solver.asp.workers import _under_way
-from ssh_abduction.theory import Speedups
 
 NO_TIME = 1e-9  # seconds: every search is stopped before it begins
 BOTH = Theory.causal().replace(misread=1.5, slipped=3)
@@ -36,7 +29,6 @@ def followed(
     theory: Theory,
     limit: float | None = None,
     maps: int = 0,
-    speedups: Speedups | None = None,
 ) -> Iterator[tuple[OnlineMapper, Solution]]:
     """The mapper after each step of a trace, and its answer."""
     first, *rest = trace.steps
@@ -48,7 +40,6 @@ def followed(
         odometry=trace.odometry,
         time_limit=limit,
         max_maps=maps or None,
-        speedups=speedups or Speedups(),
     )
     yield mapper, mapper.solution
     for action, step in zip(trace.actions, rest, strict=True):
@@ -203,8 +194,8 @@ def test_mapper_with_faults_and_no_time_has_a_map_and_belief() -> None:
 
     Its maps are consistent and have a bound, but they are never certain.
     """
-    trace, alone = circuit(30, wrong=17), Speedups.without("processes")
-    for mapper, solution in followed(trace, BOTH, NO_TIME, speedups=alone):
+    trace = circuit(30, wrong=17)
+    for mapper, solution in followed(trace, BOTH, NO_TIME):
         assert solution.status is Status.FEASIBLE
         assert solution.cost is not None
         assert (solution.bound.tenths or 0) <= solution.cost.tenths
@@ -213,91 +204,7 @@ def test_mapper_with_faults_and_no_time_has_a_map_and_belief() -> None:
         assert sum(hypothesis.weight for hypothesis in mapper.standing.hypotheses) == pytest.approx(
             1
         )
-    assert isinstance(mapper._keeper, Recovery)
-    assert mapper._keeper.solver._background is None
-
-
-def one_of_the_maps(
-    trace: Trace, theory: Theory, limit: float | None, maps: int, speedups: Speedups
-) -> Solved:
-    """There is time to prove one map minimal, but not to list all."""
-    found = solve(trace, theory, max_maps=None)
-    return Solved(
-        len(trace), found.status, found.maps[-1:], found.bound, complete=False, stopped="time limit"
-    )
-
-
-@pytest.mark.parametrize("in_a_step", [solving.solved, one_of_the_maps])
-def test_slow_step_is_solved_in_the_background(
-    in_a_step: Callable[..., Solved],
-) -> None:
-    """A stub stands in for the second process. Its answer is for fewer steps than there are."""
-    trace, solved = circuit(30, wrong=17), solving.solved
-    begun = []
-
-    def begin(*task: Any) -> BackgroundSearch:
-        now, theory, _, maps, speedups = task
-        found = solved(now, theory, None, maps, speedups)
-        begun.append(len(now))
-        ends = len(now) + 3
-
-        class Stub:
-            def done(self) -> bool:
-                return mapper is None or len(mapper.trace) >= ends
-
-            def result(self) -> Solved:
-                return found
-
-        return Stub()  # type: ignore[return-value]
-
-    mapper = None
-    with (
-        patch.object(solving, "BackgroundSearch", begin),
-        patch.object(solving, "has_processors", return_value=True),
-        patch.object(solving, "solved", in_a_step),
-    ):
-        for mapper, solution in followed(trace, BOTH, NO_TIME):  # noqa: B007
-            pass
-    assert begun
-    assert solution.status is Status.OPTIMAL
-    assert solution.complete
-    assert mapper is not None
-    assert mapper.standing.certain
-    assert {(m, m.faults) for m in solution.maps} == {
-        (m, m.faults) for m in solve(trace, BOTH, max_maps=None).maps
-    }
-
-
-class Busy:
-    """A second process that is never done."""
-
-    def done(self) -> bool:
-        return False
-
-
-def test_steps_do_not_wait_again_for_a_slow_clingo() -> None:
-    with (
-        patch.object(solving, "BackgroundSearch", lambda *told: Busy()),
-        patch.object(solving, "has_processors", return_value=True),
-        patch.object(solving, "OVERRUN", 0),
-    ):
-        answers = list(followed(circuit(30, wrong=17), BOTH, NO_TIME))
-    assert {solution.status for _, solution in answers} == {Status.FEASIBLE}
-    assert answers[-1][0].searches == 1
-
-
-def test_background_search_solves_the_trace() -> None:
-    trace = circuit(20, wrong=17)
-    meanwhile = BackgroundSearch(trace, BOTH, MEANWHILE, None, Speedups())
-    found = meanwhile.result()
-    assert meanwhile.done()
-    assert found is not None
-    assert (found.status, found.complete, found.steps) == (Status.OPTIMAL, True, 21)
-    assert found.maps == solve(trace, BOTH, max_maps=None).maps
-    long = circuit(2000, wrong=17)
-    ended = BackgroundSearch(long, BOTH, MEANWHILE, None, Speedups())
-    del ended  # and with it the process
-    assert not _under_way
+    assert mapper.searches == 16  # at every other step
 
 
 def test_mapper_with_faults_uses_later_displacements() -> None:

@@ -156,9 +156,8 @@ def reads_of(case: str) -> list[str]:
 def test_each_speedup_is_used_in_some_case() -> None:
     """Otherwise the cases below would not test the speed-up."""
     read = {name for case in CASES for name in reads_of(case)}
-    # Only the online mapper asks for `processes`. tests/test_onto.py has cases with `digest`, and
-    # tests/test_nearby.py has cases with `annealed`.
-    assert read == set(NAMES) - {"processes", "digest", "annealed"}
+    # tests/test_onto.py tests `digest`, and tests/test_nearby.py tests `annealed`.
+    assert read == set(NAMES) - {"digest", "annealed"}
 
 
 @pytest.mark.slow

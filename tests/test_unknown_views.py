@@ -168,7 +168,6 @@ def test_speedups_that_read_views_are_off() -> None:
         "sides",
         "lazy",
         "core_guided",
-        "processes",
         "annealed",
         "greedy",
         "digest",

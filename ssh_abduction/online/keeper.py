@@ -17,7 +17,6 @@ from itertools import pairwise
 from ssh_abduction.checker.checker import check, unchecked
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Action, Step, Trace
-from ssh_abduction.online.background import StepOptions
 from ssh_abduction.online.replay import MinimalMaps
 from ssh_abduction.solver import (
     Cost,
@@ -34,7 +33,7 @@ from ssh_abduction.solver import (
 from ssh_abduction.theory.evidence import said_by
 from ssh_abduction.theory.pairs import Pairs
 from ssh_abduction.theory.settle import Problem
-from ssh_abduction.theory.speedups import row
+from ssh_abduction.theory.speedups import Speedups, row
 from ssh_abduction.theory.theory import Theory
 
 # After a search that was stopped, the trace grows by this factor before the next one, so that few
@@ -45,6 +44,22 @@ PAUSE = 2
 # Keep at most this many drafts, as each takes time at every step. Mostly at least one of the best
 # drafts remains consistent for long.
 DRAFTS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class StepOptions:
+    """The limits and speed-ups for solving at each step.
+
+    Attributes:
+        time_limit: Seconds for each step. A step may take a little longer. None waits for the exact
+            answer.
+        max_maps: Keep at most this many minimal maps; None keeps all.
+        speedups: Flags that say which speed-ups of the solver to use.
+    """
+
+    time_limit: float | None
+    max_maps: int | None
+    speedups: Speedups
 
 
 class MapKeeper:

@@ -72,8 +72,7 @@ from typing import TYPE_CHECKING, Any
 from ssh_abduction.data.errors import TheoryError, TraceError, brief
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.trace import Action, Step, Trace, View
-from ssh_abduction.online.background import StepOptions
-from ssh_abduction.online.keeper import MapKeeper
+from ssh_abduction.online.keeper import MapKeeper, StepOptions
 from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import Solution, check_limit
 from ssh_abduction.theory.evidence import evidence_of

@@ -26,8 +26,7 @@ the logical representation can be restored" (Kuipers & Beeson 2002). This module
   the minimum, which is impossible. In the causal theory, the same holds for an action that was
   never tried: each map is extended by a link to each dstate that looks right. These extensions
   cost nothing, and all others cost more. If no minimal map predicts the step, the trace
-  is solved again: within the time of a step, or in another process while the robot drives
-  (`background.py`).
+  is solved again, within the time of a step.
 * **Rivals** (`rival_maps.py`): besides the minimal maps, explanations that cost a little more,
   each with its probability (`hypotheses.py`).
 * **Where the robot is** (`standing.py`), by Markov localisation in the best map. It begins just
@@ -42,11 +41,24 @@ from __future__ import annotations
 
 import time
 
-from ssh_abduction.online.background import FaultSolver, StepOptions
+from ssh_abduction.online.keeper import StepOptions
 from ssh_abduction.online.rival_maps import RivalMaps
 from ssh_abduction.online.standing import Confidence, Standing
-from ssh_abduction.solver import Effort, Judging, Seconds, Solution, Status, cost_as_counted
+from ssh_abduction.solver import (
+    Effort,
+    Judging,
+    Seconds,
+    Solution,
+    Status,
+    cost_as_counted,
+    solve,
+)
 from ssh_abduction.theory.settle import Problem
+
+# After each search with a time limit the trace has to grow by this factor, and by at least this
+# many steps, before the next search.
+RETRY = 1.05
+PAUSE = 2
 
 
 class Recovery:
@@ -58,6 +70,7 @@ class Recovery:
         before: The Recovery of fewer steps that this one replaces; None for the first.
 
     Attributes:
+        searches: The number of searches by clingo so far.
         standing: How sure the best map is; None before the first answer.
     """
 
@@ -67,15 +80,11 @@ class Recovery:
         self._trace, self._theory, self._options = problem.trace, problem.theory, options
         self._judging = Judging(problem)
         self._maps = RivalMaps(problem, options.max_maps, self._judging)
-        self.solver: FaultSolver = FaultSolver(options, before.solver.searches if before else 0)
+        self.searches: int = before.searches if before else 0
+        self._next_search = 0  # no search before the trace has this many steps
         self._confidence: Confidence = before._confidence if before else Confidence(problem.theory)
         self._spent = 0.0  # seconds that all steps took
         self.standing: Standing | None = None
-
-    @property
-    def searches(self) -> int:
-        """The number of searches by clingo so far, except those in the background."""
-        return self.solver.searches
 
     def restarted(self, problem: Problem) -> Recovery:
         """Make a Recovery for a theory that changed with the last step. It has no proofs yet."""
@@ -89,7 +98,7 @@ class Recovery:
             self._confidence.known = lead.explained()
         change = self._maps.follow(problem)
         if change.lost_proof:
-            self.solver.make_due()
+            self._next_search = 0
         self._confidence.note(len(trace) - 1, change.broke)
 
     def answer(self, began: float) -> Solution:
@@ -97,23 +106,27 @@ class Recovery:
 
         `began` is when the step began, by `time.perf_counter`.
         """
-        if not self._maps.is_settled and self.solver.is_due(self._trace):
+        if not self._maps.is_settled and len(self._trace) >= self._next_search:
             self._solve()
-        found = self.solver.finished()
-        if found and not self._maps.is_settled and not self._maps.is_outgrown(found):
-            self._maps.absorb(found)
         solution = self._solution(began)
         self.standing = self._confidence.standing(self._maps, self._trace, solution.maps)
         return solution
 
     def _solve(self) -> None:
-        """Solve the trace within the time of a step. If it runs out, go on in the background."""
-        found = self.solver.solve(self._trace, self._theory, has_map=bool(self._maps.rivals))
-        if found is None:
-            return
+        """Solve the trace within the time of a step."""
+        steps, options = len(self._trace), self._options
+        self._next_search = 0
+        if options.time_limit is not None:
+            self._next_search = max(steps + PAUSE, int(RETRY * steps))
+        self.searches += 1
+        found = solve(
+            self._trace,
+            self._theory.of_steps(0, steps),
+            time_limit=options.time_limit,
+            max_maps=options.max_maps,
+            speedups=options.speedups,
+        )
         self._maps.absorb(found)
-        if not self._maps.is_settled and found.stopped == "time limit":
-            self.solver.begin_in_background(self._trace, self._theory)
 
     def _solution(self, began: float) -> Solution:
         """The solution so far: the minimal maps, else the best rival, else none."""

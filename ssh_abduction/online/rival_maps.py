@@ -11,10 +11,9 @@ from dataclasses import dataclass
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.maps import Fault
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.online.background import Solved
 from ssh_abduction.online.chances import Chances
 from ssh_abduction.online.hypotheses import ExtendedMap, Scale, Seen
-from ssh_abduction.solver import Bound, Judging, Status, observation
+from ssh_abduction.solver import Bound, Judging, Solution, Status, observation
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import row
 from ssh_abduction.theory.theory import Theory
@@ -61,7 +60,7 @@ class RivalMaps:
     def __init__(self, problem: Problem, max_maps: int | None, judging: Judging) -> None:
         trace, theory = problem.trace, problem.theory
         self.rivals: list[ExtendedMap] = []
-        self.solved: Solved | None = None
+        self.solved: Solution | None = None
         self.bound = Bound()
         self.is_proven = self.is_complete = self.is_impossible = False
         self._problem, self._max_maps, self._judging = problem, max_maps, judging
@@ -123,7 +122,8 @@ class RivalMaps:
         has_unknown = any(rival.is_unknown(done.name) for rival in self.minimal)
         self.rivals = self._gone_on(self.rivals, t)
         if not self._replays:  # a minimal map of fewer steps says nothing about more steps
-            self.rivals, self.is_proven, self.is_complete = [], False, False
+            self.rivals = []
+            self.is_proven = self.is_complete = self.is_impossible = False
             return StepEffect()
         lost_proof = False
         if self.is_proven and self.is_complete and has_unknown and not self._lists_links:
@@ -134,30 +134,17 @@ class RivalMaps:
             return StepEffect(lost_proof, self._sentence(t, lead, contradicted, seen))
         return StepEffect(lost_proof)
 
-    def absorb(self, found: Solved) -> None:
-        """Use a result of the solver: add its maps to the rivals, and record what is proven.
-
-        If the result is about fewer steps than there are now, its maps are extended by the later
-        steps.
-        """
-        steps, self.solved = len(self._trace), found
+    def absorb(self, found: Solution) -> None:
+        """Add the maps of a solution of all steps to the rivals, and record what is proven."""
+        self.solved = found
         if (found.bound.tenths or 0) >= (self.bound.tenths or 0):
             self.bound = found.bound
         if found.status is Status.UNSATISFIABLE:
-            self.is_impossible, self.rivals = self._replays or found.steps == steps, []
+            self.is_impossible, self.rivals = True, []
             return
         rivals = [ExtendedMap.of(ssh_map, self._trace, self._theory) for ssh_map in found.maps]
-        optimal = found.status is Status.OPTIMAL and bool(rivals)
-        if optimal:
+        if found.status is Status.OPTIMAL and rivals:
             self.is_proven, self.is_complete, self._least = True, found.complete, rivals[0].cost
-        # Extend the maps by the steps that came since the search began.
-        for t in range(found.steps, steps):
-            action = self._trace.actions[t - 1].name
-            has_unknown = any(r.is_unknown(action) for r in rivals if self.is_minimal(r))
-            rivals = self._gone_on(rivals, t)
-            self.is_complete = self.is_complete and (self._lists_links or not has_unknown)
-        if optimal and not any(self.is_minimal(rival) for rival in rivals):
-            self.is_proven = self.is_complete = False
         # Keep the other rivals. But if all minimal maps are listed, no other rival can be as cheap.
         known = {(rival.labels, rival.faults) for rival in rivals}
         others = [
@@ -167,18 +154,6 @@ class RivalMaps:
             and not (self.is_complete and rival.cost <= self._least)
         ]
         self.rivals = self._ranked([*rivals, *others])
-
-    def is_outgrown(self, found: Solved) -> bool:
-        """Whether a result for fewer steps has no map, or maps cheaper than the proven minimum.
-
-        Such a result is out of date. The answer is False if nothing is proven now.
-        """
-        if not self.is_proven:
-            return False
-        return (
-            not found.maps
-            or ExtendedMap.of(found.maps[0], self._trace, self._theory).cost < self._least
-        )
 
     def drop_inconsistent(self) -> None:
         """Drop the best rival until the checker accepts the best one that is left.

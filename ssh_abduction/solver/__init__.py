@@ -11,7 +11,6 @@ TYPE_CHECKING = False
 
 if TYPE_CHECKING:
     from ssh_abduction.solver.asp import facts, workers
-    from ssh_abduction.solver.asp.control import has_processors
     from ssh_abduction.solver.asp.limits import (
         POLL,
         LimitError,
@@ -68,7 +67,6 @@ if TYPE_CHECKING:
 
 _HOMES = {  # module: the names that this package exports from it
     "asp": ("facts", "workers"),
-    "asp.control": ("has_processors",),
     "asp.limits": ("POLL", "LimitError", "Stop", "Watch", "check_limit", "resident_memory"),
     "asp.workers": ("end_all", "in_process"),
     "asp.rules": ("check_rules",),
@@ -147,7 +145,6 @@ __all__ = [
     "find_backbone",
     "find_regions",
     "fit",
-    "has_processors",
     "in_process",
     "joins_in",
     "maps_apart",

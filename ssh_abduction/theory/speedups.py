@@ -45,7 +45,6 @@ class Speedups:
     annealed: bool = True
     framing: bool = True
     ways: bool = True
-    processes: bool = True
     greedy: bool = True
     digest: bool = True
 
@@ -75,7 +74,7 @@ class Speedups:
         off = [name for name in (names.split(",") if isinstance(names, str) else names) if name]
         for name in off:
             if name in REMOVED:
-                text = f"speedups: {name} is removed, as it gained nothing; leave it out"
+                text = f"speedups: {name} is removed, as it gained too little; leave it out"
                 warnings.warn(text, DeprecationWarning, stacklevel=2)
             elif name not in SPEEDUPS:
                 raise SolverError(f"{expected} {brief(name)}; take some of these")
@@ -105,8 +104,8 @@ def checked_speedups(value: object) -> Speedups:
 SPEEDUPS = tuple(f.name for f in fields(Speedups))
 EVERY: Final = None
 NOTHING: frozenset[str] = frozenset()
-# Speed-ups of version 0.1.0 that gained nothing.
-REMOVED = ("from_below", "apart", "small_cores", "watched", "one_by_one", "threads")
+# Speed-ups of version 0.1.0 that gained too little.
+REMOVED = ("from_below", "apart", "small_cores", "watched", "one_by_one", "threads", "processes")
 
 
 @dataclass(frozen=True)
@@ -361,11 +360,6 @@ TABLE = (
         "core_guided",
         "core_guided",
         "Raise the lower bound by unsat cores, instead of improving a map step by step.",
-    ),
-    Speedup(
-        "processes",
-        "processes",
-        "While a robot drives, with faults: use a second process, if there are two processors.",
     ),
     Speedup(
         "annealed",

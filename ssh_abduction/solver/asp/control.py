@@ -360,10 +360,3 @@ def new_control(encoding: str, base: str, options: Sequence[str]) -> Control:
     control.add("base", [], base)
     control.ground([("base", [])])
     return control
-
-
-def has_processors() -> bool:
-    """Whether there are two processors, so that two processes can work at the same time."""
-    from joblib import cpu_count  # loads slowly
-
-    return bool(cpu_count() > 1)

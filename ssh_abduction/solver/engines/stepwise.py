@@ -26,6 +26,9 @@ GROWTH = 1.25
 # Ground AT_FIRST steps per call until the prefix has FIRST_STEPS, and then one step per call. For a
 # short prefix, the overhead of a call is larger than the time for a step.
 AT_FIRST, FIRST_STEPS = 8, 32
+# Later steps take longer, and clingo cannot be stopped during a call. So a call is for one step if
+# the time left is less than SLOWER times the time for AT_FIRST steps like the last ones.
+SLOWER = 4
 
 
 class StepEngine:
@@ -41,8 +44,8 @@ class StepEngine:
         self._forbidden: list[Collection[Equality]] = []
         # The exact number of dstates, places or paths that maps must have, if one is set.
         self._number: tuple[int, Count] | None = None
-        # The seconds and MiB that grounding the last step took. The next one takes about as much,
-        # and clingo cannot be stopped meanwhile.
+        # The seconds and MiB for each step that the last call grounded. The next step takes about
+        # as much, and clingo cannot be stopped meanwhile.
         self._last_step = 0.0, 0.0
         control = self.asker.control
         self._doubts = Doubts(self.asker, control, further_rules.steps_are_one)
@@ -71,9 +74,9 @@ class StepEngine:
         is_new = not self.size
         with self.asker.grounding_timed():
             while self.size < size:
-                self._ground_steps(
-                    min(size, self.size + (AT_FIRST if self.size < FIRST_STEPS else 1))
-                )
+                seconds = SLOWER * AT_FIRST * self._last_step[0]
+                many = self.size < FIRST_STEPS and self.asker.watch.allows(seconds)
+                self._ground_steps(min(size, self.size + (AT_FIRST if many else 1)))
             self._let_end_with(size - 1)
             if is_new:
                 for number in range(len(self._forbidden)):
@@ -82,8 +85,9 @@ class StepEngine:
 
     def _ground_steps(self, stop: int) -> None:
         """Ground the steps up to, but not including, `stop`."""
-        self.asker.watch.check(*self._last_step)
         control, start = self.asker.control, self.size
+        steps = stop - start
+        self.asker.watch.check(*(steps * each for each in self._last_step))
         part = f"steps_from_{start}"
         control.add(part, [], readable.trace_facts(self._task.problem, start, stop))
         before = control.seconds, control.mebibytes
@@ -93,7 +97,8 @@ class StepEngine:
         )
         if base:
             control.assign_external(readable.run_by_steps(), True)
-        self._last_step = control.seconds - before[0], control.mebibytes - before[1]
+        spent = control.seconds - before[0], control.mebibytes - before[1]
+        self._last_step = spent[0] / steps, spent[1] / steps
         self.size = stop
 
     def _let_end_with(self, last: int) -> None:
