@@ -112,8 +112,8 @@ def refused_returns(trace: Trace, ssh_map: SSHMap, theory: Theory) -> Iterator[R
     """Find the single returns and the pair of returns that displacements reject most clearly.
 
     A return is two steps that the map has at one place or dstate. Yields at most one return to a
-    place, one return to a dstate, and then one pair of returns. The theory is resolved for the
-    trace, so that it has the number of tests.
+    place, one return to a dstate, and then one pair of returns. In the theory no field is "auto",
+    and `returns` is the number of tests.
     """
     if not trace.has_displacements:
         return

@@ -82,9 +82,9 @@ def joins_by_minimality(
         theory: The theory, with each "auto" replaced; Theory.topological() if None.
 
     Raises:
-        TraceError: The trace is not a trace.
+        TraceError: `trace` is not a Trace.
         MapError: The map is of another trace.
-        TheoryError: The theory is not a theory.
+        TheoryError: `theory` is not a Theory.
     """
     checked_trace(trace)
     check_of_trace([checked_map(ssh_map)], trace, "joins_by_minimality", views=False)

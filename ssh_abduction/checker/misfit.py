@@ -70,7 +70,10 @@ def misfit(
 def false_costs(
     trace: Trace, answer: Mapping[str, Any], maps: Sequence[SSHMap], theory: Theory
 ) -> Iterator[str]:
-    """Check what an answer claims about the costs of its maps in nats, by its resolved theory."""
+    """Check what an answer claims about the costs of its maps in nats.
+
+    In the theory no field is "auto".
+    """
     weighed = answer.get("weighed")
     if not isinstance(weighed, Mapping) or not maps:
         return

@@ -144,7 +144,7 @@ class Parser(argparse.ArgumentParser):
         (to or self).add_argument(*names, help=said, **details)
 
     def add_setting(self, spec: str, said: str, default: Any = None, **details: Any) -> None:
-        """Add a setting. Its value becomes the attribute of this name of the options.
+        """Add a setting. The parsed options have its value as the attribute of the same name.
 
         Args:
             spec: The name, with underscores, and perhaps the word for its value: "near METRES".

@@ -366,7 +366,7 @@ class GatewayChange:
 
 
 def changes_in(trace: Trace, ssh_map: SSHMap, axioms: Collection[str]) -> Iterator[GatewayChange]:
-    """Yield the gateways of a map with headings that change between drives, as `changes_of`."""
+    """Yield the gateways that change between drives, for a map with headings."""
     onward = _onward_of(trace, ssh_map, axioms)
     yield from changes_of(*sights_of(trace, ssh_map, onward, changes=True), axioms)
 

@@ -31,9 +31,10 @@ def firsts(pairs: Iterable[tuple[Key, Value]]) -> dict[Key, Value]:
 
 
 def reached(starts: Iterable[Node], beside: Callable[[Node], Iterable[Node]]) -> dict[Node, None]:
-    """Find the nodes that links lead to from some starts, the nearest first, with the starts.
+    """Find the nodes that links from `starts` reach, including `starts`, the nearest first.
 
-    `beside` gives the nodes to which links of a node lead. The result is a set in order.
+    `beside` gives the nodes to which links of a node lead. The result is a dict whose keys are the
+    nodes.
     """
     found = dict.fromkeys(starts)
     waiting = list(found)

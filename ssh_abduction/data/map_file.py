@@ -284,7 +284,7 @@ def _fault(read: FieldReader, value: Any, steps: int, name: str) -> Fault:
 def _regions(
     read: FieldReader, record: Mapping[str, Any], places: set[int], paths: set[int]
 ) -> tuple[Region, ...] | None:
-    """Convert and check the regions of a map; None if the file has none, as early versions."""
+    """Convert and check the regions of a map; None if the file, of an early version, has none."""
     if record.get("regions") is None:
         return None
     return read.each(record, "regions", lambda r, name: _region(read, r, name, places, paths))

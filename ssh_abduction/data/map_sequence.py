@@ -1,4 +1,4 @@
-"""A value that is used as the sequence of its maps."""
+"""The base class of values that are also a sequence of their maps."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ssh_abduction.data.maps import SSHMap
 
 
 class MapSequence:
-    """A sequence of maps, for a class with the attributes `maps` and `drives`."""
+    """Makes a value with the attributes `maps` and `drives` a sequence of its maps."""
 
     __slots__ = ()
     maps: tuple[SSHMap, ...]

@@ -264,7 +264,7 @@ class TraceQuestion(LimitedQuestion[TraceExplanation]):
     def _with_actions(self, t: int) -> Iterator[tuple[str | None, Trace, Theory]]:
         """Yield alternatives to the action of a step: other actions, and an unknown one.
 
-        A lift is none if the next step has a displacement, as no displacement leads to a floor.
+        A lift is no alternative if the next step has a displacement: a lift has none.
         """
         step = self.trace.steps[t]
         moves = self.trace.steps[t + 1].displacement is not None

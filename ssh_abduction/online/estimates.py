@@ -132,7 +132,7 @@ def _links_of(
 
 
 def view_ratios(ssh_map: SSHMap, trace: Trace | None) -> dict[View, Observation]:
-    """For each view v that a dstate shows, find these dstates x, and the ratios f(v|x) / q(v).
+    """For each view v, find the dstates x that show it, and the ratios f(v|x) / q(v).
 
     The trace that was mapped serves to estimate f by counting (equation 3). The map says what a
     dstate shows if no step of the trace is at it, or if the trace is None (equation 4).
@@ -167,7 +167,7 @@ def view_ratios(ssh_map: SSHMap, trace: Trace | None) -> dict[View, Observation]
 
 
 def transitions(ssh_map: SSHMap, trace: Trace | None) -> dict[str, Links]:
-    """Find where each action leads, by its name.
+    """For the name of each action, find where the action leads.
 
     The trace that was mapped serves to estimate probabilities by counting (equation 3). The links
     of the map say where an action leads if the trace lacks it there, or is None (equation 4).

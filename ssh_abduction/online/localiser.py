@@ -46,7 +46,7 @@ look like o and have a link for a:
 
     p(o'|strange) = q(o')
     p(o'|akin)    = (n · mean over these x of Σ_x' f(x'|x,a) f(o'|x') + q(o')) / (n + 1)
-                    of a novel o': q(o')
+                    or q(o') if o' is novel: it looks like none of the dstates
 
 Without the second kind, a robot in another maze would be located in this one, because the views
 after turns fit any maze. All p(o|·) are divided by q(o), which changes no belief. This has two

@@ -280,7 +280,8 @@ class TheorySettler:
         first: A trace with only the first step.
 
     Raises:
-        TheoryError: The theory needs stars, but the first step has none; or it weighs maps.
+        TheoryError: The theory needs stars, but the first step has none; or it compares maps by
+            their cost in nats.
         TraceError: The first step lacks something else that the theory needs.
     """
 

@@ -158,7 +158,7 @@ class RivalMaps:
     def drop_inconsistent(self) -> None:
         """Drop the best rival until the checker accepts the best one that is left.
 
-        This is not needed if the maps are proven, or if only the causal axioms hold.
+        This is not needed if the maps are proven, or if the theory has only the causal axioms.
         """
         if self.is_proven or self._lists_links:
             return

@@ -392,6 +392,8 @@ def coarse_route(ssh_map: SSHMap, start: int, goal: int) -> tuple[Leg, ...]:
 
     Args:
         ssh_map: The map. Without regions, the route has no legs.
+        start: The id of the place where the route starts.
+        goal: The id of the place where it ends.
 
     Returns:
         The legs. Regions are left from the smallest on, and entered from the largest on.
@@ -411,9 +413,11 @@ def coarse_route(ssh_map: SSHMap, start: int, goal: int) -> tuple[Leg, ...]:
 
 
 def off_the_way(ssh_map: SSHMap, start: int, goal: int) -> set[int]:
-    """Find the places in regions behind one place that hold neither the start nor the goal.
+    """Find the places in regions that hold neither the place `start` nor the place `goal`.
 
-    A route that enters such a region has to come back through its door. It would be shorter to turn
+    Only regions behind one place, their door, are considered.
+
+    A route that enters such a region has to come back through the door. It would be shorter to turn
     at the door. So the shortest route by places does not enter such regions.
     """
     closed = [r for r in _with_doors(ssh_map) if not {start, goal} & {*r.places}]

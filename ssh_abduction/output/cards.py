@@ -79,7 +79,7 @@ def trace_card(trace: Trace) -> str:
 
 
 def card(heading: str, *parts: str) -> str:
-    """Make HTML of a heading, as plain text, with parts of HTML below it."""
+    """Make HTML from a heading in plain text, and parts in HTML below it."""
     return f"<div><p><b>{html_text(heading)}</b></p>{''.join(parts)}</div>"
 
 

@@ -132,7 +132,7 @@ def escaped(label: str) -> str:
 
 
 def page(marks: Sequence[str], points: Sequence[Point], margin: float = MARGIN) -> str:
-    """Make the text of an SVG file of marks, with a margin around the points."""
+    """Make the text of an SVG file from marks, with a margin around the points."""
     xs, ys = [x for x, _ in points] or [0.0], [y for _, y in points] or [0.0]
     left, top = min(xs) - margin, min(ys) - margin
     width, height = max(xs) + margin - left, max(ys) + margin - top

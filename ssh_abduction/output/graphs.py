@@ -47,7 +47,7 @@ def to_networkx(
     places have the ids of their regions as the attribute regions.
 
     Args:
-        level: The kind of graph: "causal", "topological" or "places", as below.
+        level: The kind of graph: "causal", "topological" or "places".
         turns: How actions turn, as in `to_svg`. It decides the positions of "places" if the map has
             no poses.
 

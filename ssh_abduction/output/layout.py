@@ -215,8 +215,8 @@ class _Drawing:
     def layout(self) -> Layout:
         """Make four drawings, and choose the one with the fewest wrong turns and bent streets.
 
-        In two of them, whole paths are straight; in the others, only segments. One drawing of each
-        two takes robust headings.
+        In two of them, whole paths are straight; in the other two, only segments. In each case, one
+        drawing takes `robust` headings, as `headings_by` does.
         """
         if not self.map.places:
             return self._spread()

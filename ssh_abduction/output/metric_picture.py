@@ -131,7 +131,7 @@ class _Picture:
         self.points += [(left, top), (right, bottom)]
 
     def dot(self, x: float, y: float, site: int) -> str:
-        """Draw the dot of a site at a point. It is white where the robot was first, else black."""
+        """Draw the dot of a site at a point. The robot's first site is white, others are black."""
         is_first = site == _site(self.map.dstates[self.map.dstate_at[0]])
         fill, width = "white" if is_first else "#222", f"{1.8 * self.unit:.1f}"
         title = place_title(self.map, site) if site >= 0 else f"dstate {-1 - site}"
@@ -222,7 +222,7 @@ class _Picture:
     def label(
         self, label: str, spots: Iterable[Point], colour: str, size: float, weight: str = "normal"
     ) -> list[str]:
-        """Draw a label at the first point where it overlaps nothing. Draw none if there is none."""
+        """Draw a label at the first point where it overlaps nothing, if there is one."""
         w, h = self.half(label, size)
         for x, y in spots:
             if all(

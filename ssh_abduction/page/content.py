@@ -150,8 +150,8 @@ def _shared(listing: Listing) -> dict[str, Any] | None:
 def _joins(listing: Listing) -> list[tuple[int, int, str | None]]:
     """List the joins of the first map that a reader may doubt, the most doubtful ones first.
 
-    Each has two steps and the probability of their join. It is None if no axiom and no observation
-    forces the join, and costs in nats are unknown.
+    Each has two steps and the probability of their join. If costs in nats are unknown, the joins
+    are those that no axiom and no observation forces, and the probability is None.
     """
     if listing.weighed is None or listing.weighed.doubt:
         return [(join.first, join.second, None) for join in listing.by_minimality[:JOINS]]
@@ -330,9 +330,9 @@ def _lifts(found: Layout, ssh_map: SSHMap, unit: float) -> list[list[Any]]:
 
 
 def _ellipses(found: Layout, ssh_map: SSHMap, unit: float) -> list[list[float]]:
-    """The ellipses of uncertain positions: a dstate, two standard deviations, and an angle.
+    """The ellipses of uncertain positions: of the first dstate of each place.
 
-    A dstate without a place has its own ellipse. The angle of the first axis is in radians
+    Each has the dstate, two standard deviations, and the angle of the first axis in radians
     counterclockwise.
     """
     assert ssh_map.fit is not None

@@ -73,10 +73,11 @@ class _Counts:
 def overview(maps: Sequence[SSHMap], spots: Sequence[Spot]) -> dict[str, Any]:
     """Collect all dstates, places and travelled streets that any map has, for JSON.
 
-    `spots` has the position and heading of each step. `nodes` are places, or dstates if there
-    are no places. `dstates` is empty if there are no places. Each has its `steps`, position and
-    heading, and `maps`, the number of maps with it. `path` of a dstate is the largest number of
-    maps that agree on all steps along its path. `streets` are lists [node, node, maps, path].
+    `spots` has the position and heading of each step. In the result, `nodes` are places, or dstates
+    if there are no places. `dstates` is empty if there are no places. Each node and dstate has its
+    `steps`, position and heading, and `maps`, the number of maps with it. `path` of a dstate is the
+    largest number of maps that agree on all steps along its path. `streets` are lists [node, node,
+    maps, path].
     """
     # Count maps together if they are the same in everything that is counted here.
     alike: dict[Any, list[SSHMap]] = {}

@@ -111,7 +111,10 @@ def _step(step: Step, view: str) -> dict[str, Any]:
 
 
 def _steps_of_map(first: SSHMap) -> list[dict[str, Any]]:
-    """Reconstruct views and actions of the trace from a map; None for several actions."""
+    """Reconstruct views and actions of the trace from a map.
+
+    An action is None if several actions, or none, link its dstate to the next one.
+    """
     actions = gathered(((s, x), action) for s, action, x in first.links)
     done = [actions.get(pair, []) for pair in pairwise(first.dstate_at)]
     names = [some[0] if len(some) == 1 else None for some in done]

@@ -1,4 +1,4 @@
-"""A list of maps of one trace, from a solution, a file or Python. It also says if others exist.
+"""A list of maps of one trace, from a solution, a file or Python, and whether it is complete.
 
 >>> from ssh_abduction.data.maps import DState, SSHMap
 >>> one = SSHMap((0, 0), (DState(0, "hall"),), ())

@@ -381,7 +381,7 @@ class Walk:
                 yield layer.first + start, action, *self.table.follow(self.group, part, action)
 
     def way(self, row: int) -> list[int]:
-        """List the indices of the actions that lead from the start to a row, by its number."""
+        """List the indices of the actions that lead from the start to the row with this number."""
         found: list[int] = []
         while row:
             row, action = self._came[row]

@@ -143,7 +143,7 @@ class Stances:
         return [at[n] for n in sorted(at)]
 
     def _possible(self, n: int) -> list[Action]:
-        """List the possible actions in stance n, from the turned star if n was never seen."""
+        """List the possible actions in stance n. If it was never seen, its star is predicted."""
         if n < len(self._looks):
             step = self._looks[n]
             seen = Seen(step.view, step.star if self._stars[n] else None)

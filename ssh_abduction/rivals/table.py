@@ -77,10 +77,10 @@ class Table:
         return len(np.unique(self.ones[sort], axis=0))
 
     def heads(self, sort: Sort) -> Ints:
-        """Return the first class that all maps treat like each class, of shape (classes,).
+        """For each class, return the first class that all maps treat in the same way.
 
         Two classes are treated in the same way if in each map they are one, or both have no
-        place, path or course.
+        place, path or course. The result has the shape (classes,).
         """
         _, first, inverse = np.unique(
             self.ones[sort], axis=1, return_index=True, return_inverse=True

@@ -10,9 +10,9 @@
 A robot that always does the nearest untried action looks around at each place, although it comes
 back to most places later and could do so then. So the tour plans ahead, in a graph of stances
 (places and headings) and moves (`rivals/stances.py`). The tour is the shortest walk that makes each
-unknown move and each expected travel, and visits each stance. Only after that are expected turns
-tried one by one. Expected ends of moves are guesses for the plan only. No conclusion is drawn from
-them, and the robot plans again after each surprise.
+unknown move and each expected travel, and visits each stance. After that, expected turns are tried
+one by one. Expected ends of moves are guesses for the plan only. No conclusion is drawn from them,
+and the robot plans again after each surprise.
 
 A map with the fewest dstates may merge places that only look alike. So the tour doubts each return
 to a place until enough is seen there. Suppose that by the map, an unknown move leads to an earlier

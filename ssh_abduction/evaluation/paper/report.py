@@ -62,7 +62,8 @@ def reproduce(
         jobs: The number of processes that work at once; -1 for one per processor.
         outcomes: Whether to also run other notches and other spreads of poses. This is only for the
             notched rectangle.
-        on_done: Called with a sentence after each part of the work. `steps` counts the parts.
+        on_done: Called with a sentence after each part of the work. The function `steps` returns
+            the number of parts.
         on_table: Called with the table once all data is written, before anything is drawn. So no
             data is lost if a figure fails.
 

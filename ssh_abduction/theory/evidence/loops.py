@@ -91,9 +91,10 @@ class Loops:
 
     @staticmethod
     def of(trace: Trace, bend: float = 0.0, drift: float | None = None) -> Loops:
-        """Make the loops of a trace, without a steady drift of heading in radians per metre.
+        """Make the loops of a trace, and remove the steady drift of heading `bend`.
 
-        `drift` is the standard deviation of the remaining drift; that of the odometry by default.
+        It is in radians per metre. `drift` is the standard deviation of the remaining drift; that
+        of the odometry by default.
         """
         odometry = trace.odometry or Odometry()
         sums = _sums(trace, 0, len(trace), np.array([bend]), np.zeros((1, COLUMNS)))[0]
@@ -147,7 +148,7 @@ class Loops:
     def _white(self, i: Steps, j: Steps, end: Steps, other_end: Steps) -> Array:
         """The covariances, m x 3 x 3, between closings from the noise of displacements from i to j.
 
-        The loops end at `end`, the other loops at `other_end`, m each.
+        They are between m loops that end at the steps `end`, and m loops that end at `other_end`.
         """
         sums = self.moments[j] - self.moments[i]
         position, mixed, mixed_across = (
@@ -297,7 +298,7 @@ class Reckoning:
         )
 
     def closings(self, numbers: Steps, first: Steps, last: Steps) -> tuple[Array, Array]:
-        """Compute closings as `Loops.closings`, with the index in `bends` of each loop's drift."""
+        """Compute closings as `Loops.closings` does, each without the drift `bends[number]`."""
         array = self._rows.array
         flat = Loops._of(array.reshape(-1, COLUMNS), self._part, self.odometry, 0.0, self._drift)
         offset = numbers * array.shape[1]

@@ -275,8 +275,8 @@ def _groups(shown: _Shown, turns: bool) -> tuple[dict[int, int], dict[int, int],
 def _can_draw_sided(shown: _Shown, crossing: bool) -> bool:
     """Whether some orders of gateways allow the edges to be drawn, if turns give sides only.
 
-    A turn shows which gateway is to the right of an edge, if both its dstates are at an edge.
-    After turning around, a robot faces the gateway that was behind it.
+    If both dstates of a turn are at ends of edges, the turn shows which gateway is to the right of
+    an edge. After turning around, a robot faces the gateway that was behind it.
     """
     same = NodeClasses[Arm]()
     for x, turn, y in shown.turns:
@@ -364,7 +364,7 @@ def _is_clockwise(order: Sequence[Arm], sequence: Sequence[Arm]) -> bool:
 
 
 def _join(same: NodeClasses[Arm], first: Arm, second: Arm) -> None:
-    """Record that two arms (of dstates) are one gateway. Then their opposite arms are, too."""
+    """Record that two arms (of dstates) are one gateway, and that their opposite arms are one."""
     for turned in (1, -1):
         same.merge((second[0], second[1] * turned), (first[0], first[1] * turned))
 

@@ -68,7 +68,7 @@ class Evidence(Protocol):
     def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
         """Return a small set of (in)equalities of steps of a map that no map satisfies together.
 
-        None if there is none. The map is of the first steps. Its first `since` steps are
-        known to have no such set, so only later steps need to be checked.
+        None if there is none. The map may be of the first steps of the trace only. Its first
+        `since` steps are known to have no such set, so only later steps need to be checked.
         """
         return None

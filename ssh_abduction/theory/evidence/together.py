@@ -50,7 +50,7 @@ class _ReturnsAlone:
     Attributes:
         inverse: The inverse covariance of each closing (the error at the end of the loop), m x 9.
             Its entries for the heading are 0 for a return to a place.
-        square: The chi-square of each closing, m.
+        square: The chi-square of each closing, an array of length m.
         repeated: The covariance of each closing from errors that repeat, m x 9.
     """
 
