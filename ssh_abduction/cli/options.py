@@ -237,7 +237,7 @@ def trace_of_maps(file: str) -> Trace | None:
 
 
 def trace_beside(maps: str) -> str | None:
-    """Return the trace file beside a file of maps that map wrote; None for any other file."""
+    """Return the trace file beside a file of maps that the verb map wrote; else None."""
     folder = Path(maps).parent
     is_written = Path(maps).name == MAPS and (folder / RUN).is_file() and (folder / TRACE).is_file()
     return str(folder / TRACE) if is_written else None
