@@ -64,7 +64,7 @@ class Task:
 
     @staticmethod
     def of(problem: Problem, watch: Watch | None = None, speedups: Speedups | None = None) -> Task:
-        """Make a task with those speed-ups that hold for the theory; by default without limits."""
+        """Make a task without the speed-ups that the theory rules out; no watch means no limits."""
         speedups = (speedups or Speedups()).that_hold_for(problem.theory)
         # `sides` treats each link between visits as a travel.
         if speedups.sides and any(action.leaves_paths for action in problem.trace.actions):
@@ -175,7 +175,10 @@ def listing(cost: tuple[int, ...]) -> str:
 
 
 def next_charted_size(size: int, failed: int, steps: int) -> int:
-    """Return the size to grow to, for an engine that compares all pairs of steps beforehand."""
+    """Return the next prefix size, for an engine that compares all pairs of steps beforehand.
+
+    `size` is the size so far, and `steps` the length of the trace. No map explains step `failed`.
+    """
     if size < FIRST_PREFIXES:
         return min(steps, max(failed + 1, FIRST_PREFIXES))
     return steps if steps <= AT_ONCE else min(steps, max(failed + 1, 2 * size, AT_ONCE))

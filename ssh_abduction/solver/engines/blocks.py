@@ -116,11 +116,11 @@ class Blocks:
         return total
 
     def _shortest(self, begin: int, fault: int, reach: int, most: int) -> int | None:
-        """Return the step after the shortest block from `begin` that needs a fault.
+        """Return the end of a short block that begins at `begin` and needs a fault.
 
-        The block ends after the step `fault`, and may be a few steps longer than the shortest one.
-        The search starts at the expected end, `reach` steps after `fault`. None if even the block
-        to the end of the trace needs no fault.
+        The end is the step after the block. The block includes the step `fault`, and is at most a
+        few steps longer than needed. The search starts at the expected end, `reach` steps after
+        `fault`. Returns None if even the block to the end of the trace needs no fault.
         """
         steps = len(self.seen)
         exact = 1 + max(most - self.dstates, 0) // COARSE

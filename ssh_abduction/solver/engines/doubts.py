@@ -36,8 +36,8 @@ class Doubts:
     ) -> None:
         """Begin without any doubt.
 
-        `condition` takes a sort and two steps (or dstates). It returns the body of a rule that is
-        true if they share a thing of this sort; None if they never do.
+        `condition` takes a sort (such as dstate or place) and two steps or dstates. It returns the
+        body of a rule that is true if both are at one thing of this sort; None if they never are.
         """
         self._asker, self._control, self._condition = asker, control, condition
         # The number of each pair of things that clingo has, and the number of questions so far.

@@ -219,8 +219,9 @@ class FaultyEngine:
     def _followed(self, answer: FaultyAnswer) -> tuple[list[int] | None, int]:
         """Follow the links of an answer through the steps that clingo was not given.
 
-        Returns the dstates of all steps, and -1. If the links do not explain a step, or evidence
-        contradicts the dstate of a step, returns None and the step to give to clingo next.
+        Returns two values: the dstates of all steps, and -1 for "no step". If the links do not
+        explain a step, or evidence contradicts its dstate, they are None and the step to give to
+        clingo next.
         """
         number, machine = self._machine(answer)
         labels: list[int] = []
@@ -264,8 +265,8 @@ class FaultyEngine:
     def _map_of(self, explained: Explained) -> Found | None:
         """Make a map of an explanation of the trace, with its cost.
 
-        Returns None if its faults are not allowed, a dstate never has its view, or the map breaks
-        an equality of the evidence or a forbidden set.
+        Returns None if its faults are not allowed, if all steps of a dstate are misread, or if the
+        map contradicts evidence about pairs of steps or has a forbidden set of equalities.
         """
         labels, shows = explained.labels, explained.machine.shows
         if (explained.misread and "misread" not in self._price) or (
@@ -309,7 +310,7 @@ class FaultyEngine:
         )
 
     def _shown_somewhere(self, labels: Sequence[int], shown: Sequence[int]) -> list[int]:
-        """Give each dstate whose view is always misread the view that is seen there most often."""
+        """Return the views of dstates. If all steps of one are misread, take their usual view."""
         views = list(shown)
         for s in set(labels) - {s for t, s in enumerate(labels) if shown[s] == self._seen[t]}:
             views[s] = Counter(

@@ -50,7 +50,7 @@ class FaultyAnswer:
 
     @property
     def is_open(self) -> bool:
-        """Whether the answer is no map yet, as a dstate has no name or a step no dstate."""
+        """Whether the answer is not a map yet: some dstate has no name, or some step no dstate."""
         return bool(self.rests or self.lost)
 
 

@@ -176,7 +176,7 @@ class FramedEngine:
                 yield settled
 
     def _namings_of_cost(self, cost: tuple[int, ...]) -> Iterator[NodeLabels]:
-        """Yield the known labels of maps of this cost; if none, all labels with as many dstates."""
+        """Yield the known labels of maps of this cost; if none are known, search for all."""
         if self._best and self._best[0] == cost:
             return iter(self._best[1])
         return self._all_with_paths(cost[0])

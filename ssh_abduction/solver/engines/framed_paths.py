@@ -42,7 +42,7 @@ PREPARING = (1.6, 2.1)
 
 @dataclass(frozen=True)
 class NodeLabels:
-    """The dstate of each node of a chart, and a clingo control for paths; None to make one."""
+    """The dstate of each node of a chart. If there is a control that finds paths, reuse it."""
 
     chart: FramedChart
     labels: Sequence[int]
@@ -159,7 +159,7 @@ class FramedPaths:
         return control
 
     def contrary(self, chart: FramedChart, labels: Sequence[int]) -> tuple[list[int], list[int]]:
-        """Find the dstates that show which single paths contradict the axioms."""
+        """Find the paths that contradict the axioms on their own (see `paths_lp.read_contrary`)."""
         control = self._control(chart, paths_lp.settled_labels(enumerate(labels)))
         control.ground([("base", []), ("again", []), ("contrary", [])])
         return next(self._asker.answers(paths_lp.read_contrary, "ignore", 1, control=control))
@@ -177,7 +177,7 @@ class FramedPaths:
         return clashes or [self._clash(chart, labels)]
 
     def _clash(self, chart: FramedChart, labels: Sequence[int]) -> list[int]:
-        """Find a small clash (nodes that no paths fit): leave out nodes while none fit."""
+        """Find a minimal clash: nodes whose labels no paths fit."""
 
         def clashes(nodes: list[int]) -> bool:
             control = self.control(chart, labels, nodes=nodes)

@@ -92,7 +92,10 @@ class FramelessEngine:
         yield from islice(self._listed(self._labels_of(cost), listing(cost)), enough or None)
 
     def _listed(self, every: Iterable[list[int]], mode: str) -> Iterator[Found]:
-        """Yield the maps with these dstates; with displacements, first maps whose places differ."""
+        """Yield the maps with each of these labels.
+
+        With displacements, first yield one map for each choice of places, for a few labels.
+        """
         left, sooner, first = iter(every), list[list[int]](), set[SSHMap]()
         while (
             self._task.theory.displacement == "use"
@@ -117,7 +120,7 @@ class FramelessEngine:
                 yield settled
 
     def _labels_of(self, cost: tuple[int, ...]) -> Iterable[list[int]]:
-        """Return the known labels of maps of this cost, else all with its number of dstates."""
+        """Return the known labels of maps of this cost; if none are known, search for all."""
         if self._best and self._best[0] == cost:
             return self._best[1]
         return self._all_that_fit(cost[0])

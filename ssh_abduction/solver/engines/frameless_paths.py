@@ -141,7 +141,7 @@ class PlacesAndPaths:
         return self._tightly(labels) is not None or self._has_paths(self._path_control(labels))
 
     def _tightly(self, labels: Sequence[int]) -> Found | None:
-        """Find a best map with no places but pairwise distinct ones (`homes.py`); None if none."""
+        """Find a best map whose places are all pairwise distinct (`homes.py`); None if unknown."""
         key = tuple(labels)
         if key in self._tight:
             return self._tight[key][1]
@@ -173,7 +173,7 @@ class PlacesAndPaths:
 
     def _best_at_home(self, labels: Sequence[int], control: Control, fewest: int) -> Found | None:
         """Find the best map that merges each place with one of its homes: the pairwise distinct
-        places that it may be (`engines/homes.py`).
+        places that it may equal (`engines/homes.py`).
 
         `fewest` is a lower bound on the number of paths. Returns None if the map is not proven to
         be the best of all maps with these dstates.
@@ -227,7 +227,7 @@ class PlacesAndPaths:
         )
 
     def _clash(self, members: list[Link | _Far]) -> bool:
-        """Whether no places and paths exist for these members."""
+        """Whether no places and paths fit these links and constraints."""
         links = [member for member in members if not isinstance(member, _Far)]
         far = [member for member in members if isinstance(member, _Far)]
         return not any(
@@ -236,7 +236,7 @@ class PlacesAndPaths:
         )
 
     def _far_away(self, labels: Sequence[int]) -> list[_Far]:
-        """List the constraints of evidence about dstates that are not at one place, pairs first."""
+        """List what evidence says about dstates at different places, single pairs first."""
         away = self._task.log.pairs.elsewhere.items()
         found = {
             (labels[i], labels[t]): (i, t) for t, others in away if t < len(labels) for i in others
@@ -353,7 +353,7 @@ class PlacesAndPaths:
 
 
 def _go_on_at_home(control: Control, homes: Mapping[int, list[int]], parts: Iterable[str]) -> None:
-    """Ground the other parts, and restrict each place to its homes: fixed places that it may be."""
+    """Restrict each place to its homes (`homes.py`), and ground the other program parts."""
     control.add("homes", [], paths_lp.tight_facts(homes))
     control.ground(
         [(part, []) for part in ("homes", *(part for part in parts if part not in BEFORE_MERGING))]

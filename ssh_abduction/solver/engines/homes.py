@@ -1,6 +1,6 @@
 """Finds the fewest places for given dstates without a search, for the engine without frames.
 
-Some places are pairwise distinct. If a map needs no others, no map has fewer places. This module
+Some places are pairwise distinct. If a map has only these places, no map has fewer. This module
 narrows down the search for such a map.
 
 As an example, take a corridor of forty landmarks, driven there and back. The dstates are found at
@@ -9,7 +9,7 @@ No map has fewer places. But to prove that the way back needs no other places is
 problem, and it takes clasp minutes.
 
 So this module finds a large clique of pairwise distinct places, which are called *fixed*. Suppose
-that a map has only as many places as there are fixed ones. Then each other place is one with a
+that a map has only as many places as there are fixed ones. Then each other place equals a
 fixed place, its *home*. If a place comes after another along a path, its home comes after the home
 of the other. This leaves few possible homes. In the corridor each place has only one.
 
@@ -34,7 +34,7 @@ from ssh_abduction.solver.steps.apart import pairwise_distinct
 def homes_of(segments: Segments) -> Mapping[int, list[int]] | None:
     """Find the possible homes of each place, if a map has only as many places as fixed ones.
 
-    Fixed places are pairwise distinct. Homes of a place are the fixed places that it may be.
+    Fixed places are pairwise distinct. Homes of a place are the fixed places that it may equal.
     Returns None if some place has none, or if no places fit these dstates at all.
     """
     if any(c == p for c, p in segments.elsewhere):
@@ -68,7 +68,7 @@ def homes_of(segments: Segments) -> Mapping[int, list[int]] | None:
 
 
 def fewest_paths(segments: Segments) -> int:
-    """Return a lower bound on the number of paths: segments known to be on different paths."""
+    """Return a lower bound on the number of paths: how many segments are on different paths."""
     return len(pairwise_distinct(segments.segments, segments.distinct))
 
 

@@ -242,7 +242,7 @@ class NameProgram:
         }
 
     def rests(self, answer: dict[int, int]) -> set[int]:
-        """Return the views whose rest (dstates without a name) an answer uses, from all names."""
+        """Return the views whose rest an answer uses. The answer has the name of each node."""
         used = set(answer.values())
         return {view for view, spare in self._known.spare.items() if spare[-1] in used}
 

@@ -27,7 +27,10 @@ CORES = 10_000
 
 
 class Incumbent:
-    """The steps' dstates, as few as known, and a lower bound on dstates; None if unknown."""
+    """The best known labels of all steps, and a lower bound on the number of dstates.
+
+    Both are None while unknown.
+    """
 
     def __init__(self) -> None:
         """Begin with no known labels (dstates of steps) and no bound."""
@@ -62,7 +65,7 @@ class NameSearch:
         self._had_all_help = False  # whether maps near a guess were sought already
 
     def improving(self) -> Iterator[list[int]]:
-        """Yield the dstates of all steps, better and better. The last ones are the fewest."""
+        """Yield labels of all steps, with ever fewer dstates. The last have the fewest."""
         known = self._incumbent
         if not self._program.chart.links:
             yield [0]
@@ -144,7 +147,7 @@ class NameSearch:
 
     @property
     def _may_help(self) -> bool:
-        """Whether to look for small maps in other ways, which know the causal axioms only."""
+        """Whether to look for small maps in other ways. These obey the causal axioms only."""
         return self._fitting is None and (
             self._task.speedups.greedy or self._task.speedups.annealed
         )

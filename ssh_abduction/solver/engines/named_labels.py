@@ -155,7 +155,7 @@ class NamedLabels:
         self._program.give_links(links)
 
     def _first_spares(self, pinned: Pinned) -> dict[int, int]:
-        """Return the names per view: one more than the given map needs, at least `SPARES`."""
+        """Return the spare names of each view: `SPARES`, or one more than a given map needs."""
         seen = pinned.chart.seen
         found = Counter(dict(zip(self._given_map, seen, strict=False)).values())
         taken = Counter(seen[node] for node in pinned.clique)
@@ -165,7 +165,7 @@ class NamedLabels:
         }
 
     def improving(self) -> Iterator[list[int]]:
-        """Yield labels of the first steps, better and better. The last have the fewest dstates."""
+        """Yield labels of the first steps, with ever fewer dstates. The last have the fewest."""
         assert self._search is not None  # `grow` comes first
         known = self._incumbent
         # Evidence about places may have refused the places of a known map since it was found.
@@ -238,7 +238,7 @@ class NamedLabels:
                 return
 
     def _needs_rest(self, spares: int) -> bool:
-        """Look for an answer of this cost with a dstate that has no name. If found, add names."""
+        """Look for an answer of this cost that uses a rest. If found, add names to its views."""
         answers = self._asker.answers(
             names_lp.read_names,
             f"enum,{spares},{spares}",

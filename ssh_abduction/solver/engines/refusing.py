@@ -22,8 +22,8 @@ def first_accepted(
 ) -> Answer | None:
     """Ask for answers until one is accepted; None if there is no answer left.
 
-    `refuse` returns the reason to reject an answer, if there is one, and `forbid` forbids all
-    answers with this reason.
+    `refuse` returns a reason to reject an answer, or None. `forbid` forbids all answers to which
+    this reason applies.
     """
     while (answer := ask()) is not None:
         reason = refuse(answer)
@@ -62,9 +62,9 @@ def all_accepted(
 
 
 def minimal_part(suffices: Callable[[list[Member]], bool], members: list[Member]) -> list[Member]:
-    """Find a minimal part of some members that still suffices.
+    """Find a minimal subset of the members for which `suffices` is true.
 
-    `suffices` has to stay true if members are added.
+    If it is true for a set, it has to be true for each larger set.
 
     Reference:
         Junker 2004, "QuickXplain: preferred explanations and relaxations for over-constrained

@@ -54,9 +54,9 @@ class FramedSides:
     ) -> bool:
         """Add the axioms of a path that labels contradict, and return whether there was one.
 
-        `contrary` and `twice` are the dstates that show such paths (`paths_lp.read_contrary`).
-        `standing` has, for each dstate that has a node in clingo, the visit and the slot
-        (direction) of such a node.
+        `contrary` has a dstate of each path that contradicts the axioms. `twice` has the dstates
+        where two paths cross that meet again. `standing` has, for each dstate that has a node in
+        clingo, the visit and the slot (direction) of such a node.
         """
         if any(self._say_once("path", *standing[dstate]) for dstate in contrary):
             return True
@@ -71,7 +71,7 @@ class FramedSides:
         return False
 
     def _say_once(self, part: str, *arguments: int) -> bool:
-        """Ground a part of sides_framed.lp for arguments, and return whether that was new."""
+        """Ground a part of sides_framed.lp for these arguments. Return False if that was done."""
         if (part, arguments) in self._said:
             return False
         control, batches = self._asker.control, range(self._batch + 1)

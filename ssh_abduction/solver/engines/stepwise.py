@@ -145,7 +145,7 @@ class StepEngine:
         self._tell_number()
 
     def _tell_number(self) -> None:
-        """Give clingo the rule about the exact number, if there is one."""
+        """Give clingo the rule that fixes a count to the number asked for, if there is one."""
         if self._number is None:
             return
         part = f"number_{self._number[0]}"

@@ -81,10 +81,10 @@ def apart_yet_joined(
 ) -> list[tuple[int, tuple[int, int], tuple[int, int]]]:
     """Find triples of visits in which two pairs are at one place, but not the third pair.
 
-    Each triple includes both visits of `pair`, which are at one place, and reads (first, (middle,
-    slot), (last, slot)). The middle visit is at one place with each of the others. The pair of the
-    first and the last visit is missing, or differs in its slot. Each slot is given as the slot of
-    this visit that is slot 0 of the first visit.
+    The two visits of `pair` are in each triple, and have just been put at one place. A triple is
+    (first, (middle, slot), (last, slot)). The answer puts the middle visit at one place with each
+    of the others. But it lacks the pair of the first and the last visit, or turns it differently.
+    Each slot of a visit is the same direction at the place as slot 0 of the first visit.
     """
     i, j, r = pair
     of_i, of_j = turned[i], turned[j]
@@ -101,6 +101,6 @@ def apart_yet_joined(
 
 
 def _in_order(*visits: tuple[int, int]) -> Three:
-    """Sort visits at one place. The slots given with them are one direction at the place."""
+    """Sort three visits at one place, each with a slot. All slots are one direction there."""
     (i, a), (j, b), (k, c) = sorted(visits)
     return i, j, k, (b - a) % 4, (c - b) % 4

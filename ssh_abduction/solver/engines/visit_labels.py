@@ -180,7 +180,7 @@ class VisitLabels:
         return None
 
     def _best_answer(self) -> list[Pair] | None:
-        """Find an answer with the fewest dstates (nodes that are the first at theirs), or None."""
+        """Find an answer with the fewest dstates; None if there is no answer."""
         read = self.program.read
         better = list(
             self._asker.answers(

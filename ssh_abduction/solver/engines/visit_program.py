@@ -82,7 +82,7 @@ class VisitProgram:
 
     @property
     def nodes(self) -> Iterable[int]:
-        """The nodes that clingo has, in the order by which a node is the first at its dstate."""
+        """The nodes that clingo has, in the order of choice (see `visit_labels.py`)."""
         return self._known.place_of
 
     def give(
@@ -174,7 +174,7 @@ class VisitProgram:
         return intransitive(pairs, self._known.fits, self.chart)
 
     def located(self, pairs: Iterable[Pair]) -> Located:
-        """Locate all visits by the pairs in a transitive answer, or say which visits are missed."""
+        """Locate all visits by the pairs in a transitive answer; else name the visits it needs."""
         first: dict[int, tuple[int, int]] = {}
         for i, j, r in sorted(pairs):
             first.setdefault(j, (i, r))
