@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Sequence
 from itertools import combinations
 from unittest.mock import patch
 
-import clingo
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -19,6 +18,7 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.online.keeper import MapKeeper
 from ssh_abduction.solver import Search, Start, Status, choosing
+from ssh_abduction.solver.asp.control import Control
 from ssh_abduction.solver.asp.facts import paths_lp, sides_lp, visits_lp
 from ssh_abduction.solver.asp.facts.atoms import number_symbols
 from ssh_abduction.solver.asp.limits import LimitError, Watch
@@ -389,7 +389,7 @@ def test_sides_and_paths_refuse_the_same_labels(theory: Theory) -> None:
         )
         contradicted += len(contrary)
 
-        def atoms(name: str, arity: int, control: clingo.Control = control) -> set[tuple[int, ...]]:
+        def atoms(name: str, arity: int, control: Control = control) -> set[tuple[int, ...]]:
             return {
                 tuple(x.number for x in atom.symbol.arguments)
                 for atom in control.symbolic_atoms.by_signature(name, arity)
@@ -409,7 +409,7 @@ def test_sides_and_paths_refuse_the_same_labels(theory: Theory) -> None:
             if (x, y, k) in beside
         }
         for (dstate,) in atoms("along", 1):
-            control = clingo.Control(["--warn=none"])
+            control = Control()
             control.load(encodings.path("visits"))
             control.load(encodings.path("sides_framed"))
             given = [(node, visit, slot) for node, _, visit, slot in nodes]

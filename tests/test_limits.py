@@ -3,8 +3,10 @@ then is printed."""
 
 from __future__ import annotations
 
+import gc
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,23 +16,29 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import aces
+import clingo
 import pytest
 from in_processes import answer_and_end, sleep, stay, vanish
 from limits import Case, cases, outcome
 from worlds import rectangle
 
+import ssh_abduction
 from ssh_abduction import Solution, Theory, Trace, solve
 from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.cli import main
+from ssh_abduction.explain import explain, explain_pair, explain_trace
 from ssh_abduction.explain.axioms import Axioms, Interrupted
 from ssh_abduction.explain.piece import Piece
-from ssh_abduction.solver import Search, Status
+from ssh_abduction.solver import Search, Status, check_rules, find_backbone
 from ssh_abduction.solver.asp import workers
 from ssh_abduction.solver.asp.control import Control
 from ssh_abduction.solver.asp.limits import LimitError, Watch, peak_memory
+from ssh_abduction.solver.asp.rules import EXAMPLE
 from ssh_abduction.solver.candidates import Candidates
 from ssh_abduction.solver.steps import certificate
 from ssh_abduction.solver.steps.noise import noise_in
+from ssh_abduction.theory.rules import Rules
 from ssh_abduction.theory.settle import settle
 
 # Seconds after which a process that obeys its limit has ended, even on a slow and busy machine. One
@@ -38,6 +46,7 @@ from ssh_abduction.theory.settle import settle
 SOON = 100
 # 64 million rules
 JOINS = "p(1..400). { q(X,Y) : p(X), p(Y) }. :- p(X), 1 = @go_on(X), q(X,Y), q(Y,Z), q(Z,X)."
+CLASH = Trace.from_steps("xyabcd", ["right", "travel", "travel", "around", "around"])  # has no map
 POSIX = pytest.mark.skipif(sys.platform == "win32", reason="signals")
 
 # Wait in clingo, which cannot be stopped, under a guard.
@@ -219,7 +228,7 @@ def test_snapshot_waits_for_the_running_sketch(
 
 
 def test_snapshot_of_an_unsatisfiable_search_is_complete() -> None:
-    search = Search(Trace.from_steps("xyabcd", ["right", "travel", "travel", "around", "around"]))
+    search = Search(CLASH)
     list(search)
     snapshot = search.snapshot("time limit")
     assert (snapshot.status, snapshot.complete) == (Status.UNSATISFIABLE, True)
@@ -379,10 +388,9 @@ def test_noise_is_reported_if_listing_is_stopped() -> None:
     search = Search(flawed, Theory.causal())
     list(search)
     assert search.status is Status.OPTIMAL
-    search._parts.prefixes.engine._named.size, search._parts.known.stopped = (
-        0,
-        "time limit",
-    )  # as if the limit ended the listing while clingo gets more steps
+    # as if the limit ended the listing while clingo gets more steps
+    search._parts.prefixes.engine._named.size = 0
+    search._parts.known.complete, search._parts.known.stopped = False, "time limit"
     noise = search.solution().noise
     assert noise
     assert noise.step == 40
@@ -415,33 +423,61 @@ def test_solve_returns_a_map_long_after_the_limit(
         assert len(solution.maps) == 1
 
 
-def test_limit_during_ranking_leaves_the_list_complete(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def over(search: Search) -> bool:
-        search._parts.known.stopped = "time limit"
-        return True
-
-    monkeypatch.setattr(Search, "over", over)
+def test_limit_during_ranking_leaves_the_list_complete() -> None:
     trace = Trace.from_steps("aba", ["travel"] * 2, displacements=[(5.0, 0.0, 0.0)] * 2)
-    solution = solve(trace, Theory(weigh="count"))
-    assert (solution.complete, solution.stopped) == (True, None)
+    search = Search(trace, Theory(weigh="count"))
+    for _ in search.unranked():
+        search._parts.watch.interrupted = True  # a limit ends the work with the last map
+        assert search.over()
+        search._parts.watch.interrupted = False
+    search._parts.watch.interrupted = True
+    assert search.over()
+    assert (search.complete, search.stopped) == (True, None)
 
 
-def test_ctrl_c_in_a_destructor_ends_the_search() -> None:
-    """Python only prints exceptions in `__del__`. Clingo's programs have one."""
+@POSIX
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda solution: solve(solution.trace),
+        find_backbone,
+        lambda solution: explain_pair(solution.trace, 0, 4),
+        lambda solution: explain_trace(solution.trace),
+        lambda _: explain(CLASH),
+        lambda _: check_rules(Theory.causal().replace(rules=[Rules("own.lp", EXAMPLE)])),
+    ],
+)
+def test_ctrl_c_while_clingo_deletes_a_program_is_raised_later(
+    ask: Callable[[Solution], object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Python only prints what is raised where an object is deleted."""
+    solution = aces.solution(max_maps=1)
+    delete, left = clingo.Control.__del__, [KeyboardInterrupt]
 
-    class Slow:
-        def __del__(self) -> None:
-            raise KeyboardInterrupt
+    def interrupted(control: clingo.Control) -> None:
+        delete(control)
+        if left:
+            raise left.pop()
 
-    before = sys.unraisablehook
-    search = Search(rectangle(8))
-    for _ in search:
-        slow = Slow()
-        del slow
-    assert search.stopped == "interrupted"
-    assert sys.unraisablehook is before
+    caught: list[int] = []
+    monkeypatch.setattr(clingo.Control, "__del__", interrupted)
+    before = signal.signal(signal.SIGINT, lambda number, _: caught.append(number))
+    try:
+        ask(solution)
+        gc.collect()
+        assert left == []
+        ends = time.monotonic() + SOON
+        while not caught and time.monotonic() < ends:
+            time.sleep(0.01)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert caught == [signal.SIGINT]
+
+
+def test_all_clingo_programs_keep_ctrl_c() -> None:
+    package = Path(ssh_abduction.__file__).parent
+    other = re.compile(r"clingo\.Control\(|ontrol\.solve\(")
+    assert [p.name for p in package.rglob("*.py") if other.search(p.read_text("utf-8"))] == []
 
 
 def test_solve_ended_late_writes_the_best_map(room: str, tmp_path: Path) -> None:

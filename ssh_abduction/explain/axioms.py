@@ -9,13 +9,11 @@ import clingo
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.explain.piece import Piece
-from ssh_abduction.solver import facts
+from ssh_abduction.solver import POLL, Control, facts
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Displacement, Equality, Planar
 from ssh_abduction.theory.settle import displacement_of
 
-# Seconds between two calls of `stop` while clingo solves.
-POLL = 0.05
 # The number of steps that are grounded between two calls of `stop`.
 AT_A_TIME = 8
 # Say why at most this many returns with the same last step are rejected.
@@ -93,9 +91,7 @@ class Axioms:
         self._conclusions: list[clingo.Symbol] = []
         self._seen: list[_ArgumentModel] = []
         self._last_core: tuple[int, ...] = ()  # clingo's literals of the last unsat core
-        self._control = clingo.Control(
-            ["--warn=none", *(["--heuristic=Domain"] if relaxed else [])]
-        )
+        self._control = Control(["--heuristic=Domain"] if relaxed else [])
         names = [name for name in facts.encoding_names(theory) if name != "preference"]
         for name in [*names, "explain", "derivation"] if relaxed else names:
             self._control.load(encodings.path(name))
@@ -286,10 +282,9 @@ class Axioms:
         if self._stop():
             raise Interrupted
         assumptions = [*((symbol, True) for symbol in active), *assumed]
-        with self._control.solve(assumptions=assumptions, on_model=keep, async_=True) as handle:
+        with self._control.searching(assumptions=assumptions, on_model=keep) as handle:
             while not handle.wait(POLL):
                 if self._stop():
-                    handle.cancel()
                     raise Interrupted
             satisfiable = bool(handle.get().satisfiable)
             self._last_core = () if satisfiable else tuple(handle.core())

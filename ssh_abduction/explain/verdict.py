@@ -135,6 +135,7 @@ class PairExplanation:
             for side, equal in ((self.same, "="), (self.different, "≠")):
                 if side.cost:
                     cost = _in_words(side.cost, self.theory.priorities)
+                    cost += "" if side.nats is None else f", and costs {side.nats:.1f} nats"
                     yield f"a map with step {self.first} {equal} step {self.second} has {cost}"
 
     def _of_costs(self) -> Iterator[str]:

@@ -376,15 +376,10 @@ class PairInMap:
     Attributes:
         is_one_place: Whether the two steps are at one place.
         probability: The probability that they are; None if it is unknown, as without costs in nats.
-        nats: The extra cost, in nats, of the best known map that contradicts `is_one_place`; None
-            if no such map is known.
-        is_estimated: Whether `nats` is an estimate: the map was not checked and may break axioms.
     """
 
     is_one_place: bool
     probability: float | None
-    nats: float | None
-    is_estimated: bool = False
 
     @classmethod
     def of(cls, listing: Listing, first: int, second: int) -> PairInMap | None:
@@ -393,29 +388,16 @@ class PairInMap:
         if None in at:
             return None
         weighed = listing.weighed
-        if weighed is None:
-            return cls(at[0] == at[1], None, None)
-        rival = weighed.rival_if_other(first, second)
-        return cls(
-            at[0] == at[1],
-            None if weighed.doubt is not None else weighed.probability(first, second, "place"),
-            rival.nats - weighed.nats if rival else None,
-            rival is not None and rival.estimated,
-        )
+        if weighed is None or weighed.doubt is not None:
+            return cls(at[0] == at[1], None)
+        return cls(at[0] == at[1], weighed.probability(first, second, "place"))
 
     def __str__(self) -> str:
         text = f"in map 1, the steps are at {'one place' if self.is_one_place else 'two places'}"
         if self.probability is not None:
             text += f"; the probability of one place is {probability_in_words(self.probability)}"
-        if self.nats is not None:
-            other = "two places" if self.is_one_place else "one place"
-            text += (
-                f"; a map with {other} may cost only {self.nats:.1f} nats more, but was not checked"
-                if self.is_estimated
-                else f"; the best known map with {other} costs {self.nats:.1f} nats more"
-            )
         return text
 
     def to_dict(self) -> dict[str, Any]:
         """Return the pair as plain data."""
-        return {"same_place": self.is_one_place, "probability": self.probability, "nats": self.nats}
+        return {"same_place": self.is_one_place, "probability": self.probability}

@@ -11,6 +11,7 @@ TYPE_CHECKING = False
 
 if TYPE_CHECKING:
     from ssh_abduction.solver.asp import facts, workers
+    from ssh_abduction.solver.asp.control import Control
     from ssh_abduction.solver.asp.limits import (
         POLL,
         LimitError,
@@ -67,6 +68,7 @@ if TYPE_CHECKING:
 
 _HOMES = {  # module: the names that this package exports from it
     "asp": ("facts", "workers"),
+    "asp.control": ("Control",),
     "asp.limits": ("POLL", "LimitError", "Stop", "Watch", "check_limit", "resident_memory"),
     "asp.workers": ("end_all", "in_process"),
     "asp.rules": ("check_rules",),
@@ -109,6 +111,7 @@ __all__ = [
     "Backbone",
     "Bound",
     "Certificate",
+    "Control",
     "Cost",
     "Effort",
     "Front",

@@ -21,7 +21,6 @@ class Known:
         lower: A lower bound on the preferred counts of every map, proven on a prefix; None if there
             is none.
         partial: The map of a prefix that was found last; None before that.
-        stopped: Why the search ended before it was complete; None if it did not.
         complete: Whether all maps were given: all minimal ones and, with `within`, all others that
             it asks for.
         count: The number of maps given to the caller.
@@ -35,11 +34,20 @@ class Known:
         self.bound = Bound()
         self.lower: tuple[int, ...] | None = None
         self.partial: SSHMap | None = None
-        self.stopped: Stop | None = None
         self.complete = False
         self.count = 0
         self.refused: dict[str, int] = {}
+        self._stopped: Stop | None = None
         self._theory = theory
+
+    @property
+    def stopped(self) -> Stop | None:
+        """Why the search ended before all maps were given; None if they were."""
+        return None if self.complete else self._stopped
+
+    @stopped.setter
+    def stopped(self, why: Stop | None) -> None:
+        self._stopped = why
 
     def is_better(self, found: Found) -> bool:
         """Whether a map of the trace, or of a prefix, costs less than the best map so far."""

@@ -52,7 +52,6 @@ def listed(parts: Parts, found: Iterator[Priced], *, keeps_time: bool) -> Iterat
             if known.count == most:
                 spent = watch.elapsed()
                 watch.stage_ends = min(ends, spent + max(ONE_MORE, ONE_MORE_SHARE * spent))
-        known.stopped = None  # the limit was reached while the caller ranked the last maps
     known.complete = True
 
 

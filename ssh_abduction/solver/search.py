@@ -32,7 +32,6 @@ from ssh_abduction.solver.asp.limits import (
     StageTimeError,
     Stop,
     Watch,
-    keeping_interrupts,
     now,
 )
 from ssh_abduction.solver.asp.rules import check_rules
@@ -257,13 +256,12 @@ class Search:
     def _given(self, ranking: Ranking | None) -> Iterator[SSHMap]:
         """Yield the maps. `ranking` sorts maps of one cost; None keeps their order."""
         drives, late = drives_of(self.trace), partial(overtime, self._parts)
-        with keeping_interrupts(self.interrupt):
-            for cost, level in groupby(self._found(), key=lambda priced: priced[1]):
-                maps = (ssh_map for ssh_map, _ in level)
-                for ssh_map in ranking.ranked(maps, self.over, late) if ranking else maps:
-                    complete = _with_names(ssh_map, self.trace, drives)
-                    self._answer.take_down(complete, cost)
-                    yield complete
+        for cost, level in groupby(self._found(), key=lambda priced: priced[1]):
+            maps = (ssh_map for ssh_map, _ in level)
+            for ssh_map in ranking.ranked(maps, self.over, late) if ranking else maps:
+                complete = _with_names(ssh_map, self.trace, drives)
+                self._answer.take_down(complete, cost)
+                yield complete
 
     def _found(self) -> Iterator[Priced]:
         """Run the search, and yield each map with its preferred counts as it is found."""

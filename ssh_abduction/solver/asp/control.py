@@ -81,16 +81,41 @@ class Control(clingo.Control):
         options: Sequence[str] = (),
         check: Callable[[], None] = lambda: None,
         preparing: tuple[float, float] = PREPARING,
+        logger: Callable[[clingo.MessageCode, str], None] | None = None,
     ) -> None:
         """Make a control without a program, with command-line options of clingo.
 
         `check` is called now and then while clingo grounds an encoding with `@go_on`. If it raises
-        an exception, the grounding ends and the control is unusable.
+        an exception, the grounding ends and the control is unusable. `logger` gets the messages of
+        clingo; None prints them.
         """
-        super().__init__(["--warn=none", *options])
+        super().__init__(["--warn=none", *options], logger)
         self.preparing = preparing
         self.seconds = self.mebibytes = 0.0
         self._check = check
+
+    def __del__(self) -> None:
+        try:
+            super().__del__()  # type: ignore[no-untyped-call]
+        except KeyboardInterrupt:
+            # Python only prints what is raised here. So let Ctrl-C come again a bit later.
+            threading.Timer(POLL, signal.raise_signal, [signal.SIGINT]).start()
+
+    @contextmanager
+    def searching(self, **options: Any) -> Iterator[clingo.SolveHandle]:
+        """Run a search of clingo in its own thread, with the arguments of `solve`.
+
+        Leaving the context stops the search.
+        """
+        with ExitStack() as stack:
+            with _held_back_interrupts():
+                handle = stack.enter_context(self.solve(async_=True, **options))
+            _under_way.add(handle)
+            try:
+                yield handle
+            finally:
+                _under_way.discard(handle)
+                handle.cancel()
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
@@ -217,7 +242,7 @@ class Asker:
         assumptions: Sequence[tuple[clingo.Symbol, bool] | int] = (),
         conflicts: int = -1,
         on_bound: Callable[[Sequence[int]], None] | None = None,
-        control: clingo.Control | None = None,
+        control: Control | None = None,
         until: Callable[[], bool] = lambda: False,
         ahead: bool = False,
     ) -> Generator[Answer, None, bool]:
@@ -287,7 +312,7 @@ class Asker:
     @contextmanager
     def _solving(
         self,
-        control: clingo.Control,
+        control: Control,
         assumptions: Sequence[tuple[clingo.Symbol, bool] | int],
         mode: str,
         models: int,
@@ -295,28 +320,18 @@ class Asker:
         conflicts: int,
         on_bound: Callable[[Sequence[int]], None] | None = None,
     ) -> Iterator[clingo.SolveHandle]:
-        """Run a search of clingo in its own thread. Leaving the context stops the search."""
+        """Run a search of clingo, as `Control.searching` does."""
         configuration: Any = control.configuration.solve
         configuration.opt_mode, configuration.models, configuration.project = mode, models, project
         configuration.solve_limit = f"{conflicts},-1"
-        if isinstance(control, Control):
-            self.watch.check(
-                control.preparing[0] * control.seconds, control.preparing[1] * control.mebibytes
-            )
-            control.seconds = control.mebibytes = 0.0
+        self.watch.check(
+            control.preparing[0] * control.seconds, control.preparing[1] * control.mebibytes
+        )
+        control.seconds = control.mebibytes = 0.0
         began = time.perf_counter()
-        with ExitStack() as stack:
-            with _held_back_interrupts():
-                handle = stack.enter_context(
-                    control.solve(assumptions, yield_=True, async_=True, on_unsat=on_bound)
-                )
+        with control.searching(assumptions=assumptions, yield_=True, on_unsat=on_bound) as handle:
             self.solve_seconds += time.perf_counter() - began
-            _under_way.add(handle)
-            try:
-                yield handle
-            finally:
-                _under_way.discard(handle)
-                handle.cancel()
+            yield handle
 
     def _has_come(self, handle: clingo.SolveHandle, until: Callable[[], bool]) -> bool:
         """Wait for an answer or the end; False if `until` ended the wait. May raise LimitError."""

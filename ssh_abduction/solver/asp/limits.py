@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from typing import Literal, TypeAlias
 
 from ssh_abduction.data.errors import SolverError, brief, is_finite
@@ -42,29 +42,6 @@ def processor_clock() -> Callable[[], float]:
         return max(time.thread_time() - used, (now() - began) / WAITING)
 
     return clock
-
-
-@contextmanager
-def keeping_interrupts(interrupt: Callable[[], None]) -> Iterator[None]:
-    """Call `interrupt` if Ctrl-C comes while Python deletes an object.
-
-    Clingo takes some time to delete a program. Python then only prints the KeyboardInterrupt, and
-    goes on.
-    """
-    before = sys.unraisablehook
-
-    def hook(unraisable: sys.UnraisableHookArgs) -> None:
-        if issubclass(unraisable.exc_type, KeyboardInterrupt):
-            interrupt()
-        else:
-            before(unraisable)
-
-    sys.unraisablehook = hook
-    try:
-        yield
-    finally:
-        if sys.unraisablehook is hook:
-            sys.unraisablehook = before
 
 
 def check_limit(name: str, unit: str, limit: object) -> None:

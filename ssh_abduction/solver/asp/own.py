@@ -85,7 +85,7 @@ def keeps_own_rules(problem: Problem, ssh_map: SSHMap) -> bool:
         look_at_clock()
         control.ground([("step", number_symbols(t))])
     control.ground([("check", number_symbols(len(trace) - 1))])
-    with control.solve(async_=True) as handle:
+    with control.searching() as handle:
         while not handle.wait(POLL):
             look_at_clock()
         return bool(handle.get().satisfiable)

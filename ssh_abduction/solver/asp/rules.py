@@ -15,10 +15,10 @@ import re
 from collections.abc import Iterable, Iterator
 from functools import lru_cache
 
-import clingo
 from clingo import ast
 
 from ssh_abduction.data.errors import TheoryError
+from ssh_abduction.solver.asp.control import Control
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.rules import Rules
 from ssh_abduction.theory.theory import Theory
@@ -203,7 +203,7 @@ def _said(rules: Rules, messages: list[str]) -> str:
 def _check_safety(*files: Rules) -> None:
     """Let clingo find unsafe variables, without grounding. Raises TheoryError if there are some."""
     messages: list[str] = []
-    control = clingo.Control(logger=lambda _, message: messages.append(message))
+    control = Control(logger=lambda _, message: messages.append(message))
     try:
         for rules in files:
             control.add("base", [], rules.text)

@@ -6,11 +6,9 @@ from collections.abc import Collection, Generator, Iterator
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
-import clingo
-
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.solver.asp.control import Asker, mapped
+from ssh_abduction.solver.asp.control import Asker, Control, mapped
 from ssh_abduction.solver.asp.facts.path_reader import PathReader
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.engines.doubts import Settled
@@ -147,7 +145,7 @@ class LabellingEngine(Protocol):
 
 def maps_of_labels(
     asker: Asker,
-    control: clingo.Control,
+    control: Control,
     reader: PathReader,
     theory: Theory,
     mode: str,

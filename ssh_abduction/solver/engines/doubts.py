@@ -15,7 +15,7 @@ from typing import TypeAlias, TypeVar
 import clingo
 
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.solver.asp.control import Asker
+from ssh_abduction.solver.asp.control import Asker, Control
 from ssh_abduction.solver.asp.facts import further_rules, path_reader
 from ssh_abduction.solver.solution.sharing import Sort
 
@@ -31,7 +31,7 @@ class Doubts:
     def __init__(
         self,
         asker: Asker,
-        control: clingo.Control,
+        control: Control,
         condition: Callable[[Sort, int, int], str | None],
     ) -> None:
         """Begin without any doubt.
@@ -76,7 +76,7 @@ class Settled:
     def __init__(
         self,
         asker: Asker,
-        control: clingo.Control,
+        control: Control,
         mode: str,
         reader: path_reader.PathReader,
     ) -> None:

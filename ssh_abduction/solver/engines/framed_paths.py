@@ -19,8 +19,6 @@ from __future__ import annotations
 from collections.abc import Collection, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
-import clingo
-
 from ssh_abduction.solver.asp.control import Asker, Control
 from ssh_abduction.solver.asp.facts import names_lp, path_reader, paths_lp
 from ssh_abduction.solver.engines.base import BETTERING, Found, Task, maps_of_labels
@@ -46,7 +44,7 @@ class NodeLabels:
 
     chart: FramedChart
     labels: Sequence[int]
-    control: clingo.Control | None = None
+    control: Control | None = None
 
 
 @dataclass(frozen=True)
@@ -112,7 +110,7 @@ class FramedPaths:
         reader = self._reader(naming, control)
         return Settled(self._asker, control, mode, reader)
 
-    def _reader(self, naming: NodeLabels, control: clingo.Control) -> path_reader.PathReader:
+    def _reader(self, naming: NodeLabels, control: Control) -> path_reader.PathReader:
         """Make a reader of the places and paths in answers of a control."""
         return path_reader.PathReader(
             control, self.task.trace, self.task.theory, naming.chart, naming.labels
@@ -126,7 +124,7 @@ class FramedPaths:
         nodes: Iterable[int] | None = None,
         *,
         single: bool = False,
-    ) -> clingo.Control:
+    ) -> Control:
         """Make a control whose answers are the places and paths that fit the labels of some nodes.
 
         `options` are those of clasp. If `nodes` is None, the paths have to fit the labels of all

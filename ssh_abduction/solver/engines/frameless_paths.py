@@ -95,7 +95,7 @@ class PlacesAndPaths:
         # Dstates for whose paths clingo has the axioms, as keys of `NameProgram.names`.
         self._grounded: set[tuple[int, int]] = set()
         # The last labels, and the control for their places and paths.
-        self._asked: tuple[_Question, clingo.Control] | None = None
+        self._asked: tuple[_Question, Control] | None = None
         # For each labelling for which the fixed places are enough: the homes (`engines/homes.py`)
         # and a best map. And the labellings for which homes did not lead to a map.
         self._tight: dict[tuple[int, ...], tuple[Mapping[int, list[int]], Found]] = {}
@@ -198,7 +198,7 @@ class PlacesAndPaths:
         """Return the labels themselves if no places and paths fit them, else None."""
         return None if self.fits(labels) else labels
 
-    def _has_paths(self, control: clingo.Control) -> bool:
+    def _has_paths(self, control: Control) -> bool:
         """Whether a control has an answer, that is, places and paths."""
         return next(self._asker.answers(lambda _: True, "ignore", 1, control=control), False)
 
@@ -290,7 +290,7 @@ class PlacesAndPaths:
         labels: Sequence[int],
         options: Sequence[str] = (),
         parts: Sequence[str] = (*PARTS, *EACH),
-    ) -> clingo.Control:
+    ) -> Control:
         """Make a control for the places and paths of given dstates, or reuse the last one."""
         key = tuple(labels), tuple(options), tuple(parts)
         if self._asked is None or self._asked[0] != key:
@@ -345,7 +345,7 @@ class PlacesAndPaths:
             )
         )
 
-    def _reader(self, control: clingo.Control, labels: Sequence[int]) -> path_reader.PathReader:
+    def _reader(self, control: Control, labels: Sequence[int]) -> path_reader.PathReader:
         """Make a reader of the places and paths in answers of a control."""
         return path_reader.PathReader(
             control, self._task.trace, self._task.theory, self.named.chart, labels

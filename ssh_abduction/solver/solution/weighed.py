@@ -138,17 +138,6 @@ class Weighed:
         are_one = self._are_one(first, second, of)
         return math.fsum(w for w, is_one in zip(self.weights, are_one, strict=True) if is_one)
 
-    def rival_if_other(self, first: int, second: int) -> Rival | None:
-        """Return the cheapest rival that decides otherwise about two steps; None if none does.
-
-        If the best map has them at one place, the rival has them at two places, and the other way
-        round. Maps without places are compared by dstates.
-        """
-        are_one = self._are_one(first, second, "place")
-        rivals = zip(self.rivals, are_one, strict=True)
-        others = [rival for rival, is_one in rivals if is_one != are_one[0]]
-        return min(others, key=lambda rival: rival.nats, default=None)
-
     def _are_one(self, first: int, second: int, of: str) -> list[bool]:
         """Return for each rival whether two steps are at one dstate, or at one place.
 
