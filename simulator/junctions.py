@@ -186,7 +186,7 @@ class Pilot:
             self.driver.go(way / strides)
 
     def _climb(self) -> bool:
-        """Climb to the place's fixed point, if any. Face the dstate nearest to the old heading."""
+        """Climb to the place's fixed point, if any. Turn to the nearest heading of its dstates."""
         came = self.driver.robot.odometry[2]
         for _ in range(TRIES):
             straight_on = came - self.driver.robot.odometry[2]

@@ -156,7 +156,7 @@ def _place(world: World, pose: Array) -> str | None:
 
 
 def _stops(driver: Driver, world: World, tours: int) -> Iterator[tuple[int, str]]:
-    """Drive to each stop of all tours. First yield its number, counted over tours, and name."""
+    """Drive to each stop of all tours. Before, yield its number over all tours, and its name."""
     for tour in range(tours):
         if tour:
             driver.world = world.arranged(driver.rng)

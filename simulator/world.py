@@ -201,8 +201,8 @@ class World:
 
         Args:
             name: Name of the lift.
-            x: Metres.
-            y: Metres.
+            x: x of the point in metres.
+            y: y of the point in metres.
         """
         a_text("name", name, SimulatorError)
         a_number("x", x, SimulatorError, -FARTHEST, FARTHEST, what="metres")

@@ -77,8 +77,8 @@ class Worker:
     def done(self, number: int, work: Callable[..., Any], arguments: tuple[object, ...]) -> Any:
         """Let the process call `work`. Return the result of `work`, or Lost if the process ends.
 
-        `number` is the number of the task, for Lost. `work` can be pickled. After `arguments`, it
-        gets a function that returns whether to stop early.
+        `number` is the number of the task, for Lost. `work` must be picklable. After `arguments`,
+        it gets a function that returns whether to stop early.
         """
         self._send((work, arguments))
         output = self._process.stdout
@@ -135,9 +135,10 @@ def answers(
 ) -> Iterator[Any]:
     """Yield what `work` returns for each task, as soon as it is ready; Lost if it has no answer.
 
-    `work` is as in `Worker.done`. A task has its arguments, first the number of the task. Once
-    `stopped` returns True, no further task begins, and running tasks may take `patience` seconds
-    more. `seconds` is the time for a task, after which its process is killed; None for no limit.
+    `work` is as in `Worker.done`. A task is a tuple of arguments; the first is its number.
+    Once `stopped` returns True, no further task begins, and running tasks may take `patience`
+    seconds more. `seconds` is the time for a task, after which its process is killed; None for no
+    limit.
     """
     waiting = queue.SimpleQueue[tuple[Any, ...]]()
     for task in tasks:
@@ -200,10 +201,11 @@ def in_process(work: Callable[..., Result], *arguments: object, watch: Watch) ->
     """Call `work` in another process, or in this one if no other process can be started.
 
     Args:
-        work: The function to call. It, its arguments, its result and its errors can be pickled.
+        work: The function to call, with `arguments` and then a watch. The function, its arguments,
+            its result and its errors must be picklable.
         arguments: The first arguments of `work`.
-        watch: The limits. The other process is ended at a limit. The last argument of `work` is a
-            new watch with only the memory limit in the other process, and `watch` in this one.
+        watch: The limits. At a limit the other process is killed. There, `work` gets a new watch
+            that has only the memory limit. In this process, it gets `watch` itself.
 
     Returns:
         The result of `work`.

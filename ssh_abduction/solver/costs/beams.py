@@ -28,7 +28,7 @@ BROAD = 4
 
 @dataclass(frozen=True, slots=True)
 class _Time:
-    """The time of all beams: the clock at its start, and how many seconds it lasts, or inf."""
+    """The time limit of all beams: the clock when they began, and the seconds (or inf)."""
 
     begun: float
     seconds: float
@@ -42,8 +42,8 @@ class Beams:
     """The beams of one search, and what they say about the best map.
 
     Attributes:
-        broken: By how many nats the best map that breaks axioms is cheaper than the best map, as in
-            `Weighed`; 0 if it is not, -inf if none was sought.
+        broken: How many nats the best map that breaks axioms costs less than the best map, as in
+            `Weighed`; 0 if it does not cost less, -inf if no such map was sought.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ class Beams:
         return True
 
     def _search_without_axioms(self, time: _Time) -> None:
-        """Find how many nats breaking axioms saves, with the widest beam that ended, if unknown."""
+        """If `broken` is unknown, find it with the widest beam that ended."""
         self._parts.watch.stage_ends = time.end(BREAKING)
         is_open = self._best[1] < math.inf and math.isinf(self.broken)
         with suppress(StageTimeError):

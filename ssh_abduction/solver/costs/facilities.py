@@ -46,7 +46,8 @@ class Facilities:
         points: x and y in metres, or x, y and a heading in radians, (n, 2) or (n, 3).
         variances: The variance of each coordinate of each point, (n, 2) or (n, 3).
         kinds: The kind of each point, (n,). Each facility is of one kind, too.
-        fees: What each point pays more at a facility of another kind; inf if it cannot, (n,).
+        fees: What each point pays in addition at a facility of another kind, (n,); inf if it cannot
+            use one.
         price: The price of a facility.
     """
 
@@ -259,7 +260,7 @@ class _Boxes:
         return bound
 
     def _first(self, half: Array) -> Array:
-        """Return the centres of boxes that cover where any point may save something."""
+        """Return the centres of boxes that cover all positions where some point may save."""
         reach = np.sqrt(2 * self._shares[:, None] * self._all.variances)
         cells: set[tuple[int, ...]] = set()
         for point, away in zip(self._all.points, reach, strict=True):
@@ -279,9 +280,9 @@ class _Boxes:
     def _bounds(self, centres: Array, half: Array) -> Array:
         """Bound what is saved in each box.
 
-        What is saved by the points that save something everywhere in a box is a concave quadratic
-        function. Its maximum is known. Any other point saves at most what it saves at the nearest
-        position in the box.
+        Some points save something everywhere in a box. The sum of their savings is a concave
+        quadratic function, whose maximum is known. Any other point saves at most what it saves at
+        the nearest position in the box.
         """
         look_at_clock()
         variances, off = self._all.variances, self._all.offsets(centres)

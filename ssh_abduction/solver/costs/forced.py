@@ -329,7 +329,7 @@ class Forcing:
         return self.visits.returns(self.joins)
 
     def bounds(self, most: float) -> Iterator[float]:
-        """Yield rising lower bounds, at most `most`, on the cost of every map. Keep `joins`."""
+        """Yield rising lower bounds, at most `most`, on the cost of all maps. Extend `joins`."""
         self._laying = self._least_laying(most)
         low = self._bound(most)
         yield low
@@ -357,10 +357,10 @@ class Forcing:
         self._forced(self.visits, self.joins, most, {}, 1)
 
     def _least_laying(self, most: float) -> float:
-        """Return what every map of a cost below `most` pays for laying drives on each other.
+        """Return what every map of a cost below `most` pays for drives that share places.
 
-        If a map in which a drive shares no place with the others costs `most` or more, each cheap
-        map lays this drive on others. Drives that closures tie count as one.
+        If a map in which a drive shares no place with the others costs `most` or more, the drive
+        shares one in each cheap map. Drives that closures tie count as one drive.
         """
         unit = np.array(self._overlap.unit_of_step)[
             np.unique(self.visits.visit, return_index=True)[1]
@@ -388,9 +388,9 @@ class Forcing:
     ) -> bool:
         """Add joins that every map of a cost below `most` has. Tell whether there is no such map.
 
-        `joins` has those to begin with. `known` maps a join to a lower bound on the cost of maps
-        without it. New bounds are added to it. Up to `branches` joins at a
-        time are assumed to be lacking.
+        `joins` has the joins found so far. `known` maps a join to a lower bound on the cost of maps
+        without it. New bounds are added to it. Up to `branches` joins at a time are assumed to be
+        lacking.
         """
         while True:
             joins, low, worth = self._grown(visits, joins, most, known)
@@ -411,9 +411,9 @@ class Forcing:
     ) -> tuple[Ints, float, list[tuple[tuple[int, int], float]]]:
         """Add joins that every map of a cost below `most` has, as far as bounds alone show them.
 
-        Returns the class of each visit, and a lower bound on the cost of maps with these joins.
-        Third come the other joins of the best map. Each has a lower bound on the cost of maps
-        without it, the highest first. `known` maps a join to such a bound. New ones are added.
+        Returns the class of each visit, a lower bound on the cost of maps with these joins, and the
+        other joins of the best map. Each of these comes with a lower bound on the cost of maps
+        without it, the highest first. `known` has such bounds by join. New bounds are added.
         """
         while True:
             look_at_clock()

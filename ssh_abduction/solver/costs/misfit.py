@@ -110,7 +110,7 @@ class Misfit:
         return [] if suffices([]) else minimal_part(suffices, list(returns))
 
     def _of_groups(self, groups: _Groups) -> float:
-        """Compute the misfit if steps share headings and positions, or look it up."""
+        """Return the misfit if steps share headings and positions. Compute it only once."""
         if groups not in self._known:
             headings, positions, wrong = groups
             trace = self.trace.without_displacements_at(wrong)

@@ -165,7 +165,7 @@ def _without_rigid_motions(poses: Array, piece: NDArray[np.int_]) -> Array:
 
 
 def _parts(problem: Problem, track: _LinearTrack, visit: NDArray[np.int_]) -> list[_MovedPoints]:
-    """Return the problems of dstates and of places."""
+    """Return the points of the two clustering problems: of dstates, and of places if any."""
     theory, steps = problem.theory, problem.trace.steps
     dstate, place, _ = theory.prices
     has_places = theory.level != "causal" and place > 0

@@ -227,7 +227,7 @@ class Weighing:
         """Yield the maps of least cost, then maps that cost up to `within` nats more.
 
         All maps of least cost come with the counts of the best one, even if theirs differ. A map
-        that costs more comes with its own counts and its rank, so that it has a level of its own.
+        that costs more comes with its own counts and its rank, so that no other has its cost.
         """
         parts, theory = self._parts, self._parts.task.theory
         complete = True
@@ -311,7 +311,7 @@ class Weighing:
 
     @property
     def _most(self) -> float:
-        """Maps of this cost or more are not worth finding."""
+        """The cost in nats from which on maps are not worth finding."""
         return self.candidates[0].nats + max(self._within, EQUAL)
 
     def _cost_of_others(self, ssh_map: SSHMap) -> float:
@@ -354,7 +354,7 @@ class Weighing:
         )
 
     def _excess(self) -> float:
-        """Divide the misfit of the returns of the best map by the misfit that is expected.
+        """Return the misfit of the returns of the best map, divided by its expected value.
 
         Return 1 if the misfit is not improbable, and inf if it is too large to be trusted.
         """

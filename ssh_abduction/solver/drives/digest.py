@@ -1,7 +1,7 @@
 """Make a short trace that the solver gets instead of old drives: each link of their map once.
 
-Axioms are about links and observations. So a map of this *digest* and a new drive is a map of all
-drives.
+Axioms are about links and observations. So each map of this *digest* and a new drive gives a map
+of all drives.
 """
 
 from __future__ import annotations

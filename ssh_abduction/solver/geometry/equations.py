@@ -79,8 +79,8 @@ class Equations:
     def beside(self, labels: NDArray[np.int_], size: int) -> Equations:
         """Return the same equations for the poses of dstates instead of those of steps.
 
-        If the robot may be off its dstates, it gets a pose of its own at each step t, which has the
-        number size + t. Then there are also equations between these poses and the dstates.
+        If the robot may be off the poses of dstates, its pose at step t is an unknown with the
+        number size + t. Then there are also equations between these poses and those of dstates.
         """
         if not self.spreads.any():
             return replace(self, first=labels[self.first], last=labels[self.last])

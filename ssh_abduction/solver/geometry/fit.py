@@ -263,7 +263,7 @@ class Poses:
         return form
 
     def _moves(self) -> Any:
-        """Make the matrix that turns positions, x or y, into displacements, x or y."""
+        """Make the matrix that maps the x (or y) of positions to the x (or y) of displacements."""
         return self._differences(self._place[self._from], self._place[self._to], self._positions)
 
     def _graph(self, first: NDArray[np.int_], second: NDArray[np.int_], size: int) -> csr_array:

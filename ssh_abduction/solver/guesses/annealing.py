@@ -131,8 +131,8 @@ def annealed_steps(
     """Yield better and better guesses at the dstates of all steps; -1 if a guess is not sure.
 
     Yield none if the transitions would take too much memory. The steps of `clique` are pairwise
-    distinct, and its step number K is pinned to dstate K. `may_be` has, for each step, the dstates
-    of the clique that it may be at.
+    distinct, and the step at index K is pinned to dstate K. `may_be` has, for each step, the
+    dstates of the clique that it may be at.
     """
     options = _step_options(chart, clique, may_be)
     leaves = [(0, action) for _, action, _ in chart.links]
@@ -146,7 +146,7 @@ def annealed_steps(
 
 
 def _options(chart: FramedChart, spares: int) -> States:
-    """List the possible states (place and slot) of each visit, in a row padded with -1."""
+    """Return the possible states (place and slot) of each visit: a row each, padded with -1."""
     misfits = chart.misfits
     # turned[visit][r] is the star of the visit in a frame whose slot r is slot 0 of the visit. The
     # least of these four stars is the kind of the visit.
@@ -172,7 +172,7 @@ def _options(chart: FramedChart, spares: int) -> States:
 
 
 def _step_options(chart: Chart, clique: Sequence[int], may_be: Sequence[Sequence[int]]) -> States:
-    """List the possible states of each step, if each step is a visit, in a row padded with -1.
+    """Return the possible states of each step, if each step is a visit: rows padded with -1.
 
     A step of the clique has only its own state. Any other step also has the spare names of its
     view. Arguments are as for `annealed_steps`.

@@ -116,7 +116,7 @@ class Beam:
 
         Give up as soon as all hypotheses cost more than `most` nats.
 
-        If an exception ended an earlier call, such as that of a time limit, go on from there. If no
+        If a time limit or another exception ended an earlier call, go on from there. If no
         hypothesis is left after some steps, go back to an earlier beam and check each hypothesis at
         each step. If that does not help, extend this beam again with new dstates and places for
         free. Then go back twice as far.
@@ -144,7 +144,7 @@ class Beam:
                 yield ssh_map
 
     def partial(self) -> Iterator[SSHMap]:
-        """Yield maps of the first steps, as far as `maps` had come, the longest one first."""
+        """Yield maps of the first steps that `maps` has reached so far, the longest first."""
         for found in [beam[0] for beam in reversed(self._kept)]:
             if (ssh_map := self._map(found, len(found.labels))) is not None:
                 yield ssh_map
@@ -166,7 +166,7 @@ class Beam:
         return float(beam[0].nats) if beam else math.inf
 
     def _onward(self, beam: list[Hypothesis], end: int) -> list[Hypothesis]:
-        """Extend a beam to its first `end` steps, or fewer if it is crowded. Do not check it."""
+        """Extend a beam to `end` steps without checks. End early if it has many hypotheses."""
         most = max(CROWDED * self._width, 2 * len(beam))
         for t in range(len(beam[0].labels), end):
             beam = list(self._best(self._options_of(beam, t, joins=True), t, self._width))
@@ -244,7 +244,7 @@ class Beam:
         return price
 
     def _checked(self, beam: list[Hypothesis], end: int, joins: bool = True) -> list[Hypothesis]:
-        """Extend a beam to its first `end` steps, and check each hypothesis at each step.
+        """Extend a beam to `end` steps, and check each hypothesis at each step.
 
         If `joins`, new dstates and places cost their prices, so that returns are cheaper. If not,
         they are free, and the robot returns to a place only if it has to.
@@ -341,7 +341,7 @@ class Beam:
         return sorted(options, key=lambda option: option.nats)
 
     def _laid(self, option: _Extension) -> _Extension:
-        """Add the price if an option makes the drive share a place with other drives."""
+        """Return an option with the price for places that its drive shares with other drives."""
         places = [option.of.places[s] for s in option.of.labels]
         nats = self._problem.overlap.nats
         price = nats([*places, option.place]) - nats(places)

@@ -79,7 +79,7 @@ def completed(
 def _on(
     ssh_map: SSHMap, courses: Mapping[int, _Course], headings: Mapping[int, int] | None = None
 ) -> SSHMap:
-    """Add to a map the path, direction and heading (a slot) of the dstates that have them."""
+    """Return a map with the given paths, directions and headings (slots); None for the others."""
     dstates = []
     for s in ssh_map.dstates:
         path, direction = courses.get(s.id, (None, None))

@@ -51,10 +51,10 @@ class ExistingMap:
         return replace(digest, steps=(digest.steps[0], *steps))
 
     def maps(self, problem: Problem, labels: Sequence[int]) -> Iterator[SSHMap]:
-        """Yield maps of a digest and new drives that keep this map, the one with most joins last.
+        """Yield maps of all drives that keep this map of the old ones; the most joined one is last.
 
-        The caller has to check them. The trace of the problem has the digest first. `labels` has
-        the dstates of its steps.
+        The caller has to check them. The trace of the problem is a digest of the old drives, and
+        then the new ones. `labels` has the dstate of each step of the digest.
         """
         log = Log(problem.trace, problem.theory, problem.pairs)
         joining = Joining(problem, log)
@@ -62,7 +62,7 @@ class ExistingMap:
         yield from joining.maps([self._part(i, labels, log, joining.sights) for i in pieces])
 
     def _part(self, piece: int, labels: Sequence[int], log: Log, sights: Sights) -> Part:
-        """Make a part of a piece of the map. It costs nothing, as the map must be kept."""
+        """Make the `Part` for a piece of the map. Its cost is 0, as the map must be kept."""
         dstates = [s for s, other in enumerate(self._piece) if other == piece]
         number = {s: i for i, s in enumerate(dstates)}
         places = list(dict.fromkeys(self._places[s] for s in dstates))

@@ -1,4 +1,4 @@
-"""Sketches of traces with stars of any number of gateways: a travel leads to a new place if it can.
+"""Sketches (maps without a search) of traces whose stars have any number of gateways.
 
 >>> from ssh_abduction import Theory, Trace
 >>> from ssh_abduction.solver.guesses.gated import sketches_of
@@ -14,9 +14,10 @@ True
 >>> sketch.map().places
 (0, 1)
 
-A path ends at a place if no gateway leads on there. So a travel to a place from which no gateway
-leads on reaches the end of its path. If the path has an end in this direction already, the travel
-leads back to that place. Otherwise the place is new. All other travels may lead to new places.
+A travel leads to a new place if it can. A path ends at a place if no gateway leads on there. So a
+travel to a place from which no gateway leads on reaches the end of its path. If the path has an end
+in this direction already, the travel leads back to that place. Otherwise the place is new. All
+other travels may lead to new places.
 
 A turn leads to a known dstate of its place if the gateways that the robot sees fit the gateways
 that it saw there, in the same directions.
@@ -43,7 +44,7 @@ _Seen = tuple[int, Star]
 
 
 def sketches_of(first: Step, theory: Theory) -> list[Sketch]:
-    """Make a sketch (a map without a search) of each kind, those with small maps first."""
+    """Begin a sketch (a map without a search) of each kind: first with `homing`, then without."""
     if _is_gated(theory):
         return [GatewaySketch(first, theory, homing) for homing in (True, False)]
     return Sketch.all_of(first, theory)
@@ -65,16 +66,16 @@ class _PlaceSights:
 
     Attributes:
         sights: For each dstate and star seen there, the first step.
-        turns: For pairs of these, the turns from the first to the second.
+        turns: For two such pairs of a dstate and a star: the turns from the first to the second.
     """
 
     sights: dict[_Seen, int] = field(default_factory=dict)
     turns: dict[tuple[_Seen, _Seen], set[Action]] = field(default_factory=dict)
 
     def with_sight(self, seen: _Seen, step: int, move: tuple[_Seen, Action] | None) -> _PlaceSights:
-        """Return this place after a step there that sees something.
+        """Return a copy to which a step at this place is added, with its dstate and star.
 
-        `move` has what was seen before at this place, and the turn since.
+        `move` has the dstate and star before the turn to this step, and the turn; None without.
         """
         turns = self.turns
         if move:
@@ -136,7 +137,7 @@ class GatewaySketch(Sketch):
         return frames_that_fit(*self._sights(grown), self._axioms, as_shown=False) is not None
 
     def _grown(self, place: int, there: int, t: int) -> _PlaceSights:
-        """Return the place after step t, which is the present step and at the dstate `there`."""
+        """Return the sights of a place with step t added, the present step, at dstate `there`."""
         move = None
         if self._turn_made and self._last and self._states[self._last[0]].place == place:
             move = self._last, self._turn_made
@@ -183,7 +184,7 @@ class GatewaySketch(Sketch):
         return fits
 
     def _first_of(self, known: Iterable[int], step: Step) -> int | None:
-        """Return the first of some dstates at which a step may be; None if there is none."""
+        """Return the first known dstate that fits a step; None if none does."""
         seen = observation(step, self._theory)
         return next((x for x in known if self._states[x].seen == seen and self._may_show(x)), None)
 

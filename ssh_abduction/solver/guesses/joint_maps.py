@@ -123,7 +123,7 @@ class Joining:
         return parts
 
     def _beside(self, parts: Sequence[Part]) -> Iterator[SSHMap]:
-        """Yield the map that has some parts as its pieces, unless it breaks an axiom."""
+        """Yield a map with these parts as separate pieces, unless it breaks an axiom."""
         whole = parts[0]
         for part in parts[1:]:
             whole = whole.beside(part)
@@ -205,7 +205,7 @@ class Joining:
         return sorted((way for way in found if way.good >= least), reverse=True)[:CROSSED]
 
     def _joined(self, first: Part, second: Part, ways: Sequence[_Anchor]) -> Part | None:
-        """Join two maps in the cheapest way that breaks no axiom; None if apart is cheaper."""
+        """Join two maps in the cheapest way that breaks no axiom; None if no join is cheaper."""
         found: list[Part] = []
         overlay = Overlay(first, second, self._problem, self.sights)
         for way in ways:
@@ -262,7 +262,7 @@ def _voted(
 
 
 def _meeting(here: Array, there: Array, near: float) -> NDArray[np.bool_]:
-    """Whether each of some points is near each of others."""
+    """Flag the pairs of a point `here` and a point `there` that are nearer than `near`."""
     met: NDArray[np.bool_] = np.hypot(*np.moveaxis(here[:, None] - there, -1, 0)) < near
     return met
 

@@ -68,8 +68,9 @@ def merged(
 
     The nodes of the clique are pairwise distinct. The map is near the guess, if one is given: a
     label for each node, or -1. A label is ignored if the node cannot be one dstate with earlier
-    nodes of that label. Unless the rest `settles`, all other nodes are dstates of their own, if the
-    links allow that. Dstates are numbered in the order of their first nodes.
+    nodes of that label. All other nodes are merged by evidence if `settles`; else they are
+    dstates of their own, if the links allow that. Dstates are numbered in the order of their first
+    nodes.
     """
     classes = Classes(chart.apart(), chart.links)
     classes.known[list(clique)] = True

@@ -40,7 +40,7 @@ TURNED = 0.4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """A map of some drives. Other fields than these are like those of a `Hypothesis`.
+    """A map of some drives. The fields that are not listed are as in `Hypothesis`.
 
     Attributes:
         seen: For each dstate, what its steps show, as numbers.
@@ -83,7 +83,8 @@ class Part:
         """Make a part from labels (the dstate of each step) and the place of each dstate.
 
         `poses` are the means and the covariance of x and y of each place, in metres, and then of
-        the heading of each dstate, in radians. `log` and `sights` are about all steps.
+        the heading of each dstate, in radians. `nats` is the cost of the part. `log` and `sights`
+        are those of the whole trace.
         """
         seen: list[set[int]] = [set() for _ in places]
         stars: list[Sight] = [None for _ in places]
@@ -162,9 +163,9 @@ class _State:
         dstate: For each dstate, the first dstate that it is merged with.
         place: For each place, the first place that it is merged with.
         sights: For each first place, what each drive saw of it.
-        links: For each first dstate, where its actions lead to.
-        kept: The dstates of a map that must be kept. A group with one of them is named by its
-            first dstate.
+        links: For each first dstate, the dstate that each of its actions leads to.
+        kept: The dstates of a map that must be kept. A dstate that is merged with an earlier one
+            is replaced by that one.
         kept_places: The places of that map, in the same way.
     """
 
@@ -316,7 +317,7 @@ class Overlay:
         return None if math.isinf(unlikely[i, j]) else (int(places[i]), int(places[j]))
 
     def _tried(self, dstates: list[tuple[int, int]], places: tuple[int, int] | None = None) -> bool:
-        """Merge dstates or places, and all that follows, if this costs less. Tell if it does."""
+        """Merge dstates or places, and what follows, if that lowers the cost. Return if it did."""
         before = self._state
         self._state = before.copy()
         try:
@@ -389,7 +390,7 @@ class Overlay:
             self._condition([*same, heading], sum(self._prices) - changes)
 
     def _condition(self, same: list[tuple[int, int]], saved: float) -> None:
-        """Condition the poses on the equality of entries of the means. Subtract the nats saved."""
+        """Condition the poses on the equality of pairs of entries. Update the cost in nats."""
         state, (first, second) = self._state, map(list, zip(*same, strict=True))
         spreads = self._spreads[-len(same) :] if len(same) % 2 else self._spreads[:2]
         state.mean, state.covariance, square = conditioned(
@@ -432,7 +433,7 @@ class Overlay:
 
 
 def _merged(kept: frozenset[int], first: int, second: int) -> frozenset[int]:
-    """Name a group by its first member, if a member is kept. Raises _ClashError if both are."""
+    """Return the kept things after a merge of two. Raises _ClashError if both are kept."""
     if {first, second} <= kept:
         raise _ClashError
     return kept - {second} | {first} if second in kept else kept

@@ -54,7 +54,7 @@ class Hypothesis:
         links: For each (dstate, action) with a link, the dstate that it leads to.
         sights: For each place, what the first step there shows of it, as `Sights.shown`. If
             gateways may change between drives, that is the first step of the last drive there.
-        drives: For each place, the drive of that step.
+        drives: For each place, the drive of the step in `sights`.
         position: For each place, the index of its x in the means; y is the next one.
         heading: For each dstate, the index of its heading in the means.
         mean: The means, in metres, radians and standard deviations. First the errors of scale and
@@ -218,8 +218,8 @@ class HypothesisPoses:
     ) -> Array:
         """Compute the chi-square of the robot being at each of some places at step t.
 
-        The hypothesis is moved to step t. If a dstate at these places is given, the heading of the
-        robot has to fit, too.
+        `moved` is a hypothesis after the move to step t. If a dstate at these places is given, the
+        heading of the robot has to fit, too.
         """
         at = np.array([moved.position[p] for p in places])
         rows, last = np.stack([at, at + 1], 1), np.arange(-3, -1)
@@ -243,8 +243,8 @@ class HypothesisPoses:
         """Compute the largest chi-square of the next steps if step t is at a known dstate.
 
         An action at a dstate always leads to the same dstate. So links say where the next steps
-        are, until a link is not known. The hypothesis is moved to step t. `actions` has a number
-        for each action of the trace.
+        are, until a link is not known. `moved` is a hypothesis after the move to step t.
+        `actions` has a number for each action of the trace.
         """
         largest = 0.0
         for k in range(t + 1, min(t + 1 + AHEAD, len(self._trace))):

@@ -71,7 +71,7 @@ class _Transitions:
         self._counted, self.counts, self.totals = self._tallied(labels)
 
     def rows(self, states: States, visits: States) -> States:
-        """Return the row of the table for the last step of each visit, by its state."""
+        """Return the row of the table for the action that ends each visit, given its state."""
         turned = (states + self._slot[visits]) % self._ways
         rows: States = (states - states % self._ways + turned) * self._actions + self._action[
             visits

@@ -38,8 +38,8 @@ class Sights:
         shown: What each step shows of its place, whichever way it faces: its star, or None without
             stars. A star of four openings is turned to a normal form.
         drive: The number of the drive of each step.
-        dearest: Do not extend a hypothesis in a way that costs this many nats more than its
-            cheapest extension.
+        dearest: The most nats by which an extension of a hypothesis may cost more than its cheapest
+            extension.
     """
 
     def __init__(self, trace: Trace, theory: Theory, log: Log, *, misreads: bool) -> None:
@@ -157,7 +157,7 @@ def _fewest_changes(first: tuple[bool, ...], second: tuple[bool, ...]) -> int:
 
 @lru_cache(maxsize=2**14)
 def _fewest_closed(first: Star, second: Star) -> float:
-    """Count the fewest gateways that changed between two stars with bearings; inf above CHANGES."""
+    """Return the fewest changed gateways that explain both stars; inf if more than CHANGES."""
     return next(
         (
             count
@@ -170,7 +170,7 @@ def _fewest_closed(first: Star, second: Star) -> float:
 
 @lru_cache(maxsize=2**14)
 def _smaller(star: Star, less: int) -> tuple[Frame, ...]:
-    """Return the frames of a star without `less` of its gateways."""
+    """Return the frames of a star, in all ways to leave out `less` of their gateways."""
     return tuple(
         Frame(
             tuple(frame.bearings[k] for k in kept),
@@ -185,7 +185,7 @@ def _smaller(star: Star, less: int) -> tuple[Frame, ...]:
 
 @lru_cache(maxsize=2**14)
 def _may_face_alike(first: Star, second: Star, changes: int) -> bool:
-    """Whether a robot may face one way where it sees two stars of a place that changed."""
+    """Whether a robot may face one way at two stars, after so many changes of gateways."""
     return any(
         "alike" in may_face(frame, other, shift)
         for frame, other in _equally_large(first, second)

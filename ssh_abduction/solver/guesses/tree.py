@@ -297,7 +297,7 @@ class Sketch:
     def _doubt_if_grown_from_map(self) -> None:
         """Set `certain` to False if the sketch began with a map.
 
-        Its last action may contradict that map. A sketch that is a tree stays certain.
+        The last action may contradict that map. A sketch that is a tree stays certain.
         """
         self.certain = self._tree
 

@@ -132,7 +132,7 @@ def drives_in(read: FieldReader, record: Mapping[str, Any], steps: int) -> tuple
 
 
 def warnings_in(read: FieldReader, record: Mapping[str, Any]) -> tuple[str, ...]:
-    """Read the sentences that warn of the trace. Raises MapError if one is no text."""
+    """Read the warnings about the trace. Raises MapError if one is not a text."""
     warnings = read.list(record, "warnings", optional=True)
     for i, warning in enumerate(warnings):
         if not isinstance(warning, str):

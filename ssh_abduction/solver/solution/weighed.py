@@ -67,8 +67,8 @@ class Weighed:
             maps come last.
         searched: Whether a broad beam of hypotheses ended with the best map, and its misfit is not
             improbable. Such a map is seldom false, even if it is not proven to be the best.
-        broken: By how many nats the best map that breaks axioms is cheaper than the best map; 0 if
-            it is not, -inf if none was sought.
+        broken: How many nats the best map that breaks axioms costs less than the best map; 0 if it
+            does not cost less, -inf if no such map was sought.
         excess: The misfit of the best map, divided by the misfit that the standard deviations
             predict. Costs are divided by it before they become probabilities.
         doubt: Why the costs cannot be trusted, such as "the track is unreliable"; None if they can.
@@ -93,8 +93,8 @@ class Weighed:
     def weights(self) -> tuple[float, ...]:
         """The probability of each rival, assuming that there are no other maps.
 
-        If a rival lays fewer or more drives on each other than the best map, the difference of
-        their costs is divided by CHANCE.
+        Drives that share places form groups. If the groups of a rival differ from those of the best
+        map, the difference of the two costs is divided by CHANCE.
         """
         drive = [i for i, d in enumerate(self.drives) for _ in range(d.first, d.stop)]
         ways = [

@@ -171,7 +171,7 @@ class _Clique:
     group: int
 
     def joined(self, other: _Clique, *, apart: bool) -> _Clique:
-        """Return a largest clique of two groups whose steps are all, or never, `apart`."""
+        """Return a largest clique of two groups. All, or no, steps of different ones are apart."""
         group = self.group + other.group
         if apart:
             more = len(self.steps) * other.group + len(other.steps) * self.group
@@ -188,7 +188,7 @@ def _ranked(keys: NDArray[np.int_]) -> NDArray[np.int_]:
 
 
 def clique(apart: Matrix, seen: Sequence[int]) -> list[int]:
-    """Grow a clique (pairwise apart nodes) greedily for each view. Return all, sorted."""
+    """Grow a clique among the nodes of each view, greedily. Return their union, sorted."""
     shown = np.asarray(seen)
     found: list[int] = []
     for view in range(int(shown.max()) + 1):

@@ -40,7 +40,7 @@ def rests_on(axiom: str, t: int, other: str) -> str:
 
 
 def one_in_doubt(number: int, condition: str | None) -> str:
-    """Return the rule that two things are one if this body of a rule holds; never if None."""
+    """Return the rule that two things are one if `condition` (a body) holds; None is never."""
     one = f"one_in_doubt({number})"
     return f"{one} :- {condition}." if condition else f"#external {one}."
 

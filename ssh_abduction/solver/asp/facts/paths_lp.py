@@ -86,7 +86,7 @@ def paths_frameless_facts(
 
 
 def read_contrary(model: Model) -> tuple[list[int], list[int]]:
-    """Read the dstates that show that the labels have no places and paths.
+    """Read why no places and paths fit the labels: two lists of dstates.
 
     A segment is steps known to be along one path. Returns a dstate of each segment that contradicts
     the axioms, the shortest segment first. Also returns the dstates at which two paths cross, if
@@ -200,7 +200,7 @@ def settled_labels(labels: Iterable[tuple[int, int]]) -> str:
 
 
 def open_labels(labels: Sequence[int]) -> str:
-    """Return rules. Each answer is a set of labels of nodes for which no paths are possible."""
+    """Return rules by which each answer is a subset of the labels that no paths fit."""
     return "\n".join(
         [
             *(f"{{ is({node},{label}) }}." for node, label in enumerate(labels)),
