@@ -54,9 +54,9 @@ TWO_DRIVES = (
 
 
 def keep_one_source(log: RobotLog) -> tuple[RobotLog, list[str]]:
-    """Keep the odometry of one source if the poses of several sources alternate, with a note.
+    """Keep the odometry of one source if the poses of several sources alternate.
 
-    The odometry of the other scans is interpolated.
+    The odometry of the other scans is interpolated. Also return a note about this, if any.
     """
     odometry = Odometry()
     for number, scan in enumerate(log.scans):
@@ -366,7 +366,7 @@ class StandstillCheck:
     """Notices whether the robot moves while its odometer stands still.
 
     Attributes:
-        moved: Whether it did.
+        moved: Whether the robot moved in this way.
     """
 
     def __init__(self) -> None:

@@ -97,7 +97,7 @@ class BeamCells:
 
     Args:
         recent: The scans with their poses.
-        reach: Metres of trajectory. The scans up to so far before and after a scan share its grid.
+        reach: Metres of trajectory. Scans within this distance of a scan share its grid.
     """
 
     def __init__(self, recent: Recent, reach: float) -> None:

@@ -158,7 +158,7 @@ class Scene:
         return np.asarray(rows * size + columns)
 
     def sampled(self, points: Array) -> _Floats:
-        """Look up points, (2, m): the blurred walls and whether a cell was observed, (2, m)."""
+        """Look up the blurred walls and the observed flags, (2, m), at m points, (2, m)."""
         cells = self.cells(points)
         return np.stack([self._blurred.ravel()[cells], self._observed.ravel()[cells]])
 

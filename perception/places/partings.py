@@ -194,7 +194,7 @@ def _tracked(drive: _DrivePoints) -> Iterator[_Alignment]:
 
 
 def _added(drive: _DrivePoints, relations: Sequence[_Alignment]) -> list[_Pass]:
-    """List the passes of partings that are at no place."""
+    """List the passes of partings that are not near a known visit."""
     found: list[_Pass] = []
     for one in relations:
         for pair in drive.partings(one):
@@ -235,8 +235,8 @@ def _links(
 ) -> dict[int, list[tuple[int, float, Array]]]:
     """For each visit, list the visits with nearly the same middle, and their relative poses.
 
-    Such a pose is the rotation from the axes of the other visit in radians, and the middle of the
-    other visit relative to the middle of the visit in metres.
+    Such a pose is a rotation from the axes of the other visit to those of this one, in radians, and
+    the middle of the other visit relative to that of this one, in metres.
     """
     links: dict[int, list[tuple[int, float, Array]]] = defaultdict(list)
     for one in relations:

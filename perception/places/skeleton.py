@@ -105,9 +105,10 @@ def junctions(patch: Patch, room: float) -> list[Junction]:
 
 
 def _with_mouths(found: list[Fork], mouths: list[Fork], far: float) -> list[Fork]:
-    """Combine the junctions `found` without shores with the `mouths`, which are those with shores.
+    """Combine two lists of junctions: `found` without shores, and `mouths` with shores.
 
-    All mouths are kept. Of the others, those amid an open space are kept, if no mouth is near.
+    All mouths are kept. A junction of `found` is kept if it is amid an open space, and no mouth is
+    near.
     """
     # The disc of a junction amid an open space is as large as those of the mouths around it.
     amid = [

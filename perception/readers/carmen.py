@@ -251,7 +251,7 @@ class _OdometerPoses:
     def pose_of(self, line: ScanLine) -> tuple[Pose, Pose | None]:
         """The pose by the odometer at a scan, and the corrected pose, if any.
 
-        Raises Damaged if it should be that of a vertex, but there is none with this pose.
+        Raises Damaged if the pose should be that of a vertex, but no vertex has this pose.
         """
         first, second = line.first, line.second
         if first is None or second is None:

@@ -371,7 +371,10 @@ def _spots(poses: Sequence[Pose], imported: Imported) -> list[Pose]:
 def _next(
     drives: Sequence[Drive], ssh_map: SSHMap | None, laid: Sequence[int]
 ) -> tuple[int, list[tuple[int, int]]]:
-    """Choose the drive that shares most places with the `laid` ones, with pairs of common steps."""
+    """Choose the drive that shares most places with the `laid` ones.
+
+    Also return pairs of steps at one place: one of a laid drive, and one of the chosen drive.
+    """
     steps = [range(drive.first, drive.stop) for drive in drives]
     known = gathered((_station(ssh_map, t), t) for k in laid for t in steps[k])
     pairs = {
@@ -392,7 +395,7 @@ def _station(ssh_map: SSHMap | None, step: int) -> object:
 def _fitted(
     spots: Sequence[Pose], pairs: Sequence[tuple[int, int]], ssh_map: SSHMap | None
 ) -> Pose:
-    """Find the motion that brings each second step, and a point ahead of it, best to the first."""
+    """Fit the rigid motion that moves the second step of each pair to the pose of the first."""
     here, there = [], []
     for first, second in pairs:
         x, y, heading = spots[first]

@@ -32,7 +32,7 @@ class Answer:
         return None if self._last is None else cost_as_counted(*self._last, self._parts.task.theory)
 
     def take_down(self, ssh_map: SSHMap, cost: tuple[int, ...]) -> None:
-        """Count a map that the caller got in its level (the maps of one cost), with its counts."""
+        """Add a map that the caller got to its level (the maps of one cost, in counts)."""
         if self._last is None or self._last[1] != cost:
             self._levels.append(Level(cost_as_counted(ssh_map, cost, self._parts.task.theory), 0))
         self._first, self._last = self._first or ssh_map, (ssh_map, cost)

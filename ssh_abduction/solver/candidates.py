@@ -98,7 +98,7 @@ class Candidates:
         yield from filter(self._judging.accepts, map(self._with_unknown_views, beam.maps()))
 
     def map_without(self, wrong: Collection[int], most: float = math.inf) -> SSHMap | None:
-        """Find a map by a narrow beam if just the displacements to these steps are wrong.
+        """Find a map by a narrow beam if only the displacements to `wrong` steps are wrong.
 
         Return the first map that the checker accepts; None if there is none, or if it costs more
         than about `most` nats.
@@ -131,7 +131,7 @@ class Candidates:
         yield from filter(self._judging.accepts, map(self._with_unknown_views, joining.maps()))
 
     def go_on(self, beam: Beam) -> None:
-        """Offer a map that extends the longest map of a beam that later steps allow."""
+        """Extend the maps of a beam to the end, the longest first, until one is a better map."""
         before = self._known.best
         for first in beam.partial():
             done = self._task.trace.prefix(len(first.dstate_at))

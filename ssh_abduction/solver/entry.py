@@ -73,8 +73,8 @@ def solve(
             `complete` only if this proves that no further map exists.
         within: Also list maps with up to this many dstates more than the minimum: for each number
             of dstates, the best maps with that number. If the theory prefers few paths or places
-            first, paths or places are counted instead. If maps are compared by cost, all maps that
-            cost up to this many nats more.
+            first, paths or places are counted instead. If maps are compared by cost, `within` is in
+            nats: all maps that cost up to this many nats more are listed.
         memory_limit: MiB of memory. The search stops when the process reaches this peak.
         speedups: The speed-ups that are on. None of them changes the answer.
         on_progress: A function that is called now and then with a `Progress`.
@@ -134,7 +134,7 @@ def _with_warnings(
     time_limit: float | None,
     memory_limit: int | None,
 ) -> Solution:
-    """Add and log warnings of drives that are apart."""
+    """Add warnings about drives that share no place, and log them."""
 
     def find(trace: Trace, theory: Theory, seconds: float) -> Solution:
         search = Search(trace, theory, time_limit=seconds, max_maps=1, memory_limit=memory_limit)

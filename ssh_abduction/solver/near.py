@@ -33,7 +33,7 @@ class NearMinimal:
     def __init__(
         self, task: Task, judging: Judging, most: int, report: Callable[[], None], before: Asker
     ) -> None:
-        """Prepare an engine for `most` maps (0: all). It adds its times to those of `before`."""
+        """Prepare an engine for `most` maps (0: all). Its clocks go on from those of `before`."""
         self._task = replace(task, speedups=replace(task.speedups, prefixes=False))
         self._judging, self._most, self._report = judging, most, report
         self.engine = step_engine(self._task)

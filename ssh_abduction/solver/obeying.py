@@ -66,7 +66,7 @@ def with_kept_apart(
     limit: float | None,
     find: Callable[[Trace, Theory, float], Solution],
 ) -> Solution:
-    """Add warnings of drives that share no place with others because a gateway was corrected.
+    """Add warnings about drives that share no place with others as a gateway was corrected.
 
     A correction changes only the stars of the steps that it names. If another drive saw the gateway
     as it was before, its steps cannot be at the place any more.
