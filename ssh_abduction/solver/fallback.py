@@ -105,7 +105,7 @@ def late_clash(
     with suppress(LimitError, KeyboardInterrupt), heeding(part.check):
         clash = clash_in(task.trace, task.theory, stretches, maps_of)
     if clash is not None:
-        known.status = Status.UNSATISFIABLE
+        known.status, known.complete, known.stopped = Status.UNSATISFIABLE, True, None
     return clash
 
 
@@ -121,6 +121,8 @@ def salvage(parts: Parts) -> None:
             parts.prefixes.engine.grow(len(parts.task.trace))
             found = parts.prefixes.minimise()
             known.status = Status.OPTIMAL if found else Status.UNSATISFIABLE
+        if not found:
+            known.complete, known.stopped = True, None
     except LimitError as limit:
         known.stopped = limit.reason
     except KeyboardInterrupt:
