@@ -108,9 +108,12 @@ TOYS = (
 
 
 @st.composite
-def traces(draw: st.DrawFn, max_steps: int = 7, closures: bool = False) -> Trace:
+def traces(
+    draw: st.DrawFn, max_steps: int = 7, closures: bool = False, metric: bool = False
+) -> Trace:
     """One to `max_steps` observations of two or three views, any actions in between, with or
-    without stars. With `closures`, some traces with displacements have closures, too."""
+    without stars. With `metric`, all have displacements. With `closures`, some traces with
+    displacements have closures, too."""
     steps = draw(st.integers(1, max_steps) | st.just(max_steps))
     views = draw(st.sampled_from(["ab", "abc"]))
     seen = draw(st.lists(st.sampled_from(views), min_size=steps, max_size=steps))
@@ -124,7 +127,7 @@ def traces(draw: st.DrawFn, max_steps: int = 7, closures: bool = False) -> Trace
         rotations = [star[k:] + star[:k] for star in patterns for k in range(4)]
         stars = draw(st.lists(st.sampled_from(rotations), min_size=steps, max_size=steps))
     moved = noise = None
-    if draw(st.integers(0, 3)) == 0:
+    if metric or draw(st.integers(0, 3)) == 0:
         wrong = st.tuples(
             st.sampled_from([-3.0, 0.0, 0.0, 3.0]),
             st.sampled_from([-3.0, 0.0, 3.0]),

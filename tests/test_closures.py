@@ -99,9 +99,8 @@ def test_malformed_closure_is_an_error(tmp_path: Path, closures: Any, said: str)
 @settings(max_examples=10)
 @given(st.data())
 def test_misfit_with_closures_equals_plain_least_squares(data: st.DataObject) -> None:
-    trace = data.draw(
-        traces(max_steps=5, closures=True).filter(lambda trace: trace.closures), label="trace"
-    )
+    drawn = traces(max_steps=5, closures=True, metric=True).filter(lambda trace: trace.closures)
+    trace = data.draw(drawn, label="trace")
     size = len(trace)
     labels = data.draw(st.lists(st.integers(0, 2), min_size=size, max_size=size), label="labels")
     labels = [list(dict.fromkeys(labels)).index(label) for label in labels]

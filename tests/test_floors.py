@@ -7,13 +7,12 @@ import warnings
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from unittest.mock import patch
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import theories, traces
-from test_property import agree, checker_rejects_foreign_maps
+from strategies import traces
+from test_property import checker_rejects_foreign_maps, solver_agrees
 
 from simulator.errors import SimulatorError
 from simulator.tours import record, simulate
@@ -25,7 +24,7 @@ from ssh_abduction.online import route
 from ssh_abduction.output import to_networkx, to_svg
 from ssh_abduction.output.export import export_map
 from ssh_abduction.output.layout import layout
-from ssh_abduction.solver import Status, choosing, prefixes
+from ssh_abduction.solver import Status
 from ssh_abduction.solver.asp.facts.readable import program
 from ssh_abduction.theory.evidence import Equality, Floors
 from ssh_abduction.theory.settle import settle
@@ -49,16 +48,7 @@ def traces_with_lifts(draw: st.DrawFn) -> Trace:
 @settings(max_examples=10)
 @given(st.data())
 def test_maps_with_floors_equal_the_brute_force(data: st.DataObject) -> None:
-    trace = data.draw(traces_with_lifts(), label="trace")
-    theory = data.draw(theories(trace), label="theory")
-    first_prefix = data.draw(st.sampled_from([1, 3, prefixes.FIRST_PREFIX]), label="first prefix")
-    few_steps = data.draw(st.sampled_from([0, choosing.FEW_STEPS]), label="few steps")
-    stepwise = data.draw(st.sampled_from([-1.0, choosing.STEPWISE]), label="seconds step by step")
-    with (
-        patch.object(prefixes, "FIRST_PREFIX", first_prefix),
-        patch.multiple(choosing, FEW_STEPS=few_steps, STEPWISE=stepwise),
-    ):
-        agree(trace, theory)
+    solver_agrees(data, data.draw(traces_with_lifts(), label="trace"))
 
 
 @settings(max_examples=3)

@@ -44,16 +44,21 @@ def agree(trace: Trace, theory: Theory) -> None:
 @settings(max_examples=20)
 @given(st.data())
 def test_minimal_maps_equal_the_brute_force(data: st.DataObject) -> None:
-    trace = data.draw(traces(closures=True), label="trace")
+    solver_agrees(data, data.draw(traces(closures=True), label="trace"))
+
+
+def solver_agrees(data: st.DataObject, trace: Trace) -> None:
+    """The solver and the brute force agree under any theory, with any first prefix and engine."""
     theory = data.draw(theories(trace), label="theory")
     # The traces are shorter than the solver's first prefix: a shorter one makes it replay and
     # extend.
     first_prefix = data.draw(st.sampled_from([1, 3, prefixes.FIRST_PREFIX]), label="first prefix")
     first_paths = data.draw(st.sampled_from([1, 2, prefixes.FIRST_PATHS]), label="first paths")
     few_steps = data.draw(st.sampled_from([0, choosing.FEW_STEPS]), label="few steps")
+    stepwise = data.draw(st.sampled_from([-1.0, choosing.STEPWISE]), label="seconds step by step")
     with (
         patch.multiple(prefixes, FIRST_PREFIX=first_prefix, FIRST_PATHS=first_paths),
-        patch.object(choosing, "FEW_STEPS", few_steps),
+        patch.multiple(choosing, FEW_STEPS=few_steps, STEPWISE=stepwise),
     ):
         agree(trace, theory)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 
@@ -12,47 +11,16 @@ from fault_cases import rectangle_of_five
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_faults import cheapest, small_traces, told
+from test_online import NO_TIME, followed
 
-from ssh_abduction import OnlineMapper, Solution, Theory, Trace, solve
+from ssh_abduction import OnlineMapper, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data import TheoryError, TraceError
 from ssh_abduction.online import Belief
 from ssh_abduction.online.hypotheses import ExtendedMap, Scale
 from ssh_abduction.solver import Status
 
-NO_TIME = 1e-9  # seconds: every search is stopped before it begins
 BOTH = Theory.causal().replace(misread=1.5, slipped=3)
-
-
-def followed(
-    trace: Trace,
-    theory: Theory,
-    limit: float | None = None,
-    maps: int = 0,
-) -> Iterator[tuple[OnlineMapper, Solution]]:
-    """The mapper after each step of a trace, and its answer."""
-    first, *rest = trace.steps
-    mapper = OnlineMapper(
-        first.view or "",
-        theory,
-        star=first.star,
-        confidence=first.confidence,
-        odometry=trace.odometry,
-        time_limit=limit,
-        max_maps=maps or None,
-    )
-    yield mapper, mapper.solution
-    for action, step in zip(trace.actions, rest, strict=True):
-        yield (
-            mapper,
-            mapper.observe(
-                action,
-                step.view or "",
-                star=step.star,
-                displacement=step.displacement,
-                confidence=step.confidence,
-            ),
-        )
 
 
 def circuit(steps: int, wrong: int | None = None, seen: str = "v3") -> Trace:

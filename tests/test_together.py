@@ -9,7 +9,6 @@ from collections.abc import Hashable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import pytest
 import test_weighing
@@ -17,7 +16,7 @@ import truth
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import theories, traces
-from test_property import agree, checker_rejects_foreign_maps
+from test_property import checker_rejects_foreign_maps, solver_agrees
 from together import of_mazes, of_worlds, report_of_guesses
 
 from ssh_abduction import (
@@ -47,7 +46,6 @@ from ssh_abduction.data.closure import Closure
 from ssh_abduction.data.drives import fingerprints_of, named_steps, pieces_in_words
 from ssh_abduction.explain import explain_trace
 from ssh_abduction.rivals import Listing, compare, difference, joins_of_drives
-from ssh_abduction.solver import choosing, prefixes
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.geometry.fit import Poses
 from ssh_abduction.solver.guesses.beam import Beam
@@ -72,17 +70,7 @@ def joint_traces(draw: st.DrawFn, closures: bool = False) -> Trace:
 @settings(max_examples=12)
 @given(st.data())
 def test_joint_maps_equal_the_brute_force(data: st.DataObject) -> None:
-    trace = data.draw(joint_traces(), label="trace")
-    theory = data.draw(theories(trace), label="theory")
-    first_prefix = data.draw(st.sampled_from([1, 3, prefixes.FIRST_PREFIX]), label="first prefix")
-    first_paths = data.draw(st.sampled_from([1, 2, prefixes.FIRST_PATHS]), label="first paths")
-    few_steps = data.draw(st.sampled_from([0, choosing.FEW_STEPS]), label="few steps")
-    stepwise = data.draw(st.sampled_from([-1.0, choosing.STEPWISE]), label="seconds step by step")
-    with (
-        patch.multiple(prefixes, FIRST_PREFIX=first_prefix, FIRST_PATHS=first_paths),
-        patch.multiple(choosing, FEW_STEPS=few_steps, STEPWISE=stepwise),
-    ):
-        agree(trace, theory)
+    solver_agrees(data, data.draw(joint_traces(), label="trace"))
 
 
 @pytest.mark.slow

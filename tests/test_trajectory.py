@@ -286,17 +286,8 @@ def test_trajectory_given_as_relations_is_refused(
         (tmp_path / "relations").write_text(text)
         trace_at().save(tmp_path / "trace.jsonl")
         there_and_back().save(tmp_path / "map.json")
-        assert (
-            main(
-                [
-                    "evaluate",
-                    *(str(tmp_path / name) for name in ("map.json", "trace.jsonl")),
-                    "--set",
-                    f"relations={tmp_path / 'relations'}",
-                ]
-            )
-            == 1
-        )
+        files = [str(tmp_path / name) for name in ("map.json", "trace.jsonl")]
+        assert main(["evaluate", *files, f"--set=relations={tmp_path / 'relations'}"]) == 1
         assert (
             "got a trajectory: each line ends in a quaternion; "
             "give it as the truth of the steps (--truth)" in capsys.readouterr().err

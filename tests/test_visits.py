@@ -227,17 +227,8 @@ def test_relations_of_another_log_give_a_warning(
             for r in related
         )
     )
-    assert (
-        main(
-            [
-                "evaluate",
-                *(str(tmp_path / name) for name in ("map.json", "trace.jsonl")),
-                "--set",
-                f"relations={tmp_path / 'relations'}",
-            ]
-        )
-        == 0
-    )
+    files = [str(tmp_path / name) for name in ("map.json", "trace.jsonl")]
+    assert main(["evaluate", *files, f"--set=relations={tmp_path / 'relations'}"]) == 0
     said = capsys.readouterr()
     assert (
         "relations and the poses of the trace agree on 6 of 10 pairs of visits only: are "
