@@ -135,7 +135,7 @@ def estimated(
 
 
 def _apart(best: Rival, drive: Drive) -> Course:
-    """Return the dstates and places of a map if a drive shares none with the other drives."""
+    """Return the dstates and places of a map after a drive gets dstates and places of its own."""
     more = len(best.dstates)
     dstates, places = (
         tuple(numbered(name + more * (drive.first <= t < drive.stop) for t, name in enumerate(of)))

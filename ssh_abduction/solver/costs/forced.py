@@ -120,18 +120,21 @@ class Visits:
         return cls(np.arange(steps), none, np.array(log.seen), place, links, apart, away)
 
     def lacking(self, first: int, second: int) -> Visits:
-        """Return the same visits, but two of them are not joined as in the map."""
+        """Copy the visits, with a flag that two of them are not joined as in the map."""
         apart = self.apart.copy()
         apart[0, first, second] = apart[0, second, first] = True
         return replace(self, apart=apart)
 
     def cut(self, side: Flags) -> Visits:
-        """Return the same visits, but those on one side share no place with the others."""
+        """Copy the visits, with flags that those in the mask `side` share no place with others."""
         apart = self.apart | (side[:, None] != side)
         return replace(self, apart=apart, away=None if self.away is None else apart[0])
 
     def joined(self, of: Ints, pairs: Iterable[tuple[int, int]]) -> Ints:
-        """Merge the classes of pairs of visits, then those that one action leads to from each."""
+        """Merge the classes of pairs of visits, and the classes that one action leads to from both.
+
+        `of` has the class of each visit. So has the result.
+        """
         of = of.copy()
         waiting = list(pairs)
         while waiting:
@@ -149,7 +152,10 @@ class Visits:
         return merged
 
     def returns(self, of: Ints) -> list[Equality]:
-        """List the returns of all maps that have the visits of each class at one place."""
+        """List the returns of all maps that have the visits of each class at one place.
+
+        `of` has the class of each visit.
+        """
         found: list[Equality] = []
         first: dict[object, int] = {}
         for t, (a, x) in enumerate(

@@ -62,7 +62,7 @@ class Misfit:
     def of_course(
         self, dstates: Sequence[int], places: Sequence[int], wrong: Collection[int] = ()
     ) -> float:
-        """Compute the chi-square if steps are at these dstates and places; ignore `wrong` moves."""
+        """Return the misfit if steps are at these dstates and places, without `wrong` moves."""
         first_at: dict[int, int] = {}
         first_in: dict[int, int] = {}
         headings = [first_at.setdefault(name, t) for t, name in enumerate(dstates)]

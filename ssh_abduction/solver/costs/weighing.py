@@ -406,7 +406,7 @@ def _exactly(ssh_map: SSHMap) -> list[Equality]:
 
 
 def _pinned(theory: Theory, ssh_map: SSHMap) -> Theory:
-    """Return a theory that weighs by counts, and asserts the dstates and places of a map.
+    """Return a theory that compares maps by counts, and asserts the dstates and places of a map.
 
     It asserts which dstates are at different places, but not which are at one place.
     """

@@ -37,7 +37,7 @@ class Found:
 
     @staticmethod
     def of(ssh_map: SSHMap, theory: Theory) -> Found:
-        """Count what the map has, and return the map with this cost."""
+        """Return a map with its cost: the counts that the theory minimises."""
         return Found(ssh_map, Cost.of(ssh_map).preferred_by(theory))
 
 
@@ -132,7 +132,7 @@ class GrowingEngine(Protocol):
 
 @runtime_checkable
 class LabellingEngine(Protocol):
-    """The protocol of an engine that finds dstates first, and lists only maps with the fewest."""
+    """The protocol of an engine that finds dstates first. All maps it lists have the fewest."""
 
     def labellings(self, cost: tuple[int, ...]) -> Iterator[Settled]:
         """Yield the maps of this cost, grouped by their labelling.

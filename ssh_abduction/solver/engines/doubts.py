@@ -71,7 +71,7 @@ class Doubts:
 
 
 class Settled:
-    """Questions about the best maps with given dstates, for engines that find dstates first."""
+    """Answers questions about the best maps with given dstates, after the dstates are found."""
 
     def __init__(
         self,

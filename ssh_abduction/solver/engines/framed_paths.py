@@ -105,7 +105,7 @@ class FramedPaths:
         )
 
     def settled(self, naming: NodeLabels, mode: str) -> Settled:
-        """Prepare questions on what the best maps share, by clingo's opt-mode `mode`."""
+        """Prepare questions about the best maps with these dstates. `mode` is clingo's opt-mode."""
         control = naming.control or self.control(naming.chart, naming.labels)
         reader = self._reader(naming, control)
         return Settled(self._asker, control, mode, reader)

@@ -311,7 +311,7 @@ class PlacesAndPaths:
         return self._asked[1]
 
     def settled(self, labels: Sequence[int], mode: str) -> Settled:
-        """Prepare questions on what the best maps share, by clingo's opt-mode `mode`."""
+        """Prepare questions about the best maps with these dstates. `mode` is clingo's opt-mode."""
         control = self._path_control(labels)
         return Settled(self._asker, control, mode, self._reader(control, labels))
 

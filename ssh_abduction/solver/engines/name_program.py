@@ -118,7 +118,7 @@ class NameProgram:
         return len(self._known.links) == len(self.chart.links)
 
     def give_links(self, links: Iterable[Link]) -> None:
-        """Give a new control some links, and all rules that forbid something."""
+        """Give a new control some links, and the rules that exclude labels."""
         self.add(links)
         for number in range(len(self.forbidden)):
             self.give_forbidden(number)
@@ -217,7 +217,7 @@ class NameProgram:
         self._asker.control.ground([(part, [])])
 
     def give_forbidden(self, number: int) -> None:
-        """Give clingo the rule against the set at an index of `forbidden`, and its nodes."""
+        """Give clingo the rule against the set `forbidden[number]`, and the nodes of this set."""
         pairs = self.forbidden[number]
         self.add_links_at({step for pair in pairs for step in pair})
         self.add_rules(f"not_together_{number}", names_lp.not_together(number, pairs))

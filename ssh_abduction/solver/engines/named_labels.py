@@ -252,6 +252,6 @@ class NamedLabels:
         return bool(views)
 
     def _answers_of(self, spares: int) -> Iterator[dict[int, int]]:
-        """Yield all answers with this many dstates beyond the pinned ones, all with names."""
+        """Yield all answers without rests that use this many spare names."""
         resting, mode = self.program.resting(False), f"enum,{spares},0"
         return self._asker.answers(names_lp.read_names, mode, 0, assumptions=[resting], ahead=True)

@@ -33,7 +33,7 @@ class FramedSides:
         self._batch = -1
 
     def extend(self, batch: int) -> None:
-        """Ground the axioms, for all paths added so far, for the visits of a new batch too.
+        """Ground the axioms of all paths added so far for the visits of a new batch.
 
         A batch is the visits that clingo gets in one call.
         """

@@ -96,7 +96,7 @@ class SmallMaps:
 
 
 def mended(guess: Sequence[int], chart: Chart) -> list[int]:
-    """Correct a guess by a vote: what does an action at a dstate mostly lead to?
+    """Correct a guess: let each action at a dstate lead to the dstate that it mostly leads to.
 
     Each node gets the dstate to which the action before it mostly leads from the dstate before it
     in the guess, unless the view at the node contradicts this. If only a few dstates were wrong,

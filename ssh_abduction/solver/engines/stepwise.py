@@ -138,7 +138,7 @@ class StepEngine:
         return True
 
     def ask_for(self, number: int, count: Count) -> None:
-        """Ask only for maps with exactly this count from now on. No steps may be added."""
+        """From now on, ask only for maps with this `number` of `count`. Add no more steps."""
         if self._number is not None:
             self.asker.control.release_external(further_rules.of_number(*self._number))
         self._number = number, count

@@ -85,7 +85,7 @@ class VisitLabels:
         return self.program.chart
 
     def work_on(self, task: Task) -> None:
-        """Go on with a longer trace that begins with the one before."""
+        """Go on with a longer trace. It begins with the steps of the previous trace."""
         self._task = task
 
     def grow(self, size: int) -> bool:
@@ -114,7 +114,7 @@ class VisitLabels:
             return True
 
     def _order_of_choice(self, chart: FramedChart) -> list[int]:
-        """Set `clique`. Return it, and then the other nodes: first those apart from most nodes."""
+        """Set `clique`. Return its nodes, then the others, those apart from most nodes first."""
         apart = chart.apart()
         self._asker.watch.check()
         self.clique = clique(apart, chart.seen) if self._task.speedups.clique else []

@@ -152,7 +152,7 @@ class VisitProgram:
         return [self._pair_of[symbol] for symbol in model.symbols(shown=True)]
 
     def add_rules(self, rules: str, part: str | None = None, number: int = 0) -> None:
-        """Give clingo more rules. If a program part is given, ground it for this number.
+        """Give clingo more rules. Then ground the program part `part(number)`, if given.
 
         This does not check the limits of time and memory. If it were stopped halfway, clingo might
         have relaxed an unsat core, but lack the rule that limits how many members are violated.

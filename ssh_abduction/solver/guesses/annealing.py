@@ -75,7 +75,7 @@ _Kind = TypeVar("_Kind")
 
 @dataclass(frozen=True)
 class Guess:
-    """A guess by annealing.
+    """A guess of the place of each visit, made by annealing.
 
     Attributes:
         states: For each visit, 4 times the number of its place, plus the slot of the place that is

@@ -157,7 +157,7 @@ class Part:
 
 @dataclass(slots=True, eq=False)
 class _State:
-    """What is merged so far.
+    """The dstates and places that are merged so far, with their poses.
 
     Attributes:
         dstate: For each dstate, the first dstate that it is merged with.
@@ -239,7 +239,7 @@ class Overlay:
         return True
 
     def part(self) -> Part:
-        """Return the map with all merges."""
+        """Return the part that all merges so far make of the two parts."""
         both, state = self._both, self._state
         dstates, places = sorted(set(state.dstate)), sorted(set(state.place))
         number = {s: i for i, s in enumerate(dstates)}

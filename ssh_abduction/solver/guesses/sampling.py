@@ -180,7 +180,7 @@ class Sampler:
             self._sweep(choice, power)
 
     def sure(self) -> NDArray[np.bool_]:
-        """Say for each visit whether the actions to and from it lead where they lead most often."""
+        """For each visit, return whether the actions to and from it lead where they mostly lead."""
         counts = self._transitions.counts
         rows = self._transitions.rows(self.labels[:-1], self._visits[:-1])
         odd = counts[rows, self.labels[1:]] < counts[rows].max(axis=1)
