@@ -151,6 +151,16 @@ def test_onto_adds_a_drive_with_displacements_by_cost() -> None:
         assert rival.dstates[:4] == standing.maps[0].dstate_at
 
 
+def test_solution_onto_a_map_is_saved_and_read(tmp_path: Path) -> None:
+    """The digest of the old drive has more steps than the old drive."""
+    old = Trace.from_steps("zcca", ["around", "left", "around"], name="old")
+    new = Trace.from_steps("c", [], name="new")
+    solution = solve(new, onto=solve(old, Theory.causal()))
+    assert solution.effort.prefix <= len(old) + len(new)
+    solution.save(tmp_path / "maps.json")
+    assert Solution.load(tmp_path / "maps.json") == solution
+
+
 def test_onto_without_time_keeps_the_existing_map() -> None:
     """The first map of a search makes every step a new dstate, so it does not keep a map."""
     around = Trace.from_steps("abababab" * 2, ["travel", "left"] * 7 + ["travel"], name="monday")

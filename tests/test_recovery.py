@@ -10,6 +10,7 @@ import recovery as bench
 from fault_cases import rectangle_of_five
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from strategies import TOYS
 from test_faults import cheapest, small_traces, told
 from test_online import NO_TIME, followed
 
@@ -19,6 +20,7 @@ from ssh_abduction.data import TheoryError, TraceError
 from ssh_abduction.online import Belief
 from ssh_abduction.online.hypotheses import ExtendedMap, Scale
 from ssh_abduction.solver import Status
+from ssh_abduction.theory.rules import Rules
 
 BOTH = Theory.causal().replace(misread=1.5, slipped=3)
 
@@ -103,6 +105,31 @@ def test_mapper_with_faults_solves_anew_without_an_axiom() -> None:
         )
         assert (solution.status, solution.complete) == (anew.status, True)
         assert {(m, m.faults) for m in solution.maps} == {(m, m.faults) for m in anew.maps}
+
+
+# For traces of up to three steps, each step is a dstate of its own. Then anything goes.
+LATE = Rules(
+    "late.lp",
+    "% @axiom(late) A toy.\n#program check(t).\n"
+    "violation(late,t) :- query(t), t < 3, N = #count { S : is(S,S) }, N <= t.",
+)
+EVEN = next(toy.rules for toy in TOYS if toy.rules.name == "even.lp")
+
+
+@pytest.mark.parametrize(
+    "choices", [{"rules": (EVEN,)}, {"rules": (LATE,)}, {"same_place": ((0, 3),)}]
+)
+@pytest.mark.parametrize("limit", [None, 60.0])
+def test_mapper_with_faults_forgets_answers_that_later_steps_may_undo(
+    choices: dict[str, Any], limit: float | None
+) -> None:
+    """A longer trace may have a map although a shorter one has none, or a cheaper one."""
+    trace = Trace.from_steps("aaaaaa", ["around", "travel", "around", "around", "around"])
+    theory = Theory(slipped=1.5, **choices)
+    for steps, (_, answer) in enumerate(followed(trace, theory, limit), 1):
+        expected = solve(trace.prefix(steps), theory.of_steps(0, steps))
+        assert (answer.status, answer.cost) == (expected.status, expected.cost)
+        assert answer.bound == expected.bound
 
 
 def test_mapper_reports_and_excuses_a_wrong_view() -> None:

@@ -121,10 +121,10 @@ class RivalMaps:
         contradicted = lead.contradiction(done.name, seen) if lead else None
         has_unknown = any(rival.is_unknown(done.name) for rival in self.minimal)
         self.rivals = self._gone_on(self.rivals, t)
-        if not self._replays:  # a minimal map of fewer steps says nothing about more steps
-            self.rivals = []
+        if not self._replays:  # the answer for fewer steps says nothing about more steps
+            self.rivals, self.bound = [], Bound()
             self.is_proven = self.is_complete = self.is_impossible = False
-            return StepEffect()
+            return StepEffect(lost_proof=True)
         lost_proof = False
         if self.is_proven and self.is_complete and has_unknown and not self._lists_links:
             self.is_complete, lost_proof = False, True

@@ -45,7 +45,7 @@ from ssh_abduction.solver.obeying import obeyed, with_names
 from ssh_abduction.solver.solution.recorded import Support
 from ssh_abduction.solver.solution.result import Solution
 from ssh_abduction.solver.solution.weighed import Weighed
-from ssh_abduction.solver.values import Cost, Level, Status
+from ssh_abduction.solver.values import Cost, Effort, Level, Status
 from ssh_abduction.theory.fields import ASSERTIONS
 from ssh_abduction.theory.settle import Problem, settle
 from ssh_abduction.theory.speedups import Speedups
@@ -128,7 +128,7 @@ def solve_onto(
         # The theory for the digest has assertions about its steps.
         theory=found.theory.replace(**{kind: getattr(theory, kind) for kind in ASSERTIONS}),
         steps=len(joint),
-        effort=replace(found.effort, seconds=replace(found.seconds, total=solving.watch.elapsed())),
+        effort=_effort(found, len(joint), solving.watch),
         levels=(Level(found.cost, len(maps), found.complete),) if found.within else (),
         shared=None,
         trace=joint,
@@ -140,6 +140,15 @@ def solve_onto(
         ),
     )
     return _named(solution, ssh_map, corrections)
+
+
+def _effort(found: Solution, steps: int, watch: Watch) -> Effort:
+    """Return the effort of solving a digest and a new drive, for all the steps of the drives.
+
+    A digest may have more steps than the old drives.
+    """
+    seconds = replace(found.seconds, total=watch.elapsed())
+    return replace(found.effort, prefix=min(found.effort.prefix, steps), seconds=seconds)
 
 
 def _named(solution: Solution, ssh_map: SSHMap, corrections: Corrections | None) -> Solution:
