@@ -257,7 +257,10 @@ class Mending:
     def _maps_of(
         self, mended: Trace, most: int, seconds: float = math.inf
     ) -> tuple[list[SSHMap], bool]:
-        """Solve a mended trace: return minimal maps (0: all) and True, or the best and False."""
+        """Solve a mended trace within some seconds.
+
+        Returns up to `most` minimal maps (0: all) and True, or the best map and False.
+        """
         maps, proven = self._solver(
             mended, self._without_faults, most, min(seconds, SHARE * self._task.watch.left())
         )

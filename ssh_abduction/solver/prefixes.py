@@ -286,8 +286,8 @@ class Prefixes:
         """Replay the trace over a map of a prefix.
 
         If stars (the openings seen at a step) need to agree only within their spread, also find out
-        at the end whether the stars of all steps fit the map. If `known` is given, only the links
-        between this many first steps are used.
+        at the end whether the stars of all steps fit the map. If `known` is given, use only the
+        links between the first `known` steps.
         """
         log = self._task.log
         replayed = log.replay(

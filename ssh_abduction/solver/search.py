@@ -323,7 +323,7 @@ class Search:
         )
 
     def _weigh(self, weighing: Weighing) -> None:
-        """Find the maps of least cost: guess some, find one with fewest dstates, and prove."""
+        """Find the maps of least cost: guess some, find one with the fewest dstates, then prove."""
         watch = self._parts.watch
 
         def maps_of(trace: Trace, theory: Theory) -> tuple[tuple[SSHMap, ...], bool]:

@@ -223,7 +223,7 @@ class Progress:
 
     @property
     def sentence(self) -> str:
-        """These values on one line, in words."""
+        """The progress on one line, in words."""
         best = (
             f"best {self.cost.dstates} dstates, {self.cost.places} places, {self.cost.paths} paths"
             if self.cost

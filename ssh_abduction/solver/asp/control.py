@@ -369,7 +369,7 @@ def _result(handle: clingo.SolveHandle, conflicts: int) -> clingo.SolveResult:
 
 
 def new_control(encoding: str, base: str, options: Sequence[str]) -> Control:
-    """Make a control, and ground an encoding with the facts `base` by options of clingo."""
+    """Make a control with these options of clingo, and ground an encoding with facts `base`."""
     control = Control(options)
     control.load_encodings(encoding)
     control.add("base", [], base)

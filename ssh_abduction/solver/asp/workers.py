@@ -42,7 +42,7 @@ class Lost(NamedTuple):
 
 
 class Worker:
-    """A process that does one task at a time, until `end` is called; late after `deadline`."""
+    """A process that does one task at a time until `end`. A task is late after `deadline`."""
 
     def __init__(self, folder: str) -> None:
         """Start a process that makes its temporary files in a folder."""

@@ -37,7 +37,7 @@ CERTAIN = 19.0
 
 
 def rivals_of(problem: Problem, misfit: Misfit, best: SSHMap, seconds: float) -> Iterator[Rival]:
-    """Yield estimated rivals of a map of a trace that cost little more than it, each once.
+    """Yield estimated rivals that cost little more than the best map, each once.
 
     `seconds` is the time that this may take. `estimated` says what the rivals are. Drives that
     closures connect to others do not overlap by chance. They stay connected.
@@ -91,8 +91,8 @@ def maps_apart(
 ) -> Iterator[SSHMap]:
     """Yield maps like `best` in which two steps are different dstates, the cheapest first.
 
-    They are estimated rivals, so they may break axioms. `seconds` is the time that it takes to
-    estimate them.
+    They are estimated rivals, so they may break axioms. `seconds` is the time that estimating them
+    may take.
     """
     at = [best.dstates[label] for label in best.dstate_at]
     rivals = rivals_of(problem, misfit, best, seconds)
@@ -196,7 +196,7 @@ def rival_of(ssh_map: SSHMap, nats: float) -> Rival:
 
 
 def least_places(problem: Problem) -> int:
-    """Return a lower bound on the places: the size of a set of steps that evidence tells apart."""
+    """Return a lower bound on the places: the size of a set of steps at different places."""
     if problem.theory.level == "causal":
         return 0
     import numpy as np

@@ -188,7 +188,7 @@ class _Program:
         self._known: set[tuple[int, ...]] = set(self._clusters)
 
     def add(self, members: NDArray[np.bool_], paid: Array, centres: Array) -> bool:
-        """Add clusters: their members, what these pay, and the facility. Tell if one is new."""
+        """Add clusters: their members, what these pay, and the facility. Return if one is new."""
         before = len(self._clusters)
         for row, pays, centre in zip(members, paid.tolist(), centres, strict=True):
             cluster = tuple(np.flatnonzero(row).tolist())

@@ -276,7 +276,7 @@ class _Joined:
         )
 
     def _lack(self, a: int, b: int) -> list[tuple[int, int, int]]:
-        """Flag that two classes are not at one place, and what follows. Return the new flags."""
+        """Flag two classes as apart, and all that are apart if they are. Return the new flags."""
         added, waiting = [], [(0, a, b)]
         while waiting:
             r, a, b = waiting.pop()
@@ -392,7 +392,7 @@ class Forcing:
         known: dict[tuple[int, int], float],
         branches: int,
     ) -> bool:
-        """Add joins that every map of a cost below `most` has. Tell whether there is no such map.
+        """Add joins that every map of a cost below `most` has. Return whether there is no such map.
 
         `joins` has the joins found so far. `known` maps a join to a lower bound on the cost of maps
         without it. New bounds are added to it. Up to `branches` joins at a time are assumed to be

@@ -283,7 +283,7 @@ class Weighing:
         return nats
 
     def too_expensive(self, ssh_map: SSHMap) -> frozenset[Equality] | None:
-        """Add a map. Find equalities to forbid, which exclude it but no map worth finding.
+        """Add a map. Return equalities that exclude it, but no map worth finding.
 
         The map has the fewest dstates, places and paths of all maps left. The equalities are
         returns and believed displacements; None if no map left is worth finding.

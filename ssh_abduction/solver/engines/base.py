@@ -132,7 +132,7 @@ class GrowingEngine(Protocol):
 
 @runtime_checkable
 class LabellingEngine(Protocol):
-    """The protocol of an engine that finds dstates first. All maps it lists have the fewest."""
+    """The protocol of an engine that finds dstates first. It lists maps with the fewest dstates."""
 
     def labellings(self, cost: tuple[int, ...]) -> Iterator[Settled]:
         """Yield the maps of this cost, grouped by their labelling.

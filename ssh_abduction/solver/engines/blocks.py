@@ -179,7 +179,10 @@ class Blocks:
         return end, known
 
     def _refuted(self, begin: int, end: int, most: int, tenths: int) -> bool:
-        """Whether clingo proves that a block (consecutive steps) has no map within these limits."""
+        """Whether clingo proves that a block has no map with at most `most` dstates and this cost.
+
+        The cost is that of the faults, at most `tenths`.
+        """
         proven = self._proven.get((begin, end))
         if proven is None or proven[0] < most or proven[1] < tenths:
             seen, actions = self.seen[begin:end], self.actions[begin : end - 1]

@@ -40,7 +40,7 @@ PREPARING = (1.6, 2.1)
 
 @dataclass(frozen=True)
 class NodeLabels:
-    """The dstate of each node of a chart. If there is a control that finds paths, reuse it."""
+    """The dstate of each node of a chart, and a control for the paths to reuse, if there is one."""
 
     chart: FramedChart
     labels: Sequence[int]

@@ -43,7 +43,7 @@ SOONER = 1000
 
 
 class FramelessEngine:
-    """The engine for a trace with a map, without frames. It minimises the dstates first."""
+    """The engine for theories without frames, if a map of the trace is known already."""
 
     def __init__(self, task: Task, known: Sequence[int] = ()) -> None:
         """Begin with an empty prefix. `known` has each step's dstate in a small map, or nothing."""

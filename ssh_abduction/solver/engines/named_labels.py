@@ -155,7 +155,10 @@ class NamedLabels:
         self._program.give_links(links)
 
     def _first_spares(self, pinned: Pinned) -> dict[int, int]:
-        """Return the spare names of each view: `SPARES`, or one more than a given map needs."""
+        """Return how many spare names each view gets.
+
+        That is `SPARES`, or one more than the given map needs if that is more.
+        """
         seen = pinned.chart.seen
         found = Counter(dict(zip(self._given_map, seen, strict=False)).values())
         taken = Counter(seen[node] for node in pinned.clique)
@@ -182,10 +185,10 @@ class NamedLabels:
         self.program.give_forbidden(len(self._forbidden) - 1)
 
     def all_of(self, dstates: int, enough: int) -> Generator[list[int], None, None]:
-        """Yield each labelling with a number of dstates once. A known labelling comes first.
+        """Yield each labelling with this number of dstates once. A known labelling comes first.
 
-        Clingo is asked for at most `enough` labellings; 0 for all. It is not asked if this is 1 and
-        a labelling is known.
+        Clingo is asked for at most `enough` labellings; 0 for all. It is not asked if `enough` is 1
+        and a labelling is known.
         """
         known = self._incumbent.labels
         if known and len(set(known)) != dstates:

@@ -30,14 +30,14 @@ GUESSED = 24_000
 
 
 class SmallMaps:
-    """Finds small maps of first steps by merging and guessing, for a search that stops early."""
+    """Finds small maps of first steps by merging and guessing, in case a search stops early."""
 
     def __init__(self, task: Task, pinned: Pinned) -> None:
         """Prepare for a chart in which each of the first steps is a node."""
         self._task, self._pinned = task, pinned
 
     def merged(self) -> Iterator[list[int]]:
-        """Merge nodes by evidence, and yield the labels of the map; none without `greedy`."""
+        """Merge nodes by evidence, and yield the labels of the map, if speed-up `greedy` is on."""
         if self._task.speedups.greedy:
             yield merged(self._pinned.chart, self._pinned.clique)
 
@@ -65,7 +65,7 @@ class SmallMaps:
             steps = min(2 * steps, most)
 
     def guessed(self) -> Iterator[list[int]]:
-        """Yield the labels of a guessed map; none without speed-up annealed, or without a guess."""
+        """Yield the labels of a guessed map, if there is a guess and speed-up `annealed` is on."""
         if self._task.speedups.annealed:
             near = self._map_of_guess(self._pinned)
             if near is not None:

@@ -154,7 +154,7 @@ class StepEngine:
         self.asker.control.assign_external(further_rules.of_number(*self._number), True)
 
     def _give_forbidden(self, number: int) -> None:
-        """Give clingo the rule that excludes a forbidden set of equalities, by its number."""
+        """Give clingo the rule that excludes the forbidden set of equalities at this index."""
         part = f"forbidden_{number}"
         self.asker.control.add(
             part, [], further_rules.forbidden_equalities(self._forbidden[number])

@@ -174,7 +174,7 @@ class VisitProgram:
         return intransitive(pairs, self._known.fits, self.chart)
 
     def located(self, pairs: Iterable[Pair]) -> Located:
-        """Locate all visits by the pairs in a transitive answer; else name the visits it needs."""
+        """Locate all visits by the pairs in a transitive answer; else return the missed visits."""
         first: dict[int, tuple[int, int]] = {}
         for i, j, r in sorted(pairs):
             first.setdefault(j, (i, r))

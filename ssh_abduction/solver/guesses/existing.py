@@ -37,7 +37,7 @@ class ExistingMap:
         self._places = numbered(-1 - s.id if s.place is None else s.place for s in ssh_map.dstates)
 
     def with_displacements(self, digest: Trace, labels: Sequence[int]) -> Trace:
-        """Give each link in a digest, with these dstates, the displacement between its ends."""
+        """Give each action of a digest the displacement between the steps before and after it."""
         positions = 2 * (max(self._places) + 1)
         at = self._mean[:positions].reshape(-1, 2)[self._places][list(labels)]
         facing = self._mean[positions:][list(labels)]

@@ -182,7 +182,7 @@ class Joining:
     def _by_places(
         self, first: Part, second: Part, same: NDArray[np.bool_], near: float
     ) -> list[_Anchor]:
-        """List the best ways to lay one map on another that make two places one, by gateways.
+        """List the best ways to lay one map on another that make two places one, by their gateways.
 
         One pair of coinciding places is too little evidence, unless no other pair may be one.
         `same` tells whether each place of the first map may be each place of the second. Places
@@ -244,8 +244,9 @@ def _voted(
 ) -> Iterator[tuple[int, int, float]]:
     """Yield one way of each group of similar ways to lay a map on another, largest groups first.
 
-    A way has the dstates that are laid on each other, and the turn of the second map, which is laid
-    on the first. Ways are similar if they differ by less than about `near` metres.
+    A way is a triple: a dstate of the first map, the dstate of the second map to lay on it, and the
+    angle in radians by which to turn the second map. Ways are similar if they differ by less than
+    about `near` metres.
     """
     listed = [*ways]
     if not listed:
@@ -268,6 +269,6 @@ def _meeting(here: Array, there: Array, near: float) -> NDArray[np.bool_]:
 
 
 def _turned(vectors: Array, angle: Array | float) -> Array:
-    """Turn vectors, (n, 2), counterclockwise."""
+    """Turn vectors, (n, 2), counterclockwise by an angle in radians, or by n angles."""
     x, y, cos, sin = vectors[:, 0], vectors[:, 1], np.cos(angle), np.sin(angle)
     return np.stack([cos * x - sin * y, sin * x + cos * y], 1)

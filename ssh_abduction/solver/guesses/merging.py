@@ -109,9 +109,9 @@ def thinned_map(
 ) -> list[int]:
     """Merge dstates of a map until no two can be one, and return which dstate represents each.
 
-    This merges as `dstates_merged` does, but for a map without a chart: with the view of each
-    dstate, links (dstate, action, dstate), and the number of nodes at each dstate. `excluded` pairs
-    must not be merged. A dstate that was not merged represents itself.
+    This merges as `dstates_merged` does, but needs no chart. `shows` has the view of each dstate,
+    and `visits` the number of its nodes. Links are triples (dstate, action, dstate). `excluded`
+    pairs must not be merged. A dstate that was not merged represents itself.
     """
     apart = _apart_in_map(np.asarray(shows), links, excluded)
     classes = Classes(apart, links, np.asarray(visits))

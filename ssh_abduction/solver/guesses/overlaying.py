@@ -189,7 +189,7 @@ class _ClashError(Exception):
 
 
 class Overlay:
-    """Merges the dstates and places of a standing map with the dstates and places of a drive."""
+    """Merges the dstates and places of two maps, such as an old map and the map of a drive."""
 
     def __init__(self, standing: Part, drive: Part, problem: Problem, sights: Sights) -> None:
         theory, both = problem.theory, standing.beside(drive)
@@ -221,7 +221,7 @@ class Overlay:
         self._state, self._changes = self._apart, self._costs
 
     def merge(self, old: int, new: int, turn: float | None = None) -> bool:
-        """Merge a dstate of the standing map with one of the drive, and then all that coincide.
+        """Merge a dstate of the old map with one of the drive, and then all that coincide.
 
         An earlier merge is undone first. With a `turn`, only their places are merged, and the map
         of the drive is turned by it, in radians. Returns whether the two can be one dstate, or one
@@ -399,7 +399,7 @@ class Overlay:
         state.nats += square / 2 - saved
 
     def _dstates_at(self, place: int) -> list[int]:
-        """List the dstates at a place, one of each group."""
+        """List the dstates at a place, one of each merged group."""
         state = self._state
         return [
             s
@@ -433,7 +433,10 @@ class Overlay:
 
 
 def _merged(kept: frozenset[int], first: int, second: int) -> frozenset[int]:
-    """Return the kept things after a merge of two. Raises _ClashError if both are kept."""
+    """Replace the second of two merged dstates or places by the first, if it is kept.
+
+    Raises _ClashError if both are kept.
+    """
     if {first, second} <= kept:
         raise _ClashError
     return kept - {second} | {first} if second in kept else kept

@@ -254,7 +254,7 @@ def robust_maps(explainer: Explainer) -> Iterator[Explained | None]:
 
 
 class _Model:
-    """A cloned hidden Markov model of a trace. Its arrays are (actions, from states, to states)."""
+    """A cloned hidden Markov model of a trace. Its arrays are (actions, states, next states)."""
 
     def __init__(self, explainer: Explainer, clones: int, rng: np.random.Generator) -> None:
         self._explainer = explainer

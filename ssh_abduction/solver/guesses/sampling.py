@@ -67,7 +67,7 @@ class _Transitions:
         self._counted, self.counts, self.totals = self._tallied(labels)
 
     def count(self, labels: States) -> None:
-        """Count the transitions of a new draw instead."""
+        """Replace the counts by those of a new draw."""
         self._counted, self.counts, self.totals = self._tallied(labels)
 
     def rows(self, states: States, visits: States) -> States:
@@ -167,7 +167,7 @@ class Sampler:
         self._transitions = _Transitions(leaves, ways, states, self.labels)
 
     def anneal(self, first: float, sweeps: int) -> None:
-        """Draw the states again and again, with rising power of probabilities.
+        """Draw the states again and again, from probabilities raised to a rising power.
 
         The power rises from `first` to COLD in this many sweeps. LAST more sweeps have the power
         QUENCHED.

@@ -84,10 +84,10 @@ class Sights:
         return _may_face_alike(first, second, CHANGES if self._price else 0)
 
     def turns(self, t: int, u: int) -> Iterator[float]:
-        """Yield by how much the robot may be turned at step u from step t if both are at one place.
+        """Yield by how much the robot may turn from step t to step u, if both are at one place.
 
-        Turns are in radians, counterclockwise. Gateways do not change between the steps. Only stars
-        with directions (frame, gateways) tell turns.
+        The turns are in radians, counterclockwise. Gateways do not change between the steps. Only
+        stars with directions (frame, gateways) determine turns.
         """
         first, then = self._steps[t], self._steps[u]
         if self._star == "frame" and first.openings and then.openings:
@@ -185,7 +185,7 @@ def _smaller(star: Star, less: int) -> tuple[Frame, ...]:
 
 @lru_cache(maxsize=2**14)
 def _may_face_alike(first: Star, second: Star, changes: int) -> bool:
-    """Whether a robot may face one way at two stars, after so many changes of gateways."""
+    """Whether a robot may face one way at two stars, if up to `changes` gateways changed."""
     return any(
         "alike" in may_face(frame, other, shift)
         for frame, other in _equally_large(first, second)

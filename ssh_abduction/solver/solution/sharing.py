@@ -257,7 +257,7 @@ class Sharing:
         return self._kept[sort]
 
     def backbone(self, *, proven: bool) -> Backbone:
-        """Make the backbone from the maps so far. Say whether it is proven that all share it."""
+        """Make the backbone of the maps so far. `proven`: it holds for all minimal maps."""
         found = {sort: self._shared(kept) for sort, kept in self._kept.items()}
         return Backbone(
             found["dstates"], found.get("places"), found.get("paths"), found.get("courses"), proven
@@ -308,7 +308,7 @@ class Kept:
         self._seen.clear()
 
     def absorb(self, names: tuple[Hashable, ...]) -> None:
-        """Update the attributes by the name of each class in one more map, None if it has none."""
+        """Add a map. `names` has the name of each class in this map; None if it has no name."""
         if names in self._seen:
             return
         if len(self._seen) == REMEMBERED:

@@ -113,7 +113,7 @@ class Continuations:
         return row
 
     def apart(self) -> Matrix:
-        """Return the pairs of steps that are apart, as a matrix of flags, steps x steps."""
+        """Flag the pairs of steps that are different dstates, in a matrix of steps x steps."""
         steps = len(self._place)
         apart = np.empty((steps, steps), dtype=bool)
         for step in range(steps):
@@ -171,7 +171,10 @@ class _Clique:
     group: int
 
     def joined(self, other: _Clique, *, apart: bool) -> _Clique:
-        """Return a largest clique of two groups. All, or no, steps of different ones are apart."""
+        """Return a largest clique of two groups.
+
+        If `apart`, each step of one group is apart from each step of the other; else none is.
+        """
         group = self.group + other.group
         if apart:
             more = len(self.steps) * other.group + len(other.steps) * self.group

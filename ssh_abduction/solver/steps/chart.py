@@ -69,7 +69,7 @@ class Chart:
         )
 
     def apart(self) -> NDArray[np.bool_]:
-        """Return the pairs of nodes that are apart, as a matrix of flags, nodes x nodes."""
+        """Flag the pairs of nodes that are different dstates, in a matrix of nodes x nodes."""
         return self.continuations.apart()
 
     @cached_property
@@ -223,7 +223,7 @@ class FramedChart(Chart):
     away: frozenset[tuple[int, int]] = frozenset()
 
     def apart(self) -> NDArray[np.bool_]:
-        """Return the pairs of nodes that are apart, as a matrix of flags, nodes x nodes."""
+        """Flag the pairs of nodes that are different dstates, in a matrix of nodes x nodes."""
         import numpy as np
 
         visits, slots = np.asarray(self.facing).T

@@ -124,7 +124,7 @@ def _in_order(fault: Fault) -> tuple[int, int]:
 
 
 def with_compass(ssh_map: SSHMap) -> SSHMap:
-    """Add the direction of its gateway to each "changed" fault, if the map has poses. North is y.
+    """Add the compass direction of the gateway to each "changed" fault, if the map has poses.
 
     A map of several pieces, which have no common frame, is returned as it is.
     """

@@ -23,7 +23,7 @@ def are_one(first: int, second: int) -> Symbol:
 
 
 def forbidden_equalities(equalities: Iterable[Equality], where: Symbol | None = None) -> str:
-    """Return the rule that equalities of steps do not all hold, or only if `where` is true."""
+    """Return the rule that some equality of these does not hold. It may depend on atom `where`."""
     atoms = [str(where)] if where else []
     for e in equalities:
         if e.of == "displacement":
@@ -40,7 +40,10 @@ def rests_on(axiom: str, t: int, other: str) -> str:
 
 
 def one_in_doubt(number: int, condition: str | None) -> str:
-    """Return the rule that two things are one if `condition` (a body) holds; None is never."""
+    """Return the rule that two things are one if a condition, the body of a rule, holds.
+
+    If `condition` is None, they never are.
+    """
     one = f"one_in_doubt({number})"
     return f"{one} :- {condition}." if condition else f"#external {one}."
 

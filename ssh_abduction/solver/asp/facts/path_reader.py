@@ -132,7 +132,7 @@ class PathReader:
         return order
 
     def _is_before(self, model: Model, ahead: _Ahead) -> bool:
-        """Tell whether an answer has the first of two places of a path before the second."""
+        """Return whether an answer has the first of two places of a path before the second."""
         literal = self._before.get(ahead)
         if literal is None:
             atom = model.context.symbolic_atoms[Function("before", number_symbols(*ahead))]

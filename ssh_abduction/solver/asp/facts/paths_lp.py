@@ -153,7 +153,7 @@ class Segments:
     Attributes:
         places: The places whose dstates are connected by turns. Several of them may be one place of
             a map.
-        elsewhere: Pairs of these places that are different places of every map.
+        elsewhere: Pairs of these places that are different places in every map.
         travels: Triples of a segment and two places: in the direction of the segment, a travel
             leads from the first place to the second.
         distinct: Pairs of segments that cannot be one path.

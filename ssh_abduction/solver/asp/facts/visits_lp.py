@@ -50,7 +50,7 @@ def listing_atom(batch: int) -> Symbol:
 
 
 def first(place: int) -> Symbol:
-    """Return the atom that the node at this index in the order of nodes is first at its dstate."""
+    """Return the atom: the node at index `place` of the order is the first one at its dstate."""
     return Function("first", number_symbols(place))
 
 
