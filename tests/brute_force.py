@@ -137,13 +137,12 @@ def minimal_maps(
 def near_minimal_maps(
     trace: Trace, theory: Theory, within: int, allows: Callable[[Key], bool] = lambda _: True
 ) -> dict[tuple[int, ...], set[Key]]:
-    """By their cost: the maps that come first by `theory.priorities` among those with one number of
-    dstates, in the order of these numbers.
+    """The best maps for each number of dstates, by cost. `theory.priorities` says which are best.
 
-    within  how much greater that number may be than in minimal maps
+    within  how many dstates more than minimal maps they may have
 
-    Where the theory prefers few paths or places first, these are counted instead of dstates; where
-    it prefers none of these, all maps have one number.
+    If the theory prefers few paths or places first, these are counted instead of dstates. If it
+    prefers none of these, the number is the same for all maps.
     """
     counted = next((name for name in theory.priorities if name != "excuses"), None)
     best: dict[int, tuple[tuple[int, ...], set[Key]]] = {}  # by that number
@@ -597,8 +596,9 @@ def _with_closed(reading: tuple[Named, ...]) -> Iterator[tuple[Named, ...]]:
 
 
 def _readings(step: Step) -> list[tuple[Named, ...]]:
-    """The gateways (number in the star, bearing, spread) from ahead clockwise, with or without each
-    that was not observed."""
+    """The possible gateways of a star, clockwise from ahead: (number in the star, bearing, spread).
+
+    A gateway that was not observed may exist or not."""
     star = step.gateways
     gateways = star.gateways if star else ()
     found = []
@@ -631,7 +631,7 @@ def _agree(
     on: Axioms,
     one_drive: bool = True,
 ) -> bool:
-    """Whether steps i < t at one place may see so. Closed gateways have the number -1."""
+    """Whether these readings of steps i < t fit one place. Closed gateways have the number -1."""
     stars = [Star.of(trace.steps[step].star or ()).gateways for step in (i, t)]
     rotations: set[int] = set()
     if len(seen_i) == len(seen_t):
@@ -1015,7 +1015,7 @@ def _is_planar(
     arms = {(s, side): (s, side) for s in supported for side in (1, -1)}
 
     def merge(one: tuple[int, int], other: tuple[int, int]) -> None:
-        """Say that two arms are one, and so those opposite to them."""
+        """Make two arms one, and also the arms opposite to them."""
         for turned in (1, -1):
             old, new = arms[one[0], turned * one[1]], arms[other[0], turned * other[1]]
             arms.update({arm: new for arm, of in arms.items() if of == old})
@@ -1024,7 +1024,7 @@ def _is_planar(
         if action.turn == "around" and s in supported and places[s] == places[t]:
             merge((s, 1), (t, -1))
     beyond = [pair for s, t in travels for pair in (((s, 1), (t, -1)), ((t, -1), (s, 1)))]
-    for _ in arms:  # gateways to which one gateway leads are one, again and again
+    for _ in arms:  # gateways that one gateway leads to are one
         for (one, other), (here, there) in product(beyond, repeat=2):
             if arms[one] == arms[here]:
                 if places[other[0]] != places[there[0]]:

@@ -129,7 +129,7 @@ class LeastSquares:
 
 
 def layings(trace: Trace, positions: Sequence[Hashable]) -> int:
-    """How often drives, or groups of drives that closures join, are laid on others.
+    """Count how often drives are laid on others. Drives that closures join count as one.
 
     positions  the position of each step
     """

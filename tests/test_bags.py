@@ -238,7 +238,7 @@ def test_note_says_that_metadata_omits_a_bag_part(tmp_path: Path) -> None:
 # A full disk
 
 
-def full(*_: Any, **__: Any) -> Any:
+def raise_disk_full(*_: Any, **__: Any) -> Any:
     raise OSError(errno.ENOSPC, "No space left on device")
 
 
@@ -246,7 +246,7 @@ def test_full_disk_while_unpacking_is_a_clear_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "a.mcap.gz").write_bytes(gzip.compress(written(tmp_path, "mcap").read_bytes()))
-    monkeypatch.setattr(shutil, "copyfileobj", full)
+    monkeypatch.setattr(shutil, "copyfileobj", raise_disk_full)
     with pytest.raises(
         LogError,
         match=(
@@ -309,11 +309,11 @@ def clocks(
     return log
 
 
-def true(t: float) -> float:
+def true_clock(t: float) -> float:
     return t
 
 
-def off(log: Any) -> float:
+def largest_error(log: Any) -> float:
     """Largest error of the odometry for most scans, in metres and so in seconds."""
     return max(abs(scan.odometry[0] - (scan.line - 1) * 0.5) for scan in log.scans)
 
@@ -337,8 +337,10 @@ BROKEN: dict[str, Callable[[float], float]] = {
 )
 def test_recording_times_replace_broken_header_times(tmp_path: Path, what: str, topic: str) -> None:
     broken = BROKEN[what]
-    log = clocks(tmp_path, *((broken, true) if topic == "scan" else (true, broken)), true)
-    assert off(log) < 0.1
+    log = clocks(
+        tmp_path, *((broken, true_clock) if topic == "scan" else (true_clock, broken)), true_clock
+    )
+    assert largest_error(log) < 0.1
     assert "The times in the headers contradict themselves" in notes(log)
     assert "The times of recording are used." in notes(log)
 
@@ -346,7 +348,7 @@ def test_recording_times_replace_broken_header_times(tmp_path: Path, what: str, 
 @pytest.mark.parametrize(
     ("recorded", "said"),
     [
-        (true, ""),
+        (true_clock, ""),
         (lambda t: t + 0.3 * math.sin(t), ""),  # Late by itself, by varying amounts.
         (lambda t: t + 3600 + 0.05 * t, ""),  # Another clock than that of both headers.
         (lambda t: 0.0, "were all recorded at one time"),
@@ -356,14 +358,16 @@ def test_recording_times_replace_broken_header_times(tmp_path: Path, what: str, 
 def test_header_times_are_used_if_recording_times_are_worse(
     tmp_path: Path, recorded: Callable[[float], float], said: str
 ) -> None:
-    log = clocks(tmp_path, true, true, recorded)
-    assert off(log) < 0.1
+    log = clocks(tmp_path, true_clock, true_clock, recorded)
+    assert largest_error(log) < 0.1
     assert said in notes(log)
     assert ("The times in the headers are used." in notes(log)) == bool(said)
 
 
 def test_note_says_that_both_clocks_are_broken(tmp_path: Path) -> None:
-    log = clocks(tmp_path, BROKEN["10 s back from midway"], true, lambda t: 10 * math.ceil(t / 10))
+    log = clocks(
+        tmp_path, BROKEN["10 s back from midway"], true_clock, lambda t: 10 * math.ceil(t / 10)
+    )
     assert "The times of recording are no better" in notes(log)
 
 

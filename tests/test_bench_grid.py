@@ -44,7 +44,7 @@ def test_beam_model_prefers_the_wall_then_people_before_it() -> None:
 
 
 def test_ranges_of_a_grid_equal_those_of_the_world() -> None:
-    """To within two cells, away from walls. A beam along a wall meets a cell of it too early."""
+    """They agree to two cells away from walls. A beam along a wall meets a cell of it too early."""
     chosen = np.array([i for i, at in enumerate(grid().centres) if WORLD.clearance(*at) > 0.3])
     exact = Laser().exact(WORLD, np.column_stack([grid().centres[chosen], np.zeros(len(chosen))]))[
         :, 5::10
@@ -87,10 +87,10 @@ def _brute_moved(
     covariance: np.ndarray,
     slipped: float,
 ) -> np.ndarray:
-    """p(x') as a sum over x:
+    """p(x') as a sum of Gaussians, one for each x, about the pose that x leads to.
 
-    Gaussians about where x leads to, whose covariance is that of the displacement, of the heading's
-    bin, and of the least blur.
+    Their covariance is the sum of that of the displacement, of the heading's bin, and of the least
+    blur.
     """
     dx, dy, turned = move
     xs, ys, headings = np.array(poses).T

@@ -165,7 +165,7 @@ def test_each_sketch_gets_a_share_of_the_time() -> None:
 
 
 def test_certificate_is_written_without_comparing_each_pair() -> None:
-    """Of 3,000 steps that show different views no pair needs a word."""
+    """The trace has 3,000 steps with different views. No pair of these needs a word."""
     trace = Trace.from_steps([*range(3000), 0, 1], ["travel"] * 3000 + ["right"])
     asked = []
     with patch(

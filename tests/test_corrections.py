@@ -263,7 +263,7 @@ def test_gateways_are_opened_and_closed(folder: Path, capsys: pytest.CaptureFixt
         assert main(["correct", maps, "--closed", way]) == 1
         assert "it contradicts the trace: the robot" in capsys.readouterr().err
         assert not file.exists()
-    # So does a file that a person wrote.
+    # A file that a person wrote is refused, too.
     save_corrections(Corrections.for_drives(ROUND).with_gateway(False, [("round:1", 180.0)]), file)
     assert main(solving(folder, "round")) == 1
     assert "it contradicts the trace: the robot" in capsys.readouterr().err
@@ -306,7 +306,7 @@ def test_warning_if_a_later_drive_contradicts_a_gateway_correction(
     said = "open: right at monday:0, left at monday:3: it contradicts what tuesday saw at step"
     assert f"{said} tuesday:0: without it, tuesday would share places with" in told
     assert told.count("it contradicts") == 1
-    # So does Python.
+    # Python gives the same warning.
     drives = [seeing(name, *stars) for name in ("monday", "tuesday")]
     said_of = load_corrections(file)
     caplog.clear()
@@ -495,7 +495,7 @@ def test_opposite_correction_replaces_the_old_one(first: str, then: str, left: l
 def test_names_of_drives_may_have_commas(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """As those of simulated drives have: "two floors, 1 tours, seed 0"."""
+    """Names of simulated drives have some: "two floors, 1 tours, seed 0"."""
     files = []
     for name in ("two floors, 1", "a,b"):
         trace = Trace.from_steps("abc", ["travel", "around"], name=name)

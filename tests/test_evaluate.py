@@ -26,7 +26,7 @@ from ssh_abduction.evaluation import Evaluation, MapEvaluation
 ROOT = Path(__file__).parent.parent
 
 
-def told(trace: Trace, truths: Sequence[Any]) -> Trace:
+def with_truth(trace: Trace, truths: Sequence[Any]) -> Trace:
     """The trace with this truth, one value per step."""
     return replace(
         trace,
@@ -38,7 +38,7 @@ def told(trace: Trace, truths: Sequence[Any]) -> Trace:
 
 def walk(truths: Sequence[Any]) -> Trace:
     """A trace of travels without views, with this truth."""
-    return told(
+    return with_truth(
         Trace.from_steps("v" * len(truths), [{"name": "go", "kind": "travel"}] * (len(truths) - 1)),
         truths,
     )
@@ -56,7 +56,7 @@ def labelled(
     return SSHMap(tuple(labels), dstates, (), tuple(sorted({p for p in at if p is not None})))
 
 
-def one(ssh_map: SSHMap, trace: Trace) -> MapEvaluation:
+def evaluation_of(ssh_map: SSHMap, trace: Trace) -> MapEvaluation:
     (found,) = evaluate([ssh_map], trace).maps
     return found
 
@@ -121,7 +121,7 @@ def test_accuracy_and_pairs_equal_naive_counts(seed: int) -> None:
     trace = walk(
         [None if d is None else {"dstate": d, "place": f"p{true_place[d]}"} for d in names]
     )
-    found = one(labelled([*labels[:-1], 3], place), trace)
+    found = evaluation_of(labelled([*labels[:-1], 3], place), trace)
     labels[-1] = 3
     assert found.accuracy == naive_accuracy(labels, names)
     true = [None if d is None else true_place[d] for d in names]
@@ -140,7 +140,7 @@ def test_edge_scores_equal_the_best_assignment(seed: int) -> None:
     rng = random.Random(seed)
     said = [*(rng.randrange(4) for _ in range(10)), 3]
     true = [x if rng.random() < 0.6 else rng.randrange(4) for x in said]
-    found = one(labelled(said, range(4)), walk([{"place": place} for place in true]))
+    found = evaluation_of(labelled(said, range(4)), walk([{"place": place} for place in true]))
     assert (found.edge_precision, found.edge_recall) in naive_edges(said, true)
 
 
@@ -192,7 +192,7 @@ def test_a_map_is_isomorphic_to_itself_as_the_truth(tour: str) -> None:
             {"dstate": f"d{s.id}", "place": s.place, "path": s.path, "direction": s.direction}
             for s in at
         ]
-        found = evaluate(solution.maps, told(trace, truths))
+        found = evaluate(solution.maps, with_truth(trace, truths))
         assert found.rank == 1 + solution.maps.index(ssh_map)  # minimal maps differ
         assert found.maps[found.rank - 1] == MapEvaluation(
             True,
@@ -212,11 +212,13 @@ def test_a_map_is_isomorphic_to_itself_as_the_truth(tour: str) -> None:
 
 def test_evaluation_of_the_notched_rectangle() -> None:
     names = [f"x{i % 8}" for i in range(41)]
-    trace = told(rectangle(40), [{"dstate": x, "place": "ABCD"[int(x[1]) // 2]} for x in names])
+    trace = with_truth(
+        rectangle(40), [{"dstate": x, "place": "ABCD"[int(x[1]) // 2]} for x in names]
+    )
     found = evaluate(solve(trace).maps, trace)
     assert (found.rank, found.true_dstates, found.true_places, found.true_paths) == (1, 8, 4, None)
     assert found.ambiguity == 4 / 28  # four pairs of opposite dstates
-    causal = one(solve(trace, Theory.causal()).maps[0], trace)
+    causal = evaluation_of(solve(trace, Theory.causal()).maps[0], trace)
     assert (causal.dstates, causal.isomorphic, causal.accuracy) == (
         4,
         False,
@@ -245,28 +247,28 @@ def test_precision_and_recall_of_edges_equal_hand_counts() -> None:
     # Truth: A – B – C – A, driven once around and back to B. The map takes C for A, so that it has
     # the edges A – B and A – A.
     trace = walk([{"place": p} for p in "ABCABA"])
-    found = one(labelled([0, 1, 0, 0, 1, 0], [0, 1]), trace)
+    found = evaluation_of(labelled([0, 1, 0, 0, 1, 0], [0, 1]), trace)
     assert (found.edge_precision, found.edge_recall) == (1 / 2, 1 / 3)
     assert found.link_precision is None  # the truth names no dstates
 
 
 def test_evaluation_ignores_turns_as_edges() -> None:
-    trace = told(
+    trace = with_truth(
         Trace.from_steps("vvvv", ["right", "travel", "left"]), [{"place": p} for p in "AABB"]
     )
-    found = one(labelled([0, 1, 2, 3], [0, 0, 0, 0]), trace)
+    found = evaluation_of(labelled([0, 1, 2, 3], [0, 0, 0, 0]), trace)
     assert (found.edge_precision, found.edge_recall) == (0, 0)  # the turns alone are right
 
 
 def test_steps_without_a_place_share_no_place() -> None:
-    found = one(labelled([0, 0, 1, 1], [0, None]), walk([{"place": p} for p in "AABB"]))
+    found = evaluation_of(labelled([0, 0, 1, 1], [0, None]), walk([{"place": p} for p in "AABB"]))
     assert (found.place_precision, found.place_recall, found.places_right) == (1, 1 / 2, False)
 
 
 def test_evaluation_omits_links_without_truth() -> None:
-    found = one(labelled([0, 1, 2, 0, 1]), walk(["a", "b", None, "a", "b"]))
+    found = evaluation_of(labelled([0, 1, 2, 0, 1]), walk(["a", "b", None, "a", "b"]))
     assert (found.accuracy, found.dstates, found.link_precision, found.link_recall) == (1, 2, 1, 1)
-    assert one(labelled([0, 1, 2]), walk(["a", None, "b"])).link_recall is None
+    assert evaluation_of(labelled([0, 1, 2]), walk(["a", None, "b"])).link_recall is None
 
 
 def test_evaluation_judges_dstates_places_and_paths_separately() -> None:
@@ -274,7 +276,7 @@ def test_evaluation_judges_dstates_places_and_paths_separately() -> None:
     courses = [(0, 1), (1, 1), (0, 1), (1, 1)]
 
     def levels(ssh_map: SSHMap) -> tuple[bool | None, ...]:
-        found = one(ssh_map, walk(truths))
+        found = evaluation_of(ssh_map, walk(truths))
         return found.isomorphic, found.dstates_right, found.places_right, found.paths_right
 
     right = [0, 0, 1, 1]
@@ -340,11 +342,11 @@ def test_truth_is_read_in_all_its_forms(truths: list[Any], counts: tuple[int | N
 def test_ambiguity_counts_dstates_not_steps() -> None:
     seen = Trace.from_steps(["a", "a", "b", "c", "a", "b"], ["go"] * 5)
     assert (
-        evaluate([], told(seen, ["u", "v", "w", "x", "u", "x"])).ambiguity == 2 / 6
+        evaluate([], with_truth(seen, ["u", "v", "w", "x", "u", "x"])).ambiguity == 2 / 6
     )  # u and v by a, w and x by b
-    assert evaluate([], told(seen, ["u"] * 6)).ambiguity is None
+    assert evaluate([], with_truth(seen, ["u"] * 6)).ambiguity is None
     blind = replace(seen, steps=tuple(replace(step, view=None, image=0) for step in seen.steps))
-    assert evaluate([], told(blind, "uvwxux")).ambiguity is None
+    assert evaluate([], with_truth(blind, "uvwxux")).ambiguity is None
 
 
 def test_to_dict_of_an_evaluation_has_its_attributes() -> None:
@@ -458,7 +460,7 @@ def test_evaluate_prints_which_map_is_true(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     names = [f"x{i % 8}" for i in range(25)]
-    trace = told(rectangle(24), names)
+    trace = with_truth(rectangle(24), names)
     trace.save(tmp_path / "trace.jsonl")
     (ssh_map,) = solve(trace).maps
     ssh_map.save(tmp_path / "map.json")
@@ -477,7 +479,7 @@ def test_evaluate_prints_which_map_is_true(
     assert capsys.readouterr().out.startswith(
         "1 map, and there may be more: none is the true one\n"
     )
-    told(trace, [{"place": name} for name in names]).save(tmp_path / "trace.jsonl")
+    with_truth(trace, [{"place": name} for name in names]).save(tmp_path / "trace.jsonl")
     assert main(["evaluate", *files]) == 0
     assert capsys.readouterr().out.startswith(
         "1 map, and there may be more: unknown which is the true one, as the truth names"
@@ -488,7 +490,7 @@ def test_evaluate_errors_are_one_line(
     solved: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bare, short, none = tmp_path / "bare.jsonl", tmp_path / "short.jsonl", tmp_path / "none.json"
-    told(Trace.load(ACES), [None] * 23).save(bare)
+    with_truth(Trace.load(ACES), [None] * 23).save(bare)
     Trace.load(ACES).prefix(9).save(short)
     none.write_text('{"maps": []}')
     for words, message in [

@@ -36,7 +36,7 @@ def never() -> bool:
     return False
 
 
-def only(theory: Theory, names: set[str]) -> Theory:
+def with_axioms(theory: Theory, names: set[str]) -> Theory:
     """The theory with these axioms and no others."""
     rules = {axiom.name for each in theory.rules for axiom in each.axioms}
     return theory.replace(
@@ -118,7 +118,7 @@ def test_each_axiom_of_the_argument_is_needed() -> None:
     derivation = argument().derivation
     assert derivation is not None
     for dropped in (None, *derivation.axioms):
-        theory = only(Theory(same=[(0, 4)]), {*derivation.axioms, "asserted"} - {dropped})
+        theory = with_axioms(Theory(same=[(0, 4)]), {*derivation.axioms, "asserted"} - {dropped})
         solution = solve(RECTANGLE.prefix(5), theory, time_limit=100, max_maps=1)
         assert solution.status is (Status.UNSATISFIABLE if dropped is None else Status.OPTIMAL)
 
@@ -297,7 +297,7 @@ def test_known_maps_do_not_change_proven_answers(trace: Trace, within: int) -> N
 
 
 def test_explain_pair_without_time_finds_a_map_for_the_other_answer() -> None:
-    """No time is left for any search, but a visit to a new place makes a map that is accepted."""
+    """There is no time for a search. But moving a visit to a new place makes a consistent map."""
     solution = solve(SQUARE)
     assert solution.weighed
     best, *others = solution.weighed.rivals

@@ -55,8 +55,8 @@ def small_traces(draw: st.DrawFn, max_steps: int = 6) -> Trace:
     )
 
 
-# The shares of a price by the confidences of these traces: log(0.9 / 0.1) / log 99, and the least
-# share.
+# By the confidence of a view: the share of the price of a fault. For 0.9 it is log(0.9 / 0.1) /
+# log 99, and for 0.4 the least share.
 SHARE = {None: 1.0, 0.9: 0.478, 0.4: 0.1}
 
 
@@ -110,7 +110,7 @@ def cheapest(trace: Trace, misread: int, slipped: int) -> tuple[int | None, set[
     return best, maps
 
 
-def told(ssh_map: SSHMap) -> Told:
+def labels_and_faults(ssh_map: SSHMap) -> Told:
     return ssh_map.labels, frozenset(
         (fault.step, fault.kind, fault.expected) for fault in ssh_map.faults
     )
@@ -135,7 +135,7 @@ def test_causal_maps_with_faults_equal_the_brute_force(
     assert solution.complete
     assert solution.cost is not None
     assert solution.cost.tenths == cost
-    assert {told(ssh_map) for ssh_map in solution.maps} == expected
+    assert {labels_and_faults(ssh_map) for ssh_map in solution.maps} == expected
     assert len(solution.maps) == len(expected)
     assert all(check(trace, ssh_map, theory) == () for ssh_map in solution.maps)
 
@@ -162,7 +162,7 @@ def test_few_names_and_short_prefixes_do_not_change_answers(data: st.DataObject)
     cost, expected = cheapest(trace, round(10 * theory.misread), round(10 * theory.slipped))
     assert solution.cost is not None
     assert solution.cost.tenths == cost
-    assert {told(ssh_map) for ssh_map in solution.maps} == expected
+    assert {labels_and_faults(ssh_map) for ssh_map in solution.maps} == expected
 
 
 @settings(max_examples=5)

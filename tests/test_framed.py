@@ -84,7 +84,7 @@ def framed_traces(draw: st.DrawFn, most_steps: int = 9) -> Trace:
 
 @st.composite
 def framed_theories(draw: st.DrawFn) -> Theory:
-    """Everything that the engine accepts."""
+    """All theories that the engine accepts."""
     rest = draw(st.sampled_from([(), ("paths",), ("paths", "places"), ("places", "paths")]))
     return Theory(
         star="frame",

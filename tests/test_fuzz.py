@@ -283,7 +283,7 @@ def damaged(data: bytes, kind: str, rng: random.Random) -> bytes:
             i = rng.randrange(len(lines))
             with contextlib.suppress(
                 ValueError, RecursionError
-            ):  # it was broken by the first damage
+            ):  # the first damage broke it already
                 lines[i] = _json(json.loads(lines[i]), rng)
         return "\n".join(lines).encode("utf-8", "surrogatepass")
     for _ in range(rng.choice((1, 1, 2, 5))):

@@ -32,21 +32,21 @@ def scans() -> tuple[Scan, ...]:
     return every_second_beam(hall()[:COUNT])
 
 
-def by(scans: Sequence[Scan], poses: Sequence[Pose]) -> tuple[Scan, ...]:
+def with_odometry(scans: Sequence[Scan], poses: Sequence[Pose]) -> tuple[Scan, ...]:
     """The scans with these poses as odometry."""
     return tuple(replace(scan, odometry=pose) for scan, pose in zip(scans, poses, strict=True))
 
 
 def stepwise(scans: Sequence[Scan], step: Callable[[int, Pose], Pose | None]) -> tuple[Scan, ...]:
-    """The scans with odometry that makes other steps: None where it starts anew."""
+    """The scans with other odometry: `step` changes each step, or returns None for a restart."""
     poses = [scans[0].odometry]
     for i, (last, scan) in enumerate(pairwise(scans), 1):
         told = step(i, displacement_between(last.odometry, scan.odometry))
         poses.append(START if told is None else moved(poses[-1], told))
-    return by(scans, poses)
+    return with_odometry(scans, poses)
 
 
-def told(scans: Sequence[Scan]) -> tuple[Track, str]:
+def track_and_notes(scans: Sequence[Scan]) -> tuple[Track, str]:
     """The track, and the notes on it."""
     _, track, notes = tracked(RobotLog(tuple(scans), source="drive"))
     return track, " ".join(notes)
@@ -55,7 +55,7 @@ def told(scans: Sequence[Scan]) -> tuple[Track, str]:
 @pytest.fixture(scope="module")
 def metres(scans: tuple[Scan, ...]) -> float:
     """Measure the length of the way, and check that a good drive has no note."""
-    track, notes = told(scans)
+    track, notes = track_and_notes(scans)
     assert (track.cuts, track.breaks, notes) == ((), (), "")
     return float(track.way[-1])
 
@@ -65,7 +65,9 @@ def test_track_is_cut_where_the_odometer_restarts(
     scans: tuple[Scan, ...], metres: float, at: set[int], is_timed: bool
 ) -> None:
     broken = stepwise(scans, lambda i, step: None if i in at else step)
-    track, notes = told(broken if is_timed else [replace(scan, time=None) for scan in broken])
+    track, notes = track_and_notes(
+        broken if is_timed else [replace(scan, time=None) for scan in broken]
+    )
     assert (set(track.cuts), track.breaks) == (at, ())
     assert track.way[-1] == pytest.approx(metres, abs=3)
     assert f"The odometry jumps {'once' if len(at) == 1 else '3 times'} in {COUNT} scans" in notes
@@ -90,7 +92,7 @@ def test_trace_has_no_displacement_across_a_cut(
 def test_stuck_odometer_is_replaced_by_scan_matching(
     scans: tuple[Scan, ...], metres: float
 ) -> None:
-    track, notes = told(stepwise(scans, lambda i, step: START if 60 <= i < 80 else step))
+    track, notes = track_and_notes(stepwise(scans, lambda i, step: START if 60 <= i < 80 else step))
     assert set(track.cuts) == set(range(60, 80))
     assert track.way[-1] == pytest.approx(metres, abs=8)
     assert "The odometry stands still in" in notes
@@ -123,7 +125,9 @@ def test_carried_robot_gives_a_slipped_action(scans: tuple[Scan, ...]) -> None:
 
 def test_note_says_that_a_second_drive_may_begin_at_a_jump(scans: tuple[Scan, ...]) -> None:
     parts = (*scans[:60], *scans[85:])
-    track, notes = told(stepwise(parts, lambda i, step: (80.0, 30.0, 0.0) if i == 60 else step))
+    track, notes = track_and_notes(
+        stepwise(parts, lambda i, step: (80.0, 30.0, 0.0) if i == 60 else step)
+    )
     assert track.cuts == (60,)
     assert "starts anew" not in notes
     assert "If a second drive begins there, cut the log there." in notes
@@ -137,8 +141,8 @@ def test_missing_scans_with_good_odometry_are_no_jump(scans: tuple[Scan, ...]) -
 def test_odometry_in_another_unit_is_converted(
     scans: tuple[Scan, ...], metres: float, unit: str, count: float
 ) -> None:
-    track, notes = told(
-        by(
+    track, notes = track_and_notes(
+        with_odometry(
             scans,
             [
                 (count * x, count * y, heading)
@@ -160,7 +164,7 @@ def test_alternating_odometry_sources_are_reduced_to_one(
         moved((20.0, 14.0, 1.0), scan.odometry) if is_other else scan.odometry
         for scan, is_other in zip(scans, other, strict=True)
     ]
-    track, notes = told(by(scans, poses))
+    track, notes = track_and_notes(with_odometry(scans, poses))
     assert track.way[-1] == pytest.approx(metres, abs=8)
     assert "The poses of several sources alternate in the odometry" in notes
 
@@ -171,14 +175,14 @@ def test_near_alternating_odometry_gives_a_note(scans: tuple[Scan, ...]) -> None
         moved((1.0, 0.8, 0.05), scan.odometry) if draw.random() < 0.5 else scan.odometry
         for scan in scans
     ]
-    assert "The odometry goes back and forth" in told(by(scans, poses))[1]
+    assert "The odometry goes back and forth" in track_and_notes(with_odometry(scans, poses))[1]
 
 
 @pytest.mark.parametrize("block", [1, 10])
 def test_note_names_a_log_that_is_not_in_order(scans: tuple[Scan, ...], block: int) -> None:
     blocks = [scans[i : i + block] for i in range(0, 40, block)]
     random.Random(1).shuffle(blocks)
-    notes = told([scan for some in blocks for scan in some])[1]
+    notes = track_and_notes([scan for some in blocks for scan in some])[1]
     assert "The odometry jumps" in notes or "The usual step between two scans is" in notes
 
 
@@ -195,7 +199,7 @@ def test_log_with_too_many_breaks_is_refused(
 def test_note_names_scans_that_turn_unlike_the_odometry(
     scans: tuple[Scan, ...], metres: float
 ) -> None:
-    track, notes = told(
+    track, notes = track_and_notes(
         stepwise(scans, lambda i, step: (step[0], step[1], step[2] + (2.0 if i == 70 else 0.0)))
     )
     assert "Scans turn differently from the odometry, once: at scan 70" in notes

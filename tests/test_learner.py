@@ -384,7 +384,7 @@ def test_cluster_and_solve_warn_of_the_runner_up(
     assert json.loads(capsys.readouterr().out)["warnings"][0].startswith(
         said[len("ssh-abduction: warning: ") :]
     )
-    assert main(["solve", views, "--time-limit", "0.1"]) in {0, 10}  # no time for it
+    assert main(["solve", views, "--time-limit", "0.1"]) in {0, 10}  # no time for the warning
     assert capsys.readouterr().err == ""
     assert main(["cluster", views, "-o", views, "--k", "4"]) == 0
     assert capsys.readouterr().err == ""

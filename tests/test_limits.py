@@ -263,7 +263,7 @@ def test_workers_answer_all_tasks() -> None:
 
 
 def test_worker_that_exits_after_its_answer_loses_no_task() -> None:
-    """The next task was lost, and its trace was said to be killed for lack of memory."""
+    """Once, the next task was lost, and the message said that its process was killed."""
     tasks = [(number, 0.5) for number in range(3)]
     assert list(workers.answers(answer_and_end, tasks, 1, bool, None, 1.0)) == [0, 1, 2]
 
@@ -358,7 +358,7 @@ def with_view(step: int) -> tuple[list[int], list[int]]:
             ACTIONS[:120] + ACTIONS[119:],
             120,
         ),  # a step that is there twice
-        (list(range(30)), [0] * 29, None),  # all is new
+        (list(range(30)), [0] * 29, None),  # all views are new
         ([0] * 40 + [1], [0] * 40, None),  # a long corridor, and its end
     ],
 )

@@ -187,7 +187,7 @@ def _labels_of(chart: Chart, states: tuple[object, ...], number: dict[object, in
         ("abc", [{"name": "travel", "kind": "travel"}, {"name": "go"}]),  # neither turn nor travel
         ("ababc", ["right", "travel", "right", "right"]),  # to the right of b are a and c
         ("abc", ["right", "right"]),  # not seen what is to the right of c
-        ("abcab", ["right", "right", "right", "right"]),  # three quarters round
+        ("abcab", ["right", "right", "right", "right"]),  # turned by three quarters
     ],
 )
 def test_inconsistent_turns_give_no_chart(views: str, actions: list[object]) -> None:

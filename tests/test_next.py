@@ -85,9 +85,7 @@ def test_plan_for_two_rivals_has_the_fewest_actions() -> None:
             machine(chance, states, 2, chance.choice([0.8, 1.0]), actions, rare=True)
             for _ in range(2)
         )
-        expected = shortest(
-            [one, other], states**2
-        )  # a longer word comes to a pair of dstates twice
+        expected = shortest([one, other], states**2)  # a longer sequence repeats a pair of dstates
         experiment = next_experiment([one, other])
         lengths.append(expected or 0)
         if expected is None:

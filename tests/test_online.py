@@ -193,9 +193,9 @@ def test_online_sketches_are_consistent(data: st.DataObject) -> None:
 
 
 def draft(trace: Trace, theory: Theory, known: int, which: int) -> list[bool]:
-    """Let a minimal map of the first steps go on. After each step it is consistent if it says so.
+    """Continue a minimal map of the first steps as a sketch, and check it after each step.
 
-    Returns for each step whether the map did not say so.
+    If the sketch is certain, it must be consistent. Returns for each step whether it was uncertain.
     """
     maps = solve(trace.prefix(known), theory, max_maps=5).maps
     if not maps:

@@ -176,7 +176,7 @@ def test_speedups_are_off_if_a_shared_encoding_drops_an_axiom(
 def test_encodings_are_not_read_from_the_working_directory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As clingo's own `#include` would."""
+    """clingo's own `#include` reads them from there."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "paths.lp").write_text(":- not never.")
     (tmp_path / "fast").mkdir()

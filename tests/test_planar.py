@@ -467,7 +467,7 @@ def test_planarity_forbids_passing_a_place_unseen(planar: bool, expected: set[in
 
 @pytest.mark.parametrize(("slot", "expected"), [(3, True), (2, False)])
 def test_headings_decide_whether_three_streets_cross(slot: int, expected: bool) -> None:
-    """Three streets lie clockwise around one place and counterclockwise around the other."""
+    """Three streets between two places do not cross if their orders around them are mirrored."""
     joined = Edges([(0, 1), (2, 3), (4, 5)], [], {0: 0, 1: 1, 2: 1, 3: 0, 4: 0, 5: 1})
     headings = {0: 1, 1: 1, 2: 0 if expected else 2, 3: 2, 4: 3, 5: slot}
     assert joined.can_be_drawn_by(headings) == expected

@@ -11,7 +11,7 @@ from fault_cases import rectangle_of_five
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import TOYS
-from test_faults import cheapest, small_traces, told
+from test_faults import cheapest, labels_and_faults, small_traces
 from test_online import NO_TIME, followed
 
 from ssh_abduction import OnlineMapper, Theory, Trace, solve
@@ -52,7 +52,7 @@ def test_online_maps_with_faults_equal_the_brute_force(
         assert solution.complete
         assert solution.cost is not None
         assert (solution.cost.tenths, solution.bound.tenths) == (cost, cost)
-        assert {told(ssh_map) for ssh_map in solution.maps} == expected
+        assert {labels_and_faults(ssh_map) for ssh_map in solution.maps} == expected
         assert len(solution.maps) == len(expected)
         if mapper.standing.certain:
             futures = {

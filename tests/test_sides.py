@@ -210,7 +210,7 @@ def test_name_of_a_region_is_shown_by_all_verbs(
 
 @pytest.mark.slow
 def test_explain_place_without_time_uses_known_maps() -> None:
-    """No time is left for a search, and a map without one has more places."""
+    """There is no time for a search. Without the known maps, the answer is about a larger map."""
     trace = Trace.load(ACES3)
     known = solve(trace).maps
     searched, told, anew = (

@@ -117,7 +117,7 @@ def test_tour_confirms_returns_by_further_steps() -> None:
         ssh_map, trace = explorer.solution.maps[0], explorer.trace
         split = with_doubted_returns(ssh_map, trace, 4)
         pairs = {(a, b) for a, b in zip(split.labels, ssh_map.labels, strict=True)}
-        assert len(pairs) == len(split.dstates)  # only ever divided
+        assert len(pairs) == len(split.dstates)  # dstates are divided, never merged
         assert with_doubted_returns(ssh_map, trace, 0).labels == ssh_map.labels
         doubts += len(split.places) > len(ssh_map.places)
     assert doubts

@@ -352,7 +352,7 @@ def test_from_steps_refuses_wrong_steps(views: list[str], actions: list[str], me
 
 
 def test_views_may_be_numpy_integers() -> None:
-    """As clusterings give them."""
+    """Clusterings return such integers."""
     trace = Trace.from_steps(np.array([3, 0, 3]), ["travel", "travel"])
     assert trace == Trace.from_steps([3, 0, 3], ["travel", "travel"])
     assert all(type(step.view) is int for step in trace)

@@ -21,7 +21,7 @@ STOPS = (0.0, 10.0, 20.0, 10.0, 0.0)
 TIMES = tuple(1000.0 + 20 * t for t in range(5))
 
 
-def line(time: float, x: float, y: float = 0.0, heading: float = 0.0) -> str:
+def pose_line(time: float, x: float, y: float = 0.0, heading: float = 0.0) -> str:
     return f"{time} {x} {y} 0.1 0 0 {math.sin(heading / 2)} {math.cos(heading / 2)}\n"
 
 
@@ -31,7 +31,7 @@ def tum(shift: float = 0.0) -> str:
     for i in range(2 * 20 * 4 + 1):
         leg, share = divmod(i / 40, 1)
         ends = STOPS[int(leg)], STOPS[min(int(leg) + 1, 4)]
-        text += line(
+        text += pose_line(
             TIMES[0] + i / 2 + shift,
             ends[0] + share * (ends[1] - ends[0]),
             0,
@@ -122,7 +122,7 @@ def test_evaluate_judges_by_a_trajectory(
 
 
 def test_pose_at_a_step_includes_the_offset_of_its_dstate(tmp_path: Path) -> None:
-    trajectory = read(tmp_path, line(0, 1, 2, math.pi / 2) + line(1, 1, 4, math.pi / 2))
+    trajectory = read(tmp_path, pose_line(0, 1, 2, math.pi / 2) + pose_line(1, 1, 4, math.pi / 2))
     told = trajectory.told_to(trace_at((0.5, 0.0), (2.0, 0.5, 0.25)))
     assert told_poses(told) == [
         pytest.approx((0.5, 5.0, math.pi / 2 + 0.25)),
@@ -211,7 +211,7 @@ def test_poses_are_interpolated_in_time(
         ),
         ("1 2 3 4 1 1 1 1\n", TIMES, "true.tum:1: qx qy qz qw: expected a quaternion"),
         (
-            line(1, 2) + line(1, 3),
+            pose_line(1, 2) + pose_line(1, 3),
             TIMES,
             "true.tum: expected one pose at a time, got different ones at 1 s",
         ),
@@ -282,7 +282,7 @@ def test_trajectory_given_as_relations_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Both have eight numbers a line. A trajectory that was read as relations judged no pair."""
-    for text in (tum(), line(1000, 0), HEAD + "5 2 3 4 0 0 0 1\n"):
+    for text in (tum(), pose_line(1000, 0), HEAD + "5 2 3 4 0 0 0 1\n"):
         (tmp_path / "relations").write_text(text)
         trace_at().save(tmp_path / "trace.jsonl")
         there_and_back().save(tmp_path / "map.json")

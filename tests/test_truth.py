@@ -22,7 +22,7 @@ NOISE = Odometry(**truth.NOISE)
 
 
 def reckoned(trace: Trace, start: tuple[float, float, float]) -> list[tuple[float, float, float]]:
-    """The poses that the displacements lead to, (x, y, heading) each."""
+    """The pose (x, y, heading) at each step by dead reckoning."""
     poses = [start]
     for step in trace.steps[1:]:
         assert step.displacement is not None

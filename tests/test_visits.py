@@ -147,7 +147,7 @@ def test_relations_are_composed_along_the_shortest_chain() -> None:
             math.radians(90.75),
         )
         assert pose == pytest.approx(displacement_between(start, poses[int(time)]), abs=0.01)
-        # not the way that was driven, of up to 215 m, but over the relation that closes the circle
+        # The chain goes over the relation that closes the circle. The robot drove up to 215 m.
         assert way < 60
     assert seen[4] is None  # long after the last time
 

@@ -29,7 +29,7 @@ ACES3, EXAMPLE = "examples/aces3-route.jsonl", "examples/notched-rectangle.jsonl
 LIMIT = 100  # seconds: a search that does not end is a failure, not a hang
 
 
-def at(ssh_map: SSHMap) -> list[int | None]:
+def places_of_steps(ssh_map: SSHMap) -> list[int | None]:
     """The place of each step."""
     return [ssh_map.dstates[label].place for label in ssh_map.labels]
 
@@ -37,7 +37,7 @@ def at(ssh_map: SSHMap) -> list[int | None]:
 @settings(max_examples=6)
 @given(st.data())
 def test_near_minimal_maps_equal_the_brute_force(data: st.DataObject) -> None:
-    """Each map once, in the order of cost, each with its own cost."""
+    """Each map comes once, in the order of cost, with its own cost."""
     trace = data.draw(traces(max_steps=6), label="trace")
     theory = data.draw(theories(trace), label="theory")
     within = data.draw(st.integers(0, 3), label="within")
@@ -92,7 +92,7 @@ def test_true_map_of_aces3_is_within_three_dstates() -> None:
     right = [
         all(
             len(set(zip(found, truth, strict=True))) == len(set(found)) == len(set(truth))
-            for found, truth in ((m.labels, true), (at(m), places))
+            for found, truth in ((m.labels, true), (places_of_steps(m), places))
         )
         for m in solution.maps
     ]
@@ -101,7 +101,7 @@ def test_true_map_of_aces3_is_within_three_dstates() -> None:
 
 
 def test_within_one_lists_all_maps_if_only_dstates_are_preferred() -> None:
-    """Then the levels are those of clingo, with at most one dstate more than the least."""
+    """Maps of one number of dstates are all equally good, so a level has all of them."""
     route = Trace.load(ACES3)[:16]
     solution = solve(route, Theory(prefer=("dstates",)), max_maps=None, within=1)
     assert [(level.cost.dstates, level.count) for level in solution.levels] == [(12, 3), (13, 4)]
