@@ -146,6 +146,49 @@ def test_visits_with_near_middles_get_one_middle(off: float, one: bool) -> None:
     assert [tuple(found.match.shift) for found in closed] == [pytest.approx((0.0, 0.0))]
 
 
+def test_successive_visits_that_get_one_middle_become_one() -> None:
+    pose = (5.0, -3.0, 0.4)
+    track, visits, closings = drive([STRAIGHT, STRAIGHT], pose, [(9.0, 0.0)])
+    for middle in points_moved(pose, np.array([(8.6, 0.0), (9.4, 0.0)])):
+        scan = int(np.hypot(*(track.poses[:, :2] - middle).T).argmin())
+        visits.append(Visit(scan, middle, scan, scan))
+    closings.append(VisitMatch(1, 4, Match(0.9, -pose[2], np.array([0.4, 0.0]), 0.9, 0.1)))
+    every, closed = with_partings(track, visits, closings)
+    assert [visit.scan for visit in every] == [visit.scan for visit in visits[:4]]
+    assert every[3].end == visits[4].end
+    assert math.dist(every[3].middle, points_moved(pose, every[1].middle[None])[0]) < 1e-6
+    assert [(one.first, one.last) for one in closed] == [(0, 2), (1, 3)]
+    assert closed[1].match.shift == pytest.approx((0.0, 0.0))
+    # Across a cut nobody knows whether the robot left the place.
+    cut = replace(track, cuts=(visits[4].scan,))
+    assert len(with_partings(cut, visits, closings)[0]) == len(visits)
+
+
+@pytest.mark.parametrize(
+    ("course", "radius", "moves"),
+    [
+        ([(9, -8), (9, 0), (0, 0)], 1.5, True),
+        ([(9, -8), (9, 0), (0, 0)], 1.1, False),  # the other middle is not in its disc
+        ([(10.2, -8), (10.2, 0), (0, 0)], 1.5, False),  # the robot came near to both
+    ],
+)
+def test_a_visit_gets_the_middle_of_others_that_the_robot_came_nearer_to(
+    course: Points, radius: float, moves: bool
+) -> None:
+    middles = np.array([(9.0, 0.0), (9.0, 0.0), (10.2, 0.0)])
+    track, begins, _ = drive([STRAIGHT, STRAIGHT, course], (0.0, 0.0, 0.0))
+    visits = []
+    for begin, middle in zip(begins, middles, strict=True):
+        far = np.hypot(*(track.poses[begin.scan :, :2] - middle).T)
+        scan = begin.scan + int(far[:80].argmin())
+        visits.append(Visit(scan, middle, scan, scan, radius))
+    shifts = middles - middles[0]
+    closings = [VisitMatch(0, k, Match(0.9, 0.0, shifts[k], 0.9, 0.1)) for k in (1, 2)]
+    every, closed = with_partings(track, visits, closings)
+    assert tuple(every[-1].middle) == pytest.approx((9.0 if moves else 10.2, 0.0))
+    assert closed[1].match.shift == pytest.approx((0.0 if moves else 1.2, 0.0))
+
+
 def test_stretches_are_compared_after_a_closure_or_short_way() -> None:
     track, visits, closings = drive([STRAIGHT, LANE], (0.0, 0.0, 0.0))
     assert with_partings(track, visits, [])[0] == tuple(visits)

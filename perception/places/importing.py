@@ -139,8 +139,8 @@ def import_live(
         items: The scans with odometry, in order, for example those of `stream_log` or `live_log`.
         width: Width of the robot in metres.
         tell: A function that gets each note on suspicious scans and odometry, at once.
-        show: A function that gets each visit when it is final, except visits where stretches of the
-            drive diverge (`partings`).
+        show: A function that gets each visit when it is final, before `partings` moves, joins and
+            adds visits.
         source: Name of the log, for errors.
 
     Returns:
@@ -222,9 +222,8 @@ def stream_visits(
     of the scans, the other visits follow. No visit is yielded before the units of the odometry are
     recognised, which takes about 100 scans of a moving robot.
 
-    If the odometry is good, the visits are the same as those of `import_log`, without visits where
-    stretches of the drive diverge (`partings`). A jump of the odometer is judged by earlier steps
-    only.
+    If the odometry is good, the visits are those of `import_log` before `partings` moves, joins and
+    adds visits. A jump of the odometer is judged by earlier steps only.
 
     Args:
         scans: The scans with odometry, in order, for example those of `stream_log`. Damaged parts

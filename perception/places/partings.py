@@ -6,7 +6,9 @@ each other, so they show where two stretches diverge. If no known place is near,
 place. Each stretch that passes it gets a visit.
 
 Closures also show visits whose middles are nearly the same. Their local maps show one junction at
-slightly different points. So they get one middle, and are visits to one place.
+slightly different points. So they get one middle, and are visits to one place. If a visit shares
+its middle with no other one, the robot may have come nearer to a middle that others share. Then the
+visit gets that middle. Successive visits that now have one middle become one.
 
 The second stretch may come long after the first one. So these visits are found when a drive ends.
 """
@@ -24,7 +26,7 @@ from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial.distance import cdist, pdist
 
 from perception.places.closures import VisitMatch
-from perception.places.stays import RIM, taken, with_ways_in_order
+from perception.places.stays import RIM, SAME, STAY, are_near, joined, taken, with_ways_in_order
 from perception.places.track import Array, Track, points_turned
 from perception.places.visits import Visit, Way
 
@@ -41,8 +43,10 @@ NEAR, ONE, PASS = 1.5, 2.0, 4.0
 # The radius of the disc of a parting in metres. The robot crosses its rim less than BOW metres of
 # trajectory away.
 RADIUS, BOW = 1.0, 6.0
-# Visits whose middles are within AGREED metres of each other are to one place.
-AGREED = 1.0
+# Visits whose middles are within AGREED metres of each other are to one place. The robot came
+# clearly nearer to a middle than to another if it came nearer by CLEARLY metres, which is twice the
+# error of the middle of a visit.
+AGREED, CLEARLY = 1.0, 0.4
 # Between visits at most MOST metres of trajectory apart, the track is as good as a closure. Two
 # stretches are LEAST metres of trajectory apart.
 MOST, LEAST = 32.0, 8.0
@@ -57,17 +61,20 @@ def with_partings(
 ) -> tuple[tuple[Visit, ...], list[VisitMatch]]:
     """Add a visit for each pass of a place where stretches of a drive diverge.
 
-    Visits whose middles are nearly the same get the same middle. An added visit has the local map
-    of the nearest other one. Return all visits, in order, and the closures between their middles.
+    Visits whose middles are nearly the same get the same middle. Successive ones with one middle
+    become one visit. An added visit has the local map of the nearest other one. Return all visits,
+    in order, and the closures between their middles.
     """
     drive = _DrivePoints(track, visits)
     relations = [*_closed(drive, closings), *_tracked(drive)]  # no middle of a visit changes them
-    moves = _agreed(drive, relations)
-    visits = [*map(_moved, visits, moves)]
-    closings = [
-        replace(one, match=replace(one.match, shift=one.match.shift + _change(one, moves)))
-        for one in closings
-    ]
+    for moves_of in (_agreed, _nearer):
+        moves = moves_of(_DrivePoints(track, visits), relations)
+        visits = [*map(_moved, visits, moves)]
+        closings = [
+            replace(one, match=replace(one.match, shift=one.match.shift + _change(one, moves)))
+            for one in closings
+        ]
+    visits, closings = _without_returns(track, visits, closings)
     drive = _DrivePoints(track, visits)
     every = [*visits, *(drive.visit(*some) for some in _added(drive, relations))]
     order = sorted(range(len(every)), key=lambda k: every[k].scan)
@@ -230,10 +237,35 @@ def _agreed(drive: _DrivePoints, relations: Sequence[_Alignment]) -> Array:
     return moves
 
 
+def _nearer(drive: _DrivePoints, relations: Sequence[_Alignment]) -> Array:
+    """Compute how to move middles, (v, 2) metres, to middles that the robot came nearer to.
+
+    A local map may show one junction where others show two. So a visit that shares its middle with
+    no other visit moves to a middle in its disc that several visits have, if the robot came clearly
+    nearer to it.
+    """
+    moves = np.zeros_like(drive.middles)
+    links = _links(drive, relations, max(visit.radius for visit in drive.visits))
+    shared = {
+        k
+        for k, near in links.items()
+        if any(n != k and math.hypot(*off) < SAME for n, _, off in near)
+    }
+    for k in links.keys() - shared:
+        part = drive.stretch(float(drive.ways[k]), PASS)
+        ours = drive.points[part.start : part.stop] - drive.middles[k]
+        others = [off for n, _, off in links[k] if n in shared]
+        inside = [off for off in others if math.hypot(*off) <= drive.visits[k].radius]
+        far = [np.hypot(*(ours - off).T).min() for off in (np.zeros(2), *inside)]
+        if min(far) < far[0] - CLEARLY:
+            moves[k] = inside[int(np.argmin(far)) - 1]
+    return moves
+
+
 def _links(
-    drive: _DrivePoints, relations: Sequence[_Alignment]
+    drive: _DrivePoints, relations: Sequence[_Alignment], most: float = AGREED
 ) -> dict[int, list[tuple[int, float, Array]]]:
-    """For each visit, list the visits with nearly the same middle, and their relative poses.
+    """For each visit, list the visits with middles at most `most` metres away.
 
     Such a pose is a rotation from the axes of the other visit to those of this one, in radians, and
     the middle of the other visit relative to that of this one, in metres.
@@ -244,7 +276,7 @@ def _links(
             np.flatnonzero(np.abs(drive.ways - way) <= REACH) for way in (one.first, one.last)
         )
         theirs = one.moved(drive.middles[last])
-        for i, j in zip(*np.nonzero(cdist(drive.middles[first], theirs) <= AGREED), strict=True):
+        for i, j in zip(*np.nonzero(cdist(drive.middles[first], theirs) <= most), strict=True):
             off = theirs[j] - drive.middles[first[i]]
             links[int(first[i])].append((int(last[j]), one.turn, off))
             links[int(last[j])].append((int(first[i]), -one.turn, points_turned(-one.turn, -off)))
@@ -266,6 +298,32 @@ def _moved(visit: Visit, move: Array) -> Visit:
 def _change(one: VisitMatch, moves: Array) -> Array:
     """Compute how the shift of a closure changes if the middles of its visits move by `moves`."""
     return np.asarray(points_turned(one.match.turn, moves[one.last]) - moves[one.first])
+
+
+def _without_returns(
+    track: Track, visits: Sequence[Visit], closings: Sequence[VisitMatch]
+) -> tuple[list[Visit], list[VisitMatch]]:
+    """Make one visit of successive visits to one place, as `Stays` does before middles move.
+
+    Return the visits, and the closures between them.
+    """
+    kept: list[Visit] = []
+    number: list[int] = []  # for each visit, the index in `kept` of the visit that it belongs to
+    for visit in visits:
+        last = kept[-1] if kept else None
+        if last and are_near(last, visit) and _is_soon(track, last, visit):
+            kept[-1] = joined(last, visit)
+        else:
+            kept.append(visit)
+        number.append(len(kept) - 1)
+    pairs = {(number[one.first], number[one.last]): one for one in closings}
+    return kept, [replace(one, first=i, last=j) for (i, j), one in pairs.items() if i != j]
+
+
+def _is_soon(track: Track, last: Visit, visit: Visit) -> bool:
+    """Whether a visit begins within STAY metres of the end of the last one, without a cut."""
+    soon = track.way[visit.scan] <= track.way[last.end] + STAY
+    return bool(soon) and not track.cuts_between(last.scan, visit.scan)
 
 
 def _passes(

@@ -110,7 +110,7 @@ class Stays:
         The visit with the largest support times radius is kept.
         """
         last = self._passing
-        near = last is not None and _are_near(last, visit)
+        near = last is not None and are_near(last, visit)
         if last is None or not near or not self._may_overlap(last, visit.scan, visit.begin):
             self._settle()
             self._passing = visit
@@ -262,10 +262,10 @@ class Stays:
         """Whether a visit continues the last one: the robot left the disc, and soon came back."""
         last = self._staying
         soon = self._recent.way(visit.scan) <= self._left + STAY
-        return last is not None and soon and _are_near(last, visit)
+        return last is not None and soon and are_near(last, visit)
 
 
-def _are_near(first: Visit, second: Visit) -> bool:
+def are_near(first: Visit, second: Visit) -> bool:
     """Whether the middles of two visits are so near that they may be one place."""
     near = max(SAME, SHARE * max(first.radius, second.radius))
     return math.dist(first.middle, second.middle) < near
