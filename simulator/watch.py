@@ -86,7 +86,7 @@ class DriveWatch:
             self._ended(tour, after)
 
     def _ended(self, tour: int, pose: Pose) -> None:
-        """Warn if a tour did not end where the first began; an error if others follow."""
+        """Warn if the tour did not end where it began. With several tours, raise an error."""
         assert self._home is not None
         if (
             math.dist(pose[:2], self._home[:2]) <= self._near

@@ -137,10 +137,13 @@ class _Gate:
 
 
 class _Gates:
-    """Makes the gates of pairs of visits that are at least `apart` metres of driving apart."""
+    """Makes the gates (`_Gate`) of pairs of visits that are at least `apart` metres apart.
+
+    That is how far the robot drove between the two visits.
+    """
 
     def __init__(self, track: Track, visits: Sequence[Visit], apart: float) -> None:
-        """Compute the middles for each drift."""
+        """Compute the middles of the visits for each drift of the heading that is tried."""
         self._track, self._apart = track, apart
         self._scans = [visit.scan for visit in visits]
         self._way = track.way[self._scans]

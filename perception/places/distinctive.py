@@ -178,7 +178,7 @@ class _Detector:
         return released
 
     def _forget(self) -> None:
-        """Forget what is too old for any visit."""
+        """Forget scans and milestones that are too old for any further visit."""
         oldest = self._recent.way(min(self._horizon, self._stays.oldest))
         self._recent.drop_before(self._recent.at(oldest - AROUND))
         while self._milestones[0] < self._recent.begin:
@@ -239,11 +239,11 @@ class _Chain:
         return self.sightings[-1].milestone
 
     def middle(self, recent: int = 0) -> Array:
-        """The median of the middles: (2,) metres; of the most recent ones only, if not 0."""
+        """The median of the middles: (2,) metres; of the last `recent` ones only, if not 0."""
         return _middle(self.sightings[-recent:])
 
     def radius(self, recent: int = 0) -> float:
-        """The median of the radii in metres; of the most recent ones only, if not 0."""
+        """The median of the radii in metres; of the last `recent` ones only, if not 0."""
         radii = [sighting.junction.radius for sighting in self.sightings[-recent:]]
         return float(np.median(radii))
 

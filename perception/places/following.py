@@ -223,9 +223,10 @@ class _ScanMotion:
 def _bridged(
     points: Array, normals: Array, recent: deque[tuple[Array, Array]], last: Pose, before: Pose
 ) -> tuple[Pose, Array, float] | None:
-    """Match a scan without odometry: its pose, covariance, and share of points on walls, or None.
+    """Match a scan without odometry.
 
-    Two guesses are tried: the robot moved as it did before, or it stood still.
+    Two guesses are tried: the robot moved as it did before, or it stood still. Returns the pose,
+    its covariance, and the share of points on walls; None if neither guess matches.
     """
     wide = np.diag(UNKNOWN) ** 2
     onward, stayed = (

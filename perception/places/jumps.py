@@ -310,7 +310,7 @@ def _impossible(
     """Find impossible steps and doubtful ones, (n - 1,) masks. The doubtful include the impossible.
 
     A step is impossible if it is long in metres, longer than the usual step, and too long for the
-    time that it took. `paused` are those that took unusually long.
+    time that it took. `paused` is the mask of the steps that took unusually long.
     """
     far, over_two = _far(log, 1), _far(log, 2)
     if not far.any():

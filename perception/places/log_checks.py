@@ -311,5 +311,5 @@ def _intruding(log: RobotLog, track: Track, one: int, other: int) -> tuple[int, 
 
 
 def _neighbours(ranges: Array, beam: Array, best: Callable[..., Array]) -> Array:
-    """The `best` (np.min or np.max) range of each beam and its two neighbours, (k,)."""
+    """For each of k beams, the `best` (np.min or np.max) of its range and its neighbours', (k,)."""
     return best([ranges[beam - 1], ranges[beam], ranges[beam + 1]], axis=0)

@@ -245,7 +245,7 @@ def _correlated(products: _Spectra) -> _Floats:
 
 
 def _spread(less: Array) -> float:
-    """The standard deviation of the shift in metres, by scores minus the best one."""
+    """The standard deviation of the shift in metres. `less` has scores minus the best score."""
     weights = np.exp(SHARPNESS * less).sum(axis=0)
     weights /= weights.sum()
     x, y = (float((weights * grid).sum()) for grid in (_X, _Y))

@@ -182,7 +182,7 @@ class Stays:
         return limit
 
     def _complete(self, limit: int) -> list[Visit]:
-        """Complete the next visits before a scan, in order, with turning points far from others."""
+        """Complete the next visits before a scan, in order. Add turning points far from visits."""
         # Begin with the shortest stride and the sharpest turn. Other turns near it belong to the
         # same turning point.
         for turn in sorted(self._turns, key=lambda turn: (turn.stride, -turn.angle, -turn.scan)):

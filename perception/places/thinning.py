@@ -173,7 +173,10 @@ def _parts(mask: Bools) -> list[list[int]]:
 
 
 def _in_order(cells: Sequence[int], steps: Sequence[int]) -> list[int]:
-    """The cells of a line from one end to the other. `steps` are tried in their order."""
+    """The cells of a line from one end to the other.
+
+    `steps` has the differences between the numbers of neighbouring cells, those to try first first.
+    """
     left = set(cells)
     is_end = (cell for cell in cells if sum(cell + step in left for step in steps) < 2)
     cell: int | None = next(is_end, cells[0])

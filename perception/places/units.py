@@ -52,7 +52,7 @@ class Units:
 
 
 def units_of(log: RobotLog) -> tuple[Units, list[str]]:
-    """Recognise the units of a log's odometry, with a note if they are not metres and radians."""
+    """Recognise the units of a log's odometry. Return notes, too, if they are unusual."""
     count, counted = _length(log)
     log = Units(count).convert(log)
     degrees = way_of(log) >= LEAST_WAY and abs(ahead(log)) <= SIDEWAYS
@@ -66,7 +66,7 @@ def units_of(log: RobotLog) -> tuple[Units, list[str]]:
 
 
 def _length(log: RobotLog) -> tuple[float, list[str]]:
-    """Recognise on a stretch of the log how many units make a metre, with a note."""
+    """Recognise from a stretch of the log how many units make a metre. Also return notes."""
     usual = jumps.usual_step(log)
     if usual <= SPARSE:
         return 1.0, []

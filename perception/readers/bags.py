@@ -232,7 +232,7 @@ def _odometer_of_transforms(bag: Bag, frames: Frames, frame: str) -> tuple[Recor
 
 
 def _of_one_source(track: RecordedTrack, called: str, notes: list[str]) -> RecordedTrack:
-    """If the poses of several sources alternate, keep those of the largest one, with a note."""
+    """If the poses of several sources alternate, keep those of the largest one, and note it."""
     sources = sources_of(track)
     if len(sources) == 1:
         return track

@@ -213,7 +213,7 @@ class Findings:
 def meaning_of(
     found: Findings, survey: Survey, kind: str, source: str, notes: list[str]
 ) -> Meaning:
-    """Find out what the poses of the scans mean, with notes.
+    """Find out what the poses of the scans mean, and append notes to `notes`.
 
     Raises LogError if no poses are the odometer's.
     """

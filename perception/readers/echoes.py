@@ -159,10 +159,10 @@ def interpret_log(
 def interpreter_of(
     scans: Sequence[Scan], options: LaserOptions
 ) -> tuple[Callable[[Scan], Scan], tuple[str, ...]]:
-    """Find out from some scans what the ranges of a log mean, with notes, as `interpret_log`.
+    """Find out from some scans what the ranges of a log mean, as `interpret_log` does.
 
-    Return a function that interprets a scan of the same lasers, also a later one. A scan of
-    another laser is interpreted as by `interpret_scan`.
+    Return a function that interprets a scan of the same lasers, also a later one, and notes. The
+    function interprets a scan of another laser as `interpret_scan` does.
     """
     lasers = len({scan.laser.mount for scan in scans})
     if options.mount is not None and lasers > 1:

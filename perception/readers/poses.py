@@ -85,7 +85,7 @@ class TimedPoses:
 
 
 def clock_of(topics: Mapping[str, Array]) -> tuple[bool, tuple[str, ...]]:
-    """Return whether to use the stamps in headers instead of the times of recording, with notes.
+    """Return whether to use the stamps in headers, not the times of recording; and notes.
 
     Stamps are used if those of each topic are consistent and those of all topics agree.
     Otherwise, the times of recording are used, even if they are wrong, too. `topics` has, for
@@ -201,7 +201,8 @@ def sources_of(track: RecordedTrack) -> list[NDArray[np.intp]]:
     """Separate the poses of sources that alternate, such as two programs with the same transform.
 
     Each pose is given to the source whose last pose is nearest. If no source is near, the pose
-    starts a new source. The largest comes first. If poses do not alternate, all are of one source.
+    starts a new source. The source with the most poses comes first. If poses do not alternate, all
+    are of one source.
     """
     poses = track.table()[:, 2:]
     if len(poses) < 10:

@@ -36,9 +36,9 @@ HEADING, CHORD = 0.2, 0.3
 
 
 def edges_of(trace: Trace, ssh_map: SSHMap) -> dict[int, int]:
-    """Number the edges of a map by first use, for the step at which each travel begins.
+    """Return the edge of each travel, by the step at which the travel begins.
 
-    Travels of a log have a `course`. Others count as straight.
+    Edges are numbered by first use. Travels of a log have a `course`. Others count as straight.
     """
     places = place_of_steps(ssh_map)
     travels = {

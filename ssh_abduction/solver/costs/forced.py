@@ -303,7 +303,10 @@ class Forcing:
     def __init__(
         self, problem: Problem, log: Log, misfit: Misfit, ssh_map: SSHMap, dstates: int = 0
     ) -> None:
-        """Chart the trace, for its best known map and the proven least number of dstates."""
+        """Chart the trace of a problem.
+
+        `ssh_map` is its best known map. Each map has at least `dstates` dstates.
+        """
         self._misfit, self._dstates, self._overlap = misfit, dstates, problem.overlap
         dstate, place, _ = problem.theory.prices
         self._prices = dstate, place if problem.theory.level == "topological" else 0.0

@@ -210,7 +210,7 @@ class Weighing:
         )
 
     def keep_best(self) -> None:
-        """Weigh the best map of the search. Then make the cheapest known map the best one."""
+        """Compute the cost of the search's best map. Make the cheapest known map the best one."""
         known = self._parts.known
         if known.best is not None:
             self.add(known.best)

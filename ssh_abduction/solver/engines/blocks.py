@@ -179,9 +179,9 @@ class Blocks:
         return end, known
 
     def _refuted(self, begin: int, end: int, most: int, tenths: int) -> bool:
-        """Whether clingo proves that a block has no map with at most `most` dstates and this cost.
+        """Whether clingo proves that a block has no map within two limits.
 
-        The cost is that of the faults, at most `tenths`.
+        The limits are `most` dstates, and faults that cost `tenths`.
         """
         proven = self._proven.get((begin, end))
         if proven is None or proven[0] < most or proven[1] < tenths:

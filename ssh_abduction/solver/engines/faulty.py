@@ -204,7 +204,10 @@ class FaultyEngine:
             self.bound = max(self.bound or 0, bound[0])
 
     def _machine(self, answer: FaultyAnswer) -> tuple[dict[int, int], PartialMachine]:
-        """Make a machine (dstates and links) from an answer, with the number of each name in it."""
+        """Make a machine (dstates and links) from an answer.
+
+        Also return the number of the dstate that each name stands for.
+        """
         number: dict[int, int] = {}
         for t in sorted(answer.where):
             number.setdefault(answer.where[t], len(number))

@@ -146,7 +146,7 @@ class GatewaySketch(Sketch):
     def _sights(
         self, place: _PlaceSights
     ) -> tuple[list[Sight], dict[tuple[Sight, Sight], set[Action]]]:
-        """Return the sights of a place and the turns between them, as `fit` takes them."""
+        """Return the sights of a place, and the turns between them, for `frames_that_fit`."""
         made: dict[_Seen, Sight] = {}
         shown: set[int] = set()
         for (s, star), t in place.sights.items():

@@ -114,7 +114,10 @@ class Sketch:
 
     @classmethod
     def all_of(cls, first: Step, theory: Theory) -> list[Sketch]:
-        """Make a sketch (a map without a search) of each kind, those with small maps first."""
+        """Begin a sketch of each kind, those with small maps first.
+
+        The kinds differ in `homing` and, if the theory leaves it open, in `framed`.
+        """
         framed = (
             [True, False] if theory.level == "topological" and theory.star != "frame" else [False]
         )
@@ -252,7 +255,7 @@ class Sketch:
         return there
 
     def _known_ahead(self, place: int, path: int, direction: int, step: Step) -> int | None:
-        """Return the dstate at which a travel to a known place ends; None if the step differs."""
+        """Return the dstate where a travel to a known place ends; None if the step rules it out."""
         there = self._along.get((place, path, direction))
         heading = 0
         if there is None and self._framed:
