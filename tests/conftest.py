@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 from worlds import rectangle
 
 from ssh_abduction import SSHMap, Trace, solve
-from ssh_abduction.cli import jobs, verbosity, view
+from ssh_abduction.cli import jobs, main, verbosity, view
 
 # Hypothesis has no deadlines, because clingo takes a hundred times as long for some random traces
 # as for others. Examples are the same in each run.
@@ -84,6 +84,21 @@ def square() -> SSHMap:
     moves = [(10, 0, 0), (0, 0, 1.5708)] * 4
     trace = Trace.from_steps("abababab" + "a", ["travel", "left"] * 4, displacements=moves)
     return solve(trace).maps[0]
+
+
+@pytest.fixture
+def refuses(capsys: pytest.CaptureFixture[str]) -> Callable[[Sequence[str], str], None]:
+    """Check that a command prints nothing but one line on stderr, which has a message."""
+
+    def check(words: Sequence[str], message: str) -> None:
+        assert main([*words]) == 1, words
+        captured = capsys.readouterr()
+        assert captured.out == ""
+        assert captured.err.startswith("ssh-abduction: ")
+        assert message in captured.err
+        assert captured.err.count("\n") == 1
+
+    return check
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 import xml.etree.ElementTree as ET
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -373,21 +374,16 @@ def test_bad_trace_is_a_one_line_error(
 )
 @pytest.mark.parametrize("verb", ["show", "check"])
 def test_bad_maps_file_is_a_one_line_error(
-    verb: str, text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    verb: str, text: str, tmp_path: Path, refuses: Callable[..., None]
 ) -> None:
     path = tmp_path / "maps.json"
     path.write_text(text)
-    assert main([verb, str(path), *([ACES] if verb == "check" else [])]) == 1
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert re.fullmatch(rf"ssh-abduction: {re.escape(str(path))}[^\n]+\n", captured.err)
+    refuses([verb, str(path), *([ACES] if verb == "check" else [])], f"ssh-abduction: {path}")
 
 
-def test_contradicting_options_are_a_one_line_error(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["solve", ACES, "--theory", "causal", "--set", "boundary=strict"]) == 1
-    assert capsys.readouterr().err.startswith(
-        "ssh-abduction: boundary: expected none with level=causal"
-    )
+def test_contradicting_options_are_a_one_line_error(refuses: Callable[..., None]) -> None:
+    command = ["solve", ACES, "--theory", "causal", "--set", "boundary=strict"]
+    refuses(command, "ssh-abduction: boundary: expected none with level=causal")
 
 
 def test_setting_level_causal_gives_the_causal_preset(
@@ -547,7 +543,7 @@ def test_wrong_usage_names_the_wrong_option(
 
 
 def test_error_messages_say_how_to_mend_the_input(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], solved: Path
+    tmp_path: Path, refuses: Callable[..., None], solved: Path
 ) -> None:
     many, none, taken = tmp_path / "many.jsonl", tmp_path / "none.json", tmp_path / "taken"
     many.write_text("{}\n{}\n")
@@ -573,10 +569,7 @@ def test_error_messages_say_how_to_mend_the_input(
             "File exists; take another name",
         ),
     ]:
-        assert main(words) == 1, words
-        err = capsys.readouterr().err
-        assert message in err
-        assert err.count("\n") == 1
+        refuses(words, message)
 
 
 def test_closed_standard_error_does_not_stop_the_answer(

@@ -558,14 +558,11 @@ def edited(path: Path, change: Callable[[dict[str, object]], object]) -> Path:
 )
 def test_compare_refuses_edited_files(
     file_of: Callable[..., Path],
-    capsys: pytest.CaptureFixture[str],
+    refuses: Callable[..., None],
     change: Callable[[dict[str, object]], object],
     message: str,
 ) -> None:
-    assert main(["compare", str(edited(file_of(), change))]) == 1
-    error = capsys.readouterr().err
-    assert message in error
-    assert error.count("\n") == 1
+    refuses(["compare", str(edited(file_of(), change))], message)
 
 
 def test_compare_refuses_maps_of_other_traces(

@@ -7,7 +7,7 @@ import random
 import re
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import combinations, pairwise, permutations
 from pathlib import Path
@@ -487,7 +487,7 @@ def test_evaluate_prints_which_map_is_true(
 
 
 def test_evaluate_errors_are_one_line(
-    solved: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    solved: str, tmp_path: Path, refuses: Callable[..., None]
 ) -> None:
     bare, short, none = tmp_path / "bare.jsonl", tmp_path / "short.jsonl", tmp_path / "none.json"
     with_truth(Trace.load(ACES), [None] * 23).save(bare)
@@ -507,9 +507,4 @@ def test_evaluate_errors_are_one_line(
         ([solved, solved], f"{solved}:1: header: expected a trace, got maps, as solve prints them"),
         ([str(tmp_path / "nosuch"), ACES], "nosuch: expected a readable file of maps"),
     ]:
-        assert main(["evaluate", *words]) == 1, words
-        captured = capsys.readouterr()
-        assert captured.out == ""
-        assert captured.err.startswith("ssh-abduction: ")
-        assert message in captured.err
-        assert captured.err.count("\n") == 1
+        refuses(["evaluate", *words], message)

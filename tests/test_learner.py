@@ -10,6 +10,7 @@ import json
 import math
 import sys
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -652,7 +653,7 @@ def test_simulate_and_cluster_work_through_pipes(
 
 
 def test_errors_of_learning_verbs_are_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, refuses: Callable[..., None]
 ) -> None:
     trace = tmp_path / "t.jsonl"
     Trace.from_steps("ab", ["travel"]).save(trace)
@@ -687,11 +688,7 @@ def test_errors_of_learning_verbs_are_one_line(
         (["recognise", str(tmp_path / "cut.skops"), str(trace)], "expected a .skops file"),
         (["reproduce", "taylor-hall", "--seeds", "x"], "--seeds: expected numbers"),
     ]:
-        assert main(words) == 1, words
-        captured = capsys.readouterr()
-        assert message in captured.err
-        assert captured.err.count("\n") == 1
-        assert captured.out == ""
+        refuses(words, message)
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ import json
 import math
 import random
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import FrozenInstanceError
 from pathlib import Path
 from typing import Any
@@ -726,7 +726,7 @@ def test_localise_reads_images_and_recognise_prints_nowhere(
     assert capsys.readouterr().out.splitlines()[-1].split() == ["5", "nowhere"]
 
 
-def test_localise_errors_are_one_line(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_localise_errors_are_one_line(files: Path, refuses: Callable[..., None]) -> None:
     maps, other = str(files / "maps.json"), str(files / "other.jsonl")
     (files / "none.json").write_text('{"maps": []}')
     _imaged(IMAGES).save(files / "images.jsonl")
@@ -756,8 +756,4 @@ def test_localise_errors_are_one_line(files: Path, capsys: pytest.CaptureFixture
         ([maps, other, "--recogniser", maps], "expected a .skops file"),
         ([other, maps], "other.jsonl: expected a file of maps, got a trace"),
     ]:
-        assert main(["localise", *words]) == 1, words
-        captured = capsys.readouterr()
-        assert message in captured.err
-        assert captured.err.count("\n") == 1
-        assert captured.out == ""
+        refuses(["localise", *words], message)

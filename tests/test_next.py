@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import random
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -439,7 +439,7 @@ def test_next_warns_that_maps_may_be_missing(
 
 
 def test_next_errors_are_one_line(
-    machines: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    machines: tuple[str, str], tmp_path: Path, refuses: Callable[..., None]
 ) -> None:
     trace, maps = machines
     none = tmp_path / "none.json"
@@ -458,9 +458,4 @@ def test_next_errors_are_one_line(
             "--time-limit: expected a number of seconds above 0, got 0.0",
         ),
     ]:
-        assert main(["next", *words]) == 1, words
-        captured = capsys.readouterr()
-        assert captured.out == ""
-        assert captured.err.startswith("ssh-abduction: ")
-        assert message in captured.err
-        assert captured.err.count("\n") == 1
+        refuses(["next", *words], message)
