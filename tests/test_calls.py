@@ -560,7 +560,7 @@ def do(call: str, function: Any, arguments: dict[str, Any]) -> None:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _in_a_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+def _temporary_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("calls"))
         made = known()

@@ -146,7 +146,7 @@ def test_visits_with_near_middles_get_one_middle(off: float, one: bool) -> None:
     assert [tuple(found.match.shift) for found in closed] == [pytest.approx((0.0, 0.0))]
 
 
-def test_successive_visits_that_get_one_middle_become_one() -> None:
+def test_successive_visits_with_one_middle_are_joined() -> None:
     pose = (5.0, -3.0, 0.4)
     track, visits, closings = drive([STRAIGHT, STRAIGHT], pose, [(9.0, 0.0)])
     for middle in points_moved(pose, np.array([(8.6, 0.0), (9.4, 0.0)])):
@@ -172,7 +172,7 @@ def test_successive_visits_that_get_one_middle_become_one() -> None:
         ([(10.2, -8), (10.2, 0), (0, 0)], 1.5, False),  # the robot came near to both
     ],
 )
-def test_a_visit_gets_the_middle_of_others_that_the_robot_came_nearer_to(
+def test_visit_gets_a_nearer_middle_of_other_visits(
     course: Points, radius: float, moves: bool
 ) -> None:
     middles = np.array([(9.0, 0.0), (9.0, 0.0), (10.2, 0.0)])

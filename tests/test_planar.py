@@ -374,7 +374,7 @@ def tour() -> Trace:
 
 
 @pytest.fixture(scope="module")
-def smaller(tour: Trace) -> Solution:
+def nonplanar(tour: Trace) -> Solution:
     """The minimal maps of the tour without planarity, even if no travel passes a place unseen."""
     return solve(tour, Theory(next_place=True), max_maps=None)
 
@@ -385,13 +385,13 @@ def true_labels(trace: Trace) -> tuple[int, ...]:
 
 
 def test_planarity_excludes_smaller_maps_and_finds_the_true_one(
-    tour: Trace, smaller: Solution
+    tour: Trace, nonplanar: Solution
 ) -> None:
     """Four smaller maps explain the tour; their streets cross."""
-    assert smaller.cost
-    assert (smaller.cost.dstates, smaller.count) == (14, 4)
-    assert true_labels(tour) not in {ssh_map.labels for ssh_map in smaller.maps}
-    for ssh_map in smaller.maps:
+    assert nonplanar.cost
+    assert (nonplanar.cost.dstates, nonplanar.count) == (14, 4)
+    assert true_labels(tour) not in {ssh_map.labels for ssh_map in nonplanar.maps}
+    for ssh_map in nonplanar.maps:
         assert "planar" in {
             violation.axiom for violation in check(tour, ssh_map, Theory(planar=True))
         }
@@ -400,8 +400,8 @@ def test_planarity_excludes_smaller_maps_and_finds_the_true_one(
     assert [ssh_map.labels for ssh_map in solution.maps] == [true_labels(tour)]
 
 
-def test_checker_names_streets_that_cross(tour: Trace, smaller: Solution) -> None:
-    ssh_map = smaller.maps[0]
+def test_checker_names_streets_that_cross(tour: Trace, nonplanar: Solution) -> None:
+    ssh_map = nonplanar.maps[0]
     (violation,) = (v for v in check(tour, ssh_map, Theory(planar=True)) if v.axiom == "planar")
     assert "paths cross" in violation.message
     moved = {t for t, action in enumerate(tour.actions) if action.kind == "travel"}
@@ -413,12 +413,12 @@ def test_checker_names_streets_that_cross(tour: Trace, smaller: Solution) -> Non
     }
 
 
-def test_refusal_by_planarity_names_few_steps(tour: Trace, smaller: Solution) -> None:
+def test_refusal_by_planarity_names_few_steps(tour: Trace, nonplanar: Solution) -> None:
     """A place that the map keeps apart from another one may be where streets meet.
 
     Without this, a refusal would forbid planar maps.
     """
-    ssh_map = smaller.maps[0]
+    ssh_map = nonplanar.maps[0]
     reason = Planar.of(settle(tour, Theory(planar=True)).theory).refuse(tour, ssh_map)
     assert reason
     place = {

@@ -130,15 +130,15 @@ def test_verb_without_handler_ends_with_the_exit_code_of_the_signal(number: int,
 
 
 @pytest.fixture
-def signals(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The signals that other tests sent are forgotten, and so are those of this test."""
+def forgotten_signals(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Forget the signals that other tests sent, and those of this test."""
     for name in ("heard", "raised"):
         monkeypatch.setattr(program, name, [])
 
 
 @POSIX
 def test_ladder_prints_the_rungs_so_far(
-    signals: None,
+    forgotten_signals: None,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -163,7 +163,7 @@ def test_ladder_prints_the_rungs_so_far(
 @POSIX
 def test_interrupted_map_run_is_repeated_by_the_next_call(
     tmp_path: Path,
-    signals: None,
+    forgotten_signals: None,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:

@@ -136,7 +136,7 @@ def test_null_view_is_unknown_and_a_missing_view_an_error(tmp_path: Path) -> Non
         solve(replace(unseen, steps=steps))
 
 
-def test_a_stretch_without_any_view_may_contradict_what_a_person_says(
+def test_solve_names_corrections_that_steps_without_views_contradict(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     trace = Trace.from_steps(["a", None, None], ["around", "travel"], name="monday")
@@ -202,7 +202,7 @@ def test_certificate_does_not_use_unknown_views() -> None:
     assert not check_bound(trace, {"clique": [0, 2], "words": [], "refuted": []}).faults
 
 
-def test_compare_takes_solutions_that_fill_in_unknown_views_differently() -> None:
+def test_compare_accepts_different_views_at_unknown_steps() -> None:
     views = ["a", "a", "b", "a", None, "b", None]
     trace = Trace.from_steps(views, ["travel", "around"] * 3)
     one, other = solve(trace), solve(trace, Theory.causal())

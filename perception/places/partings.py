@@ -267,8 +267,8 @@ def _links(
 ) -> dict[int, list[tuple[int, float, Array]]]:
     """For each visit, list the visits with middles at most `most` metres away.
 
-    Such a pose is a rotation from the axes of the other visit to those of this one, in radians, and
-    the middle of the other visit relative to that of this one, in metres.
+    Each has a pose relative to this visit. It is a rotation from its axes to those of this visit,
+    in radians, and the offset of its middle from that of this visit, in metres.
     """
     links: dict[int, list[tuple[int, float, Array]]] = defaultdict(list)
     for one in relations:

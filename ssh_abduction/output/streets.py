@@ -57,8 +57,8 @@ class _StreetDrawing:
 class StreetProgram:
     """The linear program that puts spots along the headings of streets and separates streets.
 
-    Its variables are x and y of each spot, then for each street the distance by which it deviates
-    from its heading, then for each street the length by which it is too short.
+    Its first variables are x and y of each spot. Then comes for each street the distance by which
+    it deviates from its heading, and last for each street the length by which it is too short.
 
     Args:
         spots: The ids of the spots.

@@ -369,8 +369,9 @@ class Walk:
     def moves(self, layer: Layer) -> Iterator[tuple[int, int, Array, Array]]:
         """Follow each action from the joint states of a layer, some rows at a time.
 
-        For each part of the layer and each action, yield the number of the first row of the part,
-        the index of the action, the joint states after it, and the numbers of what is seen there.
+        Yield four values for each part of the layer and each action: the number of the first row
+        of the part; the index of the action; the joint states after it; and the numbers of what is
+        seen there.
         """
         size = max(CHUNK // len(self.group), 1)
         for start in range(0, len(layer.rows), size):
