@@ -73,7 +73,7 @@ class Building:
     """A plan with walls and openings.
 
     Attributes:
-        plan: The plan.
+        plan: The floor plan.
         segments: (n, 4) walls in metres.
         openings: The opening of each door, in the order of the plan.
     """

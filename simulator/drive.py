@@ -45,7 +45,7 @@ class RecordedDrive:
         times: (n,) seconds since the beginning.
         metres: Length of the drive.
         odometer: Noise of the odometry.
-        laser: The scanner.
+        laser: The scanner that took the scans.
         truth: True places and poses, as JSON-like data for evaluation only; empty until `judged`
             adds it.
     """

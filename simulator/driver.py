@@ -67,7 +67,7 @@ class Driver:
 
     Attributes:
         world: The world, with the clutter as it is on this tour.
-        robot: The robot.
+        robot: The robot, with its true pose and its odometry.
         laser: The robot's laser.
         rng: Source of the noise of the laser.
         tolerance: Largest errors with which hill-climbing ends.
@@ -224,7 +224,7 @@ class Corridors:
     It also collects the openings of the current place, for stars.
 
     Args:
-        driver: The robot.
+        driver: Moves the robot, and takes its laser images.
         looks_behind: Whether the robot looks behind itself at the start and after a lift.
             Elsewhere, it knows that the path by which it came is behind.
     """

@@ -69,7 +69,7 @@ class Pilot:
     """Does the actions of a route in a world whose streets meet at any angles.
 
     Args:
-        driver: The robot.
+        driver: Moves the robot, and takes its laser images.
 
     Attributes:
         here: The place where the robot is; set by `begin`.

@@ -170,7 +170,7 @@ class Camera:
         rows: Number of rows of a panorama.
         columns: Number of columns of a panorama. The first column is behind the robot on the left,
             the middle one ahead.
-        paint: Paint of the walls.
+        paint: The paint, which gives each wall a texture.
         hours: Hours of the day, from 0 to 24, at which a drive begins and ends.
         noise: Standard deviation of the noise of a pixel; pixels have values from 0 to 255.
         exposure: How much of a change of brightness the camera compensates, from 0 (nothing) to 1

@@ -56,7 +56,7 @@ class Plan:
 
     Attributes:
         name: Name of the plan.
-        rooms: The rooms.
+        rooms: The rooms, which are the places.
         doors: The doors, which refer to rooms by their indices.
     """
 

@@ -53,7 +53,7 @@ class Rooms:
         radius: Radius of the robot in metres.
 
     Attributes:
-        building: The building.
+        building: The building, with the openings of its doors.
         space: Free space of the building, in which doors are open.
         graph: Rooms as nodes, and doors as edges, both by index. It has the doors that are wide
             enough for the robot and can be reached in both rooms.

@@ -68,7 +68,7 @@ class OdometryLog:
     """Collects the odometry between the logged steps.
 
     Attributes:
-        robot: The robot.
+        robot: The robot whose odometry is collected.
         reports: Motion by odometry from each step to the next.
         begun: Whether a step was logged already on this floor.
     """

@@ -52,9 +52,9 @@ def simulate(
     Args:
         tours: Number of tours.
         seed: Seed of all noise.
-        laser: The scanner.
-        body: Errors of the robot.
-        tolerance: Precision of hill-climbing.
+        laser: The scanner; None for `Laser()`.
+        body: Size and errors of the robot; None for `Body()`.
+        tolerance: Precision of hill-climbing; None for `Tolerance()`.
         stars: Whether to log a star at each step: the openings seen at the place since arrival.
         every: Log images at this distance by odometry, in metres, instead of at dstates. Then all
             actions of the trace are travels. None logs at dstates.

@@ -38,7 +38,7 @@ class DriveWatch:
 
     Attributes:
         world: The world as in its file.
-        driver: The robot.
+        driver: The robot that is watched.
         tours: Number of tours that are driven.
     """
 

@@ -358,7 +358,7 @@ def test_explanation_names_assertions_and_own_axioms() -> None:
         ),
         (
             "#program step(t).\n:- not same_place(5,15).",
-            r"own\.lp:2: not same_place\(5,15\): expected to be asked at its last step",
+            r"own\.lp:2: not same_place\(5,15\): expected an atom with t as its last step",
         ),
         ("#minimize { 1,I : same(I,3) }.", r"own\.lp:1: expected rules, got"),
         ("#show same/2.", r"own\.lp:1: expected rules, got #show"),

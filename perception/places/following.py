@@ -125,7 +125,7 @@ class Followed:
     """A scan with its pose on the track.
 
     Attributes:
-        scan: The scan.
+        scan: The scan as it was logged.
         pose: x, y in metres and heading in radians, in the frame of the first scan.
         covariance: (3, 3) covariance of the motion from the previous scan, in the frame of the
             robot at the previous scan.

@@ -168,7 +168,7 @@ class Turned:
     """A scene in several rotations.
 
     Attributes:
-        scene: The scene.
+        scene: The scene without rotation.
         turns: The rotations in radians, n.
         spectra: The transforms of the wall points, the blurred walls and the observed cells:
             (3, n, SIZE, SIZE // 2 + 1).

@@ -70,7 +70,7 @@ class Salvage:
     """The intact messages of a file of a bag, with the interface of a reader of rosbags.
 
     Args:
-        path: The file.
+        path: Path of the file.
         format: `ros1`, `ros2` (SQLite) or `mcap`.
 
     Attributes:

@@ -71,7 +71,7 @@ class Scan:
     Attributes:
         ranges: (beams,) metres. Infinite if nothing came back from within the reach; NaN if the
             range is no measurement.
-        laser: The scanner.
+        laser: The scanner that measured the ranges.
         odometry: Pose by the odometer, which starts anywhere and drifts. Only its increments
             matter.
         corrected: Pose by a later correction, or the true one; None if unknown. It is for pictures

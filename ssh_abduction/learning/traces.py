@@ -28,7 +28,7 @@ class Traces:
     """Traces of one world. Their n steps are numbered one trace after the other.
 
     Attributes:
-        each: The traces.
+        each: The traces, in the order in which their steps are numbered.
     """
 
     each: tuple[Trace, ...]

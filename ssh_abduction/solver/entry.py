@@ -168,7 +168,7 @@ def find_backbone(
     (False, True)
 
     Args:
-        solution: The solution.
+        solution: The answer of `solve` whose minimal maps are compared.
         trace: The trace that was solved. Only needed if the solution was read from a file without
             its trace.
         time_limit: Seconds of wall-clock time; None for no limit.

@@ -108,7 +108,7 @@ def fault_front(
     """Find the fewest dstates for at most 0, 1, …, `most` faults.
 
     Args:
-        trace: The trace.
+        trace: The views and actions to explain.
         theory: Theory.causal() by default. A theory without costs of faults allows both kinds:
             wrong views and wrong actions.
         most: The greatest number of faults, 0 to 1000.

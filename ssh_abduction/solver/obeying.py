@@ -35,8 +35,8 @@ def obeyed(corrections: Corrections, trace: Trace, theory: Theory) -> tuple[Trac
 
     Args:
         corrections: The corrections. Sentences about drives that the trace lacks have no effect.
-        trace: The trace.
-        theory: The theory.
+        trace: The trace of the drives that the corrections are about.
+        theory: The theory to which the pairs of steps are added.
 
     Raises:
         MapError: The corrections are of other drives, or contradict the trace.

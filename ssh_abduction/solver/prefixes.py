@@ -146,7 +146,8 @@ class Prefixes:
         if self._forbid_in_engine(equalities):
             return
         _log.debug(
-            "%s cannot forbid this, so the readable encodings go on", type(self.engine).__name__
+            "%s cannot forbid these maps, so the readable encodings go on",
+            type(self.engine).__name__,
         )
         size, theory = self.engine.size, self._task.theory
         self.engine = StepEngine(

@@ -82,7 +82,7 @@ class Search:
     Iterate over the search once to get the maps. Then `solution()` says how the search ended.
 
     Args:
-        trace: The trace.
+        trace: The views and actions to explain.
         theory: The axioms and the preference; Theory.topological() by default.
         time_limit, max_maps, within, memory_limit, speedups, on_progress: As in `solve`.
 
@@ -159,7 +159,7 @@ class Search:
         Args:
             after: The search for the first steps of the trace, which has ended; None to begin anew.
             trace: The trace that has grown.
-            theory: The theory.
+            theory: The axioms and the preference, as in the search `after`.
             time_limit: Seconds of wall-clock time; None for no limit.
             max_maps: List at most this many maps; None lists all.
             speedups: The speed-ups that are on.

@@ -93,7 +93,7 @@ def cost_as_counted(ssh_map: SSHMap, cost: tuple[int, ...], theory: Theory) -> C
     cost may have different counts. Then the result has the counts of the map.
 
     Args:
-        ssh_map: The map.
+        ssh_map: A map that clingo found.
         cost: The counts that clingo minimised, the most important one first.
         theory: The theory that minimises them.
     """

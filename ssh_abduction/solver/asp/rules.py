@@ -135,8 +135,8 @@ def _check(rules: Rules, others: tuple[Rules, ...], files: tuple[str, ...]) -> N
                 and all(_is_settled(a, parameter) for a in atom.arguments)
             ):
                 raise TheoryError(
-                    f"{where}: not {atom}: expected to be asked at its last step, got a question "
-                    "that clingo answers before it has this step; "
+                    f"{where}: not {atom}: expected an atom with {parameter} as its last step, got "
+                    "fixed steps, which clingo reads before it has them; "
                     f"write {parameter} = {atom.arguments[-1]}, "
                     f"not {name}(…,{parameter}), in the body"
                 )

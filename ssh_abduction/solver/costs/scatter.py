@@ -262,7 +262,7 @@ class _Losses:
     """What points of a part may lose if the track bends, as quadratic forms of its errors z.
 
     Attributes:
-        part: The points.
+        part: The points of one clustering problem: dstates or places.
         most: No share of a point may be more than this, (n,).
         near: Twice what the position and the heading of each point lose against points that it may
             share a facility with, if c is 1, (n, 2, k, k).

@@ -77,8 +77,8 @@ class Sketch:
     """A map of the steps so far, made without a search, which grows with each step.
 
     Args:
-        first: The first step.
-        theory: The theory.
+        first: The first step of the trace, with its view and star.
+        theory: The axioms that the map obeys.
         homing: Whether a travel may lead back to the place that the robot came from. With the axiom
             next_place it always may.
         framed: Whether places have frames even if the theory has none. Then most turns lead to

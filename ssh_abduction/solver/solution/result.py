@@ -208,9 +208,9 @@ class Solution(MapSequence):
         """Return the probability that two steps are at one dstate, or at one place.
 
         Args:
-            first: The number of a step.
+            first: The number of a step, from 0.
             second: The number of another step.
-            of: "dstate" or "place".
+            of: What the steps may share: "dstate" or "place".
 
         Returns:
             A number from 0 to 1. It sums the weights of the rival maps that say so.
@@ -401,7 +401,7 @@ class Solution(MapSequence):
         """Make a solution from the plain data that `to_dict` returns.
 
         Args:
-            data: The plain data.
+            data: What `to_dict` returned, perhaps read from JSON.
             where: The name of the data in error messages.
             trace: The trace that was solved. If it is given, the maps are checked against it, and
                 the solution keeps it.

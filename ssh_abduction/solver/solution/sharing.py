@@ -170,7 +170,7 @@ class Backbone:
         """Make a backbone from the plain data that `to_dict` returns.
 
         Args:
-            data: The plain data.
+            data: What `to_dict` returned, perhaps read from JSON.
             steps: The number of steps of the trace.
             where: The name of the data in error messages.
 

@@ -131,9 +131,9 @@ class Weighed:
         """Return the probability, by the known rivals, that two steps are at one dstate or place.
 
         Args:
-            first: A step.
-            second: Another step.
-            of: "dstate" or "place".
+            first: The number of a step, from 0.
+            second: The number of another step.
+            of: What the steps may share: "dstate" or "place".
         """
         are_one = self._are_one(first, second, of)
         return math.fsum(w for w, is_one in zip(self.weights, are_one, strict=True) if is_one)
@@ -256,8 +256,8 @@ class Weighed:
         """Read what `to_dict` wrote.
 
         Args:
-            read: Checks the fields.
-            value: The data.
+            read: Checks the fields, and names the wrong one in errors.
+            value: What `to_dict` returned, perhaps read from JSON.
             steps: The number of steps of the trace.
             drives: The drives of the trace; empty if they are unknown.
 
