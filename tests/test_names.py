@@ -1,4 +1,5 @@
-"""A name means one thing: no two classes share a name, and no two public functions."""
+"""A name means one thing: no two classes share a name, and no two public functions. Names of tests
+are short."""
 
 from __future__ import annotations
 
@@ -35,3 +36,14 @@ def test_no_two_public_functions_share_a_name() -> None:
     assert len(found) > 400
     shared = {name: count for name, count in found.items() if count > 1 and name not in IN_EACH}
     assert shared == {}
+
+
+def test_names_of_tests_have_at_most_80_characters() -> None:
+    found = [
+        node.name
+        for path in sorted((ROOT / "tests").glob("test_*.py"))
+        for node in ast.parse(path.read_text(encoding="utf-8")).body
+        if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")
+    ]
+    assert len(found) > 1000
+    assert [name for name in found if len(name) > 80] == []

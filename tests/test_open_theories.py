@@ -241,6 +241,15 @@ class NoLongReturns:
         return None
 
 
+WITH_LONG_RETURNS_REFUSED = patch.object(
+    problems, "evidence_of", lambda theory, known=(): (*evidence_of(theory), NoLongReturns())
+)
+
+
+def has_no_long_returns(found: Key) -> bool:
+    return all(found[0].count(label) <= 2 for label in found[0])
+
+
 @pytest.mark.parametrize("name", THEORIES)
 @settings(max_examples=6)
 @given(data=st.data())
@@ -250,16 +259,9 @@ def test_maps_refused_by_evidence_are_forbidden(name: str, data: st.DataObject) 
     named = Rules("seldom.lp", "% @axiom(seldom) No dstate is seen three times.\n")
     theory = THEORIES[name].replace(rules=(named,))
 
-    def allows(found: Key) -> bool:
-        return all(found[0].count(label) <= 2 for label in found[0])
-
-    counts, expected = minimal_maps(trace, THEORIES[name], allows)
+    counts, expected = minimal_maps(trace, THEORIES[name], has_no_long_returns)
     with (
-        patch.object(
-            problems,
-            "evidence_of",
-            lambda theory, known=(): (*evidence_of(theory), NoLongReturns()),
-        ),
+        WITH_LONG_RETURNS_REFUSED,
         patch.object(prefixes, "FIRST_PREFIX", 1),
         patch.object(choosing, "FEW_STEPS", 0),
     ):
@@ -285,16 +287,9 @@ def test_every_engine_forbids_maps_refused_by_evidence(name: str, data: st.DataO
     if theory.star == "frame" and not trace.has_stars:
         return
 
-    def allows(found: Key) -> bool:
-        return all(found[0].count(label) <= 2 for label in found[0])
-
-    counts, expected = minimal_maps(trace, settle(trace, theory).theory, allows)
+    counts, expected = minimal_maps(trace, settle(trace, theory).theory, has_no_long_returns)
     with (
-        patch.object(
-            problems,
-            "evidence_of",
-            lambda theory, known=(): (*evidence_of(theory), NoLongReturns()),
-        ),
+        WITH_LONG_RETURNS_REFUSED,
         patch.object(
             prefixes, "FIRST_PREFIX", data.draw(st.sampled_from([1, 8]), label="first prefix")
         ),

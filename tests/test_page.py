@@ -83,23 +83,23 @@ def test_overview_counts_the_maps_that_have_each_place(
         assert agreeing <= count <= 4
 
 
-def hostile() -> tuple[Solution, Trace]:
-    """A trace whose texts all try to be HTML, and its maps, with a view that is disbelieved."""
+def hostile_page() -> Page:
+    """The page of a trace whose texts all try to be HTML, with a fault and with beliefs."""
     trace = Trace.from_steps(views=[*HOSTILE, EVIL], actions=HOSTILE)
     trace = replace(trace, name=EVIL)
     solution = solve(trace, Theory.causal())
     faulty = replace(solution.maps[0], faults=(Fault(1, "misread", EVIL, "</script>", 1.0),))
-    return replace(solution, maps=(faulty,)), trace
+    run = trace[:3]
+    return view_page(
+        replace(solution, maps=(faulty,)),
+        trace,
+        run=run,
+        beliefs=lambda ssh_map: Localiser(ssh_map).beliefs(run),
+    )
 
 
 def test_page_is_one_file_that_loads_nothing_and_escapes_texts() -> None:
-    solution, trace = hostile()
-    text_of_page = view_page(
-        solution,
-        trace,
-        run=trace[:3],
-        beliefs=lambda ssh_map: Localiser(ssh_map).beliefs(trace[:3]),
-    ).html
+    text_of_page = hostile_page().html
     for text in [*HOSTILE, "<b>", "\u2028"]:
         assert text not in text_of_page
     assert text_of_page.count("<script") == text_of_page.count("</script>") == 2
@@ -555,13 +555,7 @@ def test_page_in_the_browser(browser: Any, tmp_path: Path, content: dict[str, An
 
 
 def test_browser_shows_hostile_texts_as_text(browser: Any, tmp_path: Path) -> None:
-    solution, trace = hostile()
-    view_page(
-        solution,
-        trace,
-        run=trace[:3],
-        beliefs=lambda ssh_map: Localiser(ssh_map).beliefs(trace[:3]),
-    ).save(tmp_path / "page.html")
+    hostile_page().save(tmp_path / "page.html")
     page = Shown(browser, (tmp_path / "page.html").as_uri())
     assert EVIL in page["seen"].text  # an alert would have made this an error
     assert EVIL in page["which"].get_attribute("textContent")
