@@ -338,7 +338,10 @@ class Forcing:
         return self.visits.returns(self.joins)
 
     def bounds(self, most: float) -> Iterator[float]:
-        """Yield rising lower bounds, at most `most`, on the cost of all maps. Extend `joins`."""
+        """Yield rising lower bounds, at most `most`, on the cost of all maps.
+
+        This leaves `joins` as it is.
+        """
         self._laying = self._least_laying(most)
         low = self._bound(most)
         yield low

@@ -24,9 +24,10 @@ each piece at most what the best facility of this piece saves. So for each kind 
 of one piece get shares.
 
 The poses are linearised at the best track without returns. All other axioms can only raise the
-cost. Two kinds are used. Steps with different views are different dstates; if a view may be wrong,
-the step pays for this at a dstate with another view. And evidence keeps pairs of steps apart,
-mostly the displacements between them. Such pairs share no facility, however the track bends.
+cost. The bound uses two kinds of them. Steps with different views are different dstates; if a view
+may be wrong, the step pays for this at a dstate with another view. And evidence keeps pairs of
+steps apart, mostly the displacements between them. Such pairs share no facility, however the track
+bends.
 """
 
 from __future__ import annotations

@@ -141,7 +141,7 @@ class PlacesAndPaths:
         return self._tightly(labels) is not None or self._has_paths(self._path_control(labels))
 
     def _tightly(self, labels: Sequence[int]) -> Found | None:
-        """Find a best map whose places are all pairwise distinct (`homes.py`); None if unknown."""
+        """Find a best map that has only the fixed places of `homes.py`; None if that fails."""
         key = tuple(labels)
         if key in self._tight:
             return self._tight[key][1]

@@ -71,7 +71,10 @@ class FramedSides:
         return False
 
     def _say_once(self, part: str, *arguments: int) -> bool:
-        """Ground a part of sides_framed.lp for these arguments. Return False if that was done."""
+        """Ground a part of sides_framed.lp for these arguments, unless it is ground already.
+
+        Returns whether it was ground now.
+        """
         if (part, arguments) in self._said:
             return False
         control, batches = self._asker.control, range(self._batch + 1)

@@ -51,7 +51,7 @@ class ExistingMap:
         return replace(digest, steps=(digest.steps[0], *steps))
 
     def maps(self, problem: Problem, labels: Sequence[int]) -> Iterator[SSHMap]:
-        """Yield maps of all drives that keep this map of the old ones; the most joined one is last.
+        """Yield maps of a digest and new drives. They keep this map; the most joined one is last.
 
         The caller has to check them. The trace of the problem is a digest of the old drives, and
         then the new ones. `labels` has the dstate of each step of the digest.

@@ -44,7 +44,7 @@ _Seen = tuple[int, Star]
 
 
 def sketches_of(first: Step, theory: Theory) -> list[Sketch]:
-    """Begin a sketch (a map without a search) of each kind: first with `homing`, then without."""
+    """Begin a sketch (a map without a search) of each kind, those with small maps first."""
     if _is_gated(theory):
         return [GatewaySketch(first, theory, homing) for homing in (True, False)]
     return Sketch.all_of(first, theory)

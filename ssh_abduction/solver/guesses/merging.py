@@ -14,8 +14,8 @@ on. All of these are merged. If two of them are apart, nothing is merged. The mo
 affects without a contradiction, the less likely it is wrong. So the *evidence* for a merge is the
 number of classes that it merges, plus the number of earlier merges that it confirms. Steps that fit
 only one known dstate, with much evidence, are merged first. Then come steps with less evidence.
-Steps that fit several known dstates come if the evidence for one dstate is clearly the greatest. A
-step that fits no known dstate becomes one.
+Steps that fit several known dstates are merged if the evidence for one of these is clearly the
+greatest. A step that fits no known dstate becomes one.
 
 A guess is completed in the same way. First, nodes with one label in the guess are merged if they
 can be one dstate. They become known dstates.
