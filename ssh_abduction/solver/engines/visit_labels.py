@@ -122,7 +122,7 @@ class VisitLabels:
         return [*self.clique, *sorted(others, key=lambda node: (-int(apart[node].sum()), node))]
 
     def _first_visits(self, chart: FramedChart) -> set[int]:
-        """Return the visits that clingo gets first: all, or those of the clique and some others."""
+        """Return the visits that clingo gets first: all, or those of the clique and early ones."""
         # Clingo has to know all visits that the user says are at one place.
         is_lazy = self._task.speedups.lazy and not self._task.log.pairs.one
         first = chart.visits_with(FIRST_PAIRS) if is_lazy else len(chart.stars)
