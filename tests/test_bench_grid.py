@@ -129,7 +129,7 @@ def _brute_likelihood(tiny: Grid, model: BeamModel, pose: int, image: np.ndarray
 
 @pytest.mark.parametrize("kind", [Histogram, Particles])
 def test_filters_track_a_robot_and_find_a_kidnapped_one(kind: type) -> None:
-    """In a room that is not symmetric, along a square, and then from somewhere else."""
+    """The robot drives along a square in an asymmetric room, and then starts somewhere else."""
     world = replace(
         WORLD,
         segments=np.vstack(

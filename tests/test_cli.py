@@ -503,7 +503,7 @@ def test_progress_shows_on_a_terminal(tmp_path: Path) -> None:
 
 
 def test_machine_output_is_utf_8_on_every_terminal(tmp_path: Path) -> None:
-    """Otherwise different views would look equal."""
+    """In another encoding, different views would look equal."""
     path = saved(Trace.from_steps(["日本", "中国", "Küche"], ["travel", "travel"]), tmp_path)
 
     def printed(*words: str, given: bytes = b"") -> str:

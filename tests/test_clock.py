@@ -28,7 +28,7 @@ TURNED = {"right": -math.pi / 2, "left": math.pi / 2, "around": math.pi}
 
 
 class OverError(Exception):
-    """The time is over."""
+    """A stand-in for the error of a limit that is over."""
 
 
 def over() -> None:

@@ -45,7 +45,7 @@ def test_continued_labels_are_a_consistent_map(trace: Trace, data: st.DataObject
 
 @pytest.mark.parametrize(("steps", "kept"), [(500, False), (800, True), (1200, True)])
 def test_map_without_some_links_is_continued_to_all_steps(steps: int, kept: bool) -> None:
-    """The labels are kept if the map says enough; else a wrong link is settled and forgotten."""
+    """The labels are kept if the map has enough links. Else a wrong link is found and dropped."""
     walk = maze(4, 4, steps=6000, seed=1)
     known, log = numbered(walk.truth[:steps]), Log(walk.trace, CAUSAL)
     assert len(log.replay(known).labels) < len(walk.trace)

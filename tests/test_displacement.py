@@ -88,8 +88,8 @@ def test_refused_returns_equal_matrices_written_out(data: st.DataObject) -> None
 def test_refused_pairs_of_returns_equal_matrices_written_out(
     seed: int, corners: int, noise: float, bend: float
 ) -> None:
-    """Labels that need not be of a map. Every second step is at one of few dstates, so many returns
-    share displacements."""
+    """The labels need not be those of a consistent map. Every second step is at one of few dstates,
+    so many returns share displacements."""
     odometry = replace(WHITE, bend=bend)
     trace = circuit(corners, 4, noise, seed, odometry)
     theory = settle(trace, Theory.causal().replace(reject=0.3)).theory

@@ -90,7 +90,7 @@ def test_solver_refuses_two_returns_that_misfit_together() -> None:
 
 
 def test_weighed_maps_pay_for_two_returns_that_misfit_together() -> None:
-    """Errors of logs have heavy tails."""
+    """Weighed maps pay for misfits instead, because errors of logs have heavy tails."""
     trace, theory = uneven(), BARE.replace(same_place=[(1, 9), (3, 11)])
     assert solve(trace, theory.replace(joint=2)).status is Status.UNSATISFIABLE
     ssh_map = solve(trace, theory).maps[0]

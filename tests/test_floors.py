@@ -150,7 +150,7 @@ def test_slipped_actions_are_refused_with_lifts() -> None:
 
 
 def test_misread_view_does_not_move_a_place_to_another_floor() -> None:
-    """A wrong view does not excuse a place on another floor."""
+    """A view can be misread, but the robot stays on its floor."""
     trace = Trace.from_steps("abab", ["travel", UP, DOWN])
     (ssh_map, *_) = solve(trace, Theory.causal().replace(misread=0.5)).maps
     assert len(ssh_map.floors) == 2

@@ -146,7 +146,7 @@ def test_framed_maps_equal_those_of_the_plain_encoding(
 def test_framed_maps_of_a_growing_trace_equal_the_plain_encoding(
     trace: Trace, theory: Theory, data: st.DataObject
 ) -> None:
-    """Whether clingo gets only what is new, or everything again."""
+    """Clingo gets only the new steps, or all steps again. Both give the same maps."""
     grown = data.draw(st.sampled_from([1, 1.5, 100]), label="grown")
     first, *rest = trace.steps
     with (

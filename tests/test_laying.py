@@ -74,7 +74,7 @@ ERRORS = st.lists(st.floats(-0.2, 0.2), min_size=3, max_size=3)
 def test_onto_costs_as_much_as_solving_all_drives(
     monday: tuple[int, int, list[float]], tuesday: tuple[int, int, list[float]]
 ) -> None:
-    """That is so if the best joint map has the map of the old drives."""
+    """This holds if the best joint map contains the map of the old drives."""
     old = around_the_room(monday[0], monday[1], "monday", monday[2])
     new = around_the_room(tuesday[0], tuesday[1], "tuesday", tuesday[2])
     existing = solve(old)

@@ -195,7 +195,7 @@ def test_covariance_of_a_point_sums_all_increments() -> None:
 def test_visit_is_matched_with_a_limited_number_of_earlier_ones(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """With one match per visit, it is the nearest one: another pass of the same fork."""
+    """If each visit is matched once, then with the nearest one: another pass of the same fork."""
     _, track, visits, patches = rounds()
     every = find_closures(track, visits, patches, 2 * WINDOW)
     asked: list[Scene] = []

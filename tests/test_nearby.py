@@ -45,7 +45,7 @@ CAUSAL = Theory.causal()
 def test_search_near_a_guess_changes_no_answer(
     trace: Trace, cores: int, data: st.DataObject
 ) -> None:
-    """The guess may be right or wrong."""
+    """This holds for right and for wrong guesses."""
     expected = solve(trace, CAUSAL, max_maps=None, speedups=PLAIN)
     guess = data.draw(
         st.lists(st.integers(-1, 3), min_size=len(trace), max_size=len(trace)), label="guess"

@@ -214,7 +214,7 @@ def test_onto_keeps_names() -> None:
 
 
 def test_onto_counts_the_time_of_all_searches() -> None:
-    """Not only those of the last search."""
+    """The time of all searches counts, not only that of the last one."""
     monday = Trace.from_steps("abcd", ["travel", "around", "travel"], name="monday")
     solution = solve(monday)
     with patch.object(Watch, "elapsed", lambda watch: 7.0):

@@ -125,7 +125,7 @@ def test_killed_process_is_a_limit_error() -> None:
 
 
 def test_memory_limit_of_a_process_ignores_its_parent() -> None:
-    """It does not count the memory of this process."""
+    """The memory of this process does not count."""
     held = b"x" * (150 * 2**20)
     limited = Watch(memory=peak_memory() + 100)
     assert in_process(use_memory, 10, watch=limited) == 10

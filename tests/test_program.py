@@ -192,7 +192,7 @@ def test_interrupted_map_run_is_repeated_by_the_next_call(
 
 @POSIX
 def test_temporary_files_of_workers_are_removed(tmp_path: Path) -> None:
-    """Also where their parent is killed."""
+    """They are removed even if the parent of the workers is killed."""
     told = tmp_path / "told"
     script = f"""
 from ssh_abduction.solver.asp import workers

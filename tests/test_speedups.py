@@ -154,7 +154,7 @@ def reads_of(case: str) -> list[str]:
 
 
 def test_each_speedup_is_used_in_some_case() -> None:
-    """Otherwise the cases below would not test the speed-up."""
+    """If no case used a speed-up, the tests below would not test it."""
     read = {name for case in CASES for name in reads_of(case)}
     # tests/test_onto.py tests `digest`, and tests/test_nearby.py tests `annealed`.
     assert read == set(NAMES) - {"digest", "annealed"}

@@ -387,7 +387,7 @@ def test_drive_that_shares_one_place_gets_four_headings() -> None:
 
 @pytest.mark.parametrize("known", MAZES, ids=[known.name for known in MAZES])
 def test_misfit_of_joint_maps_equals_that_of_the_checker(known: truth.Known) -> None:
-    """From wrong headings of the drives, Gauss-Newton would end in another minimum."""
+    """If Gauss-Newton started from wrong headings of drives, it would end in another minimum."""
     names, places = truth.partition(known.dstates), truth.partition(known.places)
     where = dict(zip(names, places, strict=True))
     poses = Poses(known.trace, names, [where[name] for name in range(len(where))])
