@@ -276,7 +276,7 @@ def _stays(far: Array, radius: float) -> Iterator[tuple[int, int]]:
 
 
 def _ways(sightings: Sequence[_Sighting], radius: float) -> tuple[Way, ...]:
-    """Find the ways out of a place. A way is sure if half of the sightings show it."""
+    """Find the ways out of a place. A way is sure if at least half of the sightings show it."""
     groups: list[list[float]] = []
     for sighting in sightings:
         for bearing in _bearings(sighting.junction, radius):

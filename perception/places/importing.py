@@ -144,7 +144,7 @@ def import_live(
         source: Name of the log, for errors.
 
     Returns:
-        The log, in which hardly any scan has ranges, and the trace with what it was made from.
+        The log, in which hardly any scan has ranges, and the result of the import, with the trace.
 
     Raises:
         LogError: As `import_log`, or an item is no scan.

@@ -52,7 +52,7 @@ class Units:
 
 
 def units_of(log: RobotLog) -> tuple[Units, list[str]]:
-    """Recognise the units of a log's odometry. Return notes, too, if they are unusual."""
+    """Recognise the units of a log's odometry. Also return notes on other units than m and rad."""
     count, counted = _length(log)
     log = Units(count).convert(log)
     degrees = way_of(log) >= LEAST_WAY and abs(ahead(log)) <= SIDEWAYS

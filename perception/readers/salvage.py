@@ -67,7 +67,7 @@ class Connection:
 
 
 class Salvage:
-    """The intact messages of a file of a bag, with the interface of a reader of rosbags.
+    """The intact messages of a bag file, with the interface of the readers of rosbags.
 
     Args:
         path: Path of the file.

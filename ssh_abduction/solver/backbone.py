@@ -12,9 +12,9 @@ trace. Each minimal map, cut to the prefix, is such a map (`prefixes.py`). So a 
 replays to the end of the trace is minimal. If a found map does not replay to the end, the prefix
 grows. Steps that are one dstate in all known maps form a *class*. If no doubt about the prefix is
 left, the steps of each class are one dstate in all minimal maps. Actions are deterministic, so the
-classes replay like a map. If they replay to the end, then in every minimal map each later step is
-one dstate with a class of the prefix, and no doubt about that step is left. Otherwise the prefix
-grows.
+classes replay like a map. Suppose that they replay to the end. Then in every minimal map each later
+step is one dstate with a class of the prefix. So no doubt about later steps is left. Otherwise the
+prefix grows.
 
 *Labels.* An engine that finds dstates before places and paths can list the labels (the dstate of
 each step) of all minimal maps. Even thousands of maps have few different labellings. So all

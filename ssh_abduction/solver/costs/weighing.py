@@ -1,8 +1,8 @@
 """Find the maps of least cost, and prove that none costs less.
 
-The cost of a map in nats is the sum of the prices of its dstates, places, paths and faults, plus
-half of the chi-square of its misfit to the displacements (`misfit.py`). The price of a fault is a
-multiple of the price of a dstate.
+The cost of a map in nats has two parts: the prices of its dstates, places, paths and faults, and
+half of its misfit to the displacements, which is a chi-square (`misfit.py`). The price of a fault
+is a multiple of the price of a dstate.
 
 *The search* is a logic-based Benders decomposition (Hooker & Ottosson 2003). Clingo finds the map
 with the fewest dstates, and among these the fewest places and paths. Clingo does not compute the
@@ -384,7 +384,8 @@ class Weighing:
 def _prices_of(theory: Theory) -> dict[str, float]:
     """Return the price in nats of one unit of each count. The count minimised first comes first.
 
-    If faults are allowed, that is "tenths": the cost of dstates and faults in tenths of dstates.
+    If faults are allowed, the first count is "tenths": the cost of dstates and faults in tenths of
+    dstates.
     """
     dstate, place, path = theory.prices
     first = {"tenths": dstate / 10} if theory.has_faults else {"dstates": dstate}

@@ -47,7 +47,7 @@ class Doubts:
     def answer(
         self, doubts: Collection[Doubt], read: Callable[[clingo.Model], Answer], mode: str
     ) -> Answer | None:
-        """Return an answer, as `read` gives it, in which a doubt holds; None if there is none."""
+        """Return the value that `read` makes of an answer in which a doubt holds; None without."""
         if not doubts:
             return None
         rules: list[str] = []

@@ -98,9 +98,10 @@ class SmallMaps:
 def mended(guess: Sequence[int], chart: Chart) -> list[int]:
     """Correct a guess: let each action at a dstate lead to the dstate that it mostly leads to.
 
-    Each node gets the dstate to which the action before it mostly leads from the dstate before it
-    in the guess, unless the view at the node contradicts this. If only a few dstates were wrong,
-    all dstates after a right one become right. In the guess, -1 is an unknown dstate.
+    Take the dstate of a node in the guess, and the action after the node. The next node gets the
+    dstate to which this action mostly leads from there, unless its view contradicts this. If only a
+    few dstates were wrong, all dstates after a right one become right. In the guess, -1 is an
+    unknown dstate.
     """
     keys = [
         None if label < 0 else (view, label) for view, label in zip(chart.seen, guess, strict=True)

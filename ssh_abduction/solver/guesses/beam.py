@@ -177,7 +177,7 @@ class Beam:
     def _best(
         self, options: Sequence[_Extension], t: int, width: int, checked: bool = False
     ) -> Iterator[Hypothesis]:
-        """Yield the hypotheses to keep: the first `width` that the options make.
+        """Yield the `width` hypotheses to keep. The options make them, the cheapest first.
 
         With several drives or floors, keep at most ALIKE hypotheses that connect the drives or
         floors in the same way, and at most LOST * ALIKE in all. Drop those that cost at least

@@ -285,9 +285,9 @@ def conditioned(
 ) -> tuple[Array, Array, float]:
     """Condition a Gaussian on the equality of some entries with others, up to some variance.
 
-    `first` has the indices of x and y, or of a heading, or of all three, and `second` those of the
-    entries that should be equal. `spreads` has the variance of each difference, in square metres
-    and square radians. The chi-square of the differences comes last in the result.
+    `first` and `second` have the indices of entries that should be equal: of x and y, of a heading,
+    or of all three. `spreads` has the variance of each difference, in square metres and square
+    radians. The chi-square of the differences comes last in the result.
     """
     off = mean[first] - mean[second]
     if len(off) % 2:

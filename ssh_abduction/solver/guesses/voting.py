@@ -225,10 +225,10 @@ class Merging:
         return list(zip(some[first].tolist(), some[second].tolist(), turns.tolist(), strict=True))
 
     def _beside(self, visit: int, other: int, turn: int) -> list[_Turned]:
-        """Find how to turn the group of another visit before it is merged with that of this visit.
+        """Find how to turn the group of `other` before it is merged with the group of `visit`.
 
-        Slot K of this visit shall be slot K + turn of the other. Returns a list with the group of
-        the other visit and the quarters to turn it by; empty if both visits are in one group.
+        Slot K of `visit` shall be slot K + turn of `other`. Returns a list with the group of
+        `other` and the quarters to turn it by; empty if both visits are in one group.
         """
         mine, its = self._group_of[visit], self._group_of[other]
         if mine == its:

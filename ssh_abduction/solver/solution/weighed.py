@@ -1,7 +1,7 @@
 """Results of comparing the maps of a trace by cost: costs in nats, rivals, and probabilities.
 
-The cost of a map is the sum of the prices of its dstates, places and paths, and half of the
-chi-square of its misfit to the displacements. A nat is the unit of natural logarithms: of two maps,
+The cost of a map has two parts: the prices of its dstates, places and paths, and half of its misfit
+to the displacements, which is a chi-square. A nat is the unit of natural logarithms: of two maps,
 one that costs 3 nats more is exp(3) = 20 times less probable.
 """
 

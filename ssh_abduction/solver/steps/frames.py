@@ -216,7 +216,7 @@ def _looks(first: Frame, then: Frame, shift: int, towards: int) -> bool:
 
 
 def _near(degrees: float, spread: float) -> bool:
-    """Whether an angle is within a spread of 0."""
+    """Whether an angle is 0 to within a spread, both in degrees."""
     return abs((degrees + 180) % 360 - 180) <= spread + ROUNDING
 
 

@@ -92,7 +92,7 @@ def _named(symbol: Symbol) -> tuple[int, int]:
 
 
 def not_together(number: int, pairs: Sequence[tuple[int, int]]) -> str:
-    """Return rules against answers with each of these pairs at one dstate that is not a rest."""
+    """Return rules against answers in which each pair is at one dstate that is not a rest."""
     together = [
         f"together({number},{k}) :- is({i},S), is({j},S), not rest(S)."
         for k, (i, j) in enumerate(pairs)
