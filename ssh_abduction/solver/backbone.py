@@ -224,7 +224,7 @@ class _Reasoning:
         )
 
     def _doubts(self, size: int) -> Iterator[Doubt]:
-        """Yield the doubts about the first `size` steps."""
+        """Yield the doubts (possible differences of minimal maps) about the first `size` steps."""
         firsts = self._sharing.firsts()
         yield from (
             ("dstates", firsts[self._sharing.classes[t]], t, False) for t in self._entering(size)

@@ -86,9 +86,9 @@ def late_clash(
 ) -> range | None:
     """Look for a short clash if a stopped search has no map.
 
-    The clash may end at a step that contradicted a sketch, or at a step that the theory asserts to
-    be at the dstate or place of an earlier one. `maps_of` is as in `clash_in`. `parts.known` gets
-    the status if there is a clash.
+    A clash is consecutive steps that have no map by themselves. It may end at a step that
+    contradicted a sketch, or at a step that the theory asserts to be at the dstate or place of an
+    earlier one. `maps_of` is as in `clash_in`. `parts.known` gets the status if there is a clash.
     """
     known, task, clash = parts.known, parts.task, None
     if known.best is not None or not known.stopped or known.status is not Status.UNKNOWN:

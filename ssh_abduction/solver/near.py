@@ -67,5 +67,5 @@ class NearMinimal:
 
 
 def counted_first(theory: Theory) -> Count | None:
-    """Return the first count, except excuses, that a theory minimises; None if there is none."""
+    """Return the first count that a theory minimises, except excuses (see `Cost`); or None."""
     return next((name for name in theory.priorities if name != "excuses"), None)

@@ -292,7 +292,7 @@ class _Joined:
 
 
 class Forcing:
-    """Finds joins that every cheap map has.
+    """Finds joins (pairs of visits at one place) that every cheap map has.
 
     Attributes:
         visits: The visits of the trace.

@@ -34,7 +34,7 @@ _Groups: TypeAlias = tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]
 
 
 class Misfit:
-    """Computes the misfit of sets of returns of one trace, and keeps each result.
+    """Computes the misfit (a chi-square) of sets of returns of one trace, and keeps each result.
 
     Attributes:
         visit: For each step, the first step of its visit. Without places, each step is a visit.

@@ -74,7 +74,7 @@ class FramedPaths:
         return Fitted(found, naming) if found else None
 
     def separate(self, chart: FramedChart, labels: Sequence[int]) -> Found | None:
-        """Find a map with these dstates in which places and segments merge only if they must."""
+        """Find a map with these dstates. Places, and segments of paths, merge only if they must."""
         naming = NodeLabels(chart, list(labels), self.control(chart, labels, single=True))
         return next(self.maps(naming, "ignore"), None)
 

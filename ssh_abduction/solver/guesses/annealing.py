@@ -87,7 +87,7 @@ class Guess:
     sure: NDArray[np.bool_]
 
     def labels(self, chart: FramedChart) -> list[int]:
-        """Return a label for each node: 4 times its place, plus the slot there that it faces.
+        """Return a label for each node: 4 times its place, plus the slot (direction) there.
 
         The label is -1 if the guess is not sure of the visit of the node.
         """

@@ -287,7 +287,7 @@ class Beam:
         return None if next(violations(whole, ssh_map, theory), None) else ssh_map
 
     def _completed(self, found: Hypothesis, trace: Trace, theory: Theory) -> Iterator[SSHMap]:
-        """Yield the valid maps of a hypothesis, one for each way to rotate its unrelated pieces."""
+        """Yield the valid maps of a hypothesis, one for each way to rotate its unrelated frames."""
         ways = headings_by_turn(found)
         for facing in ways if theory.star == "frame" else islice(ways, 1):
             ssh_map = completed(trace, theory, found.labels, found.places, facing)
@@ -416,8 +416,8 @@ class Beam:
     ) -> Iterator[tuple[int, float, Hypothesis]]:
         """Yield the chi-square of the pose of the robot at each of some places at step t.
 
-        Items are triples (place, chi-square, hypothesis). If a place is in another piece, the piece
-        of the robot is turned to fit it.
+        Items are triples (place, chi-square, hypothesis). If a place is in another piece (in
+        another frame), the piece of the robot is turned to fit it.
         """
         own = [place for place in places if moved.pieces.of_place[place] == moved.pieces.here]
         squares = self._reckoning.squares(moved, t, own).tolist() if own else []

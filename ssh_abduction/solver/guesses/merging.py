@@ -165,8 +165,9 @@ class Classes:
         links: Iterable[Link],
         nodes: NDArray[np.int_] | None = None,
     ) -> None:
-        """Begin with a class for each step. The matrix `apart` has the shape steps x steps.
+        """Begin with a class for each step.
 
+        `apart` flags the pairs of steps that are different dstates, in a matrix of steps x steps.
         Links are triples (step, action, step). If the "steps" are dstates of a map, `nodes` has the
         number of nodes at each; None for 1 each.
         """
@@ -257,7 +258,7 @@ class Classes:
         return has_merged
 
     def _fitting(self, root: int) -> list[int]:
-        """List the known dstates that are apart from no step of a root's class."""
+        """List the known dstates that each step of a root's class may be at."""
         known = np.flatnonzero(self.known)
         fits: list[int] = known[
             ~self._apart[np.ix_(known, self._members[root])].any(axis=1)

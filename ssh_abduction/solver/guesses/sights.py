@@ -107,7 +107,7 @@ class Sights:
         return sum(self._between(was, now, is_one_drive=False) for was, now in between)
 
     def _between(self, sight: Sight, own: Sight, *, is_one_drive: bool) -> float:
-        """Return the cost in nats of the changes between two sights of a place."""
+        """Return the cost in nats of the changes between two sights (seen stars) of a place."""
         if self._misreads or agree(sight, own):
             return 0.0
         if not self._price or is_one_drive:

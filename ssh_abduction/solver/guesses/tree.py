@@ -227,7 +227,7 @@ class Sketch:
         return next((x for x in s.reverse if self._states[x].seen == seen), None)
 
     def _turned_around(self, here: int, there: int) -> None:
-        """Add a turn around between two dstates, which get reverse courses."""
+        """Link two dstates by a turn around. They get opposite directions of one path."""
         self._states[here].reverse.append(there)
         self._states[there].reverse.append(here)
         for s in (self._states[here], self._states[there]):

@@ -47,7 +47,8 @@ class _SlotVisit:
     """The steps between two travels.
 
     Attributes:
-        steps: Pairs (step, slot that it faces). The robot faces slot 0 when it arrives.
+        steps: Pairs of a step and the slot that it faces. Slots are the four directions, clockwise.
+            The robot faces slot 0 when it arrives.
         leaves: The slot that the robot faces at the end of the visit, and the name of the action
             that ends it. None for the last visit of a drive, and if that action slipped.
     """
@@ -102,7 +103,7 @@ class Merging:
         self._misfits = self._misfitting(pairs)
 
     def start_from(self, places: Sequence[tuple[int, int] | None]) -> None:
-        """Merge the visits that a map has at one place, given the place and slot of each step."""
+        """Merge the visits that a map has at one place, given the place and direction of steps."""
         first: dict[int, _Turned] = {}
         for number, visit in enumerate(self.visits):
             step, _ = visit.steps[0]
@@ -160,7 +161,7 @@ class Merging:
         return replace(self._trace, steps=tuple(steps))
 
     def labels(self) -> list[int]:
-        """Return a label for each step: 4 times its place, plus the slot there that it faces."""
+        """Return a label for each step: 4 times its place, plus the slot (direction) there."""
         return [
             4 * self._group_of[number] + (slot + self._turn(number)) % 4
             for number, visit in enumerate(self.visits)

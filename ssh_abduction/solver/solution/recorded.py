@@ -34,7 +34,8 @@ class Recorded:
             steps; None if the file has none.
         warnings: Sentences that say what makes the trace suspicious.
         explanation: Why there is no map, as in the file; None if the file does not say.
-        joins: The joins of the first map that rest on minimality alone.
+        joins: The joins (pairs of steps at one place or dstate) of the first map that rest on
+            minimality alone.
         drives: The drives of the trace; empty if the file does not say.
         onto: The names of the old drives whose map had to be kept; empty if there are none.
     """

@@ -253,7 +253,7 @@ class Sharing:
         return self._kept
 
     def kept(self, sort: Sort) -> Kept:
-        """Return which classes are one in all maps, and which in some, for one sort."""
+        """For one sort, such as places, return which classes are one in all or in some maps."""
         return self._kept[sort]
 
     def backbone(self, *, proven: bool) -> Backbone:

@@ -234,7 +234,7 @@ class FramedChart(Chart):
 
     @cached_property
     def leaves(self) -> dict[int, tuple[int, int]]:
-        """For each visit but the last, the slot that it leaves through, and the action."""
+        """For each visit but the last, the slot (direction) in which it ends, and the action."""
         return {
             visit: (self.facing[node][1], action)
             for visit, (node, action, _) in enumerate(self.travels)

@@ -134,7 +134,7 @@ class _VisitLocaliser:
         )
 
     def _is_new(self, possible: set[State], visit: int) -> bool:
-        """Whether a visit has a single possible state and faces a slot that is new to the map."""
+        """Whether a visit has one possible state and faces a direction that is new to the map."""
         return len(possible) == 1 and any(
             faced(state, slot) not in self._faced
             for state in possible
@@ -143,7 +143,7 @@ class _VisitLocaliser:
 
 
 def faced(state: State, slot: int) -> State:
-    """Convert a slot of a visit into one of its place: 4 times the place plus the slot there."""
+    """Convert a direction of a visit into one of its place: 4 times the place plus the slot."""
     return state - state % 4 + (state + slot) % 4
 
 
