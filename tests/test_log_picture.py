@@ -20,9 +20,9 @@ from ssh_abduction.data.odometry import displacement_between, moved
 from ssh_abduction.output.drawing import ALARM
 from ssh_abduction.output.undecided import place_of_steps, undecided_places
 from ssh_abduction.robot_logs import log_picture
-from ssh_abduction.robot_logs.edges import resampled
+from ssh_abduction.robot_logs.edges import STEP, resampled
 from ssh_abduction.robot_logs.log_maps import LogMap, map_log
-from ssh_abduction.robot_logs.log_picture import EDGE, figure
+from ssh_abduction.robot_logs.log_picture import BESIDE, EDGE, drawn_once, figure
 from ssh_abduction.robot_logs.log_report import report
 
 
@@ -90,6 +90,18 @@ def test_picture_draws_each_edge_once_along_the_drive(house: LogMap) -> None:
     ]
     assert len(set(travels)) <= len(courses) < len(travels)
     assert max(mark.count("L") for mark in courses) > 5
+
+
+def test_edges_that_run_together_are_drawn_once() -> None:
+    short = [np.array(ends, float) for ends in ([(0, 0), (5, 0)], [(5, 0), (10, 0)])]
+    bow = np.array([(0, 0.3), (2, 0.3), (5, 3), (8, 0.3), (10, 0.3)])
+    lines = list(drawn_once([bow, *short, *short, short[0][::-1] + 0.2]))
+    assert [line[[0, -1]].tolist() for line in lines[:2]] == [one.tolist() for one in short]
+    (left,) = lines[2:]
+    assert left[:, 1].max() == pytest.approx(3, abs=STEP)
+    # It begins and ends on the short edges, where it is beside them no longer.
+    assert left[[0, -1], 1].tolist() == [0, 0]
+    assert (left[1:-1, 1] > BESIDE).all()
 
 
 def test_course_of_a_travel_follows_the_robot(house: LogMap) -> None:

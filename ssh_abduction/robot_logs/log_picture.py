@@ -1,8 +1,9 @@
 """Draw the first map of a log over the walls that the laser saw.
 
 Edges follow the course of the robot. Travels between the same two places whose courses lie close
-together are one edge. Places show their disc and their gateways. Places that the robot only passed,
-always between the same two neighbours, are drawn as dots. Each of several drives has its colour.
+together are one edge. Where edges run together, there is one line. Places show their disc and their
+gateways. Places that the robot only passed, always between the same two neighbours, are drawn as
+dots. Each of several drives has its colour.
 
 Each drive of a joint map has a frame of its own. It is moved and turned so that the places that it
 shares with earlier drives coincide. A drive that shares no place is put beside the others.
@@ -19,6 +20,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from perception.places.importing import Imported
 from perception.readers.scans import Pose, RobotLog
@@ -29,7 +31,7 @@ from ssh_abduction.data.odometry import displacement_between, moved
 from ssh_abduction.output.drawing import ALARM, COLOURS, escaped, page, svg_text, titled
 from ssh_abduction.output.region_marks import band, banded
 from ssh_abduction.output.undecided import place_of_steps, undecided_places
-from ssh_abduction.robot_logs.edges import edges_of
+from ssh_abduction.robot_logs.edges import STEP, edges_of, resampled
 from ssh_abduction.solver import Solution
 
 Array = NDArray[np.float64]
@@ -43,6 +45,8 @@ METRE, LARGEST = 24.0, 1500.0
 DRAWN = 12.0
 # Nearer than this many metres to the middle of a place, an edge leads straight to it.
 MIDDLE = 1.0
+# An edge is not drawn where it is within BESIDE metres of a shorter one.
+BESIDE = 0.75
 # The innermost bands of regions are this many metres wide.
 BROAD = 2.0
 # A join with a smaller probability is doubtful.
@@ -77,9 +81,10 @@ def figure(log: RobotLog, imported: Imported, solution: Solution) -> str:
             colours = f"Colours are drives: {legend(drives)}. "
         caption = (
             f"The first map over the scans, at {poses}. Numbers are places, ticks their gateways, "
-            f"and lines the edges along the robot's course. {colours}Dots are places at which the "
-            "robot only passed through. Bands are regions that, as far as known, have only one "
-            "entrance. Red shows the probability of a doubtful join."
+            "and lines the edges along the robot's course, drawn once where several run together. "
+            f"{colours}Dots are places at which the robot only passed through. Bands are regions "
+            "that, as far as known, have only one entrance. Red shows the probability of a "
+            "doubtful join."
         )
     return f"<figure>{picture}<figcaption>{caption}</figcaption></figure>"
 
@@ -198,15 +203,19 @@ def _map_marks(sheet: _Sheet, imported: Imported, solution: Solution) -> Iterato
     colourful = paths_mean_something(solution)
     edges = list(_edges(sheet, imported, ssh_map, visit_of, middles))
     yield from _bands(sheet, ssh_map, middles, [(places[t], places[t + 1], c) for t, c in edges])
+    lines: dict[str, list[Array]] = defaultdict(list)
     for step, course in edges:
         path = path_of[ssh_map.dstate_at[step]] or 0
         colour = COLOURS[path % len(COLOURS)] if colourful else EDGE
         if len(sheet.bounds) > 2:
             colour = colour_of(sheet.drive_of(imported.visits[visit_of[step]].scan))
-        yield (
-            f'<path d="{_line(map(sheet.on_page, course))}" stroke="{colour}" stroke-width="4" '
-            'stroke-opacity=".8" stroke-linejoin="round" fill="none"/>'
-        )
+        lines[colour].append(course)
+    for colour, courses in lines.items():
+        for part in drawn_once(courses):
+            yield (
+                f'<path d="{_line(map(sheet.on_page, part.tolist()))}" stroke="{colour}" '
+                'stroke-width="4" stroke-opacity=".8" stroke-linejoin="round" fill="none"/>'
+            )
     at = {place: sheet.on_page(middle) for place, middle in middles.items()}
     for place in visits:
         if place in hidden:
@@ -268,6 +277,24 @@ def _edges(
         if len(course) > 1:
             drawn.add(key)
             yield t, course
+
+
+def drawn_once(courses: Sequence[Array]) -> Iterator[Array]:
+    """Yield courses, (n, 2) metres, without the parts that run beside a shorter course.
+
+    If a local map does not show a place that the robot passes, its travel is an edge that runs
+    along two shorter ones. A part that is left begins and ends on the lines that it leaves.
+    """
+    drawn = np.empty((0, 2))
+    for course in sorted((resampled(course, STEP) for course in courses), key=len):
+        far, nearest = cKDTree(drawn).query(course)
+        bounds = np.flatnonzero(np.diff(far > BESIDE, prepend=False, append=False))
+        parts = []
+        for begin, stop in bounds.reshape(-1, 2).tolist():
+            before = drawn[nearest[begin - 1 : begin]] if begin else []
+            parts.append(np.array([*before, *course[begin:stop], *drawn[nearest[stop : stop + 1]]]))
+        yield from parts
+        drawn = np.concatenate([drawn, *parts])
 
 
 def _place(sheet: _Sheet, imported: Imported, at: Point, visits: Sequence[int]) -> Iterator[str]:
