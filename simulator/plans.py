@@ -138,7 +138,10 @@ class Plan:
         return other if room == one else one
 
     def _straight_on(self, leg: Leg) -> tuple[Leg, ...]:
-        """A leg and all legs straight ahead of it. A path that is a circle is followed once."""
+        """A leg (a room and the door out of it), and all legs straight ahead of it.
+
+        A path that is a circle is followed once.
+        """
         legs = [leg]
         while True:
             room = self._behind(*legs[-1])

@@ -161,7 +161,7 @@ class _Gates:
         return range(begin, max(begin, end))
 
     def allowed(self, last: int, some: Sequence[int]) -> list[tuple[int, _Gate]]:
-        """List the candidates that may be near a visit, each with its gate."""
+        """List the candidates that may be near a visit, each with its gate (allowed poses)."""
         if not some:
             return []
         # By the axes of each earlier visit, for each drift: (drifts, visits, 3).

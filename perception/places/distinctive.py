@@ -259,7 +259,7 @@ def _distance(middle: Array, radius: float, junction: Junction) -> float | None:
 
 
 def _stays(far: Array, radius: float) -> Iterator[tuple[int, int]]:
-    """Yield the first and last index of each stay in a disc.
+    """Yield the first and last index of each stay in the disc of a place.
 
     A stay ends where the robot is more than `LEFT` metres outside of the disc. `far` has the
     distance of the robot from its middle at each scan, (n,) metres.

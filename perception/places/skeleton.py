@@ -107,8 +107,8 @@ def junctions(patch: Patch, room: float) -> list[Junction]:
 def _with_mouths(found: list[Fork], mouths: list[Fork], far: float) -> list[Fork]:
     """Combine two lists of junctions: `found` without shores, and `mouths` with shores.
 
-    All mouths are kept. A junction of `found` is kept if it is amid an open space, and no mouth is
-    near.
+    Shores are lines around open spaces. All mouths are kept. A junction of `found` is kept if it is
+    amid an open space, and no mouth is near.
     """
     # The disc of a junction amid an open space is as large as those of the mouths around it.
     amid = [
@@ -133,7 +133,10 @@ def open_space(distance: Array, far: float) -> Bools:
 
 
 def with_shores(lines: Bools, inner: Bools) -> Bools:
-    """Replace lines of a skeleton, (rows, columns), inside shores by these shores."""
+    """Replace the lines of a skeleton in open spaces by shores, which run around the spaces.
+
+    `lines` and `inner` are masks, (rows, columns). `inner` has the cells inside shores.
+    """
     # A space that leads on beyond the border of the map has no shore there.
     shore = inner & ~ndimage.binary_erosion(inner, border_value=1)
     return thinned((lines & ~inner) | shore)

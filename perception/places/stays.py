@@ -240,7 +240,7 @@ class Stays:
         )
 
     def _crossing(self, visit: Visit, side: int) -> float | None:
-        """The direction in radians in which the robot enters (side -1) or leaves (1) a disc.
+        """The direction in radians in which the robot enters (-1) or leaves (1) a place's disc.
 
         None if the log begins or ends in the disc.
         """
