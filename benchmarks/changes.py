@@ -270,14 +270,8 @@ def cheapest(trace: Trace, theory: Theory, widths: Collection[int], joins: bool)
     """The map of least cost that beams of some widths find, and that joins the drives."""
     problem = settle(trace, theory)
     log, misfit = Log(trace, problem.theory, problem.pairs), Misfit(problem)
-    dstate, place, _ = theory.prices
-
-    def nats(found: SSHMap) -> float:
-        dstates = len(found.dstates) + sum(fault.cost for fault in found.faults)
-        return dstate * dstates + place * len(found.places) + misfit.of_map(found) / 2
-
     found = [ssh_map for width in widths for ssh_map in Beam(problem, log, width).maps()]
-    return min([*found, *(Joining(problem, log).maps() if joins else ())], key=nats)
+    return min([*found, *(Joining(problem, log).maps() if joins else ())], key=misfit.nats_of)
 
 
 def main() -> None:

@@ -10,8 +10,9 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Iterable, Sequence
 from functools import cache
-from itertools import combinations
+from itertools import combinations, product
 
+import networkx as nx
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.sparse import coo_array
@@ -28,6 +29,8 @@ class LeastSquares:
 
     def __init__(self, trace: Trace) -> None:
         self.trace = trace
+        # The position of each step, for the headings and positions that were fitted.
+        self.positions: dict[object, np.ndarray] = {}
         self.odometry = trace.odometry or Odometry()
         self.closures = [
             (closure, np.linalg.inv(np.array(closure.covariance))) for closure in trace.closures
@@ -103,7 +106,41 @@ class LeastSquares:
             least_squares(off, start, x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-12)
             for start in starts
         ]
-        return float(min(2 * one.cost for one in found))
+        best = min(found, key=lambda one: one.cost)
+        self.positions[headings, positions] = best.x[: 2 * len(at)].reshape(-1, 2)[where]
+        return float(2 * best.cost)
+
+    def crowding(self, headings: tuple[int, ...], positions: tuple[Hashable, ...]) -> float:
+        """How many pairs of places of different drives are at one position. A pair counts less the
+        farther apart the two are."""
+        moved = [t for t, action in enumerate(self.trace.actions, 1) if not action.starts]
+        ways = {t: math.hypot(*displacement[:2]) for t, displacement, _ in self.moved}
+        ways = {t: way for t, way in ways.items() if way > max(ways.values()) / 10}
+        self.misfit(headings, positions)
+        spots = self.positions[headings, positions]
+        places = [positions[heading] for heading in headings]
+        unit = groups_of_drives(self.trace, [])
+        if {*moved} - {t for t, *_ in self.moved} or not ways:
+            return 0.0
+        # A frame is fixed by a dstate, or by two places, that two groups of drives share.
+        tied = nx.Graph()
+        tied.add_nodes_from(unit)
+        for one, other in combinations(set(unit), 2):
+            dstates, at = (
+                {of[t] for t, u in enumerate(unit) if u == one}
+                & {of[t] for t, u in enumerate(unit) if u == other}
+                for of in (headings, places)
+            )
+            if dstates or len(at) > 1:
+                tied.add_edge(one, other)
+        count = 0.0
+        for p, q in combinations(set(places), 2):
+            saw = [{unit[t] for t, x in enumerate(places) if x == place} for place in (p, q)]
+            fixed = any(nx.has_path(tied, one, other) for one, other in product(*saw))
+            if fixed and not saw[0] & saw[1]:
+                away = math.dist(*(spots[places.index(place)] for place in (p, q)))
+                count += max(0.0, 1 - away / (0.4 * min(ways.values())))
+        return count
 
     def _reckoned(
         self, headings: Sequence[int], where: Sequence[int], places: int, dstates: int, size: int
@@ -134,16 +171,19 @@ def layings(trace: Trace, positions: Sequence[Hashable]) -> int:
     positions  the position of each step
     """
 
-    def groups(ties: Iterable[tuple[int, int]]) -> int:
-        whole = [t - 1 for t, action in enumerate(trace.actions, 1) if not action.starts]
-        ends = np.array([*((t, t + 1) for t in whole), *ties]).reshape(-1, 2).T
-        graph = coo_array((np.ones(ends.shape[1]), ends), shape=(len(trace), len(trace)))
-        return int(connected_components(graph, directed=False)[0])
-
-    closures = [(closure.first, closure.last) for closure in trace.closures]
     equal = [
         pair
         for pair in combinations(range(len(trace)), 2)
         if len({positions[t] for t in pair}) == 1
     ]
-    return groups(closures) - groups([*closures, *equal])
+    return len({*groups_of_drives(trace, [])}) - len({*groups_of_drives(trace, equal)})
+
+
+def groups_of_drives(trace: Trace, equal: Iterable[tuple[int, int]]) -> list[int]:
+    """For each step, a number of its group of drives. Closures and equal steps join drives."""
+    ties = [(closure.first, closure.last) for closure in trace.closures]
+    whole = [t - 1 for t, action in enumerate(trace.actions, 1) if not action.starts]
+    ends = np.array([*((t, t + 1) for t in whole), *ties, *equal]).reshape(-1, 2).T
+    graph = coo_array((np.ones(ends.shape[1]), ends), shape=(len(trace), len(trace)))
+    found: list[int] = connected_components(graph, directed=False)[1].tolist()
+    return found

@@ -78,10 +78,10 @@ def test_two_places_at_one_position_prevent_a_probability() -> None:
     """A gateway is closed on the second drive. If gateways may not change, a place is two."""
     drives = [
         Trace.from_steps(
-            "abcde",
-            ["travel"] * 4,
-            displacements=[(5.0, 0.0, 0.0)] * 4,
-            stars=[(1, is_open, 1, 0)] + [(1, 0, 1, 0)] * 4,
+            "abcdefg",
+            ["travel"] * 6,
+            displacements=[(5.0, 0.0, 0.0)] * 6,
+            stars=[(1, is_open, 1, 0)] + [(1, 0, 1, 0)] * 6,
             name=name,
         )
         for is_open, name in ((1, "monday"), (0, "tuesday"))
@@ -94,7 +94,7 @@ def test_two_places_at_one_position_prevent_a_probability() -> None:
     with_change = solve(drives, Theory(changed=0.9, star="frame"))
     assert with_change.confidence == pytest.approx(0.99, abs=0.01)
     # Nothing says how two pieces lie.
-    apart = solve(drives, Theory(elsewhere=tuple(product(range(5), range(5, 10)))))
+    apart = solve(drives, Theory(elsewhere=tuple(product(range(7), range(7, 14)))))
     assert len(apart[0].pieces) == 2
     assert doubt_of(settle(together(drives), Theory()), apart[0]) is None
 
@@ -103,22 +103,22 @@ def test_gateway_that_closes_and_opens_again_costs_two_changes() -> None:
     end = [(1, 0, 1, 0)]
     drives = [
         Trace.from_steps(
-            "abcde"[:length],
+            "abcdefg"[:length],
             ["travel"] * (length - 1),
             displacements=[(5.0, 0.0, 0.0)] * (length - 1),
             stars=[(1, is_open, 1, 0)] + end * (length - 1),
         )
-        for is_open, length in ((1, 5), (0, 5), (1, 4))
+        for is_open, length in ((1, 7), (0, 7), (1, 6))
     ]
     problem = settle(together(drives), Theory(changed=0.9))
     *_, ssh_map = joined(problem)
-    assert ssh_map.dstate_at == (*range(5), *range(5), *range(4))
+    assert ssh_map.dstate_at == (*range(7), *range(7), *range(6))
     assert [(fault.step, fault.place, fault.gateway) for fault in ssh_map.faults] == [
-        (5, 0, 1),
-        (10, 0, 1),
+        (7, 0, 1),
+        (14, 0, 1),
     ]
     *_, ssh_map = joined(settle(together(drives), Theory()))
-    assert len(ssh_map.dstates) == 6  # without changes, the first place is two
+    assert len(ssh_map.dstates) == 8  # without changes, the first place is two
 
 
 @pytest.mark.parametrize(

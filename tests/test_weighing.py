@@ -19,7 +19,7 @@ from strategies import TOYS, theories, traces
 from ssh_abduction import OnlineMapper, Solution, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.misfit import false_costs, misfit
-from ssh_abduction.data import MapError, Odometry, SolverError, TheoryError
+from ssh_abduction.data import MapError, Odometry, SolverError, TheoryError, together
 from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.solver import Search, Status
@@ -51,6 +51,8 @@ def cheapest(trace: Trace, theory: Theory) -> tuple[float, set[Key]]:
         nats = sum(price * count for price, count in prices)
         nats += squares.misfit(labels, positions) / 2
         nats += theory.price_of_laying * layings(trace, [positions[s] for s in labels])
+        if theory.level == "topological":
+            nats += theory.price_of_laying * squares.crowding(labels, positions)
         known = found.get((labels, places))
         if known is None or counts.paths < known[1]:
             known = found[labels, places] = nats, counts.paths, set()
@@ -174,6 +176,44 @@ def test_cheapest_maps_equal_plain_least_squares(data: st.DataObject) -> None:
     )
     theory = data.draw(theories(trace, fixed=("displacement",)), label="theory")
     agree(trace, weighed(theory, data.draw(st.sampled_from(PRICES), label="prices")))
+
+
+def test_two_places_at_one_position_pay_the_more_the_nearer_they_are() -> None:
+    theory = Theory(star="alike", elsewhere=((0, 3),), weigh="cost", boundary="none")
+    found: dict[float, float] = {}
+    for way in (9.2, 10.0, 10.5):  # the drives differ in how far the first place is off
+        drives = [
+            Trace.from_steps(
+                views,
+                ["travel"] * 2,
+                displacements=[(first, 0.0, 0.0), (5.0, 0.0, 0.0)],
+                stars=[(1, 0, 1, 0)] * 3,
+            )
+            for views, first in (("cba", 9.0), ("dba", way))
+        ]
+        trace = together(drives)
+        solution = solve(trace, theory, time_limit=100)
+        assert solution.weighed is not None
+        assert len(solution.maps[0].dstates) == 4
+        found[way] = solution.weighed.nats - 4 * 16 - solution.theory.price_of_laying
+        answer = solution.to_dict()
+        assert [*false_costs(trace, answer, solution.maps, solution.theory)] == []
+        answer["weighed"]["nats"] -= 1
+        assert [*false_costs(trace, answer, solution.maps, solution.theory)] != []
+    assert found == pytest.approx({9.2: 14.4, 10.0: 8.0, 10.5: 4.0}, abs=0.01)
+    for less in (replace(trace.steps[1], displacement=None), trace.steps[1]):
+        steps = (trace.steps[0], less, *trace.steps[2:])
+        problem = settle(replace(trace, steps=steps), theory)
+        assert (problem.overlap.near == 0) == (less.displacement is None)
+
+
+@pytest.mark.slow
+def test_two_places_at_one_position_cost_what_the_brute_force_says() -> None:
+    drives = [
+        Trace.from_steps(views, ["travel"] * 2, displacements=[(way, 0, 0), (5, 0, 0)])
+        for views, way in (("cba", 9.0), ("dba", 10.5))
+    ]
+    agree(together(drives), Theory(elsewhere=((0, 3),), weigh="cost", prices=(8.0, 1.0, 0.0)))
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from __future__ import annotations
 import cmath
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from itertools import pairwise
+from itertools import accumulate, combinations, pairwise
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -52,6 +52,9 @@ LONGEST = 400
 # The direction from one place to another is too uncertain to use if they are closer than this many
 # metres.
 NEAR = 1.0
+# Two places are at one position if they are nearer than CROWDED times the shortest travel. A move
+# is a travel if it is longer than TRAVEL of the longest one.
+CROWDED, TRAVEL = 0.4, 0.1
 
 _Frame = tuple[complex, float]  # the position and the heading of the origin of a stretch
 
@@ -63,8 +66,16 @@ def misfit(
 
     Faults have a kind and a step. A displacement that jumped is ignored.
     """
+    return _least(trace, dstates, places, faults)[0]
+
+
+def _least(
+    trace: Trace, dstates: Sequence[int], places: Sequence[int], faults: Faults
+) -> tuple[float, Array]:
+    """Compute the misfit, and the position of the dstate of each step, in metres, (n, 2)."""
     wrong = [step for kind, step in faults if kind == "jumped"]
-    return _Errors(trace.without_displacements_at(wrong), dstates, places).least()
+    errors = _Errors(trace.without_displacements_at(wrong), dstates, places)
+    return errors.least(), errors.position
 
 
 def false_costs(
@@ -100,11 +111,13 @@ def false_costs(
         courses.append((name, rival.get("nats"), rival["dstates"], at, there, of_rival))
     paths = theory.prices[2] * len(maps[0].paths)
     for name, claimed, dstates, at, count, faults in courses:
-        square = misfit(trace, dstates, at, faults)
+        square, position = _least(trace, dstates, at, faults)
         true = theory.prices[0] * len(set(dstates)) + theory.prices[1] * count + square / 2
         tenths = [theory.fault_tenths(kind, trace.steps[step]) for kind, step in faults]
         true += theory.prices[0] * sum(tenths) / 10
         true += theory.price_of_laying * _layings(trace, at)
+        if theory.level == "topological" and not theory.lifts and not theory.jumped:
+            true += theory.price_of_laying * _crowding(trace, dstates, at, position)
         # The paths of a rival are not listed.
         true += paths if name == "weighed.nats" or not theory.prices[2] else math.nan
         if abs(true - claimed) > EXACT + SHARE * square:
@@ -117,23 +130,66 @@ def _layings(trace: Trace, places: Sequence[int]) -> int:
     This is the number of groups of drives connected by closures, minus the number of groups
     connected by closures or places.
     """
-    drive = [0]
-    for action in trace.actions:
-        drive.append(drive[-1] + action.starts)
+    drive = _drives(trace)
     tied = [{drive[closure.first], drive[closure.last]} for closure in trace.closures]
     shared = [{drive[t] for t, p in enumerate(places) if p == place} for place in set(places)]
-    counts = []
-    for sets in (tied, tied + shared):
-        groups = [{number} for number in set(drive)]
-        for some in sets:
-            apart = [group for group in groups if not group & some]
-            groups = [*apart, some.union(*(group for group in groups if group & some))]
-        counts.append(len(groups))
-    return counts[0] - counts[1]
+    return len(_groups(drive, tied)) - len(_groups(drive, tied + shared))
+
+
+def _crowding(
+    trace: Trace, dstates: Sequence[int], places: Sequence[int], position: Array
+) -> float:
+    """Count the pairs of places at one position that no group of drives saw both.
+
+    Closures connect the drives of a group. A pair counts less the farther the two are apart. It
+    counts if common places or a common dstate fix how the drives lie.
+    """
+    drive = _drives(trace)
+    moves = [
+        step.displacement
+        for t, step in enumerate(trace.steps)
+        if t and not trace.actions[t - 1].starts
+    ]
+    if any(move is None for move in moves):
+        return 0.0
+    ways = [math.hypot(*move[:2]) for move in moves if move is not None]
+    near = CROWDED * min((way for way in ways if way > TRAVEL * max(ways)), default=0.0)
+    tied = [{drive[closure.first], drive[closure.last]} for closure in trace.closures]
+    groups = _groups(drive, tied)
+    group = [next(i for i, members in enumerate(groups) if number in members) for number in drive]
+    saw = {p: {group[t] for t, q in enumerate(places) if p == q} for p in places}
+    faced = [{group[t] for t, x in enumerate(dstates) if s == x} for s in set(dstates)]
+    twice = [one & other for one, other in combinations(saw.values(), 2) if len(one & other) > 1]
+    frames = _groups(group, [*faced, *twice])
+    count = 0.0
+    for p, q in combinations(saw, 2):
+        is_fixed = any(frame & saw[p] and frame & saw[q] for frame in frames)
+        if near and is_fixed and not saw[p] & saw[q]:
+            away = position[places.index(p)] - position[places.index(q)]
+            count += max(0.0, 1 - float(np.hypot(*away)) / near)
+    return count
+
+
+def _drives(trace: Trace) -> list[int]:
+    """Return the number of the drive of each step."""
+    return [0, *accumulate(int(action.starts) for action in trace.actions)]
+
+
+def _groups(members: Collection[int], ties: Sequence[set[int]]) -> list[set[int]]:
+    """Merge members that are in one set of `ties`, directly or by others."""
+    groups = [{member} for member in set(members)]
+    for some in ties:
+        apart = [group for group in groups if not group & some]
+        groups = [*apart, some.union(*(group for group in groups if group & some))]
+    return groups
 
 
 class _Errors:
-    """The errors of the displacements and closures that make the loops of a map close."""
+    """The errors of the displacements and closures that make the loops of a map close.
+
+    Attributes:
+        position: The position of the dstate of each step, after `least`.
+    """
 
     def __init__(self, trace: Trace, dstates: Sequence[int], places: Sequence[int]) -> None:
         odometry = trace.odometry or Odometry()
@@ -163,6 +219,7 @@ class _Errors:
         # off its dstate at each step, scale and drift.
         self._begin = 3 * (size + len(self._closures))
         self._size = self._begin + self._off.size + 2
+        self.position: Array = np.zeros((size, 2))
         # A loop: the last earlier step at the dstate or place of a step, the step, and whether both
         # are at one dstate.
         self._loops: list[tuple[int, int, bool]] = []
@@ -208,6 +265,8 @@ class _Errors:
             [cos * gone[:, 0] - sin * gone[:, 1], sin * gone[:, 0] + cos * gone[:, 1]], axis=1
         )
         pose = np.column_stack([np.cumsum(onward, axis=0), heading])
+        off_dstate = z[self._begin : self._begin + self._off.size].reshape(-1, 3) * self._off
+        self.position = pose[:, :2] - (off_dstate[:, :2] if len(self._off) else 0.0)
         # The derivatives of each movement, (x, y, heading), by its three errors, scale and drift.
         own = np.zeros((size, 3, 5))
         own[:, 0, 0], own[:, 0, 1] = cos / (1 + scale), -sin / (1 + scale)

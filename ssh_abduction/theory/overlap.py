@@ -1,24 +1,31 @@
-"""Compute the price of laying drives on each other, which is part of the cost of a joint map.
+"""Compute the prices that are part of the cost of a joint map: of laying drives on each other,
+and of different places at one position.
 
 Nothing is known of where a drive starts. So it can be laid on a map of other drives in very many
 ways, and in some of these ways a place or two look the same by chance. Closures (matches of local
 maps) connect some drives to groups. A map pays the price each time that common places connect two
 groups. So drives share places only if they have more in common than chance explains.
+
+Two places cannot be at one position. If drives are laid on each other by chance, many of their
+places are. So each two places that no drive (or group) saw both pay this price again if they are at
+one position, and less of it the farther they are apart.
 """
 
 from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Collection, Hashable, Iterable, Sequence
+from collections import Counter
+from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
+from itertools import combinations, pairwise
 
 from ssh_abduction.data.drives import starts_of
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory.theory import Theory
 
-# Two places are at one position if they are nearer than this share of the shortest travel. A move
-# is a travel if it is longer than TRAVEL of the longest one.
+# Two places are not at one position if they are farther apart than this share of the shortest
+# travel. A move is a travel if it is longer than TRAVEL of the longest one.
 NEAR, TRAVEL = 0.4, 0.1
 
 
@@ -26,7 +33,9 @@ class Overlap:
     """Computes the price of laying the drives of one trace on each other.
 
     Attributes:
-        price: The price of joining two groups of drives.
+        price: The price of joining two groups of drives, and of two places at one position.
+        near: Places that are nearer than this, in metres, are at one position. 0 if positions are
+            not known well enough.
     """
 
     def __init__(self, trace: Trace, theory: Theory) -> None:
@@ -42,8 +51,11 @@ class Overlap:
         self._tied = _joined(range(len(starts) + 1), closures)  # a group for each drive
         ways = [math.hypot(*step.displacement[:2]) for step in trace.steps if step.displacement]
         longest = max(ways, default=0.0)
-        # Places of two drives that are nearer than this, in metres, are at one position.
-        self.near = NEAR * min((way for way in ways if way > TRAVEL * longest), default=0.0)
+        moved = (step.displacement for t, step in enumerate(trace.steps) if t and t not in starts)
+        has_frames = theory.level == "topological" and not (theory.lifts or theory.jumped)
+        self.near = 0.0
+        if has_frames and len({*self._tied}) > 1 and None not in moved:
+            self.near = NEAR * min((way for way in ways if way > TRAVEL * longest), default=0.0)
 
     @property
     def unit_of_step(self) -> list[int]:
@@ -53,6 +65,65 @@ class Overlap:
     def is_tied(self, drive: int) -> bool:
         """Whether closures connect a drive, given by its number, to others."""
         return self._tied.count(self._tied[drive]) > 1
+
+    def crowding(
+        self,
+        labels: Mapping[int, int],
+        places: Sequence[Hashable],
+        at: Sequence[Sequence[float]],
+    ) -> float:
+        """Return the price of places at one position.
+
+        Args:
+            labels: The dstate of each step, or of each step of some drives.
+            places: The place of each dstate.
+            at: The position of each dstate, in metres.
+        """
+        return self.price * sum(share for *_, share in self.crowded(labels, places, at))
+
+    def crowded_in(self, ssh_map: SSHMap) -> Iterator[tuple[int, int, float]]:
+        """Yield the same as `crowded` for a map of the whole trace that has a fit."""
+        poses = ssh_map.fit.poses if ssh_map.fit else ()
+        places, at = [s.place for s in ssh_map.dstates], [(pose.x, pose.y) for pose in poses]
+        yield from self.crowded(dict(enumerate(ssh_map.dstate_at)), places, at)
+
+    def crowded(
+        self,
+        labels: Mapping[int, int],
+        places: Sequence[Hashable],
+        at: Sequence[Sequence[float]],
+    ) -> Iterator[tuple[int, int, float]]:
+        """Yield the first steps at two places at one position, and the share of the price to pay.
+
+        The arguments are those of `crowding`.
+        """
+        if not self.near:
+            return
+        first: dict[Hashable, int] = {}
+        seen: dict[Hashable, set[int]] = {}  # the groups of drives that saw each place
+        facing: dict[int, set[int]] = {}  # the groups of drives that saw each dstate
+        for t, s in sorted(labels.items()):
+            first.setdefault(places[s], t)
+            for groups in (seen.setdefault(places[s], set()), facing.setdefault(s, set())):
+                groups.add(self._tied[self._drive[t]])
+        frame = self._frames(seen.values(), facing.values())
+        in_order = sorted(first.values(), key=lambda t: at[labels[t]][0])
+        for i, t in enumerate(in_order):
+            for u in in_order[i + 1 :]:
+                here, there = at[labels[t]], at[labels[u]]
+                if there[0] - here[0] >= self.near:
+                    break
+                one, two = (seen[places[labels[step]]] for step in (t, u))
+                is_known = {frame[group] for group in one} & {frame[group] for group in two}
+                away = math.dist(here, there) / self.near
+                if away < 1 and is_known and not one & two:
+                    yield min(t, u), max(t, u), 1 - away
+
+    def _frames(self, seen: Iterable[set[int]], facing: Iterable[set[int]]) -> list[int]:
+        """Merge groups of drives with a dstate or two places in common, which fix how they lie."""
+        ties = [pair for groups in facing for pair in pairwise(groups)]
+        shared = Counter(pair for groups in seen for pair in combinations(sorted(groups), 2))
+        return _joined(self._tied, [*ties, *(pair for pair, count in shared.items() if count > 1)])
 
     def nats(self, at: Sequence[Hashable]) -> float:
         """Return the price of the claim that drives have these places in common.

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
-from itertools import chain, combinations, product
+from itertools import chain
 from typing import TYPE_CHECKING, TypeAlias
 
 from ssh_abduction.data.drives import Drive, drives_of, step_name
@@ -49,6 +49,7 @@ def rivals_of(problem: Problem, misfit: Misfit, best: SSHMap, seconds: float) ->
 
     def cost_of(dstates: Sequence[int], places: Sequence[int]) -> float:
         nats: float = kept + misfit.of_course(dstates, places or dstates, jumped(best)) / 2
+        nats += misfit.crowding(dstates, places or dstates)
         return nats + dstate * len(set(dstates)) + place * len(set(places))
 
     rival = rival_of(best, misfit.nats_of(best))
@@ -59,30 +60,15 @@ def doubt_of(problem: Problem, best: SSHMap) -> str | None:
     """Say why the costs of maps cannot be trusted; None if there is no such reason.
 
     Two places cannot be at one position. If two drives have such places, they overlap by chance.
-    Drives that closures connect to others do not.
     """
-    drives, overlap = drives_of(problem.trace), problem.overlap
-    free = [k for k, _ in enumerate(drives) if not overlap.is_tied(k)]
-    if len(drives) < 2 or not free or not best.places or not overlap.near:
+    if not problem.overlap.near:
         return None
     from ssh_abduction.solver.geometry.ranking import Ranking  # loads numpy
 
-    fit = (best if best.fit else Ranking(problem.trace).fitted(best)).fit
-    assert fit is not None
-    piece_of = {s: i for i, piece in enumerate(best.pieces) for s in piece}
-    at = [best.place_of(t) for t in range(len(problem.trace))]
-    seen = [{at[t]: t for t in range(drive.stop - 1, drive.first - 1, -1)} for drive in drives]
-    for i, j in combinations(range(len(drives)), 2):
-        if i not in free and j not in free:
-            continue
-        for p, q in product(seen[i].keys() - seen[j], seen[j].keys() - seen[i]):
-            s, x = (best.dstate_at[t] for t in (seen[i][p], seen[j][q]))
-            here, there = fit.poses[s], fit.poses[x]
-            if piece_of[s] != piece_of[x]:
-                continue
-            if math.hypot(here.x - there.x, here.y - there.y) < overlap.near:
-                steps = (step_name(drives, t) for t in (seen[i][p], seen[j][q]))
-                return f"{' and '.join(steps)} are at one position, but at two places"
+    fitted = best if best.fit else Ranking(problem.trace).fitted(best)
+    for *steps, _ in problem.overlap.crowded_in(fitted):
+        names = (step_name(drives_of(problem.trace), step) for step in steps)
+        return f"{' and '.join(names)} are at one position, but at two places"
     return None
 
 

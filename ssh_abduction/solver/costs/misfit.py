@@ -7,7 +7,8 @@ returns leave less freedom. So a set of returns never has a smaller misfit than 
 and a map never has a smaller misfit than a set of its returns.
 
 Places that drives have in common cost a price (`theory/overlap.py`), and more returns never lower
-it. So twice this price is a part of the misfit.
+it. So twice this price is a part of the misfit. Places at one position cost a price, too, but more
+returns may lower it. So only complete maps pay it.
 
 A visit to a place has several steps, as turns stay at their place. So these steps have one position
 in each topological map, also without a return. But if displacements may be wrong, the
@@ -17,12 +18,13 @@ return, too.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Hashable, Iterable, Sequence
 from typing import TypeAlias
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.engines.refusing import minimal_part
 from ssh_abduction.solver.geometry.fit import Poses
+from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.solver.values import Cost, nats_of
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.evidence.displacement import jumped
@@ -75,7 +77,18 @@ class Misfit:
 
     def nats_of(self, ssh_map: SSHMap) -> float:
         """Compute the cost of a map of the whole trace in nats: its prices and half its misfit."""
-        return nats_of(Cost.of(ssh_map), self._theory) + self.of_map(ssh_map) / 2
+        places = [ssh_map.dstates[label].place for label in ssh_map.dstate_at]
+        nats = nats_of(Cost.of(ssh_map), self._theory) + self.of_map(ssh_map) / 2
+        return nats + self.crowding(ssh_map.dstate_at, places)
+
+    def crowding(self, dstates: Sequence[int], places: Sequence[Hashable]) -> float:
+        """Return the price of places at one position, for the dstate and place of each step."""
+        if not self._overlap.near or not self._overlap.nats(places):
+            return 0.0
+        labels = numbered(dstates)
+        of_dstate = [*dict(zip(labels, places, strict=True)).values()]
+        at = Poses(self.trace, labels, of_dstate).positions().tolist()
+        return self._overlap.crowding(dict(enumerate(labels)), of_dstate, at)
 
     def returns_of(self, ssh_map: SSHMap) -> list[Equality]:
         """List the returns of a map: each step with the last step at its dstate or place."""

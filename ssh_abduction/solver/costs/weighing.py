@@ -299,9 +299,9 @@ class Weighing:
         nats = self.add(ssh_map)
         _log.debug("a map of %.1f nats, and all others cost at least %.1f", nats, least)
         task, returns, wrong = self._parts.task, self._misfit.returns_of(ssh_map), jumped(ssh_map)
-        if nats >= self._most:
-            # `least` already has the misfit that the track has without returns.
-            enough = 2 * (self._most - least + self._base)
+        # `least` already has the misfit that the track has without returns.
+        enough = 2 * (self._most - least + self._base)
+        if nats >= self._most and self._misfit.of_returns(returns, wrong) >= enough:
             returns = self._misfit.core(returns[::-1], enough, wrong)
         elif task.theory.has_faults:
             returns = _exactly(ssh_map)

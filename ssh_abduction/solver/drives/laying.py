@@ -106,7 +106,9 @@ def unproven(
 def _nats(ssh_map: SSHMap, problem: Problem) -> float:
     """Compute the cost in nats of a map that has a fit."""
     assert ssh_map.fit is not None
-    nats = nats_of(Cost.of(ssh_map), problem.theory) + problem.overlap.of_map(ssh_map)
+    overlap = problem.overlap
+    crowding = overlap.price * sum(share for *_, share in overlap.crowded_in(ssh_map))
+    nats = nats_of(Cost.of(ssh_map), problem.theory) + overlap.of_map(ssh_map) + crowding
     return nats + ssh_map.fit.chi2 / 2
 
 

@@ -113,6 +113,11 @@ class Poses:
         """Compute the least chi-square of the displacements."""
         return float((self._residuals(self._best()) ** 2).sum())
 
+    def positions(self) -> Array:
+        """Find the best position of each heading (mostly of each dstate), in metres, (n, 2)."""
+        at: Array = self._best()[: 2 * self._positions].reshape(-1, 2)[self._place[: self._dstates]]
+        return at
+
     def settled(
         self, start: Array | None, fixed: Sequence[int], wanted: Sequence[int]
     ) -> tuple[float, Array, Array]:

@@ -105,7 +105,7 @@ class Joining:
         }
         starts = sorted(anchors, key=lambda pair: anchors[pair][:1], reverse=True)[:STARTS]
         joined = [self._all_joined(alone, dict(anchors), start) for start in starts]
-        best = min(joined, key=lambda parts: sum(part.nats for part in parts), default=alone)
+        best = min(joined, key=lambda parts: sum(map(self._nats, parts)), default=alone)
         if len(best) < len(alone):
             yield from self._beside(best)
 
@@ -207,14 +207,20 @@ class Joining:
     def _joined(self, first: Part, second: Part, ways: Sequence[_Anchor]) -> Part | None:
         """Join two maps in the cheapest way that breaks no axiom; None if no join is cheaper."""
         found: list[Part] = []
+        most = self._nats(first) + self._nats(second)
         overlay = Overlay(first, second, self._problem, self.sights)
         for way in ways:
             look_at_clock()
             begun = overlay.merge(way.old, way.new, way.turn if way.by_places else None)
-            if begun and (part := overlay.part()).nats < first.nats + second.nats:
+            if begun and self._nats(part := overlay.part()) < most:
                 found.append(part)
-        found.sort(key=lambda joined: joined.nats)
+        found.sort(key=self._nats)
         return next((joined for joined in found if self._map(joined)), None)
+
+    def _nats(self, part: Part) -> float:
+        """Compute the cost of a part in nats, with the price of places at one position."""
+        at = part.poses[0].tolist()
+        return part.nats + self._problem.overlap.crowding(part.labels, part.places, at)
 
     def _map(self, part: Part) -> SSHMap | None:
         """Make the map of a part; None if it breaks an axiom."""

@@ -193,7 +193,7 @@ class Overlay:
 
     def __init__(self, standing: Part, drive: Part, problem: Problem, sights: Sights) -> None:
         theory, both = problem.theory, standing.beside(drive)
-        self._both, self._sights = both, sights
+        self._both, self._sights, self._overlap = both, sights, problem.overlap
         self._old = len(standing.places), len(standing.sights)
         self._has_places = theory.level == "topological"
         self._prices = theory.prices[0], theory.prices[1] if self._has_places else 0.0
@@ -331,9 +331,17 @@ class Overlay:
             self._merge_coinciding(touched)
         except _ClashError:
             self._state = before
-        if self._state.nats >= before.nats:
+        if self._state.nats >= before.nats + self._relief(before, places):
             self._state = before
         return self._state is not before
+
+    def _relief(self, before: _State, places: tuple[int, int] | None) -> float:
+        """Compute what two places at one position pay that one place does not pay."""
+        if not places or {*before.sights[places[0]]} & {*before.sights[places[1]]}:
+            return 0.0
+        x, y = (before.mean[k : k + 2] for k in self._both.position[list(places)])
+        away = math.dist(x, y) / self._overlap.near if self._overlap.near else 1.0
+        return self._overlap.price * max(0.0, 1 - away)
 
     def _merge_coinciding(self, places: set[int]) -> None:
         """Merge the coinciding dstates at some places, unless some of them cannot be one."""
