@@ -499,3 +499,27 @@ def test_unwritable_file_is_an_error_before_the_work(
         captured = capsys.readouterr()
         assert captured.out == ""
         assert captured.err == f"ssh-abduction: {file}: cannot write {what}: {why}\n"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "solve {0} -o {0}",
+        "solve {0} {1} --together -o {1}",
+        "solve {0} {1} --together --set joint_trace={1}",
+        "export {2} --to dot -o {2}",
+        "import {0} -o {0}",
+    ],
+)
+def test_verb_does_not_write_over_a_file_that_it_reads(
+    words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = [str(tmp_path / name) for name in ("a.jsonl", "b.jsonl", "maps.json")]
+    for name in files[:2]:
+        Trace.from_steps("ab", ["travel"], name=name).save(name)
+    solve(Trace.load(files[0])).save(files[2])
+    before = [Path(file).read_bytes() for file in files]
+    assert main(words.format(*files).split()) == 1
+    assert "expected another file to write than the one to read" in capsys.readouterr().err
+    assert [Path(file).read_bytes() for file in files] == before
+    assert main(["solve", files[0], "--theory", files[2], "-o", files[2]]) == 0

@@ -215,6 +215,12 @@ def test_misspelt_word_gets_a_suggestion(
     assert capsys.readouterr().err.endswith(f"; did you mean {meant}?\n")
 
 
+def test_setting_without_a_value_is_an_error(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(["solve", "trace.jsonl", "--set", "level"])
+    assert capsys.readouterr().err.endswith(", got 'level'; write level=VALUE\n")
+
+
 @pytest.mark.parametrize(
     "words",
     ["frobnicate", "solve trace.jsonl --xyzzy", "solve a b --set star=\x1b[2J", "check a b c"],

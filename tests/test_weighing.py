@@ -409,6 +409,17 @@ def test_sentence_names_the_most_probable_missed_join() -> None:
     assert replace(weighed, doubt="the track is unreliable").missed is None
 
 
+def test_sentence_of_equally_doubtful_steps_survives_a_file() -> None:
+    """Steps 0 and 2 are one dstate with probability 0.5 + 1e-7, and 1 and 3 with 0.5 - 1e-7."""
+    near = Rival(10.0, (0, 1, 0, 3), (0, 1, 0, 1)), Rival(10.0 + 4e-7, (0, 1, 2, 1), (0, 1, 0, 1))
+    for rivals in (near, near[::-1]):
+        weighed = Weighed(10.0, 0.0, tuple(rivals))
+        again = Weighed.from_dict(FieldReader("here"), weighed.to_dict(), 4)
+        assert again.sentence == weighed.sentence
+        assert again.unsure is not None
+        assert again.unsure[:2] == (0, 2)
+
+
 def test_doubted_costs_give_no_confidence() -> None:
     rivals = (Rival(10.0, (0, 1, 0), (0, 1, 0)),)
     sure = Weighed(10.0, 0.0, rivals, True, 0.0)

@@ -53,6 +53,7 @@ from ssh_abduction.cli import (
 )
 from ssh_abduction.cli import reproduce as reproduction
 from ssh_abduction.cli.guard import Guard
+from ssh_abduction.cli.options import check_inputs_are_kept
 from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.parsing import Parser, Verbs
 from ssh_abduction.cli.verbosity import add_verbosity, telling
@@ -188,6 +189,7 @@ def _main(arguments: Sequence[str] | None) -> int:
             warnings.filterwarnings("default", category=DeprecationWarning, module="ssh_abduction")
             try:
                 warn(options.notes)
+                check_inputs_are_kept(options)
                 guard = Guard(lambda: None, lambda _: ("", program.interrupted_code()), None, None)
                 with contextlib.redirect_stdout(output), guard:
                     code = int(options.run(options))

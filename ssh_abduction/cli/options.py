@@ -31,6 +31,10 @@ RULES = (
     "given again"
 )
 
+# The arguments that name files to read, and the options that name files to write.
+READ = ("trace", "traces", "log", "logs", "maps", "other", "world")
+WRITTEN = ("output", "joint_trace")
+
 # The names of the files in a folder that map wrote.
 MAPS, TRACE, RUN = "maps.json", "trace.jsonl", "run.json"
 
@@ -146,6 +150,24 @@ def check_output(target: str, what: str) -> None:
     else:
         return
     raise AbductionError(f"{named(target)}: cannot write {what}: {why}")
+
+
+def check_inputs_are_kept(options: argparse.Namespace) -> None:
+    """Raise AbductionError if a command would write to a file that it reads by its arguments.
+
+    Only `cluster` may: it reads a trace, and writes the same trace with views.
+    """
+    given = vars(options)
+    files = list[str]()
+    for read in (given.get(name) for name in READ if options.verb != "cluster"):
+        files += [read] if isinstance(read, str) else read if isinstance(read, list) else []
+    for target in filter(None, (given.get(name) for name in WRITTEN)):
+        for file in files:
+            if os.path.isfile(target) and os.path.exists(file) and os.path.samefile(target, file):
+                raise AbductionError(
+                    f"{named(target)}: expected another file to write than the one to read, got "
+                    "the same one; name another file"
+                )
 
 
 def write(trace: Trace, target: str, said: str) -> None:

@@ -94,7 +94,7 @@ class _Set(argparse.Action):
         setting = parser.settings.get(name.strip().replace("-", "_"))
         if setting is None or not equals:
             known = ", ".join(parser.settings)
-            hint = _meant(name, parser.settings)
+            hint = f"; write {name}=VALUE" if setting else _meant(name, parser.settings)
             raise argparse.ArgumentError(
                 self, f"expected NAME=VALUE with a name out of {known}, got {values!r}{hint}"
             )

@@ -19,6 +19,9 @@ from ssh_abduction.data.map_parts import FAULTS
 from ssh_abduction.theory.overlap import groups_of
 
 EQUAL = 1e-6  # costs in nats that differ by less count as equal
+# Probabilities with the same digits are equally doubtful. A file has costs with fewer digits, and
+# must say the same.
+TOLD = 4
 # The price of breaking axioms, in nats. Mention a map that breaks axioms only if it costs SAID nats
 # less than the best map.
 BROKEN, SAID = 12.0, 1.0
@@ -164,7 +167,7 @@ class Weighed:
             if step - last.get(name, step) > 1:
                 joins.append((last[name], step, self.probability(last[name], step, of)))
             last[name] = step
-        return tuple(sorted(joins, key=lambda join: join[2]))
+        return tuple(sorted(joins, key=lambda join: round(join[2], TOLD)))
 
     @cached_property
     def missed(self) -> tuple[int, int, float] | None:
@@ -175,12 +178,13 @@ class Weighed:
         """
         best = self.rivals[0].places or self.rivals[0].dstates
         apart = [told for told in self._pairs("place") if best[told[0]] != best[told[1]]]
-        return self._named(max(apart, key=lambda told: told[2], default=None))
+        return self._named(max(apart, key=lambda told: round(told[2], TOLD), default=None))
 
     @cached_property
     def unsure(self) -> tuple[int, int, float] | None:
         """The two steps whose probability of being one dstate is nearest to 0.5, as in `missed`."""
-        least = min(self._pairs("dstate"), key=lambda told: abs(told[2] - 0.5), default=None)
+        pairs = self._pairs("dstate")
+        least = min(pairs, key=lambda told: round(abs(told[2] - 0.5), TOLD), default=None)
         return self._named(least)
 
     def _pairs(self, of: str) -> Iterator[tuple[int, int, float]]:
